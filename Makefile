@@ -1,0 +1,40 @@
+# Every target works on a bare machine with Python 3.11 and make.
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: demo test check slow bench stress fix containers vm clean
+.DEFAULT_GOAL := demo
+
+$(VENV)/.runtime: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
+	touch $@
+
+$(VENV)/.dev: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	touch $@ $(VENV)/.runtime
+
+demo: $(VENV)/.runtime   ## record, align, imagine and score, on this machine
+	$(BIN)/dextouch demo
+
+test: $(VENV)/.dev       ## the default test run (under ten minutes on two cores)
+	$(BIN)/python -m pytest -q
+
+slow: $(VENV)/.dev       ## the long tests
+	$(BIN)/python -m pytest -q -m slow
+
+check: $(VENV)/.dev      ## format, lint, types, import contracts
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy -p dextouch -p services
+	PYTHONPATH=.:shared $(BIN)/lint-imports
+
+fix: $(VENV)/.dev        ## let the tools mend what they can
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+clean:
+	rm -rf demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

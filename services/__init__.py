@@ -1,0 +1,1 @@
+"""The verbs of DexTouch, in the order in which the data flows."""

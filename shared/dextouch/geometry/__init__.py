@@ -1,0 +1,1 @@
+"""Rotations, rigid transforms, interpolation and pinhole cameras, all in float64."""

@@ -1,0 +1,213 @@
+"""The 67-D action: layout, packing, and the only code that changes what poses are relative to.
+
+Equation 5 of the paper: a_t = [e_L, e_R, q_L, q_R, e_c]. e is a pose relative to an anchor step,
+3 numbers of translation (metres) then 6 of rotation (`rotation_to_6d`); q are the robot hand's 20
+joint angles (radians), `RobotHand` order. e_c is the head camera's optical frame.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry.rotations import rotation_from_6d, rotation_to_6d
+from dextouch.geometry.transforms import invert, transform
+
+ACTION_DIM = 67
+POSE_DIM = 9
+WRIST_LEFT = slice(0, 9)
+WRIST_RIGHT = slice(9, 18)
+JOINTS_LEFT = slice(18, 38)
+JOINTS_RIGHT = slice(38, 58)
+CAMERA_HEAD = slice(58, 67)
+POSE_SLICES = (WRIST_LEFT, WRIST_RIGHT, CAMERA_HEAD)
+
+IDENTITY_POSE_9D = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+
+
+@dataclass(frozen=True)
+class AnchorPoses:
+    """Absolute poses that action poses are relative to: the measured ones of the anchor step."""
+
+    T_world_wrist_left: Float64[np.ndarray, "4 4"]
+    T_world_wrist_right: Float64[np.ndarray, "4 4"]
+    T_world_camera_head: Float64[np.ndarray, "4 4"]
+
+    def as_tuple(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Left wrist, right wrist, head camera."""
+        return self.T_world_wrist_left, self.T_world_wrist_right, self.T_world_camera_head
+
+
+@dataclass(frozen=True)
+class HandTrajectory:
+    """Absolute poses and joint angles over time."""
+
+    Ts_world_wrist_left: Float64[np.ndarray, "time 4 4"]
+    Ts_world_wrist_right: Float64[np.ndarray, "time 4 4"]
+    joints_left_rad: Float64[np.ndarray, "time 20"]
+    joints_right_rad: Float64[np.ndarray, "time 20"]
+    Ts_world_camera_head: Float64[np.ndarray, "time 4 4"]
+
+    def anchor(self, index: int) -> AnchorPoses:
+        """The three poses at one step."""
+        return AnchorPoses(
+            self.Ts_world_wrist_left[index],
+            self.Ts_world_wrist_right[index],
+            self.Ts_world_camera_head[index],
+        )
+
+
+def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
+    """The actions as float64 [T, 67], or a clear refusal.
+
+    Raises:
+        ShapeError: not [T, 67] with T ≥ 1.
+        NonFiniteError: NaN or infinity; the message names the first row and column.
+    """
+    checked = np.asarray(actions, dtype=np.float64)
+    if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
+        raise ShapeError(f"{where}: got shape {checked.shape}, expected [T ≥ 1, {ACTION_DIM}]")
+    bad = np.argwhere(~np.isfinite(checked))
+    if len(bad):
+        row, column = bad[0]
+        raise NonFiniteError(
+            f"{where}: {len(bad)} values are NaN or infinite, first in row {row}, column {column}; "
+            "expected finite numbers",
+            row=int(row),
+            column=int(column),
+        )
+    return checked
+
+
+def pose_to_9d(T: np.ndarray) -> Float64[np.ndarray, "*batch 9"]:
+    """Translation (m) and 6-D rotation of transforms [..., 4, 4]."""
+    T = np.asarray(T, dtype=np.float64)
+    return np.concatenate([T[..., :3, 3], rotation_to_6d(T[..., :3, :3])], axis=-1)
+
+
+def pose_from_9d(pose: np.ndarray) -> Float64[np.ndarray, "*batch 4 4"]:
+    """Transforms [..., 4, 4] of 9-D poses; degenerate rotations raise."""
+    pose = np.asarray(pose, dtype=np.float64)
+    if pose.shape[-1:] != (POSE_DIM,):
+        raise ShapeError(f"9-D pose: got shape {pose.shape}, expected [..., {POSE_DIM}]")
+    return transform(rotation_from_6d(pose[..., 3:]), pose[..., :3])
+
+
+def relative_pose_9d(Ts_world_x: np.ndarray) -> Float64[np.ndarray, "time 9"]:
+    """Poses [T, 4, 4] relative to the first: T_0⁻¹ T_t as 9-D; row 0 is exactly the identity."""
+    Ts = np.asarray(Ts_world_x, dtype=np.float64)
+    if Ts.ndim != 3 or Ts.shape[1:] != (4, 4) or len(Ts) == 0:
+        raise ShapeError(f"poses: got shape {Ts.shape}, expected [T ≥ 1, 4, 4]")
+    relative = pose_to_9d(invert(Ts[0]) @ Ts)
+    relative[0] = IDENTITY_POSE_9D
+    return relative
+
+
+def pack_action(
+    *,
+    wrist_left: np.ndarray,
+    wrist_right: np.ndarray,
+    joints_left_rad: np.ndarray,
+    joints_right_rad: np.ndarray,
+    camera_head: np.ndarray,
+) -> Float64[np.ndarray, "*batch 67"]:
+    """Actions [..., 67] from 9-D poses and 20 joint angles a hand."""
+    parts = {
+        "wrist_left": (wrist_left, POSE_DIM),
+        "wrist_right": (wrist_right, POSE_DIM),
+        "joints_left_rad": (joints_left_rad, 20),
+        "joints_right_rad": (joints_right_rad, 20),
+        "camera_head": (camera_head, POSE_DIM),
+    }
+    arrays = []
+    for name, (part, size) in parts.items():
+        array = np.asarray(part, dtype=np.float64)
+        if array.shape[-1:] != (size,):
+            raise ShapeError(f"{name}: got shape {array.shape}, expected [..., {size}]")
+        arrays.append(array)
+    return np.concatenate(arrays, axis=-1)
+
+
+@dataclass(frozen=True)
+class ActionParts:
+    """The five blocks of actions [..., 67] (views)."""
+
+    wrist_left: np.ndarray
+    wrist_right: np.ndarray
+    joints_left_rad: np.ndarray
+    joints_right_rad: np.ndarray
+    camera_head: np.ndarray
+
+
+def unpack_action(actions: np.ndarray) -> ActionParts:
+    """The blocks of actions [..., 67]; inverse of `pack_action`."""
+    actions = np.asarray(actions)
+    if actions.shape[-1:] != (ACTION_DIM,):
+        raise ShapeError(f"actions: got shape {actions.shape}, expected [..., {ACTION_DIM}]")
+    return ActionParts(
+        actions[..., WRIST_LEFT],
+        actions[..., WRIST_RIGHT],
+        actions[..., JOINTS_LEFT],
+        actions[..., JOINTS_RIGHT],
+        actions[..., CAMERA_HEAD],
+    )
+
+
+def actions_from_poses(
+    trajectory: HandTrajectory, anchor: AnchorPoses
+) -> Float64[np.ndarray, "time 67"]:
+    """Actions of absolute poses, relative to the anchor's poses.
+
+    For measured actions the anchor is the trajectory's own first step; commanded actions are
+    relative to the *measured* poses of the anchor step.
+    """
+    T_left, T_right, T_camera = anchor.as_tuple()
+    return pack_action(
+        wrist_left=pose_to_9d(invert(T_left) @ trajectory.Ts_world_wrist_left),
+        wrist_right=pose_to_9d(invert(T_right) @ trajectory.Ts_world_wrist_right),
+        joints_left_rad=trajectory.joints_left_rad,
+        joints_right_rad=trajectory.joints_right_rad,
+        camera_head=pose_to_9d(invert(T_camera) @ trajectory.Ts_world_camera_head),
+    )
+
+
+def poses_from_actions(actions: np.ndarray, anchor: AnchorPoses) -> HandTrajectory:
+    """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`."""
+    parts = unpack_action(check_actions(actions))
+    T_left, T_right, T_camera = anchor.as_tuple()
+    return HandTrajectory(
+        T_left @ pose_from_9d(parts.wrist_left),
+        T_right @ pose_from_9d(parts.wrist_right),
+        np.array(parts.joints_left_rad),
+        np.array(parts.joints_right_rad),
+        T_camera @ pose_from_9d(parts.camera_head),
+    )
+
+
+def reanchor(
+    actions: np.ndarray, index: int, *, anchor_action: np.ndarray | None = None
+) -> Float64[np.ndarray, "time 67"]:
+    """The same actions relative to another step.
+
+    Args:
+        actions: [T, 67], all relative to one anchor.
+        index: step that becomes the anchor; its poses come out as exactly the identity.
+        anchor_action: [67], relative to the same anchor as `actions`: what the new anchor is
+            taken from instead of `actions[index]`. Commanded actions need this: their anchor is
+            the *measured* action of the step.
+
+    Raises:
+        InvalidInputError: index outside 0 … T-1.
+    """
+    checked = check_actions(actions)
+    if not 0 <= index < len(checked):
+        raise InvalidInputError(f"reanchor: got index {index}, expected 0 … {len(checked) - 1}")
+    source = checked[index] if anchor_action is None else check_actions(anchor_action[None])[0]
+    moved = checked.copy()
+    for part in POSE_SLICES:
+        T_old_new = pose_from_9d(source[part])
+        moved[:, part] = pose_to_9d(invert(T_old_new) @ pose_from_9d(checked[:, part]))
+        if anchor_action is None:
+            moved[index, part] = IDENTITY_POSE_9D
+    return moved

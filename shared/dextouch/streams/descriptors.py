@@ -1,0 +1,50 @@
+"""What a stream is: its rate, shape, unit, clock and what its device can prove about itself."""
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
+
+
+class ClockCapabilities(BaseModel):
+    """What a device tells about time and loss; quality degrades honestly without it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    crc: bool = False
+    sequence: bool = False
+    sequence_bits: int = Field(default=32, ge=8, le=64)
+    device_time: bool = False
+    tick_ns: int = Field(default=1, ge=1)
+    device_time_bits: int = Field(default=64, ge=16, le=64)
+
+
+class StreamDescriptor(BaseModel):
+    """One stream of a recording or an episode.
+
+    `shape` is that of one sample's payload; `unit` of its numbers (`counts`, `kPa`, `m`, `rad`,
+    `pose_m_wxyz`, `rgb8`, …); `frame` the coordinate system of the numbers, if any.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
+    kind: StreamKind
+    shape: tuple[int, ...]
+    dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
+    unit: str
+    nominal_rate_hz: float = Field(gt=0, le=10_000)
+    frame: str | None = None
+    side: Literal["left", "right"] | None = None
+    device: str | None = None
+    capabilities: ClockCapabilities = ClockCapabilities()
+
+    def numpy_dtype(self) -> np.dtype[np.generic]:
+        """The payload's dtype, little endian."""
+        return np.dtype(self.dtype).newbyteorder("<")
+
+    def period_ns(self) -> int:
+        """Nominal distance of two samples."""
+        return round(1e9 / self.nominal_rate_hz)

@@ -1,0 +1,81 @@
+"""Named numpy arrays and plain fields ↔ msgpack bytes: what chunks and observations ride on."""
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import msgpack
+import numpy as np
+
+from dextouch.errors import InvalidInputError, LimitExceededError
+
+MAX_ARRAYS = 64
+MAX_DIMENSIONS = 8
+DTYPES = ("uint8", "uint16", "int32", "int64", "float32", "float64", "bool")
+
+
+def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
+    """Bytes of JSON-like fields and arrays (little endian, C order).
+
+    Raises:
+        InvalidInputError: an array of a kind that does not travel.
+    """
+    packed = {}
+    for name, array in arrays.items():
+        dtype = np.asarray(array).dtype.name
+        if dtype not in DTYPES:
+            raise InvalidInputError(f"array {name!r}: dtype {dtype}, expected one of {DTYPES}")
+        ordered = np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<"))
+        packed[name] = {"dtype": dtype, "shape": list(ordered.shape), "data": ordered.tobytes()}
+    return msgpack.packb({"fields": dict(fields), "arrays": packed})
+
+
+def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Inverse of `pack`; arrays are read-only views into `data`.
+
+    Args:
+        data: bytes from somewhere that is not trusted.
+        max_bytes: the most that is accepted.
+
+    Raises:
+        LimitExceededError: more bytes, arrays or axes than allowed.
+        InvalidInputError: no msgpack, or not of this layout.
+    """
+    if len(data) > max_bytes:
+        raise LimitExceededError(f"body: got {len(data)} bytes, expected at most {max_bytes}")
+    try:
+        message = msgpack.unpackb(data, max_buffer_size=max_bytes, strict_map_key=True)
+    except (ValueError, msgpack.UnpackException) as error:
+        raise InvalidInputError(f"body: not msgpack ({type(error).__name__}: {error})") from error
+    if (
+        not isinstance(message, dict)
+        or not isinstance(message.get("fields"), dict)
+        or not isinstance(message.get("arrays"), dict)
+    ):
+        raise InvalidInputError("body: expected a map with the maps 'fields' and 'arrays'")
+    if len(message["arrays"]) > MAX_ARRAYS:
+        raise LimitExceededError(
+            f"body: got {len(message['arrays'])} arrays, expected at most {MAX_ARRAYS}"
+        )
+    return message["fields"], {
+        str(name): _array(str(name), entry) for name, entry in message["arrays"].items()
+    }
+
+
+def _array(name: str, entry: object) -> np.ndarray:
+    if not isinstance(entry, dict) or set(entry) != {"dtype", "shape", "data"}:
+        raise InvalidInputError(f"array {name!r}: expected a map of dtype, shape and data")
+    dtype, shape, data = entry["dtype"], entry["shape"], entry["data"]
+    if dtype not in DTYPES:
+        raise InvalidInputError(f"array {name!r}: dtype {dtype!r}, expected one of {DTYPES}")
+    if (
+        not isinstance(shape, list)
+        or len(shape) > MAX_DIMENSIONS
+        or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
+    ):
+        raise InvalidInputError(f"array {name!r}: shape {shape!r}, expected a list of counts")
+    expected = math.prod(shape) * np.dtype(dtype).itemsize
+    if not isinstance(data, bytes) or len(data) != expected:
+        got = len(data) if isinstance(data, bytes) else type(data).__name__
+        raise InvalidInputError(f"array {name!r}: got {got} bytes, expected {expected} for {shape}")
+    return np.frombuffer(data, dtype=np.dtype(dtype).newbyteorder("<")).reshape(shape)

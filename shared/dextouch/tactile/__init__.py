@@ -1,0 +1,1 @@
+"""Taxel layout, contact decision and heat maps of a hand."""

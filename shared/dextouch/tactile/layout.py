@@ -1,0 +1,124 @@
+"""Which of a glove's 360 raw cells are taxels, and where each of the 320 taxels sits on the hand.
+
+Anatomical order, the same for both hands: thumb, index, middle, ring and little fingertip, 4×4
+each, then the palm, 15×16. Inside every pad axis 0 runs from distal to proximal and axis 1 from
+radial (thumb side) to ulnar, so that a left and a right hand doing the same thing give the same
+numbers.
+"""
+
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.errors import ShapeError, UnknownNameError
+
+Side = Literal["left", "right"]
+SIDES: tuple[Side, Side] = ("left", "right")
+FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+NUM_RAW_TAXELS = 360
+NUM_FINGERTIPS = 5
+TIP_SHAPE = (4, 4)
+PALM_SHAPE = (15, 16)
+NUM_TIP_TAXELS = NUM_FINGERTIPS * TIP_SHAPE[0] * TIP_SHAPE[1]
+NUM_TAXELS = NUM_TIP_TAXELS + PALM_SHAPE[0] * PALM_SHAPE[1]
+
+TIP_PITCH_M = 0.004
+PALM_PITCH_M = (0.006, 0.005)
+TIP_TAXEL_AREA_M2 = TIP_PITCH_M**2
+PALM_TAXEL_AREA_M2 = PALM_PITCH_M[0] * PALM_PITCH_M[1]
+
+GLOVE_MODELS = ("dextouch_v1",)
+_SCAN_SHAPE = (18, 20)
+
+
+def taxel_areas_m2() -> np.ndarray:
+    """Sensing area of each of the 320 taxels in m² (force = pressure × area)."""
+    areas = np.full(NUM_TAXELS, PALM_TAXEL_AREA_M2)
+    areas[:NUM_TIP_TAXELS] = TIP_TAXEL_AREA_M2
+    return areas
+
+
+def raw_indices(*, side: Side, glove_model: str = "dextouch_v1") -> Int64[np.ndarray, "320"]:
+    """Raw cell of each taxel.
+
+    `dextouch_v1` scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side,
+    rows 4–15 the palm row after row, rows 16–17 nothing (40 cells). The left glove is wired as
+    the mirror image: its columns run the other way.
+    """
+    if glove_model not in GLOVE_MODELS:
+        raise UnknownNameError("glove model", glove_model, list(GLOVE_MODELS))
+    if side not in SIDES:
+        raise UnknownNameError("side", side, list(SIDES))
+    cells = np.arange(NUM_RAW_TAXELS).reshape(_SCAN_SHAPE)
+    if side == "left":
+        cells = cells[:, ::-1]
+    tips = cells[:4].reshape(4, NUM_FINGERTIPS, 4).transpose(1, 0, 2).ravel()
+    palm = cells[4:16].ravel()
+    return np.concatenate([tips, palm]).astype(np.int64)
+
+
+_RAW_INDICES = {side: raw_indices(side=side) for side in SIDES}
+
+
+def _indices(side: Side, glove_model: str) -> Int64[np.ndarray, "320"]:
+    if glove_model == "dextouch_v1" and side in _RAW_INDICES:
+        return _RAW_INDICES[side]
+    return raw_indices(side=side, glove_model=glove_model)
+
+
+def select_taxels(raw: np.ndarray, *, side: Side, glove_model: str = "dextouch_v1") -> np.ndarray:
+    """The 320 taxels, in anatomical order, of raw readings [..., 360]; dtype is kept.
+
+    Raises:
+        ShapeError: the last axis is not 360.
+        UnknownNameError: unknown side or glove model.
+    """
+    raw = np.asarray(raw)
+    if raw.shape[-1:] != (NUM_RAW_TAXELS,):
+        raise ShapeError(f"raw taxels: got shape {raw.shape}, expected [..., {NUM_RAW_TAXELS}]")
+    return raw[..., _indices(side, glove_model)]
+
+
+def expand_taxels(
+    taxels: np.ndarray, *, side: Side, glove_model: str = "dextouch_v1"
+) -> np.ndarray:
+    """Raw readings [..., 360] from taxels [..., 320]; cells without a taxel are zero.
+
+    Raises:
+        ShapeError: the last axis is not 320.
+        UnknownNameError: unknown side or glove model.
+    """
+    taxels = np.asarray(taxels)
+    if taxels.shape[-1:] != (NUM_TAXELS,):
+        raise ShapeError(f"taxels: got shape {taxels.shape}, expected [..., {NUM_TAXELS}]")
+    raw = np.zeros((*taxels.shape[:-1], NUM_RAW_TAXELS), dtype=taxels.dtype)
+    raw[..., _indices(side, glove_model)] = taxels
+    return raw
+
+
+def split_pads(taxels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Fingertips [..., 5, 4, 4] and palm [..., 15, 16] of taxels [..., 320] (views)."""
+    taxels = np.asarray(taxels)
+    if taxels.shape[-1:] != (NUM_TAXELS,):
+        raise ShapeError(f"taxels: got shape {taxels.shape}, expected [..., {NUM_TAXELS}]")
+    tips = taxels[..., :NUM_TIP_TAXELS].reshape(*taxels.shape[:-1], NUM_FINGERTIPS, *TIP_SHAPE)
+    return tips, taxels[..., NUM_TIP_TAXELS:].reshape(*taxels.shape[:-1], *PALM_SHAPE)
+
+
+def join_pads(fingertips: np.ndarray, palm: np.ndarray) -> np.ndarray:
+    """Taxels [..., 320] from fingertips [..., 5, 4, 4] and palm [..., 15, 16]."""
+    fingertips, palm = np.asarray(fingertips), np.asarray(palm)
+    if fingertips.shape[-3:] != (NUM_FINGERTIPS, *TIP_SHAPE) or palm.shape[-2:] != PALM_SHAPE:
+        raise ShapeError(
+            f"pads: got {fingertips.shape} and {palm.shape}, expected [..., 5, 4, 4] and "
+            "[..., 15, 16]"
+        )
+    return np.concatenate(
+        [
+            fingertips.reshape(*fingertips.shape[:-3], NUM_TIP_TAXELS),
+            palm.reshape(*palm.shape[:-2], NUM_TAXELS - NUM_TIP_TAXELS),
+        ],
+        axis=-1,
+    )

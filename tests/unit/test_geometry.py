@@ -1,0 +1,100 @@
+"""Rotations, transforms and re-anchoring: group axioms, both sides of every series switch."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import interpolation, rotations, transforms
+
+vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
+
+
+@given(vectors)
+def test_exponential_and_logarithm_are_inverse(vector):
+    R = rotations.rotation_from_vector(vector)
+    np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
+    again = rotations.rotation_from_vector(rotations.vector_from_rotation(R))
+    np.testing.assert_allclose(again, R, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 0.99e-3, 1.01e-3, 1.0, np.pi - 1e-7, np.pi])
+def test_angle_is_kept_at_the_switch_points(angle):
+    R = rotations.rotation_from_vector(np.array([0.0, 0.6, 0.8]) * angle)
+    assert rotations.rotation_angle(R) == pytest.approx(angle, abs=1e-12, rel=1e-9)
+
+
+@given(vectors)
+def test_6d_and_quaternion_round_trips(vector):
+    R = rotations.rotation_from_vector(vector)
+    np.testing.assert_allclose(
+        rotations.rotation_from_6d(rotations.rotation_to_6d(R)), R, atol=1e-12
+    )
+    q = rotations.quaternion_from_rotation(R)
+    np.testing.assert_allclose(rotations.rotation_from_quaternion(q), R, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "columns", [np.zeros(6), [1, 0, 0, 2, 0, 0], [1, 0, 0, -1, 1e-9, 0], [0, 0, 0, 0, 1, 0]]
+)
+def test_degenerate_columns_are_refused(columns):
+    with pytest.raises(DegenerateRotationError):
+        rotations.rotation_from_6d(np.array(columns, dtype=float))
+
+
+def test_tiny_and_huge_columns_survive():
+    columns = np.array([[1e-200, 0, 0, 0, 1e200, 0], [1, 0, 0, 1, 1e-5, 0]])
+    R = rotations.rotation_from_6d(columns)
+    np.testing.assert_allclose(
+        R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-14
+    )
+
+
+def test_nan_and_wrong_shapes_are_refused():
+    with pytest.raises(NonFiniteError):
+        rotations.rotation_from_6d(np.full(6, np.nan))
+    with pytest.raises(ShapeError):
+        rotations.rotation_to_6d(np.zeros((2, 3)))
+    with pytest.raises(DegenerateRotationError):
+        rotations.rotation_from_quaternion(np.zeros(4))
+
+
+@given(vectors, vectors)
+def test_inverse_cancels(vector, translation):
+    T = transforms.transform(rotations.rotation_from_vector(vector), translation)
+    np.testing.assert_allclose(T @ transforms.invert(T), np.eye(4), atol=1e-12)
+    np.testing.assert_allclose(
+        transforms.transform_from_pose(transforms.pose_from_transform(T)), T, atol=1e-12
+    )
+
+
+@settings(max_examples=30)
+@given(st.integers(0, 2**31))
+def test_interpolated_poses_follow_a_screw(seed):
+    rng = np.random.default_rng(seed)
+    axis = rng.normal(size=3)
+    axis /= np.linalg.norm(axis)
+    t_ns = np.cumsum(rng.integers(5_000_000, 12_000_000, size=20))
+    Ts = transforms.transform(
+        rotations.rotation_from_vector(t_ns[:, None] * 1e-9 * axis * 4), t_ns[:, None] * 1e-9 * axis
+    )
+    at_ns = rng.integers(t_ns[0], t_ns[-1], size=50)
+    left, weight, valid = interpolation.bracket(t_ns, at_ns, max_gap_ns=20_000_000)
+    got = interpolation.interpolate_poses(Ts, left, weight)
+    expected = transforms.transform(
+        rotations.rotation_from_vector(at_ns[:, None] * 1e-9 * axis * 4),
+        at_ns[:, None] * 1e-9 * axis,
+    )
+    assert valid.all()
+    np.testing.assert_allclose(got, expected, atol=1e-9)
+
+
+def test_gaps_and_outside_are_marked_not_filled():
+    t_ns = np.array([0, 10, 100, 110])
+    _, _, valid = interpolation.bracket(
+        t_ns, np.array([-1, 5, 10, 50, 100, 110, 111]), max_gap_ns=20
+    )
+    assert valid.tolist() == [False, True, True, False, True, True, False]
+    with pytest.raises(InvalidInputError):
+        interpolation.bracket(np.array([0, 0]), np.array([0]), max_gap_ns=1)

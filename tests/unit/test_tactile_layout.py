@@ -1,0 +1,53 @@
+"""Taxel layout: what goes out comes back, and left mirrors right."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import ShapeError, UnknownNameError
+from dextouch.tactile import contact, heatmap, layout
+
+
+@pytest.mark.parametrize("side", layout.SIDES)
+def test_select_inverts_expand(side):
+    taxels = np.arange(2 * 320).reshape(2, 320)
+    raw = layout.expand_taxels(taxels, side=side)
+    assert raw.shape == (2, 360)
+    np.testing.assert_array_equal(layout.select_taxels(raw, side=side), taxels)
+    assert len(set(layout.raw_indices(side=side).tolist())) == 320
+
+
+def test_left_glove_is_wired_as_the_mirror_image():
+    left = layout.raw_indices(side="left").reshape(-1)
+    right = layout.raw_indices(side="right").reshape(-1)
+    np.testing.assert_array_equal(left // 20, right // 20)
+    np.testing.assert_array_equal(left % 20, 19 - right % 20)
+
+
+def test_pads_round_trip():
+    taxels = np.random.default_rng(0).normal(size=(3, 2, 320))
+    tips, palm = layout.split_pads(taxels)
+    assert tips.shape == (3, 2, 5, 4, 4)
+    assert palm.shape == (3, 2, 15, 16)
+    np.testing.assert_array_equal(layout.join_pads(tips, palm), taxels)
+
+
+def test_bad_input_is_named():
+    with pytest.raises(ShapeError, match="360"):
+        layout.select_taxels(np.zeros(320), side="left")
+    with pytest.raises(UnknownNameError, match="dextouch_v1"):
+        layout.select_taxels(np.zeros(360), side="left", glove_model="other")
+
+
+def test_contact_threshold_is_two_kilopascal():
+    assert contact.in_contact(np.array([1.99, 2.0, np.nan])).tolist() == [False, True, False]
+
+
+def test_hand_canvas_holds_every_taxel_once_and_mirrors():
+    taxels = np.arange(1, 321, dtype=np.float32)
+    right = heatmap.hand_canvas(taxels, side="right")
+    assert sorted(right[np.isfinite(right)].tolist()) == taxels.tolist()
+    left = heatmap.hand_canvas(taxels, side="left")
+    np.testing.assert_array_equal(left, right[:, ::-1])
+    rgb = heatmap.colour(right)
+    assert rgb.shape == (28, 26, 3)
+    assert (rgb[np.isnan(right)] == rgb[0, 0]).all()
