@@ -1,0 +1,81 @@
+"""Each import contract is broken once on purpose, in a copy of the tree, and must be caught."""
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.slow
+
+ROOT = Path(__file__).parents[2]
+LINT = Path(sys.executable).with_name("lint-imports")
+
+# contract · file that offends · the offending line
+OFFENCES = [
+    (
+        "The command line stands on the services",
+        "shared/dextouch/errors.py",
+        "import services.twin",
+    ),
+    ("Services do not know each other", "services/twin/scene.py", "import services.evaluation"),
+    ("Layers of the nouns", "shared/dextouch/geometry/transforms.py", "import dextouch.schemas"),
+    ("torch only where networks are", "services/twin/scene.py", "import torch"),
+    ("zarr only in dextouch.episodes", "services/alignment/jobs.py", "import zarr"),
+    (
+        "Drivers never import mocks",
+        "services/acquisition/drivers/base.py",
+        "import services.acquisition.mocks.replay",
+    ),
+    ("No cycles anywhere", "services/twin/scene.py", "import services.twin.world"),
+    (
+        "World model: world stands on training",
+        "services/world_model/network/conditioning.py",
+        "import services.world_model.training.trainer",
+    ),
+    (
+        "Alignment: jobs stand on the stages",
+        "services/alignment/retargeting/hand_retargeter.py",
+        "import services.alignment.jobs",
+    ),
+    ("redis only in dextouch.serving", "services/dashboard/feeds.py", "import redis"),
+    ("mujoco only in the twin", "services/evaluation/closed_loop.py", "import mujoco"),
+]
+
+
+def lint(tree: Path) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [str(LINT), "--no-cache"],
+        cwd=tree,
+        env={**os.environ, "PYTHONPATH": f"{tree}:{tree / 'shared'}"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.fixture
+def tree(tmp_path):
+    for name in ("services", "shared"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / ".importlinter", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("contract", "path", "line"), OFFENCES)
+@pytest.mark.parametrize("lazy", [False, True], ids=["at the top", "inside a function"])
+def test_an_offence_is_caught(tree, contract, path, line, lazy):
+    offender = tree / path
+    extra = f"\n\ndef _offend():\n    {line}\n" if lazy else f"\n{line}\n"
+    offender.write_text(offender.read_text() + extra)
+    answer = lint(tree)
+    broken = [row for row in answer.stdout.splitlines() if row.endswith("BROKEN")]
+    assert answer.returncode != 0, answer.stdout + answer.stderr
+    assert any(row.startswith(contract) for row in broken), answer.stdout
+
+
+def test_the_untouched_tree_keeps_every_contract(tree):
+    answer = lint(tree)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
