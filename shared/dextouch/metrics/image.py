@@ -1,0 +1,83 @@
+"""Predicted and true 8-bit colour images in; PSNR (dB) and SSIM out.
+
+Both are means over images: a clip's figure is the mean of its images' figures.
+"""
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import ShapeError
+from dextouch.metrics.checks import checked_pair
+
+PEAK = 255.0
+# An exact image has an infinite PSNR; it counts as this much, so that means stay finite.
+MAX_PSNR_DB = 100.0
+SSIM_WINDOW_PX = 11
+_SSIM_SIGMA_PX = 1.5
+_C1, _C2 = (0.01 * PEAK) ** 2, (0.03 * PEAK) ** 2
+
+
+def psnr(*, predicted: np.ndarray, true: np.ndarray) -> float:
+    """Mean over images of 10 log10(255² / MSE) in dB, each image capped at 100 dB.
+
+    Args:
+        predicted: images [..., h, w, 3] in 0 … 255 (uint8, or a float that was not yet rounded).
+        true: images of the same shape.
+
+    Raises:
+        ShapeError: different shapes or not [..., h, w, 3].
+        NonFiniteError: NaN or infinity.
+    """
+    a, b = checked_pair(predicted, true, what="PSNR of images", tail=(None, None, 3))
+    mse = np.mean((a - b) ** 2, axis=(-3, -2, -1))
+    return float(np.mean(decibels(mse, peak=PEAK)))
+
+
+def decibels(mse: np.ndarray | np.floating, *, peak: float) -> Float64[np.ndarray, "*batch"]:
+    """10 log10(peak² / MSE), at most 100 dB."""
+    floor = peak**2 * 10 ** (-MAX_PSNR_DB / 10)
+    return np.asarray(10 * np.log10(peak**2 / np.maximum(mse, floor)))
+
+
+def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
+    """Mean structural similarity, 1 for equal images.
+
+    Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255,
+    each colour by itself, only where the whole window lies inside the image.
+
+    Args:
+        predicted: images [..., h, w, 3] in 0 … 255, at least 11 px high and wide.
+        true: images of the same shape.
+
+    Raises:
+        ShapeError: different shapes, not [..., h, w, 3], or images smaller than the window.
+        NonFiniteError: NaN or infinity.
+    """
+    a, b = checked_pair(predicted, true, what="SSIM of images", tail=(None, None, 3))
+    if min(a.shape[-3:-1]) < SSIM_WINDOW_PX:
+        raise ShapeError(
+            f"SSIM of images: got {a.shape[-3]} by {a.shape[-2]} px, expected at least "
+            f"{SSIM_WINDOW_PX} by {SSIM_WINDOW_PX}"
+        )
+    mean_a, mean_b = _smooth(a), _smooth(b)
+    variance_a = _smooth(a * a) - mean_a**2
+    variance_b = _smooth(b * b) - mean_b**2
+    covariance = _smooth(a * b) - mean_a * mean_b
+    return float(
+        np.mean(
+            (2 * mean_a * mean_b + _C1)
+            * (2 * covariance + _C2)
+            / ((mean_a**2 + mean_b**2 + _C1) * (variance_a + variance_b + _C2))
+        )
+    )
+
+
+def _smooth(images: np.ndarray) -> np.ndarray:
+    """Gaussian means over rows and columns, inside the image only."""
+    offsets = np.arange(SSIM_WINDOW_PX) - SSIM_WINDOW_PX // 2
+    kernel = np.exp(-0.5 * (offsets / _SSIM_SIGMA_PX) ** 2)
+    kernel /= kernel.sum()
+    for axis in (-3, -2):
+        windows = np.lib.stride_tricks.sliding_window_view(images, SSIM_WINDOW_PX, axis=axis)
+        images = windows @ kernel
+    return images

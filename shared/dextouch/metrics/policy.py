@@ -1,0 +1,100 @@
+"""Scores of the same policies in reality and in imagination in; how well they agree out.
+
+Arguments are keyword-only: MMRV is not symmetric, and swapping real and imagined is the usual
+mistake. A figure that is not defined is NaN, never 0 or 1.
+"""
+
+import numpy as np
+
+from dextouch.errors import UnknownNameError
+from dextouch.metrics.checks import checked_pair
+
+TIE_RULES = ("paper", "simpler")
+
+
+def _scores(real: np.ndarray, imagined: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+    a, b = checked_pair(real, imagined, what=f"{what} of policy scores", tail=(None,))
+    return a.ravel(), b.ravel()
+
+
+def pearson(*, real: np.ndarray, imagined: np.ndarray) -> float:
+    """Linear correlation of scores [policies], in −1 … 1.
+
+    NaN when undefined: fewer than two policies, or all scores of one side equal.
+    """
+    a, b = _scores(real, imagined, "Pearson")
+    if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
+        return float("nan")
+    a, b = a - a.mean(), b - b.mean()
+    r = np.dot(a / np.linalg.norm(a), b / np.linalg.norm(b))
+    return float(np.clip(r, -1.0, 1.0))
+
+
+def spearman(*, real: np.ndarray, imagined: np.ndarray) -> float:
+    """Pearson correlation of ranks; ties share their mean rank. NaN when undefined."""
+    a, b = _scores(real, imagined, "Spearman")
+    return pearson(real=_mean_ranks(a), imagined=_mean_ranks(b))
+
+
+def kendall(*, real: np.ndarray, imagined: np.ndarray) -> float:
+    """Kendall's τ-b: pairs in the same order less pairs in opposite order, corrected for ties.
+
+    NaN when undefined: fewer than two policies, or all scores of one side equal.
+    """
+    a, b = _scores(real, imagined, "Kendall")
+    order_a, order_b = _orders(a), _orders(b)
+    pairs = np.count_nonzero(order_a) * np.count_nonzero(order_b)
+    return float(np.sum(order_a * order_b) / np.sqrt(pairs)) if pairs else float("nan")
+
+
+def mmrv(*, real: np.ndarray, imagined: np.ndarray, ties: str = "paper") -> float:
+    """Mean maximum rank violation of scores [policies]: 0 is best.
+
+    (1/N) Σ_i max_j |real_i − real_j| · v_ij. Both rules count a pair in opposite order; they
+    differ when one side ties.
+
+    Args:
+        real: scores in the reference world.
+        imagined: scores of the same policies in the judged world.
+        ties: "paper": v_ij = 1 only if the differences have opposite signs, so a tie never
+            counts. "simpler": as in SimplerEnv, v_ij = 1 if `imagined_i > imagined_j` and
+            `real_i > real_j` differ, so a tie on the imagined side does.
+
+    Returns:
+        The violation in the unit of the scores; NaN for fewer than two policies.
+
+    Raises:
+        UnknownNameError: another tie rule.
+    """
+    a, b = _scores(real, imagined, "MMRV")
+    if ties not in TIE_RULES:
+        raise UnknownNameError("tie rule", ties, list(TIE_RULES))
+    if len(a) < 2:
+        return float("nan")
+    if ties == "paper":
+        violated = _orders(a) * _orders(b) < 0
+    else:
+        violated = (_orders(a) > 0) != (_orders(b) > 0)
+    return float(np.mean(np.max(np.abs(a[:, None] - a[None, :]) * violated, axis=1)))
+
+
+def bias(*, real: np.ndarray, imagined: np.ndarray) -> float:
+    """Mean of imagined − real: positive where imagination flatters."""
+    a, b = _scores(real, imagined, "bias")
+    return float(np.mean(b - a))
+
+
+def mean_absolute_error(*, real: np.ndarray, imagined: np.ndarray) -> float:
+    """Mean of |imagined − real|, in the unit of the scores."""
+    a, b = _scores(real, imagined, "mean absolute error")
+    return float(np.mean(np.abs(b - a)))
+
+
+def _orders(scores: np.ndarray) -> np.ndarray:
+    """+1, 0 or −1 for every ordered pair."""
+    return np.sign(scores[:, None] - scores[None, :])
+
+
+def _mean_ranks(scores: np.ndarray) -> np.ndarray:
+    order = _orders(scores)
+    return (order > 0).sum(axis=1) + (order == 0).sum(axis=1) / 2

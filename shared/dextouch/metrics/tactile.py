@@ -1,0 +1,106 @@
+"""Predicted and true taxel pressures [..., 320] in kPa in; errors and contact agreement out.
+
+Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
+at least 2 kPa (`dextouch.tactile.contact`). Leave invalid hands out before calling: NaN is refused.
+"""
+
+import numpy as np
+
+from dextouch.metrics.checks import checked_pair
+from dextouch.metrics.image import decibels
+from dextouch.tactile.contact import in_contact
+from dextouch.tactile.layout import NUM_TAXELS, split_pads
+
+# Reference pressure of PSNR and SSIM: the full scale of the heat maps.
+PEAK_KPA = 40.0
+SSIM_WINDOW_TAXELS = 4
+
+
+def _pair(predicted: np.ndarray, true: np.ndarray, what: str) -> tuple[np.ndarray, np.ndarray]:
+    return checked_pair(predicted, true, what=f"{what} of taxels", tail=(NUM_TAXELS,))
+
+
+def mse(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+    """Mean squared error in kPa²."""
+    a, b = _pair(predicted_kpa, true_kpa, "MSE")
+    return float(np.mean((a - b) ** 2))
+
+
+def mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+    """Mean absolute error in kPa."""
+    a, b = _pair(predicted_kpa, true_kpa, "MAE")
+    return float(np.mean(np.abs(a - b)))
+
+
+def psnr(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
+    """10 log10(peak² / MSE) in dB of the pooled MSE, at most 100 dB.
+
+    Pooled, since most samples of an untouched hand are exact and would fill a mean with the cap.
+    """
+    a, b = _pair(predicted_kpa, true_kpa, "PSNR")
+    return float(decibels(np.mean((a - b) ** 2), peak=peak_kpa))
+
+
+def ssim(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
+    """Mean structural similarity of the six pads of a hand, 1 for equal pads.
+
+    Never across pads: uniform windows of 4×4 taxels (one fingertip) inside each pad, K1 = 0.01,
+    K2 = 0.03, range 0 … `peak_kpa`; each of the five fingertips and the palm counts the same.
+    An untouched pad predicted as untouched scores 1.
+    """
+    a, b = _pair(predicted_kpa, true_kpa, "SSIM")
+    tips_a, palm_a = split_pads(a)
+    tips_b, palm_b = split_pads(b)
+    tips = _pad_similarity(tips_a, tips_b, peak_kpa)
+    palm = _pad_similarity(palm_a, palm_b, peak_kpa)
+    return float((tips_a.shape[-3] * np.mean(tips) + np.mean(palm)) / (tips_a.shape[-3] + 1))
+
+
+def _pad_similarity(a: np.ndarray, b: np.ndarray, peak: float) -> np.ndarray:
+    """SSIM of every 4×4 window of pads [..., rows, columns]."""
+    size = (SSIM_WINDOW_TAXELS, SSIM_WINDOW_TAXELS)
+    windows_a = np.lib.stride_tricks.sliding_window_view(a, size, axis=(-2, -1))
+    windows_b = np.lib.stride_tricks.sliding_window_view(b, size, axis=(-2, -1))
+    mean_a, mean_b = windows_a.mean((-2, -1)), windows_b.mean((-2, -1))
+    covariance = (windows_a * windows_b).mean((-2, -1)) - mean_a * mean_b
+    c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
+    return np.asarray(
+        (2 * mean_a * mean_b + c1)
+        * (2 * covariance + c2)
+        / ((mean_a**2 + mean_b**2 + c1) * (windows_a.var((-2, -1)) + windows_b.var((-2, -1)) + c2))
+    )
+
+
+def contact_mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+    """Mean absolute error in kPa over the taxels that truly are in contact.
+
+    NaN when nothing truly is in contact: there is no error to tell.
+    """
+    a, b = _pair(predicted_kpa, true_kpa, "contact MAE")
+    touched = in_contact(b)
+    return float(np.mean(np.abs(a - b)[touched])) if touched.any() else float("nan")
+
+
+def contact_iou(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+    """Contact taxels on both sides over those on either side.
+
+    1 when neither side has contact: the prediction that nothing touches was right.
+    """
+    a, b = _pair(predicted_kpa, true_kpa, "contact IoU")
+    both, either = _overlap(a, b)
+    return both / either if either else 1.0
+
+
+def contact_f1(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
+    """2 TP / (2 TP + FP + FN) of contact taxels; 1 when neither side has contact."""
+    a, b = _pair(predicted_kpa, true_kpa, "contact F1")
+    both, either = _overlap(a, b)
+    return 2 * both / (both + either) if either else 1.0
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> tuple[int, int]:
+    touched_a, touched_b = in_contact(a), in_contact(b)
+    return (
+        int(np.count_nonzero(touched_a & touched_b)),
+        int(np.count_nonzero(touched_a | touched_b)),
+    )
