@@ -1,0 +1,1 @@
+"""What policies and stations import to talk to the services; light on purpose."""

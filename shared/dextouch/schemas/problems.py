@@ -1,0 +1,118 @@
+"""An error of ours to a problem+json body (RFC 9457) and back, the same on server and client."""
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+from pydantic_core import from_json, to_json
+
+from dextouch import errors
+from dextouch.errors import (
+    AccessDeniedError,
+    ConflictError,
+    DeviceError,
+    DexTouchError,
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+    PacketError,
+    StorageError,
+    StorageFullError,
+    UnavailableError,
+)
+
+PROBLEM_MEDIA_TYPE = "application/problem+json"
+TYPE_PREFIX = "urn:dextouch:error:"
+
+# Names that the constructor of an error takes itself.
+RESERVED = frozenset({"self", "message"})
+# The first class that fits decides; the tree's leaves stand before their parents.
+STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
+    (PacketError, 400),
+    (InvalidInputError, 422),
+    (NotFoundError, 404),
+    (ConflictError, 409),
+    (LimitExceededError, 413),
+    (UnavailableError, 503),
+    (DeviceError, 503),
+    (StorageFullError, 507),
+    (StorageError, 500),
+    (AccessDeniedError, 403),
+)
+CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
+    400: InvalidInputError,
+    401: AccessDeniedError,
+    403: AccessDeniedError,
+    404: NotFoundError,
+    405: InvalidInputError,
+    406: InvalidInputError,
+    409: ConflictError,
+    413: LimitExceededError,
+    415: InvalidInputError,
+    422: InvalidInputError,
+    429: LimitExceededError,
+    502: UnavailableError,
+    503: UnavailableError,
+    504: UnavailableError,
+    507: StorageFullError,
+}
+
+
+class Problem(BaseModel):
+    """The body of every answer with a status of 400 or more.
+
+    `type` names the class of `dextouch.errors` behind `urn:dextouch:error:`; `details` holds the
+    facts of `detail` as data (`expected`, `got`, `valid`, `retry_after_s`, …).
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    type: str
+    title: str
+    status: int = Field(ge=400, le=599)
+    detail: str
+    instance: str = ""
+    request_id: str = ""
+    details: dict[str, Any] = {}
+
+
+def status_of(error: DexTouchError) -> int:
+    """The HTTP status of an error.
+
+    Two classes answer by their details: a limit that waiting helps against (`retry_after_s`) is
+    429, any other 413; a missing or unknown key (`reason`) is 401, a missing scope 403.
+    """
+    if isinstance(error, LimitExceededError) and "retry_after_s" in error.details:
+        return 429
+    if isinstance(error, AccessDeniedError) and error.details.get("reason") != "missing_scope":
+        return 401
+    return next((status for kind, status in STATUS_OF_CLASS if isinstance(error, kind)), 500)
+
+
+def problem_from_error(error: DexTouchError, *, instance: str, request_id: str) -> Problem:
+    """The body that tells a client about an error; details become plain JSON."""
+    name = type(error).__name__
+    details = from_json(to_json(error.details, fallback=str, inf_nan_mode="strings"))
+    return Problem(
+        type=TYPE_PREFIX + name,
+        title=name.removesuffix("Error"),
+        status=status_of(error),
+        detail=error.message,
+        instance=instance,
+        request_id=request_id,
+        details=details,
+    )
+
+
+def error_from_problem(problem: Problem) -> DexTouchError:
+    """The error that a server meant: its own class where known, else one that fits the status."""
+    name = problem.type.removeprefix(TYPE_PREFIX)
+    named = getattr(errors, name, None)
+    if isinstance(named, type) and issubclass(named, DexTouchError):
+        kind: type[DexTouchError] = named
+    else:
+        kind = CLASS_OF_STATUS.get(problem.status, UnavailableError)
+    # UnknownNameError builds its own message; the server's is the one to keep.
+    error = kind.__new__(kind)
+    details = {key: value for key, value in problem.details.items() if key not in RESERVED}
+    DexTouchError.__init__(error, problem.detail, **details)
+    return error

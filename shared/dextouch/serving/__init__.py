@@ -1,0 +1,1 @@
+"""What services stand on: the application factory, settings, logs, keys, bus and state."""

@@ -1,0 +1,169 @@
+"""Routers to one service application: errors as problem+json, health, metrics, keys, limits."""
+
+from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from http import HTTPStatus
+
+import structlog
+from fastapi import APIRouter, FastAPI, Request, Response
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse
+from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from starlette.exceptions import HTTPException
+
+from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
+from dextouch.schemas.health import Health, Readiness
+from dextouch.schemas.problems import (
+    CLASS_OF_STATUS,
+    PROBLEM_MEDIA_TYPE,
+    Problem,
+    problem_from_error,
+)
+from dextouch.serving.access import AccessControl
+from dextouch.serving.middleware import RequestMetrics, RequestMiddleware
+from dextouch.serving.settings import ServiceSettings
+
+logger = structlog.get_logger(__name__)
+
+Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
+# What is still missing before work may be sent, by name; empty when ready.
+ReadinessCheck = Callable[[], Awaitable[Sequence[str]]]
+
+
+def create_service_app(
+    *,
+    name: str,
+    version: str,
+    settings: ServiceSettings,
+    routers: Sequence[APIRouter],
+    lifespan: Lifespan | None = None,
+    readiness: ReadinessCheck | None = None,
+) -> FastAPI:
+    """One service.
+
+    Args:
+        name: of the service, in health, logs and titles.
+        version: of the package.
+        settings: keys and limits are taken from here.
+        routers: what the service offers; their routes raise our errors only.
+        lifespan: what lives as long as the application (pools, workers).
+        readiness: asked at /readyz; names of what is missing.
+
+    Returns:
+        The application; `app.state.registry` takes further metrics of the service.
+    """
+    app = FastAPI(
+        title=name, version=version, docs_url=None, redoc_url=None, lifespan=_started(lifespan)
+    )
+    app.state.access = AccessControl(settings.api_keys)
+    app.state.registry = CollectorRegistry()
+    app.state.running = False
+    app.add_middleware(
+        RequestMiddleware,
+        metrics=RequestMetrics(app.state.registry),
+        max_body_bytes=settings.max_body_bytes,
+    )
+    _add_error_handlers(app)
+    app.include_router(_health_router(name, version, readiness))
+    for router in routers:
+        app.include_router(router)
+    return app
+
+
+def _started(lifespan: Lifespan | None) -> Lifespan:
+    """Mark the application as running exactly while its own lifespan is."""
+
+    @asynccontextmanager
+    async def around(app: FastAPI) -> AsyncIterator[None]:
+        if lifespan is None:
+            app.state.running = True
+            yield
+        else:
+            async with lifespan(app):
+                app.state.running = True
+                yield
+                app.state.running = False
+        app.state.running = False
+
+    return around
+
+
+def _health_router(name: str, version: str, readiness: ReadinessCheck | None) -> APIRouter:
+    router = APIRouter(tags=["health"])
+
+    @router.get("/healthz")
+    async def healthz() -> Health:
+        """The process answers."""
+        return Health(service=name, version=version)
+
+    @router.get("/readyz", responses={503: {"model": Readiness}})
+    async def readyz(request: Request, response: Response) -> Readiness:
+        """Whether work may be sent."""
+        waiting = [] if request.app.state.running else ["start"]
+        if not waiting and readiness is not None:
+            waiting = list(await readiness())
+        response.status_code = HTTPStatus.SERVICE_UNAVAILABLE if waiting else HTTPStatus.OK
+        return Readiness(ready=not waiting, service=name, waiting_for=tuple(waiting))
+
+    @router.get("/metrics", include_in_schema=False)
+    async def metrics(request: Request) -> Response:
+        """Prometheus text."""
+        text = generate_latest(request.app.state.registry)
+        return Response(text, headers={"content-type": CONTENT_TYPE_LATEST})
+
+    return router
+
+
+def _add_error_handlers(app: FastAPI) -> None:
+    @app.exception_handler(DexTouchError)
+    async def ours(request: Request, error: DexTouchError) -> Response:
+        return _problem_response(request, error)
+
+    @app.exception_handler(RequestValidationError)
+    async def validation(request: Request, error: RequestValidationError) -> Response:
+        return _problem_response(request, *_validation_error(error))
+
+    @app.exception_handler(HTTPException)
+    async def http(request: Request, error: HTTPException) -> Response:
+        kind = CLASS_OF_STATUS.get(error.status_code, UnavailableError)
+        ours = kind(f"{request.method} {request.url.path}: {error.detail}")
+        response = _problem_response(request, ours, error.status_code)
+        response.headers.update(error.headers or {})
+        return response
+
+    @app.exception_handler(Exception)
+    async def unexpected(request: Request, error: Exception) -> Response:
+        # Starlette raises it again behind this answer, for the server's log.
+        logger.error("answer_failed", path=request.url.path, error=type(error).__name__)
+        ours = DexTouchError("unexpected error in the service; its log tells more by request id")
+        response = _problem_response(request, ours)
+        response.headers["x-request-id"] = request.state.request_id
+        return response
+
+
+def _validation_error(error: RequestValidationError) -> tuple[DexTouchError, int]:
+    items = [
+        {"where": ".".join(str(part) for part in item["loc"]), "what": str(item["msg"])}
+        for item in error.errors()
+    ]
+    malformed = any(item["type"] == "json_invalid" for item in error.errors())
+    text = "; ".join(f"{item['where']}: {item['what']}" for item in items)
+    return InvalidInputError(text or "invalid request", errors=items), 400 if malformed else 422
+
+
+def _problem_response(
+    request: Request, error: DexTouchError, status: int | None = None
+) -> Response:
+    problem: Problem = problem_from_error(
+        error, instance=request.url.path, request_id=request.state.request_id
+    )
+    if status is not None:
+        problem = problem.model_copy(update={"status": status})
+    headers = {}
+    if "retry_after_s" in error.details:
+        headers["retry-after"] = str(error.details["retry_after_s"])
+    if problem.status == HTTPStatus.UNAUTHORIZED:
+        headers["www-authenticate"] = "Bearer"
+    return JSONResponse(
+        problem.model_dump(), problem.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE
+    )

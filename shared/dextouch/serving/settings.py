@@ -1,0 +1,108 @@
+"""Environment and flags to one frozen settings object per service, and a service to a socket."""
+
+import ipaddress
+from typing import Literal, TypeVar
+
+from fastapi import FastAPI
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, model_validator
+from pydantic_settings import BaseSettings, CliApp, SettingsConfigDict
+
+from dextouch.errors import InvalidInputError
+
+MIN_KEY_CHARACTERS = 16
+SettingsT = TypeVar("SettingsT", bound="ServiceSettings")
+
+
+class ApiKey(BaseModel):
+    """One key and what it may do; `name` appears in logs, the key never."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")
+    key: SecretStr = Field(min_length=MIN_KEY_CHARACTERS)
+    scopes: tuple[str, ...] = Field(min_length=1)
+
+
+class ServiceSettings(BaseSettings):
+    """What every service has; a service derives its own class from it.
+
+    `host` other than loopback needs `api_keys`. Port 0 takes any free port.
+    """
+
+    model_config = SettingsConfigDict(
+        frozen=True, extra="forbid", env_nested_delimiter="__", env_prefix="DEXTOUCH_"
+    )
+
+    host: str = "127.0.0.1"
+    port: int = Field(default=0, ge=0, le=65535)
+    api_keys: tuple[ApiKey, ...] = ()
+    max_body_bytes: int = Field(default=16 * 2**20, ge=1024)
+    log_format: Literal["auto", "json", "console"] = "auto"
+    log_level: Literal["debug", "info", "warning", "error"] = "info"
+    shutdown_grace_s: int = Field(default=10, ge=0, le=600)
+
+    @model_validator(mode="after")
+    def _needs_keys_off_loopback(self) -> "ServiceSettings":
+        if not self.api_keys and not is_loopback(self.host):
+            raise ValueError(
+                f"host {self.host} is not loopback and no api_keys are set; "
+                "set at least one key with its scopes, or listen on 127.0.0.1"
+            )
+        names = [key.name for key in self.api_keys]
+        if len(set(names)) != len(names):
+            raise ValueError(f"api_keys: names must differ, got {names}")
+        return self
+
+
+def service_config(service: str) -> SettingsConfigDict:
+    """The `model_config` of a service's settings class: variables DEXTOUCH_<SERVICE>_<FIELD>."""
+    return SettingsConfigDict(
+        frozen=True,
+        extra="forbid",
+        env_prefix=f"DEXTOUCH_{service.upper()}_",
+        env_nested_delimiter="__",
+        cli_prog_name=service,
+        cli_kebab_case=False,
+    )
+
+
+def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
+    """Settings from flags, then the environment, then defaults.
+
+    Raises:
+        InvalidInputError: a value that does not fit; every one of them is named.
+        SystemExit: an unknown flag, or --help (after printing the usage).
+    """
+    try:
+        return CliApp.run(cls, cli_args=arguments)
+    except ValidationError as error:
+        found = "; ".join(
+            f"{'.'.join(str(part) for part in item['loc']) or 'settings'}: {item['msg']}"
+            for item in error.errors(include_input=False, include_url=False)
+        )
+        raise InvalidInputError(f"settings of {cls.__name__}: {found}") from error
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a socket bound to `host`."""
+    if host == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def run(app: FastAPI, settings: ServiceSettings) -> None:
+    """Serve until SIGINT or SIGTERM; requests in flight get `shutdown_grace_s` to end."""
+    import uvicorn
+
+    uvicorn.run(
+        app,
+        host=settings.host,
+        port=settings.port,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        timeout_graceful_shutdown=settings.shutdown_grace_s,
+    )

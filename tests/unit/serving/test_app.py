@@ -1,0 +1,227 @@
+"""The application factory: every failure is a problem+json, nothing leaks, health is honest."""
+
+import json
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import httpx
+import pytest
+from fastapi import APIRouter, Depends, FastAPI, Request
+from httpx import ASGITransport, AsyncClient
+from pydantic import BaseModel, SecretStr
+
+from dextouch import errors
+from dextouch.schemas.problems import Problem, error_from_problem
+from dextouch.serving.access import RequireScope
+from dextouch.serving.app import create_service_app
+from dextouch.serving.middleware import timed
+from dextouch.serving.settings import ApiKey, ServiceSettings
+
+CASES = [
+    (errors.PacketError("bad"), 400),
+    (errors.ShapeError("bad", got=[1, 2]), 422),
+    (errors.UnknownNameError("task", "x", ["a", "b"]), 422),
+    (errors.NotFoundError("gone"), 404),
+    (errors.ConflictError("other state", expected=3), 409),
+    (errors.LimitExceededError("too big"), 413),
+    (errors.LimitExceededError("too many", retry_after_s=2), 429),
+    (errors.UnavailableError("not ready", retry_after_s=1), 503),
+    (errors.StaleDataError("old"), 503),
+    (errors.StorageFullError("full"), 507),
+    (errors.CorruptDataError("damaged"), 500),
+    (errors.AccessDeniedError("no", reason="missing_key"), 401),
+    (errors.AccessDeniedError("no", reason="missing_scope"), 403),
+    (errors.DexTouchError("odd", value=float("nan"), thing=object()), 500),
+]
+
+
+JSON = {"content-type": "application/json"}
+
+
+class Body(BaseModel):
+    number: int
+
+
+def make_app(**kwargs) -> FastAPI:
+    router = APIRouter()
+
+    @router.get("/fail/{index}")
+    async def fail(index: int) -> None:
+        raise CASES[index][0]
+
+    @router.get("/boom")
+    async def boom() -> None:
+        raise RuntimeError("secret internals")
+
+    @router.post("/json")
+    async def take_json(body: Body) -> int:
+        return body.number
+
+    @router.post("/raw")
+    async def take_raw(request: Request) -> int:
+        with timed(request, "read"):
+            return len(await request.body())
+
+    @router.get("/guarded", dependencies=[Depends(RequireScope("rollout"))])
+    async def guarded() -> str:
+        return "in"
+
+    settings = kwargs.pop("settings", ServiceSettings(max_body_bytes=2048))
+    return create_service_app(
+        name="probe", version="1", settings=settings, routers=[router], **kwargs
+    )
+
+
+def client_of(app: FastAPI) -> AsyncClient:
+    transport = ASGITransport(app, raise_app_exceptions=False)
+    return AsyncClient(transport=transport, base_url="http://probe")
+
+
+def problem_of(response: httpx.Response) -> Problem:
+    assert response.headers["content-type"] == "application/problem+json"
+    problem = Problem.model_validate_json(response.content)
+    assert problem.status == response.status_code
+    assert problem.request_id == response.headers["x-request-id"]
+    assert "Traceback" not in response.text
+    return problem
+
+
+@pytest.mark.parametrize("index", range(len(CASES)))
+async def test_each_error_has_its_status_and_comes_back_as_itself(index):
+    error, status = CASES[index]
+    async with client_of(make_app()) as client:
+        response = await client.get(f"/fail/{index}")
+    assert response.status_code == status
+    back = error_from_problem(problem_of(response))
+    assert type(back) is type(error)
+    assert back.message == error.message
+    assert set(back.details) == set(error.details)
+    if "retry_after_s" in error.details:
+        assert response.headers["retry-after"] == str(error.details["retry_after_s"])
+
+
+async def test_an_unexpected_error_says_nothing_of_the_inside():
+    async with client_of(make_app()) as client:
+        response = await client.get("/boom")
+    assert response.status_code == 500
+    assert "secret" not in response.text
+    assert problem_of(response).type.endswith(":DexTouchError")
+
+
+async def test_unknown_routes_methods_and_bodies_are_problems():
+    async with client_of(make_app()) as client:
+        assert problem_of(await client.get("/nowhere")).status == 404
+        wrong_method = await client.get("/json")
+        assert problem_of(wrong_method).status == 405
+        assert wrong_method.headers["allow"] == "POST"
+        assert problem_of(await client.post("/json", content=b"{", headers=JSON)).status == 400
+        missing = problem_of(await client.post("/json", json={"number": "many"}))
+        assert missing.status == 422
+        assert "body.number" in missing.detail
+
+
+@pytest.mark.parametrize("path", ["/raw", "/json"])
+@pytest.mark.parametrize("announced", [True, False])
+async def test_a_body_over_the_limit_is_refused_announced_or_not(path, announced):
+    async def parts() -> AsyncIterator[bytes]:
+        for _ in range(5):
+            yield b"x" * 1000
+
+    content = b"x" * 5000 if announced else parts()
+    async with client_of(make_app()) as client:
+        response = await client.post(path, content=content, headers=JSON)
+    problem = problem_of(response)
+    assert problem.status == 413
+    assert "2048" in problem.detail
+
+
+async def test_readiness_follows_lifespan_and_check():
+    seen: list[str] = []
+    missing = ["model"]
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        seen.append("start")
+        yield
+        seen.append("stop")
+
+    async def readiness() -> list[str]:
+        return missing
+
+    app = make_app(lifespan=lifespan, readiness=readiness)
+    async with client_of(app) as client:
+        assert (await client.get("/healthz")).json() == {
+            "status": "ok",
+            "service": "probe",
+            "version": "1",
+        }
+        early = await client.get("/readyz")
+        assert (early.status_code, early.json()["waiting_for"]) == (503, ["start"])
+        async with app.router.lifespan_context(app):
+            waiting = await client.get("/readyz")
+            assert (waiting.status_code, waiting.json()["waiting_for"]) == (503, ["model"])
+            missing.clear()
+            assert (await client.get("/readyz")).status_code == 200
+        assert (await client.get("/readyz")).status_code == 503
+    assert seen == ["start", "stop"]
+
+
+async def test_metrics_count_by_route_template_in_an_own_registry():
+    async with client_of(make_app()) as client:
+        await client.get("/fail/0")
+        await client.get("/fail/1")
+        await client.get("/nowhere")
+        text = (await client.get("/metrics")).text
+    sample = 'dextouch_http_requests_total{method="GET",route="/fail/{index}",status="400"} 1.0'
+    assert sample in text
+    assert 'route="unmatched",status="404"' in text
+    assert "python_info" not in text
+
+
+async def test_request_id_is_kept_when_sane_and_timing_is_told():
+    async with client_of(make_app()) as client:
+        kept = await client.post("/raw", content=b"ab", headers={"x-request-id": "take-7"})
+        replaced = await client.post("/raw", content=b"", headers={"x-request-id": "a b\x7f"})
+    assert kept.headers["x-request-id"] == "take-7"
+    assert len(replaced.headers["x-request-id"]) == 32
+    assert kept.headers["server-timing"].startswith("read;dur=")
+    assert "total;dur=" in kept.headers["server-timing"]
+
+
+async def test_keys_open_only_what_their_scopes_name():
+    good, weak = "g" * 20, "w" * 20
+    settings = ServiceSettings(
+        host="0.0.0.0",  # noqa: S104 - that keys are demanded there is what is tested
+        api_keys=(
+            ApiKey(name="policy", key=SecretStr(good), scopes=("rollout",)),
+            ApiKey(name="rater", key=SecretStr(weak), scopes=("rate",)),
+        ),
+    )
+    async with client_of(make_app(settings=settings)) as client:
+        missing = await client.get("/guarded")
+        assert missing.status_code == 401
+        assert missing.headers["www-authenticate"] == "Bearer"
+        for header, status in [
+            (f"Bearer {good}", 200),
+            (f"bearer {good}", 200),
+            (f"Bearer {weak}", 403),
+            ("Bearer nonsense", 401),
+            (f"Basic {good}", 401),
+            ("Bearer ", 401),
+        ]:
+            answer = await client.get("/guarded", headers={"authorization": header})
+            assert answer.status_code == status, header
+            assert good not in answer.text
+
+
+async def test_without_keys_loopback_is_open():
+    async with client_of(make_app()) as client:
+        assert (await client.get("/guarded")).status_code == 200
+
+
+async def test_request_id_reaches_the_log(caplog):
+    async with client_of(make_app()) as client:
+        with caplog.at_level(logging.ERROR):
+            response = await client.get("/boom", headers={"x-request-id": "abc"})
+    assert json.loads(response.content)["request_id"] == "abc"

@@ -1,0 +1,63 @@
+"""Settings: one class gives environment and flags, refuses what it does not know, and is frozen."""
+
+import pytest
+from pydantic import ValidationError
+
+from dextouch.errors import InvalidInputError
+from dextouch.serving.settings import ServiceSettings, is_loopback, load_settings, service_config
+
+EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested
+
+
+class ProbeSettings(ServiceSettings):
+    """Settings of a service that exists only here."""
+
+    model_config = service_config("probe")
+
+    rate_hz: float = 15.0
+
+
+def test_flags_stand_above_the_environment(monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_PROBE_PORT", "8101")
+    monkeypatch.setenv("DEXTOUCH_PROBE_RATE_HZ", "30")
+    settings = load_settings(ProbeSettings, ["--rate_hz", "60"])
+    assert (settings.port, settings.rate_hz) == (8101, 60.0)
+
+
+def test_unknown_flags_are_refused(capsys):
+    with pytest.raises(SystemExit) as caught:
+        load_settings(ProbeSettings, ["--colour", "red"])
+    assert caught.value.code == 2
+    assert "--colour" in capsys.readouterr().err
+
+
+def test_wrong_values_are_named():
+    with pytest.raises(InvalidInputError, match=r"port: .*65535"):
+        load_settings(ProbeSettings, ["--port", "99999"])
+
+
+def test_open_addresses_need_keys(monkeypatch):
+    with pytest.raises(InvalidInputError, match="not loopback"):
+        load_settings(ProbeSettings, ["--host", EVERYWHERE])
+    monkeypatch.setenv(
+        "DEXTOUCH_PROBE_API_KEYS", '[{"name": "a", "key": "0123456789abcdef", "scopes": ["x"]}]'
+    )
+    settings = load_settings(ProbeSettings, ["--host", EVERYWHERE])
+    assert settings.api_keys[0].scopes == ("x",)
+    assert "0123456789abcdef" not in repr(settings)
+
+
+def test_settings_are_frozen_and_closed():
+    settings = ProbeSettings()
+    with pytest.raises(ValidationError, match="frozen"):
+        settings.port = 1
+    with pytest.raises(ValidationError, match="extra"):
+        ProbeSettings(colour="red")
+
+
+@pytest.mark.parametrize(
+    ("host", "expected"),
+    [("127.0.0.1", True), ("::1", True), ("localhost", True), (EVERYWHERE, False), ("lab", False)],
+)
+def test_loopback(host, expected):
+    assert is_loopback(host) is expected
