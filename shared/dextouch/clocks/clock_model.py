@@ -1,0 +1,240 @@
+"""A take's device stamps and host arrivals in, a map from device time to host time out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from dextouch.clocks.lower_hull import Line, LowerHull
+from dextouch.clocks.steps import find_steps
+from dextouch.errors import ClockFitError, InvalidInputError
+
+MIN_SAMPLES = 10
+# One straight line holds for a minute of a crystal's wander; longer takes get a bent one.
+WINDOW_S = 60.0
+# Below this many samples or seconds a segment's own slope is mostly noise.
+MIN_SLOPE_SAMPLES = 50
+MIN_SLOPE_SPAN_S = 1.0
+PATH_DELAY_NOTE = (
+    "host times include the stream's smallest path delay, which stamps of one direction cannot "
+    "show; subtract the calibrated latency_ns"
+)
+
+
+@dataclass(frozen=True)
+class ClockSegment:
+    """Stretch of a take during which the device's clock ran without a step.
+
+    host = device + reference_offset_ns + (broken line through knots of the offset), where knots
+    are in seconds of device time after `start_device_ns`; beyond the ends the end lines go on.
+    """
+
+    start_index: int
+    start_device_ns: int
+    stop_device_ns: int
+    start_host_ns: int
+    reference_offset_ns: int
+    knots_s: Float64[np.ndarray, " k"]
+    knot_offsets_ns: Float64[np.ndarray, " k"]
+
+    def to_host_ns(self, t_device_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
+        """Host times of device times."""
+        x = (t_device_ns - self.start_device_ns).astype(np.float64) * 1e-9
+        offset = np.interp(x, self.knots_s, self.knot_offsets_ns)
+        for end, inner in ((0, 1), (-1, -2)):
+            run = self.knots_s[end] - self.knots_s[inner]
+            slope = (self.knot_offsets_ns[end] - self.knot_offsets_ns[inner]) / run
+            outside = x < self.knots_s[0] if end == 0 else x > self.knots_s[-1]
+            beyond = self.knot_offsets_ns[end] + slope * (x - self.knots_s[end])
+            offset = np.where(outside, beyond, offset)
+        return t_device_ns + self.reference_offset_ns + np.rint(offset).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class ClockModel:
+    """Device time → host time.
+
+    Attributes:
+        segments: in order of arrival; more than one where the device's clock was stepped.
+        skew_ppm: how much faster the host's clock runs, mean over all segments.
+        residual_rms_ns: root mean square of arrival minus fitted time: the path's queueing, not
+            the error of the fit (which is far smaller).
+        path_delay_note: what these host times still contain.
+    """
+
+    segments: tuple[ClockSegment, ...]
+    skew_ppm: float
+    residual_rms_ns: float
+    path_delay_note: str = PATH_DELAY_NOTE
+
+    @property
+    def num_steps(self) -> int:
+        """How often the device's clock was stepped or restarted."""
+        return len(self.segments) - 1
+
+    @property
+    def is_ambiguous(self) -> bool:
+        """Whether the device's clock went back, so that one device time means two moments."""
+        stops = [segment.stop_device_ns for segment in self.segments[:-1]]
+        starts = [segment.start_device_ns for segment in self.segments[1:]]
+        return any(start <= stop for stop, start in zip(stops, starts, strict=True))
+
+    def to_host_ns(
+        self, t_device_ns: np.ndarray, t_host_ns: np.ndarray | None = None
+    ) -> Int64[np.ndarray, " n"]:
+        """Host times of device times [n], on the host's clock at the smallest path delay.
+
+        Args:
+            t_device_ns: unwrapped device stamps, int64.
+            t_host_ns: arrival of each, needed only where the device's clock went back: it tells
+                which stretch a stamp belongs to.
+
+        Raises:
+            InvalidInputError: the device's clock went back and no arrivals are given.
+        """
+        t_device_ns = np.asarray(t_device_ns, dtype=np.int64)
+        if t_host_ns is None and self.is_ambiguous:
+            raise InvalidInputError(
+                f"clock: the device's clock went back ({self.num_steps} steps), so a device time "
+                "can mean two moments; pass t_host_ns too"
+            )
+        if t_host_ns is None:
+            starts = [segment.start_device_ns for segment in self.segments]
+            keys = t_device_ns
+        else:
+            starts = [segment.start_host_ns for segment in self.segments]
+            keys = np.asarray(t_host_ns, dtype=np.int64)
+        chosen = np.clip(np.searchsorted(starts, keys, side="right") - 1, 0, len(starts) - 1)
+        host_ns = np.empty_like(t_device_ns)
+        for index, segment in enumerate(self.segments):
+            mine = chosen == index
+            host_ns[mine] = segment.to_host_ns(t_device_ns[mine])
+        return host_ns
+
+
+def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
+    """Fit device time → host time on a whole take by the lower convex hull, looking both ways.
+
+    Args:
+        t_device_ns: unwrapped device stamps [n], in order of arrival. Steps and restarts of the
+            device's clock are found and fitted piece by piece.
+        t_host_ns: arrivals [n] on the host's monotonic clock.
+
+    Raises:
+        ClockFitError: `details["cause"]` is "too_few" (below 10 samples), "not_finite" (no
+            integers), "not_increasing" (arrivals go back, or device stamps run back more often
+            than a clock is stepped) or "length" (unequal lengths).
+    """
+    device, host = _checked(t_device_ns, t_host_ns)
+    cuts = find_steps(device, host)
+    bounds = list(zip([0, *cuts], [*cuts, len(device)], strict=True))
+    slopes = [_slope(device[a:b], host[a:b]) for a, b in bounds]
+    lengths = np.array(
+        [b - a if slope is not None else 0 for (a, b), slope in zip(bounds, slopes, strict=True)]
+    )
+    known = np.array([0.0 if slope is None else slope for slope in slopes])
+    mean_slope = float((known * lengths).sum() / max(lengths.sum(), 1))
+    segments = tuple(
+        _fit_segment(device, host, bound, None if slope is not None else mean_slope)
+        for bound, slope in zip(bounds, slopes, strict=True)
+    )
+    fitted = np.concatenate(
+        [segment.to_host_ns(device[a:b]) for segment, (a, b) in zip(segments, bounds, strict=True)]
+    )
+    residual_ns = (host - fitted).astype(np.float64)
+    return ClockModel(segments, mean_slope * 1e-3, float(np.sqrt(np.mean(residual_ns**2))))
+
+
+def _checked(
+    t_device_ns: np.ndarray, t_host_ns: np.ndarray
+) -> tuple[Int64[np.ndarray, " n"], Int64[np.ndarray, " n"]]:
+    device, host = np.asarray(t_device_ns), np.asarray(t_host_ns)
+    if device.ndim != 1 or device.shape != host.shape:
+        raise _refusal("length", f"got shapes {device.shape} and {host.shape}, expected two [n]")
+    if not all(np.issubdtype(array.dtype, np.integer) for array in (device, host)):
+        raise _refusal(
+            "not_finite", f"got {device.dtype} and {host.dtype}, expected int64 nanoseconds"
+        )
+    if len(device) < MIN_SAMPLES:
+        raise _refusal("too_few", f"got {len(device)} samples, expected at least {MIN_SAMPLES}")
+    device, host = device.astype(np.int64), host.astype(np.int64)
+    backwards = int((np.diff(host) < 0).sum())
+    if backwards:
+        raise _refusal("not_increasing", f"{backwards} host arrivals lie before their predecessor")
+    backwards = int((np.diff(device) < 0).sum())
+    if backwards > max(1, len(device) // 100):
+        raise _refusal(
+            "not_increasing",
+            f"{backwards} of {len(device)} device stamps run back, more than steps can explain; "
+            "unwrap the counter and keep the order of arrival",
+        )
+    if device[0] == device[-1] and not np.diff(device).any():
+        raise _refusal("not_increasing", "the device's stamp never changes")
+    return device, host
+
+
+def _refusal(cause: str, text: str) -> ClockFitError:
+    return ClockFitError(f"clock fit: {text}", cause=cause)
+
+
+def _offsets(device: np.ndarray, host: np.ndarray) -> tuple[list[float], list[float], int]:
+    """Seconds of device time, apparent offsets in ns, and the int64 taken away from the latter."""
+    reference_ns = int(host[0] - device[0])
+    x = (device - device[0]).astype(np.float64) * 1e-9
+    y = (host - device - reference_ns).astype(np.float64)
+    return x.tolist(), y.tolist(), reference_ns
+
+
+def _hull(x: list[float], y: list[float]) -> LowerHull:
+    hull = LowerHull()
+    for x_s, y_ns in zip(x, y, strict=True):
+        hull.add(x_s, y_ns)
+    return hull
+
+
+def _slope(device: np.ndarray, host: np.ndarray) -> float | None:
+    """Drift of a segment in ns per second, or None where it is too short to tell."""
+    if len(device) < MIN_SLOPE_SAMPLES or device[-1] - device[0] < MIN_SLOPE_SPAN_S * 1e9:
+        return None
+    x, y, _ = _offsets(device, host)
+    return _hull(x, y).supporting_line(x[-1] / 2).slope_ns_per_s
+
+
+def _fit_segment(
+    device: np.ndarray, host: np.ndarray, bound: tuple[int, int], slope: float | None
+) -> ClockSegment:
+    start, stop = bound
+    x, y, reference_ns = _offsets(device[start:stop], host[start:stop])
+    knots = _knots(x, y) if slope is None else _straight(x, _hull(x, y).line_of_slope(slope))
+    return ClockSegment(
+        start_index=start,
+        start_device_ns=int(device[start]),
+        stop_device_ns=int(device[stop - 1]),
+        start_host_ns=int(host[start]),
+        reference_offset_ns=reference_ns,
+        knots_s=np.array([knot[0] for knot in knots]),
+        knot_offsets_ns=np.array([knot[1] for knot in knots]),
+    )
+
+
+def _straight(x: list[float], line: Line) -> list[tuple[float, float]]:
+    end_s = max(x[-1], 1e-3)
+    return [(0.0, line.at(0.0)), (end_s, line.at(end_s))]
+
+
+def _knots(x: list[float], y: list[float]) -> list[tuple[float, float]]:
+    """Centres of half-overlapping windows, each with its supporting line's value, and the ends."""
+    span_s = x[-1]
+    if span_s <= WINDOW_S:
+        return _straight(x, _hull(x, y).supporting_line(span_s / 2))
+    num_windows = int(np.ceil((span_s - WINDOW_S) / (WINDOW_S / 2))) + 1
+    centres = np.linspace(WINDOW_S / 2, span_s - WINDOW_S / 2, num_windows)
+    lines = []
+    for centre in centres:
+        a, b = np.searchsorted(x, [centre - WINDOW_S / 2, centre + WINDOW_S / 2])
+        if b - a >= MIN_SAMPLES:
+            lines.append((float(centre), _hull(x[a:b], y[a:b]).supporting_line(float(centre))))
+    if not lines:
+        return _straight(x, _hull(x, y).supporting_line(span_s / 2))
+    knots = [(centre, line.at(centre)) for centre, line in lines]
+    return [(0.0, lines[0][1].at(0.0)), *knots, (span_s, lines[-1][1].at(span_s))]

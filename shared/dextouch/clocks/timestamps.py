@@ -1,0 +1,76 @@
+"""Wrapping device counters in, straight int64 counts out; sequence numbers in, lost samples out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.errors import InvalidInputError, ShapeError
+
+
+@dataclass(frozen=True)
+class SequenceReport:
+    """What a stream's sequence numbers say about loss.
+
+    `num_missing_before[i]` samples are missing between sample i-1 and i (0 for the first, at a
+    duplicate and at a restart); `restart_indices` are samples whose number went back or stood.
+    """
+
+    num_missing_before: Int64[np.ndarray, " n"]
+    restart_indices: Int64[np.ndarray, " r"]
+
+    @property
+    def num_missing(self) -> int:
+        """All samples that were numbered by the device and never arrived."""
+        return int(self.num_missing_before.sum())
+
+
+def unwrap_counter(
+    raw: np.ndarray, *, modulus: int, hint: np.ndarray | None = None
+) -> Int64[np.ndarray, " n"]:
+    """A counter that wraps at `modulus`, made straight.
+
+    Args:
+        raw: integer counts [n], each in 0 … modulus - 1.
+        modulus: count at which the counter starts again from zero, 2 … 2**62.
+        hint: another clock in the same unit [n] (arrival times). It tells how often the counter
+            wrapped in a silence longer than a wrap; without it a step of more than half a
+            modulus counts as one wrap, a smaller step back as a step back.
+
+    Raises:
+        ShapeError: not one axis of integers, or a hint of another length.
+        InvalidInputError: a count outside 0 … modulus - 1, or an impossible modulus.
+    """
+    counts = np.asarray(raw)
+    if counts.ndim != 1 or not np.issubdtype(counts.dtype, np.integer):
+        raise ShapeError(f"counter: got {counts.dtype} {counts.shape}, expected integers [n]")
+    if not 2 <= modulus <= 2**62:
+        raise InvalidInputError(f"counter: got modulus {modulus}, expected 2 … 2**62")
+    if counts.size and (int(counts.min()) < 0 or int(counts.max()) >= modulus):
+        raise InvalidInputError(
+            f"counter: got counts {counts.min()} … {counts.max()}, expected 0 … {modulus - 1}"
+        )
+    straight = counts.astype(np.int64)
+    steps: Int64[np.ndarray, " m"] = np.diff(straight)
+    expected = np.zeros_like(steps) if hint is None else np.diff(np.asarray(hint, dtype=np.int64))
+    if expected.shape != steps.shape:
+        raise ShapeError(f"counter: got {counts.size} counts and a hint of another length")
+    half = modulus // 2
+    # The step congruent to the counted one that lies nearest to the expected one.
+    steps = expected + np.mod(steps - expected + half, modulus) - half
+    return np.concatenate([straight[:1], straight[:1] + np.cumsum(steps)]).astype(np.int64)
+
+
+def find_lost_samples(sequence: np.ndarray, *, bits: int = 64) -> SequenceReport:
+    """Gaps and restarts in a stream's sequence numbers.
+
+    Args:
+        sequence: numbers [n] as the device sent them.
+        bits: width of the device's counter, 8 … 64 (64 never wraps in practice).
+    """
+    if not 8 <= bits <= 64:
+        raise InvalidInputError(f"sequence: got a counter of {bits} bits, expected 8 … 64")
+    numbers = np.asarray(sequence, dtype=np.int64)
+    straight = numbers if bits > 62 else unwrap_counter(numbers, modulus=2**bits)
+    steps = np.diff(straight, prepend=straight[:1] - 1)
+    return SequenceReport(np.maximum(steps - 1, 0), np.flatnonzero(steps <= 0).astype(np.int64))
