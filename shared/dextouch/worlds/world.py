@@ -5,75 +5,36 @@ old state as it was, a step can be replayed, and a rollout can branch. States ar
 caller; `snapshot` and `restore` turn them into bytes for another process.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, Literal, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
-from jaxtyping import Float32, Float64, UInt8
-from pydantic import BaseModel, ConfigDict
+from jaxtyping import Float64
 
 from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.rollouts import (
+    ActionKind,
+    Observation,
+    RolloutStart,
+    WorldDescription,
+    WorldKind,
+)
 
-ActionKind = Literal["measured", "commanded"]
-WorldKind = Literal["twin", "model", "baseline", "robot"]
 State = TypeVar("State")
 
-
-class WorldDescription(BaseModel):
-    """What a world is and accepts: the handshake before a rollout."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    name: str
-    kind: WorldKind
-    digest: str
-    tasks: tuple[str, ...]
-    cameras: tuple[str, ...]
-    image_height_px: int
-    image_width_px: int
-    model_rate_hz: float
-    action_kinds: tuple[ActionKind, ...]
-    starts_from: tuple[Literal["task_seed", "observation"], ...]
-    chunk_multiple: int = 4
-    max_chunk_steps: int = 64
-    knows_success: bool = False
-
-
-@dataclass(frozen=True)
-class Observation:
-    """What is seen, felt and measured over n consecutive steps of the model grid.
-
-    `action_reached` is the pose and joint reading as an action, relative to the rollout's step 0:
-    measured by a twin or a robot; in an imagined world, which senses no joints, the actions it was
-    given (`reached_is_measured` says which).
-    """
-
-    first_step: int
-    images: dict[str, UInt8[np.ndarray, "n h w 3"]]
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
-    action_reached: Float64[np.ndarray, "n 67"]
-    reached_is_measured: bool
-    success: bool | None = None
-
-    def __len__(self) -> int:
-        return len(self.tactile_kpa)
-
-
-@dataclass(frozen=True)
-class RolloutStart:
-    """Where a future begins: a task and seed, or an observation made elsewhere.
-
-    `anchor` are the absolute poses of step 0, `K_head` the head camera's matrix in pixels; both
-    come with `observation` (one step), and with every first observation that a world gives.
-    """
-
-    task: str
-    seed: int
-    instruction: str
-    action_kind: ActionKind = "commanded"
-    observation: Observation | None = None
-    anchor: AnchorPoses | None = None
-    K_head: Float64[np.ndarray, "3 3"] | None = None
+__all__ = [
+    "ActionKind",
+    "BatchWorld",
+    "Observation",
+    "RolloutStart",
+    "StartedRollout",
+    "State",
+    "SteppedRollout",
+    "World",
+    "WorldDescription",
+    "WorldKind",
+]
 
 
 @dataclass(frozen=True)
@@ -136,4 +97,18 @@ class World(Protocol[State]):
         Raises:
             InvalidInputError: bytes that are no snapshot of this world.
         """
+        ...
+
+
+class BatchWorld(World[State], Protocol[State]):
+    """A world that advances several rollouts together for less than the sum of their times."""
+
+    def step_batch(
+        self,
+        states: Sequence[State],
+        actions: Float64[np.ndarray, "batch steps 67"],
+        *,
+        seeds: Sequence[int],
+    ) -> list[SteppedRollout[State]]:
+        """`step` for each entry; who else is in the batch changes no answer."""
         ...

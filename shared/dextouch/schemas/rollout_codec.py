@@ -1,0 +1,242 @@
+"""Starts and answers of a rollout ↔ msgpack packing; one codec for server, client and store."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, ShapeError
+from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.rollouts import (
+    Observation,
+    ReturnSelector,
+    RolloutInfo,
+    RolloutStart,
+    StartRequest,
+    check_observation_arrays,
+)
+from dextouch.streams.packing import pack, unpack
+
+IMAGE_PREFIX = "image/"
+ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
+DEFAULT_SELECTOR = ReturnSelector()
+RIGID_TOLERANCE = 1e-6
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+class ObservationFields(BaseModel):
+    """What of an observation is no array."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    first_step: int
+    reached_is_measured: bool
+    success: bool | None = None
+
+
+class AnswerFields(BaseModel):
+    """The fields of an answer that carries an observation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rollout: RolloutInfo
+    observation: ObservationFields
+    info: dict[str, float] = {}
+
+
+class StartFields(BaseModel):
+    """The fields of a start that carries an observation."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start: StartRequest
+    observation: ObservationFields | None = None
+
+
+@dataclass(frozen=True)
+class Origin:
+    """What action poses refer to and images were taken with: given with every first observation."""
+
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class RolloutAnswer:
+    """A decoded answer; `origin` only with the first observation of a rollout."""
+
+    rollout: RolloutInfo
+    observation: Observation
+    info: dict[str, float]
+    origin: Origin | None
+
+
+def encode_answer(
+    rollout: RolloutInfo,
+    observation: Observation,
+    *,
+    selector: ReturnSelector = DEFAULT_SELECTOR,
+    info: dict[str, float] | None = None,
+    origin: Origin | None = None,
+) -> bytes:
+    """The selected part of an observation, with where the rollout stands, as bytes."""
+    shown = observation.last() if selector.steps == "last" else observation
+    arrays = _observation_arrays(shown)
+    if selector.cameras is not None:
+        wanted = {IMAGE_PREFIX + camera for camera in selector.cameras}
+        arrays = {
+            name: array
+            for name, array in arrays.items()
+            if not name.startswith(IMAGE_PREFIX) or name in wanted
+        }
+    if not selector.tactile:
+        del arrays["tactile_kpa"]
+    if origin is not None:
+        arrays |= _origin_arrays(origin)
+    fields = AnswerFields(rollout=rollout, observation=_fields_of(shown), info=info or {})
+    return pack(fields.model_dump(mode="json"), arrays)
+
+
+def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
+    """Inverse of `encode_answer` with tactile.
+
+    Raises:
+        InvalidInputError: bytes that are no such answer.
+    """
+    raw, arrays = unpack(data, max_bytes=max_bytes)
+    fields = _validated(AnswerFields, raw, where="answer")
+    origin = _origin_from(arrays, where="answer") if "K_head" in arrays else None
+    observation = _observation_from(fields.observation, arrays, where="answer")
+    return RolloutAnswer(fields.rollout, observation, fields.info, origin)
+
+
+def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
+    """The body of POST /v1/rollouts, with the observation to start from if there is one."""
+    arrays: dict[str, np.ndarray] = {}
+    observation = None
+    if start.observation is not None:
+        if start.anchor is None or start.K_head is None:
+            raise InvalidInputError("start: an observation needs anchor and K_head beside it")
+        arrays = _observation_arrays(start.observation)
+        arrays |= _origin_arrays(Origin(start.anchor, start.K_head))
+        observation = _fields_of(start.observation)
+    fields = StartFields(start=request, observation=observation)
+    return pack(fields.model_dump(mode="json"), arrays)
+
+
+def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
+    """Inverse of `encode_start`, for bytes from somewhere that is not trusted.
+
+    Raises:
+        InvalidInputError: bytes that are no such start.
+    """
+    raw, arrays = unpack(data, max_bytes=max_bytes)
+    fields = _validated(StartFields, raw, where="start")
+    if fields.observation is None:
+        return fields.start, start_from(fields.start)
+    observation = _observation_from(fields.observation, arrays, where="start")
+    origin = _origin_from(arrays, where="start")
+    return fields.start, start_from(fields.start, observation=observation, origin=origin)
+
+
+def start_from(
+    request: StartRequest, *, observation: Observation | None = None, origin: Origin | None = None
+) -> RolloutStart:
+    """The start that a request (and an observation beside it) describes."""
+    return RolloutStart(
+        task=request.task,
+        seed=request.seed,
+        instruction=request.instruction,
+        action_kind=request.action_kind,
+        observation=observation,
+        anchor=None if origin is None else origin.anchor,
+        K_head=None if origin is None else origin.K_head,
+    )
+
+
+def _fields_of(observation: Observation) -> ObservationFields:
+    return ObservationFields(
+        first_step=observation.first_step,
+        reached_is_measured=observation.reached_is_measured,
+        success=observation.success,
+    )
+
+
+def _observation_arrays(observation: Observation) -> dict[str, np.ndarray]:
+    return {
+        "tactile_kpa": observation.tactile_kpa,
+        "action_reached": observation.action_reached,
+        **{IMAGE_PREFIX + camera: images for camera, images in observation.images.items()},
+    }
+
+
+def _origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
+    return {
+        **dict(zip(ANCHOR_NAMES, origin.anchor.as_tuple(), strict=True)),
+        "K_head": origin.K_head,
+    }
+
+
+def _observation_from(
+    fields: ObservationFields, arrays: Mapping[str, np.ndarray], *, where: str
+) -> Observation:
+    images = {
+        name.removeprefix(IMAGE_PREFIX): array
+        for name, array in arrays.items()
+        if name.startswith(IMAGE_PREFIX)
+    }
+    tactile_kpa = _array(arrays, "tactile_kpa", where=where)
+    action_reached = _array(arrays, "action_reached", where=where)
+    check_observation_arrays(
+        images=images, tactile_kpa=tactile_kpa, action_reached=action_reached, where=where
+    )
+    return Observation(
+        first_step=fields.first_step,
+        images=images,
+        tactile_kpa=tactile_kpa,
+        action_reached=action_reached,
+        reached_is_measured=fields.reached_is_measured,
+        success=fields.success,
+    )
+
+
+def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> Origin:
+    poses = []
+    for name in ANCHOR_NAMES:
+        T = _array(arrays, name, where=where)
+        if T.shape != (4, 4) or T.dtype != np.float64 or not np.isfinite(T).all():
+            raise ShapeError(f"{where}: {name} got {T.dtype} {T.shape}, expected finite [4, 4]")
+        R = T[:3, :3]
+        bottom = np.array([0.0, 0.0, 0.0, 1.0])
+        off = max(np.abs(R.T @ R - np.eye(3)).max(), np.abs(T[3] - bottom).max())
+        if off > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+            raise DegenerateRotationError(
+                f"{where}: {name} is no rigid transform (off by {off:.1e}, expected at most "
+                f"{RIGID_TOLERANCE:.0e})"
+            )
+        poses.append(T)
+    K_head = _array(arrays, "K_head", where=where)
+    if K_head.shape != (3, 3) or K_head.dtype != np.float64 or not np.isfinite(K_head).all():
+        raise ShapeError(f"{where}: K_head got {K_head.dtype} {K_head.shape}, expected [3, 3]")
+    return Origin(AnchorPoses(*poses), K_head)
+
+
+def _array(arrays: Mapping[str, np.ndarray], name: str, *, where: str) -> np.ndarray:
+    if name not in arrays:
+        listed = ", ".join(sorted(arrays)) or "none"
+        raise InvalidInputError(f"{where}: array {name!r} is missing; got: {listed}")
+    return arrays[name]
+
+
+def _validated(model: type[ModelT], fields: object, *, where: str) -> ModelT:
+    try:
+        return model.model_validate(fields)
+    except ValidationError as error:
+        found = "; ".join(
+            f"{'.'.join(str(part) for part in item['loc']) or 'fields'}: {item['msg']}"
+            for item in error.errors(include_input=False, include_url=False)
+        )
+        raise InvalidInputError(f"{where}: {found}") from error
