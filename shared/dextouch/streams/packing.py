@@ -44,7 +44,7 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
     if len(data) > max_bytes:
         raise LimitExceededError(f"body: got {len(data)} bytes, expected at most {max_bytes}")
     try:
-        message = msgpack.unpackb(data, max_buffer_size=max_bytes, strict_map_key=True)
+        message = msgpack.unpackb(data, strict_map_key=True)
     except (ValueError, msgpack.UnpackException) as error:
         raise InvalidInputError(f"body: not msgpack ({type(error).__name__}: {error})") from error
     if (
