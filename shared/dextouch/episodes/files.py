@@ -1,0 +1,66 @@
+"""Bytes to files that survive a crash: whole writes, atomic replacement, and honest disk errors."""
+
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from dextouch.errors import StorageError, StorageFullError
+
+# EFBIG: the file size limit of the process or file system; for a recording the same decision.
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+
+
+@contextmanager
+def disk_errors(what: str) -> Iterator[None]:
+    """Turn the operating system's errors into ours, naming `what` was being done.
+
+    Raises:
+        StorageFullError: no space, quota or file size left.
+        StorageError: any other failure of the disk.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _FULL:
+            raise StorageFullError(
+                f"{what}: no space left ({error.strerror}); what was recorded stays, "
+                "free space and try again"
+            ) from error
+        raise StorageError(f"{what}: {error}") from error
+
+
+def write_all(descriptor: int, data: bytes | memoryview) -> None:
+    """Write every byte to an open file."""
+    view = memoryview(data)
+    while view:
+        view = view[os.write(descriptor, view) :]
+
+
+def sync_folder(path: Path) -> None:
+    """Make the names in a folder survive a power loss."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def write_file(path: Path, data: bytes) -> None:
+    """A new file with these bytes, on the disk when this returns."""
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    try:
+        write_all(descriptor, data)
+        os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def replace_file(path: Path, data: bytes) -> None:
+    """Put these bytes in place of a file, whole or not at all."""
+    partial = path.with_name(path.name + ".partial")
+    partial.unlink(missing_ok=True)
+    write_file(partial, data)
+    partial.replace(path)
+    sync_folder(path.parent)

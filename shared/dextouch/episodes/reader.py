@@ -1,0 +1,194 @@
+"""An episode or recording on disk → its streams by time, and windows on the model grid."""
+
+from pathlib import Path
+from typing import Literal, overload
+
+import numpy as np
+
+from dextouch.episodes.format import STAMPS
+from dextouch.episodes.groups import GroupReader
+from dextouch.episodes.window import (
+    ActionKind,
+    NativeWindow,
+    StreamData,
+    Window,
+    mean_over_ranges,
+    nearest_indices,
+    step_ranges,
+)
+from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
+from dextouch.schemas.episodes import EpisodeAttributes
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.samples import SampleBatch
+from dextouch.tactile.layout import NUM_TAXELS
+
+SIDES = ("left", "right")
+ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
+
+
+class RecordingReader(GroupReader[RecordingAttributes]):
+    """A finished recording: raw streams, each with its own clock."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "recording", RecordingAttributes)
+
+    def read(
+        self, name: str, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> SampleBatch:
+        """Samples with start_ns ≤ t_host_ns < stop_ns; `jpeg` streams come as decoded images.
+
+        Raises:
+            UnknownNameError: no such stream.
+            CorruptDataError: damaged bytes.
+        """
+        low, high = self._range(name, start_ns, stop_ns)
+        t_host_ns, t_device_ns, sequence = (
+            self._shard(f"{name}_{stamp}").read(low, high) for stamp in STAMPS["recording"]
+        )
+        return SampleBatch(t_host_ns, t_device_ns, sequence, self._values(name, low, high))
+
+
+class EpisodeReader(GroupReader[EpisodeAttributes]):
+    """An episode: streams on one reference clock, actions on the model grid."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(folder, "episode", EpisodeAttributes)
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of the model grid: the rows of `action`."""
+        return self.num_samples("action")
+
+    def read(
+        self, name: str, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> StreamData:
+        """Samples with start_ns ≤ t_ref_ns < stop_ns; `jpeg` streams come as decoded images.
+
+        Raises:
+            UnknownNameError: no such stream.
+            CorruptDataError: damaged bytes.
+        """
+        low, high = self._range(name, start_ns, stop_ns)
+        stamps = self._column(f"{name}_t_ref_ns")[low:high].copy()
+        return StreamData(stamps, self._values(name, low, high))
+
+    @overload
+    def window(
+        self,
+        start: int,
+        num_steps: int = ...,
+        *,
+        cameras: tuple[str, ...] = ...,
+        action_kind: ActionKind = ...,
+        grid: Literal[True] = ...,
+    ) -> Window: ...
+    @overload
+    def window(
+        self,
+        start: int,
+        num_steps: int = ...,
+        *,
+        cameras: tuple[str, ...] = ...,
+        action_kind: ActionKind = ...,
+        grid: Literal[False],
+    ) -> NativeWindow: ...
+    def window(
+        self,
+        start: int,
+        num_steps: int = 17,
+        *,
+        cameras: tuple[str, ...] = ("camera_head",),
+        action_kind: ActionKind = "measured",
+        grid: bool = True,
+    ) -> Window | NativeWindow:
+        """Steps start … start + num_steps − 1, decoding only what they need.
+
+        Args:
+            start: first step, 0 … `num_steps` of the episode − 1.
+            num_steps: at least 1.
+            cameras: whose images are wanted; the others are not touched.
+            action_kind: measured (reached) or commanded (sent) actions.
+            grid: on the model grid; False gives all streams at their own rates, the camera
+                streams among them only for `cameras`.
+
+        Raises:
+            InvalidInputError: steps outside the episode.
+            UnknownNameError: a camera or action kind that the episode does not have.
+            CorruptDataError: damaged bytes.
+        """
+        if num_steps < 1 or start < 0 or start + num_steps > self.num_steps:
+            raise InvalidInputError(
+                f"{self._what}: got window of steps {start} … {start + num_steps - 1}, "
+                f"expected within 0 … {self.num_steps - 1}"
+            )
+        self._check_cameras(cameras)
+        if action_kind not in ACTION_STREAMS:
+            raise UnknownNameError("action kind", action_kind, list(ACTION_STREAMS))
+        stop = start + num_steps
+        grid_ns = self._column("action_t_ref_ns")
+        if not grid:
+            return self._native_window(int(grid_ns[start]), int(grid_ns[stop - 1]), cameras, start)
+        images, image_dt_ns = {}, {}
+        for camera in cameras:
+            stamps = self._column(f"{camera}_t_ref_ns")
+            if not len(stamps):
+                raise NotFoundError(f"{self._what}: {camera!r} holds no image")
+            nearest = nearest_indices(stamps, grid_ns[start:stop])
+            images[camera] = self._pick(camera, nearest)
+            image_dt_ns[camera] = stamps[nearest] - grid_ns[start:stop]
+        left, right = (self._tactile(side, start, stop) for side in SIDES)
+        return Window(
+            images=images,
+            image_dt_ns=image_dt_ns,
+            tactile_kpa=np.stack([left[0], right[0]], axis=1),
+            tactile_valid=np.stack([left[1], right[1]], axis=1),
+            actions=self._actions(start, stop, action_kind),
+            action_kind=action_kind,
+            instruction=self.attributes.instruction,
+            t_ref_ns=grid_ns[start:stop].copy(),
+            anchor=self._anchor(start),
+            K_head=self.attributes.K_head_matrix(),
+        )
+
+    def _native_window(
+        self, first_ns: int, last_ns: int, cameras: tuple[str, ...], start: int
+    ) -> NativeWindow:
+        names = [n for n, d in self.streams.items() if d.kind != "image" or n in cameras]
+        return NativeWindow(
+            streams={name: self.read(name, first_ns, last_ns + 1) for name in names},
+            start_ns=first_ns,
+            stop_ns=last_ns + 1,
+            instruction=self.attributes.instruction,
+            anchor=self._anchor(start),
+            K_head=self.attributes.K_head_matrix(),
+        )
+
+    def _check_cameras(self, cameras: tuple[str, ...]) -> None:
+        valid = [name for name, stream in self.streams.items() if stream.kind == "image"]
+        for camera in cameras:
+            if camera not in valid:
+                raise UnknownNameError("camera", camera, valid)
+
+    def _tactile(self, side: str, start: int, stop: int) -> tuple[np.ndarray, np.ndarray]:
+        name = f"tactile_{side}"
+        if name not in self.streams:
+            empty = np.zeros((stop - start, NUM_TAXELS), dtype=np.float32)
+            return empty, np.zeros(stop - start, dtype=bool)
+        stamps, grid_ns = self._column(f"{name}_t_ref_ns"), self._column("action_t_ref_ns")
+        ranges = step_ranges(stamps, grid_ns, start, stop)
+        low, high = int(ranges[0, 0]), int(max(ranges[0, 0], ranges[-1, 1]))
+        return mean_over_ranges(self._values(name, low, high), ranges - low)
+
+    def _actions(self, start: int, stop: int, action_kind: ActionKind) -> np.ndarray:
+        measured = self._column("action")
+        if action_kind == "measured":
+            return reanchor(measured[start:stop], 0)
+        commanded = self._column(self._stream("action_commanded").name)
+        return reanchor(commanded[start:stop], 0, anchor_action=measured[start])
+
+    def _anchor(self, start: int) -> AnchorPoses:
+        measured = self._column("action")[start : start + 1]
+        if measured.shape[1:] != (ACTION_DIM,):
+            raise InvalidInputError(f"{self._what}: 'action' has rows of {measured.shape[1:]}")
+        return poses_from_actions(measured, self.attributes.anchor.to_poses()).anchor(0)

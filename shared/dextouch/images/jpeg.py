@@ -1,0 +1,54 @@
+"""Images [h, w, 3] uint8 RGB ↔ JPEG bytes: the one still-image codec."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import simplejpeg
+from jaxtyping import Shaped, UInt8
+
+from dextouch.errors import CorruptDataError, ShapeError
+
+DEFAULT_QUALITY = 90
+
+
+def encode_jpeg(image: np.ndarray, *, quality: int = DEFAULT_QUALITY) -> bytes:
+    """JPEG bytes of one RGB image, without chroma subsampling.
+
+    Raises:
+        ShapeError: not uint8 [h ≥ 1, w ≥ 1, 3].
+    """
+    if image.dtype != np.uint8 or image.ndim != 3 or image.shape[2] != 3 or 0 in image.shape:
+        raise ShapeError(f"image: got {image.dtype} {image.shape}, expected uint8 [h, w, 3]")
+    return simplejpeg.encode_jpeg(np.ascontiguousarray(image), quality=quality)
+
+
+def decode_jpeg(data: bytes, *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
+    """The RGB image of JPEG bytes.
+
+    Raises:
+        CorruptDataError: bytes that are no whole JPEG image; `where` names them.
+    """
+    try:
+        return simplejpeg.decode_jpeg(data, colorspace="RGB")
+    except ValueError as error:
+        raise CorruptDataError(f"{where}: {len(data)} bytes are no JPEG image ({error})") from error
+
+
+def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
+    """Height and width (pixels) announced by JPEG bytes; only the header is read.
+
+    Raises:
+        CorruptDataError: no JPEG header.
+    """
+    try:
+        height_px, width_px, _, _ = simplejpeg.decode_jpeg_header(data)
+    except ValueError as error:
+        raise CorruptDataError(f"{where}: {len(data)} bytes are no JPEG image ({error})") from error
+    return height_px, width_px
+
+
+def jpeg_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
+    """JPEG images as the `values` of a batch of a `jpeg` stream: an object array of bytes."""
+    values = np.empty(len(images), dtype=object)
+    values[:] = images
+    return values

@@ -1,0 +1,176 @@
+"""What an episode says about itself, and the catalog's answers: pydantic models in and out."""
+
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+
+from dextouch.hands.actions import AnchorPoses
+from dextouch.streams.descriptors import StreamDescriptor
+
+FORMAT_VERSION: Final = 1
+ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
+
+StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
+Domain = Literal["human", "robot"]
+Origin = Literal["recorded", "twin", "imagined"]
+Matrix = tuple[tuple[FiniteFloat, ...], ...]
+
+
+def matrix_rows(matrix: np.ndarray) -> Matrix:
+    """A two-dimensional array as nested tuples, the way attributes keep it."""
+    return tuple(tuple(float(value) for value in row) for row in np.asarray(matrix))
+
+
+def _check_matrix(rows: Matrix, shape: tuple[int, int]) -> Matrix:
+    got = (len(rows), *{len(row) for row in rows})
+    if got != shape:
+        raise ValueError(f"got a matrix of rows and columns {got}, expected {shape}")
+    return rows
+
+
+class StoredAnchor(BaseModel):
+    """The absolute poses of step 0 that an episode's actions are relative to, as 4×4 rows."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    T_world_wrist_left: Matrix
+    T_world_wrist_right: Matrix
+    T_world_camera_head: Matrix
+
+    @field_validator("*")
+    @classmethod
+    def _is_rigid(cls, rows: Matrix) -> Matrix:
+        T = np.array(_check_matrix(rows, (4, 4)))
+        orthonormal = np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-6)
+        if not orthonormal or np.linalg.det(T[:3, :3]) < 0 or T[3].tolist() != [0, 0, 0, 1]:
+            raise ValueError("expected a rigid transform: a rotation and the last row 0 0 0 1")
+        return rows
+
+    @classmethod
+    def from_poses(cls, anchor: AnchorPoses) -> "StoredAnchor":
+        """The stored form of an anchor."""
+        return cls(
+            T_world_wrist_left=matrix_rows(anchor.T_world_wrist_left),
+            T_world_wrist_right=matrix_rows(anchor.T_world_wrist_right),
+            T_world_camera_head=matrix_rows(anchor.T_world_camera_head),
+        )
+
+    def to_poses(self) -> AnchorPoses:
+        """The anchor as arrays."""
+        return AnchorPoses(
+            np.array(self.T_world_wrist_left),
+            np.array(self.T_world_wrist_right),
+            np.array(self.T_world_camera_head),
+        )
+
+
+class LineageEntry(BaseModel):
+    """One thing that another was made from, by id and content hash."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["recording", "episode", "checkpoint", "rollout"]
+    id: str
+    sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
+
+
+class ClockReport(BaseModel):
+    """How well one stream's clock was fitted to the reference clock."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stream: str
+    skew_ppm: FiniteFloat | None = None
+    latency_ms: FiniteFloat | None = None
+    residual_rms_ms: FiniteFloat | None = None
+    num_samples: int = Field(ge=0)
+    num_dropped: int = Field(default=0, ge=0)
+
+
+class EpisodeAttributes(BaseModel):
+    """Everything about an episode that is not a sample.
+
+    `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
+    `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format_version: Literal[1] = FORMAT_VERSION
+    episode_id: StoreId
+    task: str = Field(min_length=1, max_length=128)
+    instruction: str = Field(max_length=2000)
+    domain: Domain
+    origin: Origin
+    seed: int | None = None
+    model_rate_hz: FiniteFloat = Field(default=15.0, gt=0)
+    anchor: StoredAnchor
+    K_head: Matrix
+    success: bool | None = None
+    generator_command: str | None = None
+    lineage: tuple[LineageEntry, ...] = ()
+    object_names: tuple[str, ...] = ()
+    calibration: dict[str, Matrix] = {}
+    clocks: tuple[ClockReport, ...] = ()
+    quality: dict[str, FiniteFloat] = {}
+    created_at: AwareDatetime | None = None
+    streams: tuple[StreamDescriptor, ...] = ()
+
+    @field_validator("K_head")
+    @classmethod
+    def _is_camera_matrix(cls, rows: Matrix) -> Matrix:
+        return _check_matrix(rows, (3, 3))
+
+    def K_head_matrix(self) -> Float64[np.ndarray, "3 3"]:  # noqa: N802 (K is the camera matrix)
+        """The head camera's matrix in pixels."""
+        return np.array(self.K_head)
+
+
+class EpisodeSummary(BaseModel):
+    """One row of the catalog."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    episode_id: StoreId
+    task: str
+    domain: Domain
+    origin: Origin
+    success: bool | None
+    num_steps: int
+    content_sha256: str
+
+
+class EpisodeList(BaseModel):
+    """One page of the catalog and how many episodes match in all."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    episodes: tuple[EpisodeSummary, ...]
+    num_matching: int
+
+
+class EpisodeDetail(BaseModel):
+    """An episode's attributes with its length and hash."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    attributes: EpisodeAttributes
+    num_steps: int
+    content_sha256: str
+
+
+class Verification(BaseModel):
+    """What `verify` read and found whole."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    num_arrays: int
+    num_bytes: int
+    content_sha256: str
+
+
+def json_ready(model: BaseModel) -> dict[str, Any]:
+    """A model as plain JSON values."""
+    return model.model_dump(mode="json")

@@ -1,0 +1,104 @@
+"""What a raw take says about itself, and the bodies a station exchanges with the store."""
+
+from typing import Literal
+
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+
+from dextouch.schemas.episodes import (
+    FORMAT_VERSION,
+    Domain,
+    LineageEntry,
+    Matrix,
+    StoreId,
+)
+from dextouch.streams.descriptors import StreamDescriptor
+
+
+class LedgerEntry(BaseModel):
+    """One kind of fault that a station noticed in one stream, and how often."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    stream: str
+    event: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
+    count: int = Field(ge=0)
+    first_t_host_ns: int | None = None
+
+
+class RecordingAttributes(BaseModel):
+    """Everything about a raw take that is not a sample.
+
+    `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
+    matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` what went wrong, counted.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format_version: Literal[1] = FORMAT_VERSION
+    recording_id: StoreId
+    task: str = Field(min_length=1, max_length=128)
+    instruction: str = Field(max_length=2000)
+    domain: Domain
+    station: str = Field(min_length=1, max_length=128)
+    operator: str | None = None
+    consent: bool = False
+    started_at: AwareDatetime | None = None
+    started_t_host_ns: int | None = None
+    success: bool | None = None
+    calibration: dict[str, Matrix] = {}
+    lineage: tuple[LineageEntry, ...] = ()
+    ledger: tuple[LedgerEntry, ...] = ()
+    streams: tuple[StreamDescriptor, ...] = ()
+
+
+class RecordingStatus(BaseModel):
+    """Where an upload stands: the batch number that each stream expects next."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recording_id: StoreId
+    state: Literal["open", "finished"]
+    next_batch: dict[str, int] = {}
+
+
+class BatchReceipt(BaseModel):
+    """The store holds this batch; `replayed` when it already did."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recording_id: StoreId
+    stream: str
+    number: int
+    num_samples: int
+    replayed: bool
+
+
+class FinishRecording(BaseModel):
+    """The end of an upload: how many batches each stream has, and what is known only now."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    num_batches: dict[str, int]
+    success: bool | None = None
+    ledger: tuple[LedgerEntry, ...] = ()
+
+
+class RecordingSummary(BaseModel):
+    """One row of the list of recordings."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recording_id: StoreId
+    task: str
+    domain: Domain
+    station: str
+    num_samples: dict[str, int]
+    content_sha256: str
+
+
+class RecordingList(BaseModel):
+    """Finished recordings, by id."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recordings: tuple[RecordingSummary, ...]

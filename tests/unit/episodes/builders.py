@@ -1,0 +1,1 @@
+"""Small made-up episodes and recordings for the tests of the store."""

@@ -1,0 +1,125 @@
+"""Windows on the model grid against the plain computation from the arrays they were made of."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dextouch.episodes import groups
+from dextouch.episodes.window import nearest_indices, step_ranges
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.hands import actions as act
+
+
+@pytest.mark.parametrize("start", [0, 1, 4])
+def test_window_equals_the_plain_way(made, store, start):
+    window = made.write(store).window(start)
+    grid_ns = made.stamps_ns["action"]
+    np.testing.assert_array_equal(window.t_ref_ns, grid_ns[start : start + 17])
+    expected = act.actions_from_poses(made.trajectory, made.trajectory.anchor(start))
+    np.testing.assert_allclose(window.actions, expected[start : start + 17], atol=1e-9)
+    np.testing.assert_allclose(
+        window.anchor.T_world_camera_head,
+        made.trajectory.Ts_world_camera_head[start],
+        atol=1e-9,
+    )
+    for row in range(17):
+        step = start + row
+        for hand, side in enumerate(("left", "right")):
+            values = made.values[f"tactile_{side}"]
+            last = 4 * step + 1
+            plain = values[0] if step == 0 else values[last - 4 : last].mean(axis=0)
+            np.testing.assert_allclose(window.tactile_kpa[row, hand], plain, rtol=1e-6)
+        np.testing.assert_array_equal(
+            window.images["camera_head"][row], made.values["camera_head"][2 * step]
+        )
+    assert window.tactile_valid.all()
+    assert set(window.images) == {"camera_head"}
+    assert (window.image_dt_ns["camera_head"] == 0).all()
+    assert window.K_head[0, 0] == 60.0
+    assert len(window) == 17
+
+
+def test_commanded_actions_refer_to_the_measured_pose(made, store):
+    window = made.write(store).window(3, 5, action_kind="commanded")
+    poses = act.poses_from_actions(made.values["action_commanded"], made.trajectory.anchor(0))
+    expected = act.actions_from_poses(poses, made.trajectory.anchor(3))
+    np.testing.assert_allclose(window.actions, expected[3:8], atol=1e-9)
+    assert abs(window.actions[0, :3]).max() > 1e-3
+
+
+def test_jpeg_images_are_near_and_only_asked_ones_are_decoded(make_episode, store, monkeypatch):
+    made = make_episode(camera_unit="jpeg")
+    reader = made.write(store)
+    decoded = []
+    real = groups.decode_jpeg
+    monkeypatch.setattr(
+        groups, "decode_jpeg", lambda data, where: decoded.append(where) or real(data, where=where)
+    )
+    window = reader.window(2, 5)
+    assert len(decoded) == 5
+    error = window.images["camera_head"].astype(int) - made.values["camera_head"][4:14:2]
+    assert abs(error).mean() < 2
+    reader.verify()
+
+
+def test_lost_tactile_samples_are_flagged(made, store):
+    keep = np.ones(len(made.stamps_ns["tactile_left"]), dtype=bool)
+    keep[[0, 9, 10, 11, 12, 14]] = False
+    made.stamps_ns["tactile_left"] = made.stamps_ns["tactile_left"][keep]
+    made.values["tactile_left"] = made.values["tactile_left"][keep]
+    window = made.write(store).window(0)
+    assert window.tactile_valid[:, 0].tolist() == [True, True, True, False] + [True] * 13
+    assert (window.tactile_kpa[3, 0] == 0).all()
+    np.testing.assert_allclose(
+        window.tactile_kpa[4, 0], made.values["tactile_left"][[8, 9, 10]].mean(axis=0), rtol=1e-6
+    )
+
+
+def test_native_rates(made, store):
+    window = made.write(store).window(3, 5, grid=False)
+    assert len(window.streams["tactile_left"]) == 17
+    assert len(window.streams["camera_head"]) == 9
+    assert "camera_wrist_left" not in window.streams
+
+
+@pytest.mark.parametrize(("start", "num_steps"), [(-1, 5), (5, 17), (0, 0), (30, 1)])
+def test_steps_outside_are_refused(made, store, start, num_steps):
+    with pytest.raises(InvalidInputError, match="expected within 0"):
+        made.write(store).window(start, num_steps)
+
+
+def test_unknown_names_are_refused(made, store):
+    reader = made.write(store)
+    with pytest.raises(UnknownNameError, match="camera_head"):
+        reader.window(0, cameras=("camera_left",))
+    with pytest.raises(UnknownNameError, match="tactile_left"):
+        reader.read("tactile")
+
+
+@given(
+    stamps=st.lists(st.integers(0, 1000), min_size=1, max_size=20, unique=True).map(sorted),
+    t=st.lists(st.integers(-100, 1100), max_size=10),
+)
+def test_nearest_is_nearest(stamps, t):
+    stamps, t = np.array(stamps), np.array(t, dtype=np.int64)
+    got = nearest_indices(stamps, t)
+    for index, time in zip(got, t, strict=True):
+        assert abs(stamps[index] - time) == abs(stamps - time).min()
+
+
+@given(
+    stamps=st.lists(st.integers(-50, 900), max_size=40, unique=True).map(sorted),
+    start=st.integers(0, 8),
+    count=st.integers(1, 5),
+)
+def test_ranges_tile_the_time_and_windows_agree(stamps, start, count):
+    stamps_ns = np.array(stamps, dtype=np.int64) * 1_000_000
+    grid_ns = np.arange(14, dtype=np.int64) * 66_666_667
+    whole = step_ranges(stamps_ns, grid_ns, 0, 14)
+    part = step_ranges(stamps_ns, grid_ns, start, start + count)
+    np.testing.assert_array_equal(part, whole[start : start + count])
+    for step in range(1, 14):
+        low, high = whole[step]
+        inside = (stamps_ns > grid_ns[step - 1] + 1000) & (stamps_ns <= grid_ns[step] + 1000)
+        assert np.flatnonzero(inside).tolist() == list(range(low, high))
