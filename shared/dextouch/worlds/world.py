@@ -7,7 +7,7 @@ caller; `snapshot` and `restore` turn them into bytes for another process.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -56,6 +56,7 @@ class SteppedRollout(Generic[State]):
     info: dict[str, float] = field(default_factory=dict)
 
 
+@runtime_checkable
 class World(Protocol[State]):
     """One world. Implementations are used by one thread at a time."""
 
@@ -100,6 +101,7 @@ class World(Protocol[State]):
         ...
 
 
+@runtime_checkable
 class BatchWorld(World[State], Protocol[State]):
     """A world that advances several rollouts together for less than the sum of their times."""
 

@@ -1,0 +1,122 @@
+"""One suite for every state store: compare-and-set, time to live, keys; memory and Redis."""
+
+import asyncio
+import os
+import uuid
+
+import pytest
+
+from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
+from dextouch.serving.state import MemoryState, open_state
+
+
+@pytest.fixture(params=["memory", "redis"])
+async def state(request):
+    url = "memory://" if request.param == "memory" else request.getfixturevalue("redis_url")
+    store = open_state(url)
+    yield store
+    await store.close()
+
+
+@pytest.fixture
+def key():
+    return f"test:{uuid.uuid4().hex}"
+
+
+async def test_values_come_back_byte_for_byte_with_their_version(state, key):
+    value = bytes(range(256)) + os.urandom(1000) + b"\r\n\x00"
+    assert await state.get(key) is None
+    assert await state.set(key, value, expected_version=0, ttl_s=60.0) == 1
+    stored = await state.get(key)
+    assert (stored.value, stored.version) == (value, 1)
+    assert await state.set(key, b"", expected_version=1, ttl_s=60.0) == 2
+    assert (await state.get(key)).value == b""
+
+
+async def test_a_write_on_another_version_is_refused_and_changes_nothing(state, key):
+    with pytest.raises(ConflictError) as caught:
+        await state.set(key, b"x", expected_version=1, ttl_s=60.0)
+    assert caught.value.details == {"expected": 1, "got": 0}
+    await state.set(key, b"first", expected_version=0, ttl_s=60.0)
+    for wrong in (0, 2):
+        with pytest.raises(ConflictError):
+            await state.set(key, b"other", expected_version=wrong, ttl_s=60.0)
+    assert (await state.get(key)).value == b"first"
+
+
+async def test_of_many_writers_exactly_one_wins(state, key):
+    writes = [state.set(key, b"%d" % i, expected_version=0, ttl_s=60.0) for i in range(16)]
+    results = await asyncio.gather(*writes, return_exceptions=True)
+    winners = [i for i, result in enumerate(results) if result == 1]
+    assert len(winners) == 1
+    assert (await state.get(key)).value == b"%d" % winners[0]
+
+
+async def test_delete_and_keys(state, key):
+    other = key.replace("test:", "tes*:")
+    await state.set(key + ":b", b"1", expected_version=0, ttl_s=60.0)
+    await state.set(key + ":a", b"2", expected_version=0, ttl_s=60.0)
+    await state.set(other, b"3", expected_version=0, ttl_s=60.0)
+    assert await state.keys(key) == [key + ":a", key + ":b"]
+    assert await state.keys("tes*:") == [other]
+    assert await state.delete(key + ":a")
+    assert not await state.delete(key + ":a")
+    assert await state.keys(key) == [key + ":b"]
+    # After deletion it is a new thing.
+    assert await state.set(key + ":a", b"4", expected_version=0, ttl_s=60.0) == 1
+
+
+async def test_values_expire(state, key):
+    await state.set(key, b"brief", expected_version=0, ttl_s=0.005)
+    for _ in range(100_000):
+        if await state.get(key) is None:
+            break
+    assert await state.get(key) is None
+    assert not await state.touch(key, ttl_s=60.0)
+    assert await state.keys(key) == []
+    assert await state.set(key, b"again", expected_version=0, ttl_s=60.0) == 1
+
+
+async def test_touch_makes_a_value_stay(state, key):
+    await state.set(key, b"kept", expected_version=0, ttl_s=0.5)
+    assert await state.touch(key, ttl_s=60.0)
+    await state.set(key + "x", b"brief", expected_version=0, ttl_s=0.001)
+    assert (await state.get(key)).version == 1
+
+
+@pytest.mark.parametrize("ttl_s", [0.0, -1.0, float("nan"), float("inf")])
+async def test_a_time_to_live_must_be_a_time(state, key, ttl_s):
+    with pytest.raises(InvalidInputError, match="time to live"):
+        await state.set(key, b"x", expected_version=0, ttl_s=ttl_s)
+    assert await state.get(key) is None
+
+
+async def test_ping(state):
+    await state.ping()
+
+
+async def test_memory_expires_by_its_clock(key):
+    now_s = [100.0]
+    store = MemoryState(clock_s=lambda: now_s[0])
+    await store.set(key, b"x", expected_version=0, ttl_s=10.0)
+    now_s[0] = 109.9
+    assert await store.get(key) is not None
+    await store.touch(key, ttl_s=10.0)
+    now_s[0] = 119.8
+    assert await store.get(key) is not None
+    now_s[0] = 119.9
+    assert await store.get(key) is None
+
+
+async def test_a_server_that_is_not_there_is_unavailable(free_port):
+    store = open_state(f"redis://:secret@127.0.0.1:{free_port}/0")
+    with pytest.raises(UnavailableError, match="is the server running") as caught:
+        await store.ping()
+    assert "secret" not in str(caught.value)
+    await store.close()
+
+
+@pytest.mark.parametrize("url", ["", "sqlite://x", "redis//host"])
+def test_other_addresses_are_refused(url):
+    with pytest.raises(InvalidInputError, match="expected memory"):
+        open_state(url)
