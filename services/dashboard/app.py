@@ -1,0 +1,68 @@
+"""Settings in, the dashboard's application out."""
+
+import asyncio
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+from fastapi import FastAPI
+from fastapi.staticfiles import StaticFiles
+
+from dextouch import __version__
+from dextouch.serving.app import create_service_app
+from services.dashboard.feeds import Feeds
+from services.dashboard.routes import api_router, live_router, page_router
+from services.dashboard.sessions import Sessions
+from services.dashboard.settings import DashboardSettings
+from services.dashboard.topics import run_topics
+from services.dashboard.upstream import Upstream
+
+STATIC = Path(__file__).parent / "static"
+
+
+def create_app(
+    settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None = None
+) -> FastAPI:
+    """The page and what feeds it.
+
+    Args:
+        settings: which services are shown, and who may look.
+        upstreams: the services to read; made from the settings' URLs when not given.
+    """
+    if upstreams is None:
+        upstreams = {
+            name: Upstream.connect(
+                name, url, key=settings.upstream_key, timeout_s=settings.upstream_timeout_s
+            )
+            for name, url in settings.upstream_urls().items()
+        }
+    feeds = Feeds(upstreams, settings)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        stopped = asyncio.Event()
+        running = asyncio.create_task(run_topics(feeds.topics.values(), stopped))
+        try:
+            yield
+        finally:
+            stopped.set()
+            await running
+            for upstream in upstreams.values():
+                await upstream.close()
+
+    app = create_service_app(
+        name="dashboard",
+        version=__version__,
+        settings=settings,
+        routers=[page_router(settings), api_router(settings), live_router()],
+        lifespan=lifespan,
+    )
+    app.state.settings = settings
+    app.state.feeds = feeds
+    app.state.sessions = Sessions(
+        app.state.access,
+        needs_key=bool(settings.api_keys),
+        lifetime_s=3600 * settings.session_hours,
+    )
+    app.mount("/static", StaticFiles(directory=STATIC), name="static")
+    return app

@@ -1,0 +1,126 @@
+"""The other services' APIs in, the page's topics out: cached, never waiting for a viewer."""
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+from dextouch.errors import DexTouchError, NotFoundError
+from dextouch.streams.packing import unpack
+from dextouch.tactile.layout import SIDES
+from services.dashboard import station_api, store_api
+from services.dashboard.settings import DashboardSettings
+from services.dashboard.topics import Message, Topic, topic_message
+from services.dashboard.upstream import Upstream
+from services.dashboard.views import (
+    ServiceView,
+    StationView,
+    TakeView,
+    taxel_message,
+    unreachable_station,
+)
+
+MAX_TAXEL_BYTES = 64 * 1024
+NUM_TAKES = 8
+
+
+class Feeds:
+    """Everything the page shows, read from the services that are there."""
+
+    def __init__(self, upstreams: Mapping[str, Upstream], settings: DashboardSettings) -> None:
+        self._upstreams = upstreams
+        topics = [
+            Topic("station", settings.station_period_s, self._station_messages),
+            Topic("taxels", settings.taxel_period_s, self._taxel_messages),
+            Topic("cameras", settings.station_period_s, self._camera_messages),
+            Topic("services", settings.list_period_s, self._service_messages),
+            Topic("takes", settings.list_period_s, self._take_messages),
+        ]
+        self.topics = {topic.name: topic for topic in topics}
+
+    def upstream(self, name: str) -> Upstream:
+        """The service of that name.
+
+        Raises:
+            NotFoundError: this dashboard was started without its URL.
+        """
+        if name not in self._upstreams:
+            raise NotFoundError(
+                f"no {name} service: this dashboard was started without "
+                f"DEXTOUCH_DASHBOARD_{name.upper()}_URL"
+            )
+        return self._upstreams[name]
+
+    async def station(self) -> StationView:
+        """Streams and recorder of the station, or why it does not answer."""
+        try:
+            acquisition = self.upstream("acquisition")
+            health, recorder = await asyncio.gather(
+                acquisition.json("GET", station_api.HEALTH_PATH),
+                acquisition.json("GET", station_api.RECORDER_PATH),
+            )
+            return station_api.station_view(health, recorder)
+        except DexTouchError as error:
+            return unreachable_station(error.message)
+
+    async def services(self) -> list[ServiceView]:
+        """Whether each service would take work."""
+        names = list(self._upstreams)
+        answers = await asyncio.gather(*(self._upstreams[name].ready() for name in names))
+        return [
+            ServiceView(name=name, level="OK" if ready else "ERROR", message=reason)
+            for name, (ready, reason) in zip(names, answers, strict=True)
+        ]
+
+    async def takes(self) -> list[TakeView]:
+        """The newest recordings and episodes, newest first; empty while the store is away."""
+        if "episode_store" not in self._upstreams:
+            return []
+        store = self._upstreams["episode_store"]
+        try:
+            recordings, episodes = await asyncio.gather(
+                store.json("GET", store_api.RECORDINGS_PATH),
+                store.json("GET", store_api.EPISODES_PATH),
+            )
+        except DexTouchError:
+            return []  # the services topic tells that the store is away
+        return store_api.take_views(recordings, episodes, newest=NUM_TAKES)
+
+    async def operate(self, action: str, body: Mapping[str, Any]) -> dict[str, object]:
+        """One recorder action; the recorder's new state."""
+        path = station_api.action_path(action)
+        answer = await self.upstream("acquisition").json("POST", path, body=body)
+        return station_api.recorder_view(answer).model_dump()
+
+    async def camera_image(self, name: str) -> tuple[bytes, str]:
+        """The newest image of a camera and its media type."""
+        path = station_api.camera_path(name)
+        content, headers = await self.upstream("acquisition").content(path)
+        return content, headers.get("content-type", "image/jpeg")
+
+    async def _station_messages(self) -> list[Message]:
+        return [topic_message("station", (await self.station()).model_dump())]
+
+    async def _service_messages(self) -> list[Message]:
+        return [topic_message("services", [view.model_dump() for view in await self.services()])]
+
+    async def _take_messages(self) -> list[Message]:
+        return [topic_message("takes", [view.model_dump() for view in await self.takes()])]
+
+    async def _camera_messages(self) -> list[Message]:
+        try:
+            answer = await self.upstream("acquisition").json("GET", station_api.CAMERAS_PATH)
+            views = [view.model_dump() for view in station_api.camera_views(answer)]
+        except DexTouchError:
+            views = []  # the station topic tells why
+        return [topic_message("cameras", views)]
+
+    async def _taxel_messages(self) -> list[Message]:
+        try:
+            content, _ = await self.upstream("acquisition").content(station_api.TAXELS_PATH)
+            _, arrays = unpack(content, max_bytes=MAX_TAXEL_BYTES)
+        except DexTouchError as error:
+            return [topic_message("taxels_lost", error.message)]
+        pressures = {side: arrays.get(f"tactile_{side}") for side in SIDES}
+        return [
+            taxel_message(side, array) for side, array in pressures.items() if array is not None
+        ]

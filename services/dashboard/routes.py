@@ -1,0 +1,185 @@
+"""The page, its live websocket and its recorder buttons: requests in, answers of the feeds out."""
+
+import asyncio
+import json
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+from urllib.parse import parse_qs
+
+from fastapi import APIRouter, Body, Depends, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
+from jinja2 import Environment, FileSystemLoader
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.requests import HTTPConnection
+
+from dextouch.errors import AccessDeniedError
+from services.dashboard.feeds import Feeds
+from services.dashboard.sessions import COOKIE, Sessions, check_same_site
+from services.dashboard.settings import DashboardSettings
+from services.dashboard.topics import Viewer
+from services.dashboard.views import heatmap_layout
+
+TEMPLATES = Path(__file__).parent / "templates"
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+PAGE_HEADERS = {
+    "content-security-policy": CONTENT_SECURITY_POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+MAX_VIEW_CHARACTERS = 1000
+WEBSOCKET_REFUSED = 1008
+
+
+class RecorderRequest(BaseModel):
+    """What an operator sends with a recorder action; `arm` needs both."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    task: str | None = Field(default=None, min_length=1, max_length=64)
+    instruction: str | None = Field(default=None, min_length=1, max_length=400)
+
+
+def guard(connection: HTTPConnection) -> None:
+    """Refuse foreign sites and browsers that did not sign in."""
+    settings: DashboardSettings = connection.app.state.settings
+    sessions: Sessions = connection.app.state.sessions
+    check_same_site(connection, settings.allowed_hosts)
+    if not sessions.allows(connection):
+        raise AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
+
+
+def page_router(settings: DashboardSettings) -> APIRouter:
+    """The page and signing in."""
+    router = APIRouter(include_in_schema=False)
+    # Jinja2 escapes everything it fills in; no part of a page is built from strings elsewhere.
+    templates = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
+
+    def page(name: str, status: int = 200, **values: object) -> HTMLResponse:
+        text = templates.get_template(name).render(station=settings.station, **values)
+        return HTMLResponse(text, status, headers=PAGE_HEADERS)
+
+    @router.get("/")
+    async def index(request: Request) -> Response:
+        check_same_site(request, settings.allowed_hosts)
+        if not request.app.state.sessions.allows(request):
+            return page("sign_in.html", reason="")
+        return page("index.html", tasks=settings.tasks)
+
+    @router.post("/sign_in")
+    async def sign_in(request: Request) -> Response:
+        check_same_site(request, settings.allowed_hosts)
+        fields = parse_qs((await request.body()).decode("utf-8", "replace"))
+        sessions: Sessions = request.app.state.sessions
+        try:
+            token = sessions.sign_in(fields.get("key", [""])[0])
+        except AccessDeniedError as error:
+            return page("sign_in.html", 401, reason=error.message)
+        answer = RedirectResponse("/", 303)
+        answer.set_cookie(
+            COOKIE,
+            token,
+            max_age=int(sessions.lifetime_s),
+            httponly=True,
+            samesite="strict",
+            secure=request.url.scheme == "https",
+        )
+        return answer
+
+    return router
+
+
+def api_router(settings: DashboardSettings) -> APIRouter:
+    """What the page asks for."""
+    router = APIRouter(prefix="/v1", dependencies=[Depends(guard)], tags=["dashboard"])
+    layout = heatmap_layout()
+
+    @router.get("/heatmap")
+    async def heatmap() -> JSONResponse:
+        """Layout and colours of the taxel maps."""
+        return JSONResponse(layout)
+
+    @router.get("/overview")
+    async def overview(request: Request) -> JSONResponse:
+        """What the page shows, once, as JSON."""
+        feeds: Feeds = request.app.state.feeds
+        station, services, takes = await asyncio.gather(
+            feeds.station(), feeds.services(), feeds.takes()
+        )
+        return JSONResponse(
+            {
+                "name": settings.station,
+                "station": station.model_dump(),
+                "services": [view.model_dump() for view in services],
+                "takes": [view.model_dump() for view in takes],
+            }
+        )
+
+    @router.post("/recorder/{action}")
+    async def operate(
+        action: str, request: Request, wanted: Annotated[RecorderRequest, Body()]
+    ) -> JSONResponse:
+        """Arm, record, stop, save or discard; answers with the recorder's new state."""
+        feeds: Feeds = request.app.state.feeds
+        return JSONResponse(await feeds.operate(action, wanted.model_dump(exclude_none=True)))
+
+    @router.get("/cameras/{name}.jpg")
+    async def camera(name: str, request: Request) -> Response:
+        """The newest image of one camera."""
+        feeds: Feeds = request.app.state.feeds
+        content, media_type = await feeds.camera_image(name)
+        return Response(content, media_type=media_type, headers={"cache-control": "no-store"})
+
+    return router
+
+
+def live_router() -> APIRouter:
+    """The live link: the page says what is in view, news of that is sent until it leaves."""
+    router = APIRouter()
+
+    @router.websocket("/v1/live")
+    async def live(websocket: WebSocket) -> None:
+        try:
+            guard(websocket)
+        except AccessDeniedError as error:
+            await websocket.close(WEBSOCKET_REFUSED, error.message[:120])
+            return
+        await websocket.accept()
+        viewer = Viewer(websocket.app.state.feeds.topics)
+        sender = asyncio.create_task(_send_news(websocket, viewer))
+        try:
+            with suppress(WebSocketDisconnect):
+                while True:
+                    viewer.look_at(_view(await websocket.receive_text()))
+        finally:
+            viewer.look_at(())
+            sender.cancel()
+            with suppress(asyncio.CancelledError, WebSocketDisconnect, RuntimeError):
+                await sender
+
+    return router
+
+
+async def _send_news(websocket: WebSocket, viewer: Viewer) -> None:
+    while True:
+        for message in await viewer.news():
+            if isinstance(message, bytes):
+                await websocket.send_bytes(message)
+            else:
+                await websocket.send_text(message)
+
+
+def _view(text: str) -> list[str]:
+    """The topics a page asks for; what does not fit asks for nothing."""
+    if len(text) > MAX_VIEW_CHARACTERS:
+        return []
+    try:
+        wanted = json.loads(text)
+    except ValueError:
+        return []
+    names = wanted.get("view", []) if isinstance(wanted, dict) else []
+    return [name for name in names if isinstance(name, str)] if isinstance(names, list) else []

@@ -1,0 +1,74 @@
+"""A browser's key in, a session cookie and same-site checks out."""
+
+import secrets
+import time
+from collections.abc import Callable
+from urllib.parse import urlsplit
+
+from starlette.requests import HTTPConnection
+
+from dextouch.errors import AccessDeniedError
+from dextouch.serving.access import AccessControl
+
+COOKIE = "dextouch_session"
+SCOPE = "operate"
+MAX_SESSIONS = 1000
+
+
+class Sessions:
+    """Who may see and operate: everyone on loopback without keys, else browsers that signed in."""
+
+    def __init__(
+        self,
+        access: AccessControl,
+        *,
+        needs_key: bool,
+        lifetime_s: float,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.needs_key = needs_key
+        self.lifetime_s = lifetime_s
+        self._access = access
+        self._clock_s = clock_s
+        self._ends_s: dict[str, float] = {}
+
+    def sign_in(self, key: str) -> str:
+        """A new session's token for a key with the scope `operate`.
+
+        Raises:
+            AccessDeniedError: an unknown key or one without the scope.
+        """
+        self._access.check(f"Bearer {key}", SCOPE)
+        now_s = self._clock_s()
+        self._ends_s = {token: end for token, end in self._ends_s.items() if end > now_s}
+        while len(self._ends_s) >= MAX_SESSIONS:
+            self._ends_s.pop(next(iter(self._ends_s)))
+        token = secrets.token_urlsafe(32)
+        self._ends_s[token] = now_s + self.lifetime_s
+        return token
+
+    def allows(self, connection: HTTPConnection) -> bool:
+        """Whether this request or websocket comes from a session that is still open."""
+        if not self.needs_key:
+            return True
+        return self._ends_s.get(connection.cookies.get(COOKIE, ""), 0.0) > self._clock_s()
+
+
+def check_same_site(connection: HTTPConnection, allowed_hosts: tuple[str, ...]) -> None:
+    """Refuse requests that another site's page sends through the operator's browser.
+
+    Raises:
+        AccessDeniedError: a host name this page is not served under, or a foreign origin.
+    """
+    host = urlsplit(f"//{connection.headers.get('host', '')}")
+    if host.hostname not in allowed_hosts:
+        raise AccessDeniedError(
+            f"host {host.hostname!r}: expected one of {', '.join(allowed_hosts)} "
+            "(setting allowed_hosts)",
+            reason="missing_scope",
+        )
+    origin = connection.headers.get("origin")
+    if origin is not None and urlsplit(origin).netloc != host.netloc:
+        raise AccessDeniedError(
+            f"origin {origin!r}: expected this page's own", reason="missing_scope"
+        )

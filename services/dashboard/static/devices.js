@@ -1,0 +1,41 @@
+// Health of every stream → table rows, updated in place so that the eye keeps its line.
+
+import { element, levelBadge } from "./dom.js";
+import { age, count, number } from "./format.js";
+
+function rateCell(stream) {
+  const nominal = stream.nominal_rate_hz;
+  const children = [element("span", {}, `${number(stream.rate_hz, 1)} / ${number(nominal, 0)} Hz`)];
+  if (nominal && stream.rate_hz !== null) {
+    children.unshift(element("meter", {
+      min: 0, max: 1.1 * nominal, low: 0.9 * nominal, high: 0.98 * nominal, optimum: nominal,
+      value: Math.min(stream.rate_hz, 1.1 * nominal), "aria-hidden": "true",
+    }));
+  }
+  return element("td", {}, element("span", { class: "rate" }, ...children));
+}
+
+function drops(stream) {
+  const counted = count(stream.dropped);
+  return stream.drop_percent === null ? counted : `${counted} (${number(stream.drop_percent, 2)} %)`;
+}
+
+function row(stream) {
+  return element("tr", {},
+    element("td", {}, levelBadge(stream.level)),
+    element("td", { class: "name" }, stream.name,
+      stream.message ? element("span", { class: "why" }, stream.message) : null),
+    rateCell(stream),
+    element("td", { class: "number" }, drops(stream)),
+    element("td", { class: "number" }, age(stream.age_s)),
+    element("td", { class: "number" }, number(stream.skew_ppm, 1, "ppm")),
+    element("td", { class: "number" }, number(stream.clock_error_ms, 2, "ms")),
+  );
+}
+
+export function showDevices(body, note, station) {
+  note.hidden = station.note === "";
+  note.textContent = station.note;
+  note.dataset.level = station.reachable ? "OK" : "ERROR";
+  body.replaceChildren(...station.streams.map(row));
+}

@@ -1,0 +1,26 @@
+// Numbers as an operator reads them; null and undefined are "–", never a zero that nobody measured.
+
+const MISSING = "–";
+
+export function number(value, digits = 1, unit = "") {
+  if (value === null || value === undefined || !Number.isFinite(value)) return MISSING;
+  const text = value.toFixed(digits);
+  return unit ? `${text} ${unit}` : text;
+}
+
+export function count(value) {
+  return value === null || value === undefined ? MISSING : String(value);
+}
+
+export function age(value_s) {
+  if (value_s === null || value_s === undefined || !Number.isFinite(value_s)) return MISSING;
+  if (value_s < 1) return `${Math.round(value_s * 1000)} ms`;
+  if (value_s < 120) return `${value_s.toFixed(1)} s`;
+  return `${Math.round(value_s / 60)} min`;
+}
+
+export function stopwatch(value_s) {
+  const seconds = Math.max(0, value_s ?? 0);
+  const minutes = Math.floor(seconds / 60);
+  return `${minutes}:${(seconds - 60 * minutes).toFixed(1).padStart(4, "0")}`;
+}

@@ -1,0 +1,31 @@
+// Services, newest takes and camera thumbnails → short lists.
+
+import { element, levelBadge } from "./dom.js";
+import { age } from "./format.js";
+
+export function showServices(list, services) {
+  list.replaceChildren(...services.map((service) => element("li", { title: service.message },
+    levelBadge(service.level), element("span", {}, service.name),
+    service.level === "OK" ? null : element("span", { class: "quiet" }, service.message))));
+}
+
+export function showTakes(body, takes) {
+  const rows = takes.map((take) => element("tr", {},
+    element("td", { class: "quiet" }, take.kind), element("td", { class: "name" }, take.name),
+    element("td", {}, take.task), element("td", {}, take.domain), element("td", {}, take.outcome)));
+  const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, "Nothing stored yet."));
+  body.replaceChildren(...(rows.length ? rows : [empty]));
+}
+
+export function showCameras(section, row, cameras) {
+  section.hidden = cameras.length === 0;
+  const known = new Map([...row.children].map((figure) => [figure.dataset.name, figure]));
+  for (const camera of cameras) {
+    const figure = known.get(camera.name) ?? row.appendChild(element("figure", { "data-name": camera.name },
+      element("img", { alt: `newest image of ${camera.name}` }), element("figcaption", {})));
+    figure.querySelector("img").src = `/v1/cameras/${encodeURIComponent(camera.name)}.jpg?at=${camera.image_index}`;
+    figure.querySelector("figcaption").textContent = `${camera.name} · ${age(camera.age_s)}`;
+    known.delete(camera.name);
+  }
+  for (const figure of known.values()) figure.remove();
+}

@@ -1,0 +1,55 @@
+// The one websocket: tells the server what is in view, hands out what comes back, reconnects by itself.
+
+const FIRST_RETRY_MS = 500;
+const LONGEST_RETRY_MS = 8000;
+
+export class LiveLink {
+  constructor({ onTopic, onBinary, onState }) {
+    this.onTopic = onTopic;
+    this.onBinary = onBinary;
+    this.onState = onState;
+    this.view = new Set();
+    this.retry_ms = FIRST_RETRY_MS;
+    this.socket = null;
+    this.open();
+  }
+
+  open() {
+    const scheme = location.protocol === "https:" ? "wss" : "ws";
+    const socket = new WebSocket(`${scheme}://${location.host}/v1/live`);
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      this.retry_ms = FIRST_RETRY_MS;
+      this.onState(true);
+      this.sendView();
+    };
+    socket.onmessage = (event) => {
+      if (event.data instanceof ArrayBuffer) {
+        this.onBinary(event.data);
+      } else {
+        const message = JSON.parse(event.data);
+        this.onTopic(message.topic, message.data);
+      }
+    };
+    socket.onclose = () => {
+      this.onState(false);
+      setTimeout(() => this.open(), this.retry_ms);
+      this.retry_ms = Math.min(2 * this.retry_ms, LONGEST_RETRY_MS);
+    };
+    this.socket = socket;
+  }
+
+  show(topic, visible) {
+    const changed = visible ? !this.view.has(topic) : this.view.has(topic);
+    if (!changed) return;
+    if (visible) this.view.add(topic);
+    else this.view.delete(topic);
+    this.sendView();
+  }
+
+  sendView() {
+    if (this.socket?.readyState !== WebSocket.OPEN) return;
+    const view = document.hidden ? [] : [...this.view];
+    this.socket.send(JSON.stringify({ view }));
+  }
+}

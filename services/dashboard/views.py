@@ -1,0 +1,135 @@
+"""What the other services answer in, what the page shows out: checked, in the page's own units."""
+
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
+from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+
+Level = Literal["OK", "WARN", "ERROR", "STALE"]
+LEVELS: tuple[Level, ...] = ("OK", "WARN", "STALE", "ERROR")
+FULL_SCALE_KPA = 40.0
+RAMP_STEPS = 128
+TAXEL_MESSAGE = 1
+
+
+class StreamView(BaseModel):
+    """One row of the device table; None where nothing was measured."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str
+    level: Level
+    message: str = ""
+    rate_hz: float | None = None
+    nominal_rate_hz: float | None = None
+    dropped: int | None = None
+    drop_percent: float | None = None
+    age_s: float | None = None
+    skew_ppm: float | None = None
+    clock_error_ms: float | None = None
+
+
+class RecorderView(BaseModel):
+    """The recorder's state and which of its actions make sense now."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    state: str
+    actions: tuple[str, ...] = ()
+    elapsed_s: float | None = None
+    level: Level = "OK"
+    note: str = ""
+
+
+class StationView(BaseModel):
+    """The station at a glance."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    reachable: bool
+    level: Level
+    summary: str
+    note: str
+    streams: tuple[StreamView, ...]
+    recorder: RecorderView
+
+
+class ServiceView(BaseModel):
+    """One service: may work be sent to it?"""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    level: Level
+    message: str
+
+
+class TakeView(BaseModel):
+    """One stored recording or episode."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: Literal["recording", "episode"]
+    name: str
+    task: str
+    domain: str
+    outcome: str
+
+
+class CameraView(BaseModel):
+    """One camera whose newest image can be had."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+    name: str
+    image_index: int
+    age_s: float | None
+
+
+def worst(levels: list[Level]) -> Level:
+    """The level that asks most urgently for a look; STALE when there is nothing to judge."""
+    return max(levels, key=LEVELS.index) if levels else "STALE"
+
+
+def unreachable_station(reason: str) -> StationView:
+    """The station view while its acquisition service does not answer: no old numbers."""
+    return StationView(
+        reachable=False,
+        level="ERROR",
+        summary="acquisition does not answer",
+        note=reason,
+        streams=(),
+        recorder=RecorderView(state="unknown", level="ERROR"),
+    )
+
+
+def heatmap_layout() -> dict[str, object]:
+    """Where each of the 320 taxels is drawn and in which colours, from `dextouch.tactile`."""
+    cells = {side: _cells(side) for side in SIDES}
+    rows, columns = hand_canvas(np.zeros(NUM_TAXELS, dtype=np.float32), side="right").shape
+    pressures_kpa = np.linspace(0.0, FULL_SCALE_KPA, RAMP_STEPS)
+    return {
+        "rows": rows,
+        "columns": columns,
+        "cells": cells,
+        "ramp": colour(pressures_kpa, full_scale_kpa=FULL_SCALE_KPA).tolist(),
+        "full_scale_kpa": FULL_SCALE_KPA,
+        "contact_kpa": CONTACT_THRESHOLD_KPA,
+    }
+
+
+def taxel_message(side: Side, pressures_kpa: np.ndarray) -> bytes:
+    """uint8 kind, uint8 side, uint16 count, then float32 kPa, little endian."""
+    header = bytes([TAXEL_MESSAGE, SIDES.index(side)]) + len(pressures_kpa).to_bytes(2, "little")
+    return header + np.ascontiguousarray(pressures_kpa, dtype="<f4").tobytes()
+
+
+def _cells(side: Side) -> list[int]:
+    canvas = hand_canvas(np.arange(NUM_TAXELS, dtype=np.float32), side=side)
+    used = np.flatnonzero(~np.isnan(canvas))
+    order = np.argsort(canvas.ravel()[used])
+    return [int(cell) for cell in used[order]]

@@ -1,0 +1,80 @@
+"""A station and a store that answer as the real services do, from plain dictionaries."""
+
+import httpx
+import numpy as np
+from fastapi import FastAPI, Response
+from fastapi.responses import JSONResponse
+
+from dextouch.streams.packing import pack
+from services.dashboard import station_api
+from services.dashboard.upstream import Upstream
+
+PRESSURES = {
+    "left": np.linspace(0, 30, 320, dtype=np.float32),
+    "right": np.zeros(320, dtype=np.float32),
+}
+EPISODE = {
+    "episode_id": "take-0001",
+    "task": "stack_bowls",
+    "domain": "human",
+    "origin": "recorded",
+    "success": None,
+    "num_steps": 81,
+    "content_sha256": "a" * 64,
+}
+
+
+class FakeServices:
+    """Acquisition and store in one; tests change `health`, `recorder` and read `asked`."""
+
+    def __init__(self):
+        self.health = {
+            "streams": [
+                {"stream": "tactile_left", "level": "OK", "rate_hz": 59.9, "nominal_rate_hz": 60.0}
+                | {"lost": 2, "received": 998, "age_s": 0.01, "skew_ppm": 49.8}
+            ]
+        }
+        self.recorder = {"state": "idle"}
+        self.asked = []
+        self.app = FastAPI()
+        self.app.middleware("http")(self._note)
+        self.app.get("/readyz")(lambda: {"ready": True, "waiting_for": []})
+        self.app.get(station_api.HEALTH_PATH)(lambda: JSONResponse(self.health))
+        self.app.get(station_api.RECORDER_PATH)(lambda: self.recorder)
+        self.app.get(station_api.TAXELS_PATH)(self._taxels)
+        self.app.post(station_api.RECORDER_PATH + "/{action}")(self._act)
+        self.app.get("/v1/episodes")(lambda: {"episodes": [EPISODE], "num_matching": 1})
+        self.app.get("/v1/recordings")(lambda: {"recordings": []})
+
+    async def _note(self, request, call_next):
+        self.asked.append(request.url.path)
+        return await call_next(request)
+
+    def _taxels(self):
+        arrays = {f"tactile_{side}": values for side, values in PRESSURES.items()}
+        return Response(pack({}, arrays), media_type="application/msgpack")
+
+    def _act(self, action: str, wanted: dict):
+        if action == "record" and self.recorder["state"] != "armed":
+            problem = {"type": "urn:dextouch:error:ConflictError", "title": "Conflict"}
+            return JSONResponse(
+                problem | {"status": 409, "detail": "record: got state idle, expected armed"}, 409
+            )
+        self.recorder = {"state": {"arm": "armed", "record": "recording"}[action]}
+        self.asked.append(wanted)
+        return self.recorder
+
+    def upstream(self, name):
+        """This service under a name."""
+        transport = httpx.ASGITransport(app=self.app)
+        return Upstream(name, httpx.AsyncClient(transport=transport, base_url="http://fake"))
+
+
+def broken_upstream(name):
+    """A service whose socket is closed."""
+
+    def refuse(request):
+        raise httpx.ConnectError("refused", request=request)
+
+    transport = httpx.MockTransport(refuse)
+    return Upstream(name, httpx.AsyncClient(transport=transport, base_url="http://fake"))

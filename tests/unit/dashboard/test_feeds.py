@@ -1,0 +1,103 @@
+"""Feeds turn what services answer into views, and absence into words, never into old numbers."""
+
+import json
+
+import numpy as np
+import pytest
+from dashboard_fakes import PRESSURES, broken_upstream
+
+from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
+from services.dashboard.feeds import Feeds
+from services.dashboard.settings import DashboardSettings
+
+
+@pytest.fixture
+def feeds(upstreams):
+    return Feeds(upstreams, DashboardSettings())
+
+
+async def test_station(feeds):
+    view = await feeds.station()
+    assert (view.reachable, view.level, view.summary) == (True, "OK", "1 OK")
+    (stream,) = view.streams
+    assert (stream.name, stream.dropped, stream.drop_percent) == ("tactile_left", 2, 0.2)
+    assert (stream.skew_ppm, stream.clock_error_ms) == (49.8, None)
+    assert view.recorder.actions == ("arm",)
+
+
+async def test_worst_level_leads(feeds, services):
+    row = services.health["streams"][0]
+    services.health["streams"] = [row | {"level": level} for level in ("OK", "STALE", "WARN")]
+    view = await feeds.station()
+    assert (view.level, view.summary) == ("STALE", "1 STALE · 1 WARN · 1 OK")
+
+
+async def test_absent_station_shows_no_numbers():
+    view = await Feeds(
+        {"acquisition": broken_upstream("acquisition")}, DashboardSettings()
+    ).station()
+    assert (view.reachable, view.level, view.streams) == (False, "ERROR", ())
+    assert "acquisition: no answer to GET" in view.note
+
+
+async def test_answer_of_another_form_is_named(feeds, services):
+    services.health = {"streams": [{"stream": "x", "level": "FINE"}]}
+    view = await feeds.station()
+    assert not view.reachable
+    assert "answer of an unknown form" in view.note
+
+
+async def test_services(upstreams):
+    upstreams["twin"] = broken_upstream("twin")
+    views = await Feeds(upstreams, DashboardSettings()).services()
+    assert [(view.name, view.level) for view in views] == [
+        ("acquisition", "OK"),
+        ("episode_store", "OK"),
+        ("twin", "ERROR"),
+    ]
+    assert views[2].message == "no answer (ConnectError)"
+
+
+async def test_takes(feeds):
+    (take,) = await feeds.takes()
+    assert (take.kind, take.name, take.outcome) == ("episode", "take-0001", "not judged, 81 steps")
+
+
+async def test_operate(feeds, services):
+    answer = await feeds.operate("arm", {"task": "stack_bowls", "instruction": "stack"})
+    assert (answer["state"], answer["actions"]) == ("armed", ("record", "discard"))
+    assert services.asked[-1] == {"task": "stack_bowls", "instruction": "stack"}
+
+
+async def test_refusal_keeps_its_class(feeds):
+    with pytest.raises(ConflictError, match="got state idle, expected armed"):
+        await feeds.operate("record", {})
+
+
+async def test_unknown_action(feeds):
+    with pytest.raises(UnknownNameError, match="valid: arm, discard, record, save, stop"):
+        await feeds.operate("../health", {})
+
+
+async def test_missing_service_is_named():
+    feeds = Feeds({}, DashboardSettings())
+    with pytest.raises(NotFoundError, match="DEXTOUCH_DASHBOARD_ACQUISITION_URL"):
+        feeds.upstream("acquisition")
+
+
+async def test_taxel_messages_carry_the_pressures(feeds):
+    topic = feeds.topics["taxels"]
+    await topic.refresh()
+    assert [message[0] for message in topic.messages] == [1, 1]
+    for index, side in enumerate(("left", "right")):
+        message = topic.messages[index]
+        assert message[1] == index
+        assert int.from_bytes(message[2:4], "little") == 320
+        np.testing.assert_array_equal(np.frombuffer(message[4:], "<f4"), PRESSURES[side])
+
+
+async def test_lost_taxels_are_said():
+    feeds = Feeds({"acquisition": broken_upstream("acquisition")}, DashboardSettings())
+    await feeds.topics["taxels"].refresh()
+    (message,) = feeds.topics["taxels"].messages
+    assert json.loads(message)["topic"] == "taxels_lost"
