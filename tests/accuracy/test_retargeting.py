@@ -1,0 +1,117 @@
+"""Retargeting against forward kinematics of known joint angles, both hands."""
+
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
+from services.alignment.retargeting import HandRetargeter, RetargetStatus
+from services.twin.hands import HumanHand
+
+SIDES = ("left", "right")
+
+
+def moving_joints(hand, num_steps, seed, *, natural):
+    """Smooth joint angles: every joint its own sum of sines, inside the limits."""
+    rng = np.random.default_rng(seed)
+    low, high = hand.lower_rad.copy(), hand.upper_rad.copy()
+    if natural:
+        flexion = np.tile([True, False, True, True], 5)
+        low, high = (
+            np.where(flexion, 0.05 * high, 0.4 * low),
+            np.where(flexion, 0.85 * high, 0.4 * high),
+        )
+    t_s = np.arange(num_steps)[:, None, None] / 60
+    rate_hz = rng.uniform(0.15, 1.6, (20, 3))
+    waves = np.sin(2 * np.pi * (rate_hz * t_s + rng.random((20, 3)))).mean(axis=-1)
+    return low + (high - low) * (0.5 + 0.5 * waves)
+
+
+def keypoints_of(hand, joints_rad):
+    """The 25 human nodes of a hand with that skeleton."""
+    points = hand.chain_points_m(joints_rad)
+    keypoints = np.zeros((len(joints_rad), NUM_KEYPOINTS, 3))
+    for finger, chain in enumerate(CHAINS):
+        keypoints[:, solver_indices(chain)] = points[:, finger]
+        if chain != "thumb":
+            keypoints[:, NODE_INDEX[chain, "metacarpal"]] = 0.4 * points[:, finger, 0]
+    return keypoints
+
+
+def tip_error_mm(hand, got_rad, true_rad):
+    reached, wanted = hand.fingertips_m(got_rad), hand.fingertips_m(true_rad)
+    return np.linalg.norm(reached - wanted, axis=-1) * 1e3
+
+
+@pytest.mark.parametrize("side", SIDES)
+@pytest.mark.parametrize("natural", [True, False])
+def test_robot_motion_is_recovered(side, natural, capsys):
+    hand = RobotHand(side)
+    joints = moving_joints(hand, 200, 1, natural=natural)
+    began = time.perf_counter()
+    result = HandRetargeter(side).retarget(keypoints_of(hand, joints))
+    step_us = (time.perf_counter() - began) / len(joints) * 1e6
+    tip_mm = tip_error_mm(hand, result.joints_rad, joints)
+    joint_deg = np.rad2deg(np.abs(result.joints_rad - joints))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\n{side:5s} {'natural' if natural else 'full':7s} {step_us:4.0f} us a step | "
+            f"tip max {tip_mm.max():.1e} mm, bound 1e-3 | "
+            f"joint max {joint_deg.max():.1e} deg, bound 0.05"
+        )
+    assert (result.status == RetargetStatus.SOLVED).all()
+    assert tip_mm.max() <= 1e-3
+    assert joint_deg.max() <= 0.05
+    assert result.tip_error_m.max() <= 1e-6
+
+
+def test_cold_poses_anywhere_are_found(capsys):
+    hand = RobotHand("right")
+    rng = np.random.default_rng(3)
+    joints = rng.uniform(hand.lower_rad, hand.upper_rad, (1500, 20))
+    result = HandRetargeter("right").retarget(keypoints_of(hand, joints))
+    stuck = result.tip_error_m > 1e-5
+    with capsys.disabled():
+        sys.stdout.write(f"\ncold start: {stuck.sum()} of {stuck.size} fingers stuck | bound 0")
+    assert not stuck.any()
+
+
+def test_one_millimetre_of_noise(capsys):
+    hand = RobotHand("left")
+    joints = moving_joints(hand, 200, 2, natural=True)
+    keypoints = keypoints_of(hand, joints)
+    keypoints += np.random.default_rng(5).normal(scale=1e-3, size=keypoints.shape)
+    began = time.perf_counter()
+    result = HandRetargeter("left").retarget(keypoints)
+    step_us = (time.perf_counter() - began) / len(joints) * 1e6
+    tip_mm = tip_error_mm(hand, result.joints_rad, joints)
+    joint_deg = np.rad2deg(np.abs(result.joints_rad - joints))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\n1 mm noise: {step_us:.0f} us a step | tip mean {tip_mm.mean():.2f} mm, bound 4 | "
+            f"joint mean {joint_deg.mean():.2f} deg, bound 3"
+        )
+    assert (result.joints_rad >= hand.lower_rad).all()
+    assert (result.joints_rad <= hand.upper_rad).all()
+    assert tip_mm.mean() <= 4
+    assert joint_deg.mean() <= 3
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_human_hand_keeps_its_angles(side, capsys):
+    human, robot = HumanHand(side), RobotHand(side)
+    joints = moving_joints(human, 200, 4, natural=True)
+    result = HandRetargeter(side).retarget(keypoints_of(human, joints))
+    angle_deg = np.rad2deg(np.abs(result.joints_rad - joints))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\n{side} human hand: same-angle mean {angle_deg.mean():.2f} deg, bound 5 | "
+            f"tip against target max {result.tip_error_m.max() * 1e3:.3f} mm"
+        )
+    assert (result.status == RetargetStatus.SOLVED).all()
+    assert (result.joints_rad >= robot.lower_rad).all()
+    assert (result.joints_rad <= robot.upper_rad).all()
+    assert angle_deg.mean() <= 5
