@@ -1,0 +1,1 @@
+"""The network: tokenizers, two experts under one attention, conditioning and flow matching."""

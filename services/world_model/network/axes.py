@@ -1,0 +1,9 @@
+"""A tensor in, the same tensor with one axis split into several out."""
+
+from torch import Tensor
+
+
+def split_axis(tensor: Tensor, axis: int, sizes: tuple[int, ...]) -> Tensor:
+    """One axis as several; one size may be -1. `Tensor.unflatten` has no types."""
+    axis = axis % tensor.ndim
+    return tensor.reshape(*tensor.shape[:axis], *sizes, *tensor.shape[axis + 1 :])

@@ -1,0 +1,198 @@
+"""Times, actions, words, kind of action and scene in, one condition a latent frame or hand out.
+
+Dual rate (equation 4 of the paper): video latent j sees a[4j-3 … 4j], tactile step t sees a_t, and
+index 0 sees zeros.
+"""
+
+import math
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor, nn
+
+from services.world_model.network.axes import split_axis
+from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
+from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.instruction import InstructionEncoder
+from services.world_model.network.mirroring import CAMERA_DIM, HAND_DIM
+
+TIME_WIDTH = 64
+TIME_RANGE = 1000.0
+# Own hand, other hand, camera.
+ACTION_WIDTH = 2 * HAND_DIM + CAMERA_DIM
+MAX_DEVIATION = 10.0
+_CAMERA_SCALE = torch.tensor([0.05] * 3 + [0.1] * 6)
+_LAYOUT_SCALE = torch.tensor([0.1] * 3 + [0.5] * 6)
+_NO_MOTION = torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+_TYPICAL_LAYOUT = torch.tensor([0.0, 0.0, 0.5] + [0.0] * 6)
+
+
+@dataclass(frozen=True)
+class ActionFeatures:
+    """Normalized actions as each hand sees them: own, other, camera."""
+
+    per_hand: Float32[Tensor, "batch time 2 67"]
+    layout: Float32[Tensor, "batch 2 18"]
+
+
+class ActionNormalizer(nn.Module):
+    """Statistics of training actions, kept in the checkpoint."""
+
+    mean: Tensor
+    std: Tensor
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(HAND_DIM))
+        self.register_buffer("std", torch.ones(HAND_DIM))
+
+    def fit(self, hands: Float32[Tensor, "n time 2 29"]) -> None:
+        """Mean and deviation over windows; one deviation for the three axes of translation."""
+        flat = hands.reshape(-1, HAND_DIM).double()
+        mean, std = flat.mean(dim=0), flat.std(dim=0)
+        mean[:3] = 0.0
+        std[:3] = flat[:, :3].square().mean().sqrt()
+        std[:3] = std[:3].clamp_min(0.005)
+        std[3:] = std[3:].clamp_min(0.02)
+        self.mean.copy_(mean.float())
+        self.std.copy_(std.float())
+
+    def forward(self, inputs: ModelInputs) -> ActionFeatures:
+        """Features bounded to ten deviations, so that no input can blow up the network."""
+        own = _bounded((inputs.hands - self.mean) / self.std)
+        camera = _bounded((inputs.camera - _NO_MOTION) / _CAMERA_SCALE)
+        layout = _bounded((inputs.layout - _TYPICAL_LAYOUT) / _LAYOUT_SCALE)
+        return ActionFeatures(
+            torch.cat([own, own.flip(2), camera], dim=-1),
+            torch.cat([layout, layout.flip(1)], dim=-1),
+        )
+
+
+class TimeEmbedding(nn.Module):
+    """A flow time in 0 … 1 as a vector; float32 throughout."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.project = two_layers(TIME_WIDTH, width, width)
+
+    def forward(self, t: Float32[Tensor, "..."]) -> Float32[Tensor, "*batch width"]:
+        """Sines and cosines, then two layers."""
+        half = TIME_WIDTH // 2
+        rates = torch.exp(-math.log(1e4) * torch.arange(half, dtype=torch.float32) / half)
+        angles = t[..., None] * TIME_RANGE * rates
+        return self.project(torch.cat([angles.cos(), angles.sin()], dim=-1))
+
+
+class VideoCondition(nn.Module):
+    """One condition a latent frame."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width = config.video_width
+        # Both hands and the camera, once, for each of the four steps of a latent frame.
+        self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, 2 * width, width)
+        self.time = TimeEmbedding(width)
+        self.static = StaticCondition(config, width)
+
+    def forward(
+        self,
+        inputs: ModelInputs,
+        features: ActionFeatures,
+        t: Float32[Tensor, "batch latents"],
+    ) -> Float32[Tensor, "batch latents width"]:
+        """T is zero where the latent is clean."""
+        right_view = features.per_hand[:, 1:, 1]
+        groups = split_axis(right_view, 1, (-1, FRAMES_PER_LATENT)).flatten(2)
+        actions = after_first(self.actions(groups))
+        return self.time(t) + actions + self.static(inputs)[:, None]
+
+
+class TactileCondition(nn.Module):
+    """One condition a step and hand."""
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        width = config.tactile_width
+        self.actions = two_layers(ACTION_WIDTH, 2 * width, width)
+        self.layout = two_layers(2 * CAMERA_DIM, width, width)
+        self.scene = SceneEncoder(width)
+        self.time = TimeEmbedding(width)
+        self.static = StaticCondition(config, width)
+
+    def forward(
+        self,
+        inputs: ModelInputs,
+        features: ActionFeatures,
+        t: Float32[Tensor, "batch time"],
+    ) -> Float32[Tensor, "batch time 2 width"]:
+        """T is zero where the step is clean."""
+        actions = after_first(self.actions(features.per_hand[:, 1:]))
+        scene = self.scene(inputs) + self.layout(features.layout)
+        return (
+            self.time(t)[:, :, None] + actions + scene[:, None] + self.static(inputs)[:, None, None]
+        )
+
+
+class StaticCondition(nn.Module):
+    """What holds for the whole window: the instruction and the kind of action."""
+
+    def __init__(self, config: NetworkConfig, width: int) -> None:
+        super().__init__()
+        self.instruction = InstructionEncoder(
+            num_buckets=config.num_word_buckets, word_width=config.word_width, width=width
+        )
+        self.commanded = nn.Parameter(torch.zeros(width))
+
+    def forward(self, inputs: ModelInputs) -> Float32[Tensor, "batch width"]:
+        """Words, and one vector more where actions are commanded."""
+        return self.instruction(inputs.words) + inputs.commanded[:, None] * self.commanded
+
+
+class SceneEncoder(nn.Module):
+    """The first image, with the own hand's raster at the first and last step, for each hand."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(
+            nn.Conv2d(5, 16, 4, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(16, 24, 4, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(24, 32, 4, stride=2, padding=1),
+            nn.GELU(),
+            nn.Conv2d(32, 32, 4, stride=2, padding=1),
+            nn.GELU(),
+            nn.AdaptiveAvgPool2d(4),
+            nn.Flatten(),
+            nn.Linear(32 * 16, width),
+        )
+
+    def forward(self, inputs: ModelInputs) -> Float32[Tensor, "batch 2 width"]:
+        """One vector a hand; the left hand sees the mirror image."""
+        image = inputs.first_image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
+        ends = inputs.raster[:, [0, -1]].transpose(1, 2)
+        ends = nn.functional.interpolate(ends.flatten(0, 1), size=image.shape[-2:])
+        views = torch.cat(
+            [image[:, None].expand(-1, 2, -1, -1, -1), split_axis(ends, 0, (-1, 2))], dim=2
+        )
+        views = torch.stack([views[:, 0].flip(-1), views[:, 1]], dim=1)
+        return split_axis(self.layers(views.flatten(0, 1)), 0, (-1, 2))
+
+
+def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequential:
+    """Linear, SiLU, linear."""
+    return nn.Sequential(
+        nn.Linear(in_width, hidden_width), nn.SiLU(), nn.Linear(hidden_width, out_width)
+    )
+
+
+def after_first(
+    condition: Float32[Tensor, "batch later ..."],
+) -> Float32[Tensor, "batch time ..."]:
+    """The condition with zeros put before it: index 0 has no action (c_0 = 0)."""
+    return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
+
+
+def _bounded(features: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
+    return features.clamp(-MAX_DEVIATION, MAX_DEVIATION)

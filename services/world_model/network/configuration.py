@@ -1,0 +1,75 @@
+"""Every number that fixes the network's shape and sampling: in from settings or a checkpoint."""
+
+from typing import Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+
+class NetworkConfig(BaseModel):
+    """Shape and sampling of the joint model; stored in every checkpoint."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    image_px: int = Field(default=64, ge=16, le=256, description="side of the square head image")
+    patch_px: int = Field(default=8, description="side of a visual patch")
+    max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
+    codec_channels: int = Field(default=48, ge=1, le=768, description="latents of a visual patch")
+    palm_channels: int = Field(default=32, ge=1, le=240, description="latents of a palm pad")
+    video_width: int = Field(default=96, ge=8)
+    tactile_width: int = Field(default=96, ge=8)
+    num_layers: int = Field(default=3, ge=1)
+    num_heads: int = Field(default=3, ge=1)
+    head_width: int = Field(default=32, ge=4)
+    ffn_ratio: int = Field(default=3, ge=1)
+    num_word_buckets: int = Field(default=64, ge=2)
+    word_width: int = Field(default=16, ge=1)
+    use_pose_raster: bool = True
+    training_time_shift: float = Field(default=5.0, ge=1.0)
+    sampling_time_shift: float = Field(default=3.0, ge=1.0)
+    sampling_steps: int = Field(default=2, ge=1, le=64)
+    model_rate_hz: float = Field(default=15.0, gt=0)
+
+    @model_validator(mode="after")
+    def _sizes_fit(self) -> Self:
+        if (self.max_steps - 1) % FRAMES_PER_LATENT:
+            raise ValueError(f"max_steps: got {self.max_steps}, expected 1 + 4k")
+        if self.image_px % (2 * self.patch_px):
+            raise ValueError(
+                f"image_px: got {self.image_px}, expected a multiple of {2 * self.patch_px} "
+                "(tokens of two patches by two)"
+            )
+        return self
+
+    @property
+    def tokens_across(self) -> int:
+        """Visual tokens along one side of the image."""
+        return self.image_px // (2 * self.patch_px)
+
+    @property
+    def tokens_per_latent(self) -> int:
+        """Visual tokens of one latent frame."""
+        return self.tokens_across**2
+
+    @property
+    def raster_cells(self) -> int:
+        """Cells along one side of the pose raster: four across a token."""
+        return RASTER_CELLS_PER_TOKEN * self.tokens_across
+
+    @property
+    def video_channels(self) -> int:
+        """Channels of one visual token: four patches."""
+        return 4 * self.codec_channels
+
+    @property
+    def max_latents(self) -> int:
+        """Latent frames of the longest window."""
+        return num_latents(self.max_steps)
+
+
+FRAMES_PER_LATENT = 4
+RASTER_CELLS_PER_TOKEN = 4
+
+
+def num_latents(num_steps: int) -> int:
+    """Latent frames of 1 + 4k steps: the first step alone, then groups of four."""
+    return 1 + (num_steps - 1) // FRAMES_PER_LATENT

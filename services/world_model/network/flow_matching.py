@@ -1,0 +1,67 @@
+"""Clean latents and noise in, noisy ones out; a network's guess of the clean ones in, samples out.
+
+Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0, so
+that the velocity is (x_t - x_0) / t and the last Euler step lands on its guess exactly.
+"""
+
+from collections.abc import Callable
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError
+
+# A training time is never below this: velocities divide by it.
+MIN_TIME = 1e-3
+Denoiser = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
+
+
+def shift_time(t: Float32[Tensor, " n"], shift: float) -> Float32[Tensor, " n"]:
+    """Times moved towards noise: s t / (1 + (s - 1) t); keeps 0 and 1."""
+    return shift * t / (1.0 + (shift - 1.0) * t)
+
+
+def training_times(
+    batch: int, *, shift: float, generator: torch.Generator
+) -> Float32[Tensor, " batch"]:
+    """Random times in (0, 1], mostly noisy ones, where actions decide."""
+    return shift_time(torch.rand(batch, generator=generator), shift).clamp_min(MIN_TIME)
+
+
+def add_noise(
+    clean: Float32[Tensor, "batch ..."],
+    noise: Float32[Tensor, "batch ..."],
+    t: Float32[Tensor, " batch"],
+) -> Float32[Tensor, "batch ..."]:
+    """x_t = (1 - t) x_0 + t ε; exact at both ends."""
+    spread = t.view(-1, *[1] * (clean.ndim - 1))
+    return (1.0 - spread) * clean + spread * noise
+
+
+def sample(
+    denoise: Denoiser,
+    noise: tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]],
+    *,
+    num_steps: int,
+    shift: float,
+) -> tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]]:
+    """Euler's method from noise to data for both streams at once.
+
+    Args:
+        denoise: noisy video, noisy touch and times [batch] to guesses of the clean ones.
+        noise: what to start from.
+        num_steps: network calls, at least one; with one the sample is the first guess.
+        shift: of the time grid.
+    """
+    if num_steps < 1:
+        raise InvalidInputError(f"sampling: got {num_steps} steps, expected at least 1")
+    video, tactile = noise
+    times = shift_time(torch.linspace(1.0, 0.0, num_steps + 1), shift)
+    for t, t_next in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
+        guess_video, guess_tactile = denoise(video, tactile, torch.full((len(video),), t))
+        # x + (t' - t) (x - x_0) / t, written so that t' = 0 gives x_0 without rounding.
+        keep = t_next / t
+        video = keep * video + (1.0 - keep) * guess_video
+        tactile = keep * tactile + (1.0 - keep) * guess_tactile
+    return video, tactile

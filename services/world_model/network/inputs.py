@@ -1,0 +1,215 @@
+"""What is asked of the model in (image, touch, actions, words, geometry), its tensors out.
+
+This is the only way into the network: the training loader and the world server both call
+`build_inputs`, so that a window means the same to both.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.geometry.transforms import invert
+from dextouch.hands.actions import (
+    IDENTITY_POSE_9D,
+    JOINTS_LEFT,
+    JOINTS_RIGHT,
+    POSE_SLICES,
+    AnchorPoses,
+    check_actions,
+    pose_to_9d,
+)
+from dextouch.tactile.layout import NUM_TAXELS
+from dextouch.worlds.world import ActionKind
+from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
+from services.world_model.network.instruction import hash_words
+from services.world_model.network.mirroring import (
+    MIRROR_CAMERA,
+    MIRROR_WRIST,
+    camera_features,
+    hand_features,
+    mirror_pose_9d,
+)
+from services.world_model.network.pose_raster import pose_raster
+
+MAX_TRANSLATION_M = 2.0
+MAX_JOINT_RAD = 2.0 * np.pi
+MAX_PRESSURE_KPA = 1e5
+ACTION_KINDS: tuple[ActionKind, ActionKind] = ("measured", "commanded")
+
+
+@dataclass(frozen=True)
+class PredictionRequest:
+    """One window to be predicted.
+
+    `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; row 0's own poses
+    are the anchor by definition and are not read.
+    """
+
+    first_image: UInt8[np.ndarray, "h w 3"]
+    first_tactile_kpa: Float32[np.ndarray, "2 320"]
+    actions: Float64[np.ndarray, "time 67"]
+    action_kind: ActionKind
+    instruction: str
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class ModelInputs:
+    """Tensors of a batch of requests; physical units, normalized inside the network."""
+
+    first_image: UInt8[Tensor, "batch px px 3"]
+    first_tactile_kpa: Float32[Tensor, "batch 2 320"]
+    hands: Float32[Tensor, "batch time 2 29"]
+    camera: Float32[Tensor, "batch time 2 9"]
+    layout: Float32[Tensor, "batch 2 9"]
+    raster: Float32[Tensor, "batch time 2 cells cells"]
+    commanded: Float32[Tensor, " batch"]
+    words: Int64[Tensor, "batch max_words"]
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of the window, the first one included."""
+        return self.hands.shape[1]
+
+    def __len__(self) -> int:
+        return len(self.first_image)
+
+
+def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
+    """Check and stack requests of one length into the network's tensors.
+
+    Raises:
+        ShapeError: arrays of another shape, or requests of different lengths.
+        NonFiniteError: NaN or infinity.
+        DegenerateRotationError: actions that describe no rotation.
+        UnknownNameError: an action kind that does not exist.
+        InvalidInputError: poses or angles outside what a body can do, or no request.
+    """
+    if not requests:
+        raise InvalidInputError("model input: got no request, expected at least one")
+    actions = np.stack(_same_length([_checked_actions(r, config) for r in requests]))
+    anchors = np.stack([_checked_anchor(r.anchor) for r in requests])
+    K_head = np.stack([_checked_camera(r.K_head) for r in requests])
+    raster = pose_raster(
+        actions, anchors, K_head, image_px=config.image_px, cells=config.raster_cells
+    )
+    return ModelInputs(
+        first_image=torch.from_numpy(np.stack([_checked_image(r, config) for r in requests])),
+        first_tactile_kpa=torch.from_numpy(np.stack([_checked_tactile(r) for r in requests])),
+        hands=_float_tensor(hand_features(actions)),
+        camera=_float_tensor(camera_features(actions)),
+        layout=_float_tensor(_hand_layout(anchors)),
+        raster=torch.from_numpy(raster),
+        commanded=torch.tensor([float(_is_commanded(r.action_kind)) for r in requests]),
+        words=torch.stack([hash_words(r.instruction, config.num_word_buckets) for r in requests]),
+    )
+
+
+def _float_tensor(values: np.ndarray) -> Tensor:
+    return torch.from_numpy(values.astype(np.float32))
+
+
+def _hand_layout(anchors: np.ndarray) -> Float64[np.ndarray, "batch 2 9"]:
+    """T_camera_wrist of both hands at the anchor, the left one mirrored."""
+    Ts_camera_wrist = invert(anchors[:, 2])[:, None] @ anchors[:, :2]
+    poses = pose_to_9d(Ts_camera_wrist)
+    left = mirror_pose_9d(poses[:, 0], mirror_to=MIRROR_CAMERA, mirror_from=MIRROR_WRIST)
+    return np.stack([left, poses[:, 1]], axis=1)
+
+
+def _same_length(actions: list[np.ndarray]) -> list[np.ndarray]:
+    lengths = {len(rows) for rows in actions}
+    if len(lengths) != 1:
+        raise ShapeError(
+            f"model input: got windows of {sorted(lengths)} steps in one batch, expected one length"
+        )
+    return actions
+
+
+def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.ndarray:
+    actions = check_actions(request.actions, where="model actions").copy()
+    num_future = len(actions) - 1
+    if num_future < 1 or num_future % FRAMES_PER_LATENT or len(actions) > config.max_steps:
+        raise ShapeError(
+            f"model actions: got {len(actions)} rows, expected 1 + 4k, at most {config.max_steps}"
+        )
+    for part in POSE_SLICES:
+        actions[0, part] = IDENTITY_POSE_9D
+        reach_m = float(np.abs(actions[:, part][:, :3]).max())
+        if reach_m > MAX_TRANSLATION_M:
+            raise InvalidInputError(
+                f"model actions: a pose lies {reach_m:.3g} m from the anchor, expected at most "
+                f"{MAX_TRANSLATION_M} m; translations are in metres, relative to row 0",
+                got=reach_m,
+            )
+    for part in (JOINTS_LEFT, JOINTS_RIGHT):
+        angle_rad = float(np.abs(actions[:, part]).max())
+        if angle_rad > MAX_JOINT_RAD:
+            raise InvalidInputError(
+                f"model actions: a joint angle of {angle_rad:.3g} rad, expected at most "
+                f"{MAX_JOINT_RAD:.3g}; angles are in radians",
+                got=angle_rad,
+            )
+    return actions
+
+
+def _checked_anchor(anchor: AnchorPoses) -> np.ndarray:
+    Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
+    if Ts.shape != (3, 4, 4):
+        raise ShapeError(f"anchor: got shape {Ts.shape}, expected three 4x4 transforms")
+    if not np.isfinite(Ts).all():
+        raise NonFiniteError("anchor: holds NaN or infinity, expected rigid transforms")
+    R = Ts[:, :3, :3]
+    error = float(np.abs(np.swapaxes(R, -1, -2) @ R - np.eye(3)).max())
+    if error > 1e-3 or (np.linalg.det(R) < 0).any():
+        raise InvalidInputError(
+            f"anchor: no rigid transform (RᵀR differs from the identity by {error:.2g}), "
+            "expected T_world_wrist_left, T_world_wrist_right, T_world_camera_head"
+        )
+    return Ts
+
+
+def _checked_camera(K_head: np.ndarray) -> np.ndarray:
+    K = np.asarray(K_head, dtype=np.float64)
+    if K.shape != (3, 3):
+        raise ShapeError(f"K_head: got shape {K.shape}, expected [3, 3]")
+    if not np.isfinite(K).all():
+        raise NonFiniteError("K_head: holds NaN or infinity")
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise InvalidInputError(
+            f"K_head: focal lengths {K[0, 0]:.3g} and {K[1, 1]:.3g} px, expected positive ones"
+        )
+    return K
+
+
+def _checked_image(request: PredictionRequest, config: NetworkConfig) -> np.ndarray:
+    image = np.asarray(request.first_image)
+    expected = (config.image_px, config.image_px, 3)
+    if image.shape != expected or image.dtype != np.uint8:
+        raise ShapeError(f"first image: got {image.dtype} {image.shape}, expected uint8 {expected}")
+    return image
+
+
+def _checked_tactile(request: PredictionRequest) -> np.ndarray:
+    tactile = np.asarray(request.first_tactile_kpa, dtype=np.float32)
+    if tactile.shape != (2, NUM_TAXELS):
+        raise ShapeError(f"first touch: got shape {tactile.shape}, expected [2, {NUM_TAXELS}]")
+    if not np.isfinite(tactile).all():
+        raise NonFiniteError("first touch: holds NaN or infinity; mend or mask the sensor first")
+    if tactile.max() > MAX_PRESSURE_KPA:
+        raise InvalidInputError(
+            f"first touch: got {tactile.max():.3g} kPa, expected at most {MAX_PRESSURE_KPA:.0e}"
+        )
+    return tactile
+
+
+def _is_commanded(action_kind: str) -> bool:
+    if action_kind not in ACTION_KINDS:
+        raise UnknownNameError("action kind", action_kind, list(ACTION_KINDS))
+    return action_kind == "commanded"

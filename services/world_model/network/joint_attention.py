@@ -1,0 +1,119 @@
+"""Tokens of both experts and their modulations in, the same tokens after one joint layer out.
+
+Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
+network; only the attention is shared, over the tokens of both.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32
+from torch import Tensor, nn
+from torch.nn import functional
+
+from services.world_model.network.axes import split_axis
+
+NUM_MODULATIONS = 6
+
+
+@dataclass(frozen=True)
+class Stream:
+    """Tokens of one expert and the modulation of each: shift, scale and gate, twice."""
+
+    tokens: Float32[Tensor, "batch tokens width"]
+    modulation: Float32[Tensor, "batch tokens 6 width"]
+
+
+def clean_mask(
+    is_clean: Bool[Tensor, " tokens"],
+) -> Bool[Tensor, "tokens tokens"]:
+    """Which key each query may see: clean queries only clean keys, noisy queries all.
+
+    So clean context never depends on noise. Every query sees at least itself.
+    """
+    return ~is_clean[:, None] | is_clean[None, :]
+
+
+class ExpertBlock(nn.Module):
+    """One expert's part of a layer, before and after the shared attention."""
+
+    def __init__(self, *, width: int, num_heads: int, head_width: int, ffn_ratio: int) -> None:
+        super().__init__()
+        inner = num_heads * head_width
+        self.num_heads = num_heads
+        self.to_qkv = nn.Linear(width, 3 * inner)
+        self.to_out = nn.Linear(inner, width)
+        # Norms of queries and keys bound the logits whatever the tokens are.
+        self.query_norm = nn.RMSNorm(head_width, eps=1e-6)
+        self.key_norm = nn.RMSNorm(head_width, eps=1e-6)
+        self.ffn = nn.Sequential(
+            nn.Linear(width, ffn_ratio * width),
+            nn.GELU(approximate="tanh"),
+            nn.Linear(ffn_ratio * width, width),
+        )
+        self.modulation = nn.Parameter(torch.zeros(NUM_MODULATIONS, width))
+
+    def queries_keys_values(
+        self, stream: Stream
+    ) -> tuple[
+        Float32[Tensor, "batch heads tokens head_width"],
+        Float32[Tensor, "batch heads tokens head_width"],
+        Float32[Tensor, "batch heads tokens head_width"],
+    ]:
+        """What the expert brings into the attention."""
+        shift, scale, *_ = (stream.modulation + self.modulation).unbind(dim=2)
+        normed = modulated_norm(stream.tokens, shift, scale)
+        heads = split_axis(self.to_qkv(normed), -1, (3, self.num_heads, -1))
+        query, key, value = heads.permute(2, 0, 3, 1, 4)
+        return self.query_norm(query), self.key_norm(key), value
+
+    def finish(self, stream: Stream, attended: Float32[Tensor, "batch tokens inner"]) -> Stream:
+        """Add the attention's answer, then the feed-forward network's."""
+        _, _, gate, ffn_shift, ffn_scale, ffn_gate = (stream.modulation + self.modulation).unbind(2)
+        tokens = stream.tokens + (1.0 + gate) * self.to_out(attended)
+        normed = modulated_norm(tokens, ffn_shift, ffn_scale)
+        return Stream(tokens + (1.0 + ffn_gate) * self.ffn(normed), stream.modulation)
+
+
+class JointLayer(nn.Module):
+    """One layer: two expert blocks around one attention."""
+
+    def __init__(self, video: ExpertBlock, tactile: ExpertBlock) -> None:
+        super().__init__()
+        self.video = video
+        self.tactile = tactile
+
+    def forward(
+        self, video: Stream, tactile: Stream, mask: Bool[Tensor, "tokens tokens"]
+    ) -> tuple[Stream, Stream]:
+        """Both streams, each knowing of the other."""
+        parts = zip(
+            self.video.queries_keys_values(video),
+            self.tactile.queries_keys_values(tactile),
+            strict=True,
+        )
+        query, key, value = (torch.cat(pair, dim=2) for pair in parts)
+        attended = functional.scaled_dot_product_attention(query, key, value, attn_mask=mask)
+        attended = attended.transpose(1, 2).flatten(2)
+        num_video = video.tokens.shape[1]
+        return (
+            self.video.finish(video, attended[:, :num_video]),
+            self.tactile.finish(tactile, attended[:, num_video:]),
+        )
+
+
+def modulated_norm(
+    tokens: Float32[Tensor, "*batch width"],
+    shift: Float32[Tensor, "*batch width"],
+    scale: Float32[Tensor, "*batch width"],
+) -> Float32[Tensor, "*batch width"]:
+    """Layer norm without weights of its own, then the condition's scale and shift (AdaLN)."""
+    return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
+
+
+def zero_linear(in_width: int, out_width: int) -> nn.Linear:
+    """A linear map that gives zero until it is trained: modulations and outputs begin neutral."""
+    layer = nn.Linear(in_width, out_width)
+    nn.init.zeros_(layer.weight)
+    nn.init.zeros_(layer.bias)
+    return layer

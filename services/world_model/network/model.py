@@ -1,0 +1,180 @@
+"""The joint model: inputs and noise in, images and pressures of the future out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float32, UInt8
+from torch import Tensor, nn
+
+from services.world_model.network import flow_matching
+from services.world_model.network.conditioning import (
+    ActionNormalizer,
+    TactileCondition,
+    VideoCondition,
+)
+from services.world_model.network.configuration import NetworkConfig, num_latents
+from services.world_model.network.inputs import ModelInputs
+from services.world_model.network.joint_attention import JointLayer, clean_mask
+from services.world_model.network.tactile_expert import TactileExpert
+from services.world_model.network.tactile_tokenizer import TactileTokenizer
+from services.world_model.network.video_expert import VideoExpert
+from services.world_model.network.visual_codec import VisualCodec, to_unit
+
+
+@dataclass(frozen=True)
+class JointLatents:
+    """Latents of both streams."""
+
+    video: Float32[Tensor, "batch latents tokens channels"]
+    tactile: Float32[Tensor, "batch time 2 tactile_channels"]
+
+
+@dataclass(frozen=True)
+class FirstLatents:
+    """Clean latents of the first step of both streams: the context and the anchor."""
+
+    video: Float32[Tensor, "batch tokens channels"]
+    tactile: Float32[Tensor, "batch 2 tactile_channels"]
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """The future after the first step."""
+
+    images: Float32[Tensor, "batch steps px px 3"]
+    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+
+
+class JointWorldModel(nn.Module):
+    """Video and tactile expert over anchored residual latents, with their frozen codecs."""
+
+    video_residual_std: Tensor
+    tactile_residual_std: Tensor
+
+    def __init__(self, config: NetworkConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.codec = VisualCodec(config)
+        self.tokenizer = TactileTokenizer(config)
+        self.normalizer = ActionNormalizer()
+        self.register_buffer("video_residual_std", torch.ones(()))
+        self.register_buffer("tactile_residual_std", torch.ones(()))
+        self.video_condition = VideoCondition(config)
+        self.tactile_condition = TactileCondition(config)
+        self.video = VideoExpert(config)
+        self.tactile = TactileExpert(config, self.tokenizer.channels)
+        self.layers = nn.ModuleList(
+            JointLayer(VideoExpert.block(config), TactileExpert.block(config))
+            for _ in range(config.num_layers)
+        )
+
+    def first_latents(self, inputs: ModelInputs) -> FirstLatents:
+        """Latents of the first image and the first touch."""
+        images = to_unit(inputs.first_image)[:, None]
+        return FirstLatents(
+            self.codec.encode(images)[:, 0], self.tokenizer.encode(inputs.first_tactile_kpa)
+        )
+
+    def residuals(
+        self,
+        images: UInt8[Tensor, "batch time px px 3"],
+        tactile_kpa: Float32[Tensor, "batch time 2 320"],
+    ) -> JointLatents:
+        """Anchored residuals of true windows, in units of their deviation: the target."""
+        video, tactile = self.codec.encode(to_unit(images)), self.tokenizer.encode(tactile_kpa)
+        return JointLatents(
+            (video - video[:, :1]) / self.video_residual_std,
+            (tactile - tactile[:, :1]) / self.tactile_residual_std,
+        )
+
+    def forward(
+        self,
+        inputs: ModelInputs,
+        first: FirstLatents,
+        noisy: JointLatents,
+        t: Float32[Tensor, " batch"],
+    ) -> JointLatents:
+        """The guess of the clean residuals from noisy ones at time t (the first step is clean)."""
+        features = self.normalizer(inputs)
+        video_condition = self.video_condition(inputs, features, _time_of_each(t, noisy.video))
+        tactile_condition = self.tactile_condition(
+            inputs, features, _time_of_each(t, noisy.tactile)
+        )
+        video = self.video.start(
+            _first_zero(noisy.video), first.video, video_condition, inputs.raster
+        )
+        tactile = self.tactile.start(_first_zero(noisy.tactile), first.tactile, tactile_condition)
+        mask = self.attention_mask(inputs.num_steps)
+        for layer in self.layers:
+            video, tactile = layer(video, tactile, mask)
+        return JointLatents(
+            self.video.finish(video, video_condition),
+            self.tactile.finish(tactile, tactile_condition),
+        )
+
+    def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
+        """Clean tokens (first latent frame, first touch) see only each other."""
+        per_latent = self.config.tokens_per_latent
+        is_clean_video = torch.arange(num_latents(num_steps) * per_latent) < per_latent
+        is_clean_tactile = torch.arange(2 * num_steps) < 2
+        return clean_mask(torch.cat([is_clean_video, is_clean_tactile]))
+
+    def noise(self, num_steps: int, generator: torch.Generator) -> JointLatents:
+        """Noise of one rollout's chunk; stack several for a batch."""
+        config = self.config
+        video = (num_latents(num_steps), config.tokens_per_latent, config.video_channels)
+        tactile = (num_steps, 2, self.tokenizer.channels)
+        return JointLatents(
+            torch.randn(1, *video, generator=generator),
+            torch.randn(1, *tactile, generator=generator),
+        )
+
+    @torch.no_grad()
+    def predict(
+        self, inputs: ModelInputs, noise: JointLatents, *, sampling_steps: int | None = None
+    ) -> Prediction:
+        """Sample the future of every request.
+
+        Args:
+            inputs: from `build_inputs`.
+            noise: one a request, from `noise`.
+            sampling_steps: Euler steps; None takes the configuration's.
+        """
+        first = self.first_latents(inputs)
+
+        def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
+            guess = self(inputs, first, JointLatents(video, tactile), t)
+            return guess.video, guess.tactile
+
+        video, tactile = flow_matching.sample(
+            denoise,
+            (noise.video, noise.tactile),
+            num_steps=sampling_steps or self.config.sampling_steps,
+            shift=self.config.sampling_time_shift,
+        )
+        return self.decode(first, JointLatents(video, tactile))
+
+    def decode(self, first: FirstLatents, residuals: JointLatents) -> Prediction:
+        """Images and pressures after the first step."""
+        video = first.video[:, None] + self.video_residual_std * _first_zero(residuals.video)
+        tactile = first.tactile[:, None] + self.tactile_residual_std * residuals.tactile[:, 1:]
+        return Prediction(self.codec.decode(video)[:, 1:], self.tokenizer.decode(tactile))
+
+
+def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:
+    """Noise of several rollouts as one batch."""
+    return JointLatents(
+        torch.cat([noise.video for noise in noises]), torch.cat([noise.tactile for noise in noises])
+    )
+
+
+def _time_of_each(t: Tensor, latents: Tensor) -> Tensor:
+    """Flow time of every latent or step: zero for the clean first one."""
+    times = t[:, None].repeat(1, latents.shape[1])
+    times[:, 0] = 0.0
+    return times
+
+
+def _first_zero(latents: Tensor) -> Tensor:
+    return torch.cat([torch.zeros_like(latents[:, :1]), latents[:, 1:]], dim=1)

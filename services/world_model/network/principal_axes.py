@@ -1,0 +1,34 @@
+"""Second moments in, an orthonormal basis with fixed signs and a scale for each channel out."""
+
+import torch
+from jaxtyping import Float32, Float64
+from torch import Tensor
+
+# No channel is scaled up by more than the root of 1 / this share of the strongest one.
+MIN_RELATIVE_SCALE = 1e-3
+
+
+def principal_axes(
+    second_moment: Float64[Tensor, "dim dim"], num_channels: int
+) -> tuple[Float32[Tensor, "dim channels"], Float32[Tensor, " channels"]]:
+    """Strongest eigenvectors, strongest first, and the root mean square along each.
+
+    Signs are fixed by making each vector's largest entry positive, so that the same data always
+    give the same basis.
+    """
+    values, vectors = torch.linalg.eigh(second_moment)
+    basis = vectors[:, -num_channels:].flip(1)
+    largest = basis.abs().argmax(dim=0)
+    signs = torch.sign(basis[largest, torch.arange(num_channels)])
+    rms = values[-num_channels:].flip(0).clamp_min(0).sqrt()
+    return (basis * signs).float(), rms.float()
+
+
+def root_scale(rms: Float32[Tensor, " channels"]) -> Float32[Tensor, " channels"]:
+    """Divisors that leave channel c with the amplitude sqrt(rms_c / rms_0).
+
+    Full whitening would let the weakest channels, which are mostly noise, weigh as much as the
+    strongest; no whitening would hide everything but those.
+    """
+    strongest = rms[0].clamp_min(1e-6)
+    return torch.sqrt((rms / strongest).clamp_min(MIN_RELATIVE_SCALE)) * strongest

@@ -1,0 +1,59 @@
+"""Noisy tactile latents, the first latent and the condition in, tokens for the joint layers out."""
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor, nn
+
+from services.world_model.network.axes import split_axis
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.joint_attention import (
+    NUM_MODULATIONS,
+    ExpertBlock,
+    Stream,
+    modulated_norm,
+    zero_linear,
+)
+
+
+class TactileExpert(nn.Module):
+    """The tactile stream: one token a hand and step, the first step clean."""
+
+    def __init__(self, config: NetworkConfig, channels: int) -> None:
+        super().__init__()
+        width = config.tactile_width
+        self.embed = nn.Linear(2 * channels, width)
+        self.hands = nn.Parameter(0.02 * torch.randn(2, width))
+        self.steps = nn.Parameter(0.02 * torch.randn(config.max_steps, 1, width))
+        self.modulate = nn.Sequential(nn.SiLU(), zero_linear(width, NUM_MODULATIONS * width))
+        self.modulate_out = nn.Sequential(nn.SiLU(), zero_linear(width, 2 * width))
+        self.predict = zero_linear(width, channels)
+
+    @staticmethod
+    def block(config: NetworkConfig) -> ExpertBlock:
+        """This expert's part of one joint layer."""
+        return ExpertBlock(
+            width=config.tactile_width,
+            num_heads=config.num_heads,
+            head_width=config.head_width,
+            ffn_ratio=config.ffn_ratio,
+        )
+
+    def start(
+        self,
+        noisy: Float32[Tensor, "batch time 2 channels"],
+        first: Float32[Tensor, "batch 2 channels"],
+        condition: Float32[Tensor, "batch time 2 width"],
+    ) -> Stream:
+        """Tokens before the first layer; `noisy` is a residual, its first step zero."""
+        both = torch.cat([noisy, first[:, None].expand_as(noisy)], dim=-1)
+        tokens = self.embed(both) + self.hands + self.steps[: noisy.shape[1]] + condition
+        modulation = split_axis(self.modulate(condition), -1, (NUM_MODULATIONS, -1))
+        return Stream(tokens.flatten(1, 2), modulation.flatten(1, 2))
+
+    def finish(
+        self, stream: Stream, condition: Float32[Tensor, "batch time 2 width"]
+    ) -> Float32[Tensor, "batch time 2 channels"]:
+        """The guess of the clean residual."""
+        tokens = split_axis(stream.tokens, 1, (condition.shape[1], 2))
+        shift, scale = self.modulate_out(condition).chunk(2, dim=-1)
+        return self.predict(modulated_norm(tokens, shift, scale))

@@ -1,0 +1,73 @@
+"""Flags and environment in, the frozen settings of training and serving out."""
+
+import sys
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from dextouch.serving.settings import ServiceSettings, service_config
+from services.world_model.checkpoints import default_checkpoint
+from services.world_model.network.configuration import NetworkConfig
+
+
+class OptimizerSettings(BaseModel):
+    """How weights are moved."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    batch: int = Field(default=16, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    warmup_steps: int = Field(default=100, ge=1)
+    weight_decay: float = Field(default=0.02, ge=0)
+    max_gradient_norm: float = Field(default=1.0, gt=0)
+    ema_decay: float = Field(default=0.995, ge=0, lt=1)
+    tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac of equation 5")
+
+
+class WindowSettings(BaseModel):
+    """Which windows are trained on."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    commanded_fraction: float = Field(default=0.5, ge=0, le=1)
+    chained_fraction: float = Field(default=0.3, ge=0, le=1)
+    short_fraction: float = Field(default=0.25, ge=0, le=1, description="of 5, 9, 13 … steps")
+    context_noise: float = Field(default=0.05, ge=0, le=1, description="on the first latents")
+    fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
+
+
+class TrainSettings(BaseModel):
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    episodes: str = Field(description="URL or folder of the episode store to train on")
+    heldout: str | None = Field(
+        default=None, description="store to be judged on; without it a tenth of `episodes`, by hash"
+    )
+    output: Path = Path("runs/world_model/tiny.safetensors")
+    name: str = "tiny"
+    seed: int = Field(default=0, ge=0)
+    cpu_budget_s: float = Field(default=480.0, gt=0)
+    max_steps: int | None = Field(default=None, ge=1)
+    num_threads: int = Field(default=1, ge=1)
+    heldout_percent: int = Field(default=10, ge=1, le=50)
+    evaluation_stride: int = Field(default=8, ge=1)
+    network: NetworkConfig = NetworkConfig()
+    optimizer: OptimizerSettings = OptimizerSettings()
+    windows: WindowSettings = WindowSettings()
+
+
+class WorldModelSettings(ServiceSettings):
+    """A served world model."""
+
+    model_config = service_config("world_model")
+
+    checkpoint: Path = default_checkpoint()
+    sampling_steps: int | None = Field(default=None, ge=1, le=64)
+    num_threads: int = Field(default=1, ge=1)
+
+
+def command_line() -> str:
+    """The command that runs now, without its path: kept in checkpoints."""
+    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])

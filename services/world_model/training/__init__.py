@@ -1,0 +1,1 @@
+"""Training: episodes to windows, windows to a loss, a loss to a measured checkpoint."""

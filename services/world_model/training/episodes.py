@@ -1,0 +1,76 @@
+"""An episode store in, episodes as arrays on the model grid out, and their split by hash."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError
+from dextouch.worlds.world import ActionKind
+from services.world_model.training.dataset import EpisodeArrays, fingerprint
+
+CAMERA = "camera_head"
+
+
+def load_episodes(url: str) -> list[EpisodeArrays]:
+    """All episodes of a store, read once into memory.
+
+    Raises:
+        InvalidInputError: a store without episodes, or one of another rate than the others.
+        UnknownNameError: an episode without the head camera.
+    """
+    store = EpisodeStore(url)
+    episodes = [read_episode(store.open(episode_id)) for episode_id in store.list()]
+    if not episodes:
+        raise InvalidInputError(
+            f"episodes: the store {url} holds none; record some first (dextouch twin record)"
+        )
+    rates = {episode.model_rate_hz for episode in episodes}
+    if len(rates) > 1:
+        raise InvalidInputError(f"episodes: model rates {sorted(rates)} Hz in one store {url}")
+    return episodes
+
+
+def read_episode(reader: EpisodeReader) -> EpisodeArrays:
+    """One whole episode as a single window for each kind of action it holds."""
+    measured = reader.window(0, reader.num_steps, cameras=(CAMERA,))
+    actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]] = {"measured": measured.actions}
+    if "action_commanded" in reader.streams:
+        sent = reader.window(0, reader.num_steps, cameras=(), action_kind="commanded")
+        actions["commanded"] = sent.actions
+    attributes = reader.attributes
+    return EpisodeArrays(
+        episode_id=attributes.episode_id,
+        task=attributes.task,
+        instruction=attributes.instruction,
+        seed=attributes.seed,
+        images=measured.images[CAMERA],
+        tactile_kpa=measured.tactile_kpa,
+        tactile_valid=measured.tactile_valid,
+        actions=actions,
+        anchor=measured.anchor,
+        K_head=measured.K_head,
+        model_rate_hz=attributes.model_rate_hz,
+    )
+
+
+def split_by_hash(
+    episodes: Sequence[EpisodeArrays], *, heldout_percent: int
+) -> tuple[list[EpisodeArrays], list[EpisodeArrays]]:
+    """Training and held-out episodes; which is which depends on an episode's content alone.
+
+    Raises:
+        InvalidInputError: one of the two sides would be empty.
+    """
+    trained: list[EpisodeArrays] = []
+    heldout: list[EpisodeArrays] = []
+    for episode in episodes:
+        bucket = int(fingerprint(episode)[:8], 16) % 100
+        (heldout if bucket < heldout_percent else trained).append(episode)
+    if not trained or not heldout:
+        raise InvalidInputError(
+            f"split: {len(trained)} episodes to train on and {len(heldout)} held out of "
+            f"{len(episodes)}; expected at least one each: give a held-out store or more episodes"
+        )
+    return trained, heldout

@@ -1,0 +1,187 @@
+"""A model and held-out episodes in, its errors and those of simple rivals out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError
+from dextouch.metrics import image as image_metrics
+from dextouch.metrics import tactile as tactile_metrics
+from dextouch.worlds.world import ActionKind
+from services.world_model.network.inputs import PredictionRequest, build_inputs
+from services.world_model.network.model import JointWorldModel, stack_noise
+from services.world_model.network.visual_codec import to_uint8, to_unit
+from services.world_model.training.dataset import (
+    EpisodeArrays,
+    Window,
+    cut_window,
+    fingerprint,
+    stack_windows,
+)
+
+BATCH = 24
+
+
+@dataclass(frozen=True)
+class Futures:
+    """Images and pressures after the first step, of all windows."""
+
+    images: UInt8[np.ndarray, "n steps h w 3"]
+    tactile_kpa: Float32[np.ndarray, "n steps 2 320"]
+
+
+def evaluate_prediction(
+    model: JointWorldModel,
+    episodes: Sequence[EpisodeArrays],
+    *,
+    train_fingerprints: Sequence[str],
+    stride: int = 8,
+    action_kind: ActionKind = "commanded",
+    seed: int = 0,
+) -> dict[str, float]:
+    """Errors over every window that starts at a multiple of `stride`.
+
+    Args:
+        model: ready to predict.
+        episodes: held out, none of them trained on.
+        train_fingerprints: of the episodes trained on, from the checkpoint.
+        stride: steps between window starts.
+        action_kind: of the actions given; episodes without it give their measured ones.
+        seed: of the noise.
+
+    Returns:
+        psnr, psnr_copy, psnr_codec, psnr_wrong_actions (dB, mean over images); tactile_mse and its
+        _copy, _zero, _codec, _wrong_actions (kPa²); contact_f1, contact_f1_copy, contact_f1_codec;
+        num_windows. Copy repeats the first step, zero feels nothing, codec encodes and decodes the
+        truth, wrong actions are those of another held-out episode of the same task (absent where
+        no task has two episodes).
+
+    Raises:
+        InvalidInputError: an episode that was trained on, or no window at all.
+    """
+    refuse_trained(episodes, train_fingerprints)
+    places = [
+        (episode, start)
+        for episode in episodes
+        for start in range(0, len(episode) - model.config.max_steps + 1, stride)
+    ]
+    if not places:
+        raise InvalidInputError(
+            f"evaluation: {len(episodes)} episodes hold no window of {model.config.max_steps} steps"
+        )
+    windows = [
+        _cut(episode, start, model.config.max_steps, action_kind) for episode, start in places
+    ]
+    truth = _truth(windows)
+    first = Futures(
+        np.stack([w.images[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
+        np.stack([w.tactile_kpa[:1] for w in windows]).repeat(truth.images.shape[1], axis=1),
+    )
+    requests = [window.request for window in windows]
+    figures = _figures(predict_all(model, requests, seed=seed), truth, "")
+    figures |= _figures(first, truth, "_copy")
+    figures |= _figures(_through_codec(model, windows), truth, "_codec")
+    figures["tactile_mse_zero"] = tactile_metrics.mse(
+        predicted_kpa=np.zeros_like(truth.tactile_kpa), true_kpa=truth.tactile_kpa
+    )
+    others = _other_actions(places, requests, action_kind)
+    if others:
+        kept = [index for index, _ in others]
+        wrong = predict_all(model, [request for _, request in others], seed=seed)
+        figures |= _figures(wrong, _at(truth, kept), "_wrong_actions")
+    return {**figures, "num_windows": float(len(windows))}
+
+
+def refuse_trained(episodes: Sequence[EpisodeArrays], train_fingerprints: Sequence[str]) -> None:
+    """Raise if any episode was trained on, by the hash of its content."""
+    trained = set(train_fingerprints)
+    seen = [episode.episode_id for episode in episodes if fingerprint(episode) in trained]
+    if seen:
+        raise InvalidInputError(
+            f"evaluation: {len(seen)} episodes were trained on {seen[:3]}; expected held-out ones",
+            episodes=seen,
+        )
+
+
+def predict_all(
+    model: JointWorldModel, requests: Sequence[PredictionRequest], *, seed: int
+) -> Futures:
+    """One sample for each request, in batches; request i has its own noise, seeded by i."""
+    images, touches = [], []
+    for begin in range(0, len(requests), BATCH):
+        part = requests[begin : begin + BATCH]
+        inputs = build_inputs(part, model.config)
+        noises = [
+            model.noise(inputs.num_steps, torch.Generator().manual_seed(seed + begin + index))
+            for index in range(len(part))
+        ]
+        future = model.predict(inputs, stack_noise(noises))
+        images.append(to_uint8(future.images).numpy())
+        touches.append(future.tactile_kpa.numpy())
+    return Futures(np.concatenate(images), np.concatenate(touches))
+
+
+def _cut(episode: EpisodeArrays, start: int, num_steps: int, kind: ActionKind) -> Window:
+    available: ActionKind = kind if kind in episode.actions else "measured"
+    return cut_window(episode, start, num_steps, action_kind=available)
+
+
+def _truth(windows: Sequence[Window]) -> Futures:
+    return Futures(
+        np.stack([w.images[1:] for w in windows]), np.stack([w.tactile_kpa[1:] for w in windows])
+    )
+
+
+def _at(futures: Futures, kept: list[int]) -> Futures:
+    return Futures(futures.images[kept], futures.tactile_kpa[kept])
+
+
+def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures:
+    images, touches = [], []
+    for begin in range(0, len(windows), BATCH):
+        batch = stack_windows(windows[begin : begin + BATCH])
+        decoded: Tensor = model.codec.decode(model.codec.encode(to_unit(batch.images)))
+        images.append(to_uint8(decoded[:, 1:]).numpy())
+        touch = model.tokenizer.decode(model.tokenizer.encode(batch.tactile_kpa))
+        touches.append(touch[:, 1:].numpy())
+    return Futures(np.concatenate(images), np.concatenate(touches))
+
+
+def _other_actions(
+    places: Sequence[tuple[EpisodeArrays, int]],
+    requests: Sequence[PredictionRequest],
+    kind: ActionKind,
+) -> list[tuple[int, PredictionRequest]]:
+    """Each request with the actions of the next other episode of its task, at the same start."""
+    by_task: dict[str, list[EpisodeArrays]] = {}
+    for episode, _ in places:
+        if all(episode is not known for known in by_task.setdefault(episode.task, [])):
+            by_task[episode.task].append(episode)
+    others = []
+    for index, ((episode, start), request) in enumerate(zip(places, requests, strict=True)):
+        siblings = by_task[episode.task]
+        here = next(i for i, known in enumerate(siblings) if known is episode)
+        other = siblings[(here + 1) % len(siblings)]
+        num_steps = len(request.actions)
+        if other is not episode and start + num_steps <= len(other):
+            taken = _cut(other, start, num_steps, kind).request
+            others.append(
+                (index, replace(request, actions=taken.actions, action_kind=taken.action_kind))
+            )
+    return others
+
+
+def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]:
+    return {
+        f"psnr{suffix}": image_metrics.psnr(predicted=predicted.images, true=true.images),
+        f"tactile_mse{suffix}": tactile_metrics.mse(
+            predicted_kpa=predicted.tactile_kpa, true_kpa=true.tactile_kpa
+        ),
+        f"contact_f1{suffix}": tactile_metrics.contact_f1(
+            predicted_kpa=predicted.tactile_kpa, true_kpa=true.tactile_kpa
+        ),
+    }

@@ -1,0 +1,301 @@
+"""A checkpoint in, a world out: observations and action chunks to imagined observations."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.errors import (
+    InvalidInputError,
+    ShapeError,
+    UnavailableError,
+    UnknownNameError,
+)
+from dextouch.hands.actions import (
+    IDENTITY_POSE_9D,
+    POSE_SLICES,
+    AnchorPoses,
+    check_actions,
+    poses_from_actions,
+    reanchor,
+)
+from dextouch.streams.packing import pack, unpack
+from dextouch.worlds.world import (
+    ActionKind,
+    Observation,
+    RolloutStart,
+    StartedRollout,
+    SteppedRollout,
+    WorldDescription,
+)
+from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
+from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
+from services.world_model.network.model import Prediction, stack_noise
+from services.world_model.network.visual_codec import to_uint8
+
+CAMERA = "camera_head"
+MAX_SNAPSHOT_BYTES = 4 * 2**20
+_SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head")
+
+
+@dataclass(frozen=True)
+class ModelState:
+    """What the next chunk starts from; `reached` is relative to `anchor`, the poses of step 0."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    tactile_kpa: Float32[np.ndarray, "2 320"]
+    reached: Float64[np.ndarray, "67"]
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+    instruction: str
+    action_kind: ActionKind
+    step: int
+
+
+class ModelWorld:
+    """Implements `dextouch.worlds.world.BatchWorld` with a trained model.
+
+    Args:
+        checkpoint: loaded, from `read_checkpoint`.
+        sampling_steps: Euler steps; None takes the checkpoint's.
+    """
+
+    def __init__(self, checkpoint: Checkpoint, *, sampling_steps: int | None = None) -> None:
+        self._model = checkpoint.model
+        self._digest = checkpoint.digest
+        self._sampling_steps = sampling_steps
+        config, metadata = checkpoint.metadata.network, checkpoint.metadata
+        self._description = WorldDescription(
+            name=metadata.name,
+            kind="model",
+            digest=checkpoint.digest,
+            tasks=metadata.tasks,
+            cameras=(CAMERA,),
+            image_height_px=config.image_px,
+            image_width_px=config.image_px,
+            model_rate_hz=config.model_rate_hz,
+            action_kinds=ACTION_KINDS,
+            starts_from=("observation",),
+            max_chunk_steps=config.max_steps - 1,
+        )
+
+    @property
+    def description(self) -> WorldDescription:
+        """What this world is and accepts."""
+        return self._description
+
+    def reset(self, start: RolloutStart) -> StartedRollout[ModelState]:
+        """Begin from one observed step.
+
+        Raises:
+            UnknownNameError: a task or action kind that the model was not trained on.
+            InvalidInputError: no observation, anchor or K_head, or ones that do not fit.
+        """
+        if start.task not in self._description.tasks:
+            raise UnknownNameError("task", start.task, list(self._description.tasks))
+        observation, anchor, K_head = _complete(start)
+        reached = observation.action_reached[-1].copy()
+        for part in POSE_SLICES:
+            reached[part] = IDENTITY_POSE_9D
+        state = ModelState(
+            image=observation.images[CAMERA][-1],
+            tactile_kpa=np.maximum(observation.tactile_kpa[-1], 0.0),
+            reached=reached,
+            anchor=anchor,
+            K_head=K_head,
+            instruction=start.instruction,
+            action_kind=start.action_kind,
+            step=0,
+        )
+        # The same checks as of a chunk, now rather than at the first one.
+        standing = np.repeat(reached[None], self._description.chunk_multiple, axis=0)
+        build_inputs([_request(state, standing)], self._model.config)
+        return StartedRollout(state, _first_observation(state), anchor, K_head)
+
+    def step(
+        self, state: ModelState, actions: Float64[np.ndarray, "steps 67"], *, seed: int
+    ) -> SteppedRollout[ModelState]:
+        """Imagine one action chunk of 4k ≤ 16 steps.
+
+        Raises:
+            ShapeError: a chunk of another length.
+            InvalidInputError: actions that no hand can follow.
+            UnavailableError: the model gave numbers that are not finite.
+        """
+        return self.step_batch([state], np.asarray(actions)[None], seeds=[seed])[0]
+
+    def step_batch(
+        self,
+        states: Sequence[ModelState],
+        actions: Float64[np.ndarray, "batch steps 67"],
+        *,
+        seeds: Sequence[int],
+    ) -> list[SteppedRollout[ModelState]]:
+        """`step` for each entry at once; answers differ from single ones by rounding only."""
+        if not len(states) == len(actions) == len(seeds) or len(states) == 0:
+            raise ShapeError(
+                f"chunks: got {len(states)} states, {len(actions)} action chunks and {len(seeds)} "
+                "seeds, expected one of each for every rollout"
+            )
+        chunks = [self._checked_chunk(chunk) for chunk in actions]
+        requests = [_request(state, chunk) for state, chunk in zip(states, chunks, strict=True)]
+        inputs = build_inputs(requests, self._model.config)
+        noise = stack_noise(
+            [self._model.noise(inputs.num_steps, _generator(seed)) for seed in seeds]
+        )
+        future = self._model.predict(inputs, noise, sampling_steps=self._sampling_steps)
+        _refuse_non_finite(future)
+        images, touches = to_uint8(future.images).numpy(), future.tactile_kpa.numpy()
+        return [
+            _advance(state, chunk, image, touch)
+            for state, chunk, image, touch in zip(states, chunks, images, touches, strict=True)
+        ]
+
+    def snapshot(self, state: ModelState) -> bytes:
+        """The state as bytes that `restore` of the same checkpoint accepts."""
+        fields = {
+            "digest": self._digest,
+            "instruction": state.instruction,
+            "action_kind": state.action_kind,
+            "step": state.step,
+        }
+        arrays = {
+            "image": state.image,
+            "tactile_kpa": state.tactile_kpa,
+            "reached": state.reached,
+            "anchor": np.stack(state.anchor.as_tuple()),
+            "K_head": state.K_head,
+        }
+        return pack(fields, arrays)
+
+    def restore(self, data: bytes) -> ModelState:
+        """The state of a snapshot.
+
+        Raises:
+            InvalidInputError: bytes that are no snapshot of this checkpoint.
+        """
+        fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
+        if fields.get("digest") != self._digest:
+            raise InvalidInputError(
+                f"snapshot: of world {str(fields.get('digest'))[:12]!r}, expected "
+                f"{self._digest[:12]!r}; restore it in the world that made it"
+            )
+        step, words = fields.get("step"), fields.get("instruction")
+        if (
+            set(arrays) != set(_SNAPSHOT_ARRAYS)
+            or not isinstance(step, int)
+            or not isinstance(words, str)
+            or fields.get("action_kind") not in ACTION_KINDS
+            or arrays["anchor"].shape != (3, 4, 4)
+        ):
+            raise InvalidInputError(
+                f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
+                "this world's own snapshot writes"
+            )
+        state = ModelState(
+            image=arrays["image"],
+            tactile_kpa=arrays["tactile_kpa"],
+            reached=check_actions(arrays["reached"][None], where="snapshot")[0],
+            anchor=AnchorPoses(*arrays["anchor"]),
+            K_head=arrays["K_head"],
+            instruction=words,
+            action_kind=fields["action_kind"],
+            step=step,
+        )
+        standing = np.repeat(state.reached[None], self._description.chunk_multiple, axis=0)
+        build_inputs([_request(state, standing)], self._model.config)
+        return state
+
+    def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
+        chunk = check_actions(actions, where="action chunk")
+        multiple, longest = self._description.chunk_multiple, self._description.max_chunk_steps
+        if len(chunk) % multiple or len(chunk) > longest:
+            raise ShapeError(
+                f"action chunk: got {len(chunk)} rows, expected a multiple of {multiple} up to "
+                f"{longest}"
+            )
+        return chunk
+
+
+def open_world(path: Path | None = None, *, sampling_steps: int | None = None) -> ModelWorld:
+    """The world of a checkpoint file; without one, of that which comes with the package."""
+    checkpoint = read_checkpoint(path if path is not None else default_checkpoint())
+    return ModelWorld(checkpoint, sampling_steps=sampling_steps)
+
+
+def _complete(
+    start: RolloutStart,
+) -> tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]:
+    if start.observation is None or start.anchor is None or start.K_head is None:
+        raise InvalidInputError(
+            "start: this world begins from an observation; send one step of images, touch and "
+            "reached action together with the anchor poses and K_head"
+        )
+    if CAMERA not in start.observation.images:
+        raise UnknownNameError("camera of the start", "none of them", [CAMERA])
+    if len(start.observation) != 1:
+        raise ShapeError(f"start: got {len(start.observation)} observed steps, expected one")
+    return start.observation, start.anchor, start.K_head
+
+
+def _request(state: ModelState, chunk: np.ndarray) -> PredictionRequest:
+    """The chunk re-anchored to where the rollout stands."""
+    rows = np.concatenate([state.reached[None], chunk])
+    return PredictionRequest(
+        first_image=state.image,
+        first_tactile_kpa=state.tactile_kpa,
+        actions=reanchor(rows, 0),
+        action_kind=state.action_kind,
+        instruction=state.instruction,
+        anchor=poses_from_actions(state.reached[None], state.anchor).anchor(0),
+        K_head=state.K_head,
+    )
+
+
+def _advance(
+    state: ModelState, chunk: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray
+) -> SteppedRollout[ModelState]:
+    """The new state and what was imagined.
+
+    The model senses no pose: the next chunk starts from the last action that was given.
+    """
+    observation = Observation(
+        first_step=state.step + 1,
+        images={CAMERA: images},
+        tactile_kpa=tactile_kpa,
+        action_reached=chunk,
+        reached_is_measured=False,
+    )
+    following = replace(
+        state,
+        image=images[-1],
+        tactile_kpa=tactile_kpa[-1],
+        reached=chunk[-1],
+        step=state.step + len(chunk),
+    )
+    return SteppedRollout(following, observation)
+
+
+def _first_observation(state: ModelState) -> Observation:
+    return Observation(
+        first_step=0,
+        images={CAMERA: state.image[None]},
+        tactile_kpa=state.tactile_kpa[None],
+        action_reached=state.reached[None],
+        reached_is_measured=True,
+    )
+
+
+def _generator(seed: int) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def _refuse_non_finite(future: Prediction) -> None:
+    for what, values in (("image", future.images), ("touch", future.tactile_kpa)):
+        if not torch.isfinite(values).all():
+            raise UnavailableError(
+                f"world model: its {what} holds NaN or infinity; the rollout stands where it stood"
+            )
