@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas.episodes import FORMAT_VERSION, ID_PATTERN
+from dextouch.streams.checks import JPEG_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 
 Kind = Literal["episode", "recording"]
@@ -19,7 +20,6 @@ METADATA_FILE = "zarr.json"
 ATTRIBUTES_KEY = "dextouch"
 CHUNK_SECONDS = 0.5
 ZSTD_LEVEL = 1
-JPEG_UNIT = "jpeg"
 # JPEG bytes lie end to end in one array; its storage chunks are only the unit of checksums.
 JPEG_CHUNK_BYTES = 1 << 16
 JPEG_END_SUFFIX = "_end"

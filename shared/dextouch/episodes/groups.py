@@ -13,7 +13,6 @@ from dextouch.episodes.format import (
     ATTRIBUTES_KEY,
     COMMIT_FILE,
     JPEG_END_SUFFIX,
-    JPEG_UNIT,
     METADATA_FILE,
     STAMPS,
     Kind,
@@ -28,6 +27,7 @@ from dextouch.errors import CorruptDataError, StorageError, UnknownNameError
 from dextouch.images.jpeg import decode_jpeg
 from dextouch.schemas.episodes import EpisodeAttributes, Verification
 from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.checks import JPEG_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)

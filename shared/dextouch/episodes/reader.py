@@ -8,7 +8,6 @@ import numpy as np
 from dextouch.episodes.format import STAMPS
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.window import (
-    ActionKind,
     NativeWindow,
     StreamData,
     Window,
@@ -20,6 +19,7 @@ from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas.rollouts import ActionKind
 from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS
 

@@ -1,14 +1,13 @@
 """Stamps and samples at native rates → values on the model grid, and the window they make up."""
 
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
 from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.rollouts import ActionKind
 
-ActionKind = Literal["measured", "commanded"]
 # Stamps of one instant may differ by the rounding of whoever computed them.
 SAME_INSTANT_NS = 1_000
 

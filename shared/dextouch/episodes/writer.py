@@ -14,7 +14,6 @@ from dextouch.episodes.format import (
     COMMIT_FILE,
     JPEG_CHUNK_BYTES,
     JPEG_END_SUFFIX,
-    JPEG_UNIT,
     METADATA_FILE,
     STAMPS,
     ArrayEntry,
@@ -39,6 +38,7 @@ from dextouch.errors import (
 from dextouch.images.jpeg import encode_jpeg, jpeg_size
 from dextouch.schemas.episodes import EpisodeAttributes, json_ready
 from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.checks import JPEG_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
 

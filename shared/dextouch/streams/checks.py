@@ -1,0 +1,62 @@
+"""A batch and its stream's descriptor → nothing, or the refusal that says what does not fit."""
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import SampleBatch
+
+JPEG_UNIT = "jpeg"
+
+
+def check_batch(
+    descriptor: StreamDescriptor, batch: SampleBatch, *, last_t_host_ns: int | None = None
+) -> None:
+    """Refuse a batch that is not of this stream.
+
+    Args:
+        descriptor: of the stream.
+        batch: values of the descriptor's dtype and shape; for unit `jpeg` an object array of
+            bytes; `t_host_ns` never decreases.
+        last_t_host_ns: stamp of the sample before the batch.
+
+    Raises:
+        ShapeError: another dtype or shape.
+        InvalidInputError: stamps that go back, or an empty image.
+    """
+    values, name = batch.values, descriptor.name
+    for stamp in ("t_host_ns", "t_device_ns", "sequence"):
+        column = getattr(batch, stamp)
+        if column.dtype != np.int64 or column.shape != (len(batch),):
+            raise ShapeError(f"{name}: {stamp} is {column.dtype} {column.shape}, expected int64")
+    if descriptor.unit == JPEG_UNIT:
+        _check_images(name, values)
+    elif values.dtype != descriptor.numpy_dtype() or values.shape[1:] != descriptor.shape:
+        raise ShapeError(
+            f"{name}: got values {values.dtype} {values.shape}, expected {descriptor.dtype} "
+            f"[n, {', '.join(map(str, descriptor.shape))}]"
+        )
+    if not len(batch):
+        return
+    if last_t_host_ns is not None and int(batch.t_host_ns[0]) < last_t_host_ns:
+        raise InvalidInputError(
+            f"{name}: t_host_ns goes back to {int(batch.t_host_ns[0])} from {last_t_host_ns}; "
+            "append samples in the order of their arrival"
+        )
+    back = np.flatnonzero(np.diff(batch.t_host_ns) < 0)
+    if len(back):
+        raise InvalidInputError(
+            f"{name}: t_host_ns goes back after sample {int(back[0])} of the batch; "
+            "append samples in the order of their arrival"
+        )
+
+
+def _check_images(name: str, values: np.ndarray) -> None:
+    if values.dtype != object or values.ndim != 1:
+        raise ShapeError(
+            f"{name}: got values {values.dtype} {values.shape}, expected an object array of "
+            "JPEG bytes (see dextouch.images.jpeg.jpeg_values)"
+        )
+    for index, data in enumerate(values):
+        if not isinstance(data, bytes) or not data:
+            raise InvalidInputError(f"{name}: image {index} is no JPEG bytes")

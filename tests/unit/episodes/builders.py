@@ -1,1 +1,0 @@
-"""Small made-up episodes and recordings for the tests of the store."""
