@@ -1,0 +1,139 @@
+"""Several service applications in, all of them served from one event loop until told to stop."""
+
+import asyncio
+import signal
+import socket
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import uvicorn
+from fastapi import FastAPI
+
+from dextouch.errors import ConflictError, UnavailableError
+
+BACKLOG = 128
+
+
+class Server(uvicorn.Server):
+    """One service; signals belong to whoever runs all of them."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self.answers = asyncio.Event()
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Start, and say when that is done.
+
+        Raises:
+            UnavailableError: the service's own start failed; its log says why.
+        """
+        try:
+            await super().startup(sockets)
+        except SystemExit as error:  # uvicorn would end the whole process
+            raise UnavailableError("the service did not start") from error
+        self.answers.set()
+
+    @contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        """Leave the process's signal handlers alone."""
+        yield
+
+
+@dataclass(frozen=True)
+class Place:
+    """A bound socket: the URL is known before the service exists, so others can be told it."""
+
+    name: str
+    socket: socket.socket
+
+    @property
+    def url(self) -> str:
+        """Where the service answers."""
+        host, port = self.socket.getsockname()[:2]
+        return f"http://{host}:{port}"
+
+
+def bind(name: str, *, host: str, port: int) -> Place:
+    """Take a port; 0 takes any free one.
+
+    Raises:
+        ConflictError: the port is taken, or this host is not ours.
+    """
+    listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise ConflictError(
+            f"{name}: cannot listen on {host}:{port} ({error.strerror}); "
+            f"choose another port with --{name}_port, or 0 for any free one"
+        ) from error
+    return Place(name, listener)
+
+
+async def serve_all(
+    placed: Sequence[tuple[Place, FastAPI]],
+    *,
+    stop: asyncio.Event,
+    ready: asyncio.Event,
+    grace_s: int = 10,
+) -> None:
+    """Serve until `stop` is set; set `ready` once all of them answer.
+
+    Raises:
+        UnavailableError: a service ended by itself; the others were stopped in order.
+    """
+    servers = {place.name: _server(app, grace_s) for place, app in placed}
+    tasks = {
+        place.name: asyncio.create_task(servers[place.name].serve(sockets=[place.socket]))
+        for place, _ in placed
+    }
+    stopping = asyncio.create_task(stop.wait())
+    announcing = asyncio.create_task(_announce(list(servers.values()), ready))
+    await asyncio.wait([stopping, *tasks.values()], return_when=asyncio.FIRST_COMPLETED)
+    ended = [name for name, task in tasks.items() if task.done()]
+    # In reverse: readers go before what they read from.
+    for name in reversed(list(servers)):
+        servers[name].should_exit = True
+        await asyncio.wait([tasks[name]])
+    for task in (stopping, announcing):
+        task.cancel()
+    for place, _ in placed:
+        place.socket.close()
+    failures = [error for task in tasks.values() if (error := task.exception()) is not None]
+    if failures or (ended and not stop.is_set()):
+        raise UnavailableError(
+            f"service ended by itself: {', '.join(ended) or 'unknown'}; its log above says why"
+        ) from (failures[0] if failures else None)
+
+
+def stop_on_signals(stop: asyncio.Event) -> None:
+    """SIGINT and SIGTERM set `stop`; a second one ends the process at once."""
+    loop = asyncio.get_running_loop()
+
+    def on_signal(number: signal.Signals) -> None:
+        stop.set()
+        loop.remove_signal_handler(number)
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, on_signal, number)
+
+
+async def _announce(servers: Sequence[Server], ready: asyncio.Event) -> None:
+    for server in servers:
+        await server.answers.wait()
+    ready.set()
+
+
+def _server(app: FastAPI, grace_s: int) -> Server:
+    config = uvicorn.Config(
+        app,
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        backlog=BACKLOG,
+        timeout_graceful_shutdown=grace_s,
+    )
+    return Server(config)

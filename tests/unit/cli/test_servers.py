@@ -1,0 +1,61 @@
+"""Several services in one process: known URLs, one stop for all, a failing one is said."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from dextouch.errors import ConflictError, UnavailableError
+from services.cli.servers import bind, serve_all
+
+
+def app_named(name, lives, *, fails=False):
+    @asynccontextmanager
+    async def lifespan(_):
+        if fails:
+            raise RuntimeError("planted")
+        lives.append(f"{name} up")
+        yield
+        lives.append(f"{name} down")
+
+    app = FastAPI(lifespan=lifespan)
+    app.get("/")(lambda: name)
+    return app
+
+
+async def test_all_answer_and_stop_in_reverse():
+    lives = []
+    placed = [
+        (bind(name, host="127.0.0.1", port=0), app_named(name, lives)) for name in ("store", "page")
+    ]
+    stop, ready = asyncio.Event(), asyncio.Event()
+    serving = asyncio.create_task(serve_all(placed, stop=stop, ready=ready))
+    await asyncio.wait_for(ready.wait(), 10)
+    async with httpx.AsyncClient(trust_env=False) as client:
+        answers = [(await client.get(place.url)).json() for place, _ in placed]
+    assert answers == ["store", "page"]
+    stop.set()
+    await asyncio.wait_for(serving, 10)
+    assert lives[-2:] == ["page down", "store down"]
+
+
+async def test_a_service_that_cannot_start_ends_all():
+    lives = []
+    placed = [
+        (bind("store", host="127.0.0.1", port=0), app_named("store", lives)),
+        (bind("page", host="127.0.0.1", port=0), app_named("page", lives, fails=True)),
+    ]
+    with pytest.raises(UnavailableError, match="ended by itself: page"):
+        await asyncio.wait_for(serve_all(placed, stop=asyncio.Event(), ready=asyncio.Event()), 10)
+    assert "store down" in lives
+
+
+def test_a_taken_port_is_named():
+    place = bind("store", host="127.0.0.1", port=0)
+    place.socket.listen()
+    port = place.socket.getsockname()[1]
+    with pytest.raises(ConflictError, match=rf"cannot listen on 127.0.0.1:{port}.*--page_port"):
+        bind("page", host="127.0.0.1", port=port)
+    place.socket.close()
