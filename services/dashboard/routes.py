@@ -4,7 +4,7 @@ import asyncio
 import json
 from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Body, Depends, Request, Response, WebSocket, WebSocketDisconnect
@@ -36,12 +36,15 @@ WEBSOCKET_REFUSED = 1008
 
 
 class RecorderRequest(BaseModel):
-    """What an operator sends with a recorder action; `arm` needs both."""
+    """What an operator sends with an action: a prompt with `arm`, an outcome with `save`."""
 
     model_config = ConfigDict(extra="forbid")
 
-    task: str | None = Field(default=None, min_length=1, max_length=64)
-    instruction: str | None = Field(default=None, min_length=1, max_length=400)
+    task: str | None = Field(default=None, min_length=1, max_length=128)
+    instruction: str | None = Field(default=None, min_length=1, max_length=2000)
+    domain: Literal["human", "robot"] | None = None
+    success: bool | None = None
+    accept_incomplete: bool | None = None
 
 
 def guard(connection: HTTPConnection) -> None:

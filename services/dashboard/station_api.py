@@ -19,15 +19,6 @@ RECORDER_PATH = "/v1/recorder"
 TAXELS_PATH = "/v1/live/taxels"
 CAMERAS_PATH = "/v1/live/cameras"
 
-# What an operator may do in each state of the recorder.
-ACTIONS: dict[str, tuple[str, ...]] = {
-    "idle": ("arm",),
-    "armed": ("record", "discard"),
-    "recording": ("stop", "discard"),
-    "checking": ("save", "discard"),
-    "saved": ("arm",),
-    "discarded": ("arm",),
-}
 ALL_ACTIONS = ("arm", "record", "stop", "save", "discard")
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
@@ -40,39 +31,73 @@ class _Answer(BaseModel):
 
 
 class StreamHealth(_Answer):
-    """Health of one stream as acquisition tells it."""
+    """One stream as acquisition judges it; clock figures only where a clock is being fitted."""
 
     stream: str
     level: Level
     reasons: tuple[str, ...] = ()
     rate_hz: float | None = None
     nominal_rate_hz: float | None = None
-    lost: int | None = None
-    received: int | None = None
     age_s: float | None = None
+    drop_ratio: float | None = None
     skew_ppm: float | None = None
     clock_residual_ms: float | None = None
 
 
+class DeviceHealth(_Answer):
+    """One device with its streams."""
+
+    device: str
+    level: Level
+    lost: int | None = None
+    reconnects: int = 0
+    dead_taxels: int = 0
+    last_error: str | None = None
+    streams: tuple[StreamHealth, ...] = ()
+
+
 class StationHealth(_Answer):
-    """Health of all streams."""
+    """All devices."""
 
-    streams: tuple[StreamHealth, ...]
+    devices: tuple[DeviceHealth, ...]
 
 
-class RecorderState(_Answer):
+class TakeProblem(_Answer):
+    """Something found in a take right after its end."""
+
+    message: str
+
+
+class TakeCheck(_Answer):
+    """Whether a take is complete."""
+
+    complete: bool
+    problems: tuple[TakeProblem, ...] = ()
+
+
+class RecorderStatus(_Answer):
     """Where the recorder stands."""
 
     state: str
-    duration_s: float | None = None
-    problems: tuple[str, ...] = ()
+    actions: tuple[str, ...]
     recording_id: str | None = None
+    elapsed_s: float | None = None
+    failure: str | None = None
+    check: TakeCheck | None = None
+
+
+class CameraLive(_Answer):
+    """A camera whose newest image can be had."""
+
+    name: str
+    sequence: int
+    age_s: float | None = None
 
 
 class CameraList(_Answer):
-    """Cameras with a newest image."""
+    """Cameras that have sent an image."""
 
-    cameras: tuple[CameraView, ...]
+    cameras: tuple[CameraLive, ...]
 
 
 def action_path(action: str) -> str:
@@ -97,7 +122,8 @@ def station_view(health: object, recorder: object) -> StationView:
     Raises:
         UnavailableError: answers in a form this version does not know.
     """
-    streams = tuple(_stream_view(item) for item in _read(StationHealth, health).streams)
+    devices = _read(StationHealth, health).devices
+    streams = tuple(_stream_view(device, item) for device in devices for item in device.streams)
     levels = [stream.level for stream in streams]
     return StationView(
         reachable=True,
@@ -111,35 +137,47 @@ def station_view(health: object, recorder: object) -> StationView:
 
 def recorder_view(answer: object) -> RecorderView:
     """The recorder from its own answer."""
-    recorder = _read(RecorderState, answer)
-    level: Level = "WARN" if recorder.problems else "OK"
-    named = f"{recorder.recording_id}: " if recorder.recording_id else ""
-    note = named + "; ".join(recorder.problems) if recorder.problems else recorder.recording_id
+    recorder = _read(RecorderStatus, answer)
+    complete = recorder.check is None or recorder.check.complete
+    words = [recorder.failure] if recorder.failure else []
+    if recorder.check is not None:
+        words += [problem.message for problem in recorder.check.problems]
+        words += [] if words else ["complete"]
+    named = [recorder.recording_id] if recorder.recording_id else []
     return RecorderView(
         state=recorder.state,
-        actions=ACTIONS.get(recorder.state, ()),
-        elapsed_s=recorder.duration_s,
-        level=level,
-        note=note or "",
+        actions=recorder.actions,
+        elapsed_s=recorder.elapsed_s,
+        level="ERROR" if recorder.failure else "OK" if complete else "WARN",
+        complete=complete,
+        note=" · ".join([*named, *words]),
     )
 
 
 def camera_views(answer: object) -> list[CameraView]:
     """The cameras from the answer at CAMERAS_PATH."""
-    return list(_read(CameraList, answer).cameras)
+    return [
+        CameraView(name=camera.name, image_index=camera.sequence, age_s=camera.age_s)
+        for camera in _read(CameraList, answer).cameras
+    ]
 
 
-def _stream_view(item: StreamHealth) -> StreamView:
-    offered = (item.received or 0) + (item.lost or 0)
-    percent = None if item.lost is None or offered == 0 else 100 * item.lost / offered
+def _stream_view(device: DeviceHealth, item: StreamHealth) -> StreamView:
+    words = list(item.reasons)
+    if device.reconnects:
+        words.append(f"{device.reconnects} reconnects")
+    if device.dead_taxels:
+        words.append(f"{device.dead_taxels} dead taxels")
+    if device.last_error and item.level in {"ERROR", "STALE"}:
+        words.append(device.last_error)
     return StreamView(
         name=item.stream,
         level=item.level,
-        message="; ".join(item.reasons),
+        message=" · ".join(words),
         rate_hz=item.rate_hz,
         nominal_rate_hz=item.nominal_rate_hz,
-        dropped=item.lost,
-        drop_percent=percent,
+        dropped=device.lost,
+        drop_percent=None if item.drop_ratio is None else 100 * item.drop_ratio,
         age_s=item.age_s,
         skew_ppm=item.skew_ppm,
         clock_error_ms=item.clock_residual_ms,

@@ -42,6 +42,7 @@ class RecorderView(BaseModel):
     actions: tuple[str, ...] = ()
     elapsed_s: float | None = None
     level: Level = "OK"
+    complete: bool = True
     note: str = ""
 
 

@@ -28,8 +28,8 @@ function row(stream) {
     rateCell(stream),
     element("td", { class: "number" }, drops(stream)),
     element("td", { class: "number" }, age(stream.age_s)),
-    element("td", { class: "number" }, number(stream.skew_ppm, 1, "ppm")),
-    element("td", { class: "number" }, number(stream.clock_error_ms, 2, "ms")),
+    element("td", { class: "number clock_figure" }, number(stream.skew_ppm, 1, "ppm")),
+    element("td", { class: "number clock_figure" }, number(stream.clock_error_ms, 2, "ms")),
   );
 }
 
@@ -37,5 +37,7 @@ export function showDevices(body, note, station) {
   note.hidden = station.note === "";
   note.textContent = station.note;
   note.dataset.level = station.reachable ? "OK" : "ERROR";
+  const clocks = station.streams.some((stream) => stream.skew_ppm !== null || stream.clock_error_ms !== null);
+  body.closest("table").classList.toggle("no_clocks", !clocks);
   body.replaceChildren(...station.streams.map(row));
 }

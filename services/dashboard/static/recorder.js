@@ -12,7 +12,8 @@ export class RecorderPanel {
     this.buttons = [...root.querySelectorAll("button[data-action]")];
     this.recorder = null;
     this.received_ms = 0;
-    this.discard_until_ms = 0;
+    this.asked = null;
+    this.asked_until_ms = 0;
     for (const button of this.buttons) button.addEventListener("click", () => this.act(button.dataset.action));
     document.addEventListener("keydown", (event) => this.onKey(event));
     this.find("prompt").addEventListener("submit", (event) => event.preventDefault());
@@ -21,7 +22,7 @@ export class RecorderPanel {
   }
 
   onKey(event) {
-    const typing = event.target instanceof HTMLInputElement;
+    const typing = event.target instanceof HTMLInputElement || event.target instanceof HTMLSelectElement;
     if (typing || event.repeat || event.ctrlKey || event.metaKey || event.altKey) return;
     const button = this.buttons.find((candidate) => candidate.dataset.key === event.key.toLowerCase());
     if (!button || button.disabled) return;
@@ -29,17 +30,36 @@ export class RecorderPanel {
     this.act(button.dataset.action);
   }
 
-  async act(action) {
-    if (action === "discard" && performance.now() > this.discard_until_ms) {
-      this.discard_until_ms = performance.now() + CONFIRM_MS;
-      this.say("Discard this take? Press D or the button again within three seconds.", "WARN");
-      return;
+  // Throwing a take away, or keeping one with holes, takes the same key twice.
+  confirmed(action, question) {
+    const now_ms = performance.now();
+    if (this.asked === action && now_ms < this.asked_until_ms) {
+      this.asked = null;
+      return true;
     }
+    this.asked = action;
+    this.asked_until_ms = now_ms + CONFIRM_MS;
+    this.say(`${question} Once more within three seconds to do it.`, "WARN");
+    return false;
+  }
+
+  body(action) {
+    if (action === "arm") {
+      return { task: this.find("task").value.trim(), instruction: this.find("instruction").value.trim(), domain: this.find("domain").value };
+    }
+    if (action === "save") {
+      const outcome = this.find("outcome").value;
+      const success = outcome === "" ? {} : { success: outcome === "true" };
+      return { ...success, accept_incomplete: !this.recorder.complete };
+    }
+    return {};
+  }
+
+  async act(action) {
+    if (action === "discard" && !this.confirmed(action, "Discard this take?")) return;
+    if (action === "save" && !this.recorder.complete && !this.confirmed(action, "This take is incomplete. Save it anyway?")) return;
     if (action === "arm" && !this.find("prompt").reportValidity()) return;
-    const body = action === "arm"
-      ? { task: this.find("task").value.trim(), instruction: this.find("instruction").value.trim() }
-      : {};
-    this.discard_until_ms = 0;
+    const body = this.body(action);
     try {
       const answer = await fetch(`/v1/recorder/${action}`, {
         method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
@@ -80,7 +100,7 @@ export class RecorderPanel {
     const allowed = new Set(this.recorder?.actions ?? []);
     for (const button of this.buttons) button.disabled = !allowed.has(button.dataset.action);
     const locked = ["recording", "checking"].includes(this.recorder?.state);
-    for (const id of ["task", "instruction"]) this.find(id).disabled = locked;
+    for (const id of ["task", "instruction", "domain"]) this.find(id).disabled = locked;
   }
 
   tick() {

@@ -28,13 +28,11 @@ class FakeServices:
     """Acquisition and store in one; tests change `health`, `recorder` and read `asked`."""
 
     def __init__(self):
-        self.health = {
-            "streams": [
-                {"stream": "tactile_left", "level": "OK", "rate_hz": 59.9, "nominal_rate_hz": 60.0}
-                | {"lost": 2, "received": 998, "age_s": 0.01, "skew_ppm": 49.8}
-            ]
-        }
-        self.recorder = {"state": "idle"}
+        self.stream = {"stream": "tactile_left", "level": "OK", "reasons": [], "rate_hz": 59.9}
+        self.stream |= {"nominal_rate_hz": 60.0, "age_s": 0.01, "drop_ratio": 0.002}
+        device = {"device": "glove_left", "level": "OK", "lost": 2, "streams": [self.stream]}
+        self.health = {"station": "one", "level": "OK", "devices": [device]}
+        self.recorder = {"state": "idle", "actions": ["arm"]}
         self.asked = []
         self.app = FastAPI()
         self.app.middleware("http")(self._note)
@@ -60,7 +58,7 @@ class FakeServices:
             return JSONResponse(
                 problem | {"status": 409, "detail": "record: got state idle, expected armed"}, 409
             )
-        self.recorder = {"state": {"arm": "armed", "record": "recording"}[action]}
+        self.recorder = {"state": "armed", "actions": ["record", "discard"]}
         self.asked.append(wanted)
         return self.recorder
 

@@ -21,15 +21,36 @@ async def test_station(feeds):
     assert (view.reachable, view.level, view.summary) == (True, "OK", "1 OK")
     (stream,) = view.streams
     assert (stream.name, stream.dropped, stream.drop_percent) == ("tactile_left", 2, 0.2)
-    assert (stream.skew_ppm, stream.clock_error_ms) == (49.8, None)
+    assert (stream.skew_ppm, stream.clock_error_ms) == (None, None)
     assert view.recorder.actions == ("arm",)
 
 
 async def test_worst_level_leads(feeds, services):
-    row = services.health["streams"][0]
-    services.health["streams"] = [row | {"level": level} for level in ("OK", "STALE", "WARN")]
+    levels = ("OK", "STALE", "WARN")
+    services.health["devices"][0]["streams"] = [services.stream | {"level": it} for it in levels]
     view = await feeds.station()
     assert (view.level, view.summary) == ("STALE", "1 STALE · 1 WARN · 1 OK")
+
+
+async def test_what_ails_a_device_is_said(feeds, services):
+    services.stream |= {"level": "STALE", "reasons": ["no sample for 2.0 s"]}
+    services.health["devices"][0] |= {"reconnects": 3, "dead_taxels": 16, "last_error": "gone"}
+    (stream,) = (await feeds.station()).streams
+    assert stream.message == "no sample for 2.0 s · 3 reconnects · 16 dead taxels · gone"
+
+
+async def test_incomplete_take_is_shown(feeds, services):
+    problem = {"stream": "head", "code": "gap", "level": "ERROR", "message": "head: 0.4 s gap"}
+    services.recorder = {
+        "state": "checking",
+        "actions": ["save", "discard"],
+        "recording_id": "take-7",
+        "elapsed_s": 5.5,
+        "check": {"complete": False, "problems": [problem]},
+    }
+    recorder = (await feeds.station()).recorder
+    assert (recorder.complete, recorder.level, recorder.elapsed_s) == (False, "WARN", 5.5)
+    assert recorder.note == "take-7 · head: 0.4 s gap"
 
 
 async def test_absent_station_shows_no_numbers():
@@ -41,7 +62,7 @@ async def test_absent_station_shows_no_numbers():
 
 
 async def test_answer_of_another_form_is_named(feeds, services):
-    services.health = {"streams": [{"stream": "x", "level": "FINE"}]}
+    services.health = {"devices": [{"device": "x", "level": "FINE"}]}
     view = await feeds.station()
     assert not view.reachable
     assert "answer of an unknown form" in view.note
