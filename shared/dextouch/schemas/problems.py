@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import from_json, to_json
 
 from dextouch import errors
@@ -116,3 +116,12 @@ def error_from_problem(problem: Problem) -> DexTouchError:
     details = {key: value for key, value in problem.details.items() if key not in RESERVED}
     DexTouchError.__init__(error, problem.detail, **details)
     return error
+
+
+def first_problems(error: ValidationError, *, limit: int = 5) -> str:
+    """What pydantic found, in one line, without the input itself."""
+    items = error.errors(include_input=False, include_url=False)[:limit]
+    return "; ".join(
+        f"{'.'.join(str(part) for part in item['loc']) or 'fields'}: {item['msg']}"
+        for item in items
+    )

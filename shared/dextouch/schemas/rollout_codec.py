@@ -10,6 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, ShapeError
 from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.problems import first_problems
 from dextouch.schemas.rollouts import (
     Observation,
     ReturnSelector,
@@ -111,6 +112,22 @@ def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
     origin = _origin_from(arrays, where="answer") if "K_head" in arrays else None
     observation = _observation_from(fields.observation, arrays, where="answer")
     return RolloutAnswer(fields.rollout, observation, fields.info, origin)
+
+
+def encode_observation(observation: Observation) -> bytes:
+    """An observation alone, for a world's snapshot."""
+    return pack(_fields_of(observation).model_dump(mode="json"), _observation_arrays(observation))
+
+
+def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
+    """Inverse of `encode_observation`.
+
+    Raises:
+        InvalidInputError: bytes that are no observation.
+    """
+    raw, arrays = unpack(data, max_bytes=max_bytes)
+    fields = _validated(ObservationFields, raw, where="observation")
+    return _observation_from(fields, arrays, where="observation")
 
 
 def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
@@ -235,8 +252,4 @@ def _validated(model: type[ModelT], fields: object, *, where: str) -> ModelT:
     try:
         return model.model_validate(fields)
     except ValidationError as error:
-        found = "; ".join(
-            f"{'.'.join(str(part) for part in item['loc']) or 'fields'}: {item['msg']}"
-            for item in error.errors(include_input=False, include_url=False)
-        )
-        raise InvalidInputError(f"{where}: {found}") from error
+        raise InvalidInputError(f"{where}: {first_problems(error)}") from error

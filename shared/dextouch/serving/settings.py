@@ -8,6 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, m
 from pydantic_settings import BaseSettings, CliApp, SettingsConfigDict
 
 from dextouch.errors import InvalidInputError
+from dextouch.schemas.problems import first_problems
 
 MIN_KEY_CHARACTERS = 16
 SettingsT = TypeVar("SettingsT", bound="ServiceSettings")
@@ -76,11 +77,7 @@ def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
     try:
         return CliApp.run(cls, cli_args=arguments)
     except ValidationError as error:
-        found = "; ".join(
-            f"{'.'.join(str(part) for part in item['loc']) or 'settings'}: {item['msg']}"
-            for item in error.errors(include_input=False, include_url=False)
-        )
-        raise InvalidInputError(f"settings of {cls.__name__}: {found}") from error
+        raise InvalidInputError(f"settings of {cls.__name__}: {first_problems(error)}") from error
 
 
 def is_loopback(host: str) -> bool:

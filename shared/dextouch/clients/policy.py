@@ -1,0 +1,42 @@
+"""The Policy protocol: an observation in, the next action chunk out."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.rollouts import Observation
+
+
+@dataclass(frozen=True)
+class PolicyStart:
+    """What a policy may know before its first observation.
+
+    `anchor` are the absolute poses of the rollout's step 0, which all actions are relative to;
+    `seed` is for the policy's own random numbers.
+    """
+
+    task: str
+    instruction: str
+    seed: int
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """Acts in any world: it sees observations and cannot tell worlds apart."""
+
+    def reset(self, start: PolicyStart) -> None:
+        """Forget the last rollout and begin another."""
+        ...
+
+    def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
+        """The next chunk, from everything seen since the last call (the last step is now).
+
+        Rows are poses and joint angles as commands, relative to the rollout's step 0; their
+        number is a multiple of the world's chunk.
+        """
+        ...

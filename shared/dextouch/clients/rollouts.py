@@ -1,0 +1,227 @@
+"""Action chunks to a served world, observations back; base dependencies only.
+
+with RolloutClient("http://127.0.0.1:8100") as client:
+    with client.start(world="twin", task="stand_bottle", seed=3, instruction="…") as rollout:
+        while not rollout.observation.success:
+            rollout.step(policy.act(rollout.observation))
+"""
+
+from types import TracebackType
+from typing import TypeVar
+from urllib.parse import urlencode
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ValidationError
+
+from dextouch.clients.http_link import HttpLink, Reply
+from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError
+from dextouch.hands.actions import AnchorPoses, check_actions
+from dextouch.schemas.problems import first_problems
+from dextouch.schemas.rollout_codec import (
+    Origin,
+    RolloutAnswer,
+    decode_answer,
+    encode_start,
+)
+from dextouch.schemas.rollouts import (
+    ActionKind,
+    ForkRequest,
+    Observation,
+    ReturnSelector,
+    RolloutInfo,
+    RolloutStart,
+    StartRequest,
+    WorldDescription,
+    WorldList,
+)
+
+MSGPACK = "application/msgpack"
+ACTIONS_TYPE = "application/octet-stream; dtype=float64"
+MAX_ANSWER_BYTES = 2**28
+ALL = ReturnSelector()
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+# An observation of one step made elsewhere, the poses at that step and the head camera's matrix.
+InitialObservation = tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]
+
+
+class RolloutClient:
+    """A connection to a service of worlds; for one thread (open one a thread).
+
+    Args:
+        url: of the service.
+        api_key: with the scope `rollout`; None where the service needs none.
+        timeout_s: for one answer.
+        selector: which cameras and steps every rollout of this client gets back.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        api_key: str | None = None,
+        *,
+        timeout_s: float = 60.0,
+        selector: ReturnSelector = ALL,
+    ) -> None:
+        if not selector.tactile:
+            raise InvalidInputError("selector: an Observation holds touch; expected tactile=True")
+        self._link = HttpLink(url, api_key=api_key, timeout_s=timeout_s)
+        self._query = _query(selector)
+
+    def worlds(self) -> list[WorldDescription]:
+        """What can be rolled out there."""
+        reply = self._link.request("GET", "/v1/worlds")
+        return list(_parsed(WorldList, reply).worlds)
+
+    def start(
+        self,
+        *,
+        world: str,
+        task: str,
+        seed: int,
+        instruction: str,
+        init: InitialObservation | None = None,
+        action_kind: ActionKind = "commanded",
+    ) -> "Rollout":
+        """Begin a future from a task and seed, or from an observation made elsewhere.
+
+        A connection that is lost meanwhile may leave a second, unused rollout at the service; it
+        expires there by itself.
+
+        Raises:
+            UnknownNameError: world, task or action kind (the valid ones are listed).
+            InvalidInputError: a start that this world cannot begin from.
+            LimitExceededError: the service has as many rollouts as it allows.
+            UnavailableError: the service does not answer.
+        """
+        request = _start_request(
+            world=world, task=task, seed=seed, instruction=instruction, action_kind=action_kind
+        )
+        observation, anchor, K_head = (None, None, None) if init is None else init
+        start = RolloutStart(task, seed, instruction, action_kind, observation, anchor, K_head)
+        reply = self._link.request(
+            "POST",
+            f"/v1/rollouts?{self._query}",
+            body=encode_start(request, start),
+            content_type=MSGPACK,
+            accept=MSGPACK,
+        )
+        answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
+        if answer.origin is None:
+            raise UnavailableError("start: the answer holds no anchor; is the service too old?")
+        return Rollout(self._link, self._query, answer, answer.origin)
+
+    def close(self) -> None:
+        """Close the connection; rollouts stay at the service until closed or expired."""
+        self._link.close()
+
+    def __enter__(self) -> "RolloutClient":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+class Rollout:
+    """One future at a service: what is seen now, and what every action is relative to.
+
+    Attributes:
+        observation: the newest; n steps, of which the last is now.
+        anchor: absolute poses of step 0, which actions are relative to for the whole rollout.
+        K_head: the head camera's matrix in pixels.
+        info: where it stands.
+        told: numbers the world told about the newest chunk.
+    """
+
+    def __init__(self, link: HttpLink, query: str, answer: RolloutAnswer, origin: Origin) -> None:
+        self._link = link
+        self._query = query
+        self._origin = origin
+        self.info = answer.rollout
+        self.observation = answer.observation
+        self.anchor = origin.anchor
+        self.K_head = origin.K_head
+        self.told = answer.info
+
+    @property
+    def id(self) -> str:
+        """Its name at the service."""
+        return self.info.id
+
+    def step(self, actions: np.ndarray) -> Observation:
+        """Advance by one action chunk.
+
+        If this raises UnavailableError, the same call may be made again: a chunk that the service
+        already took is not taken twice, its answer is given again.
+
+        Args:
+            actions: [K, 67], K a multiple of the world's chunk; row i is the pose at step i+1 of
+                the chunk, relative to the rollout's step 0.
+
+        Returns:
+            What was seen at the K steps (the last one if the client's selector says so).
+        """
+        checked = check_actions(actions, where=f"rollout {self.id}")
+        reply = self._link.request(
+            "POST",
+            f"/v1/rollouts/{self.id}/chunks/{self.info.next_chunk}?{self._query}",
+            body=checked.astype("<f8").tobytes(),
+            content_type=ACTIONS_TYPE,
+            accept=MSGPACK,
+        )
+        answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
+        self.info, self.observation, self.told = answer.rollout, answer.observation, answer.info
+        return self.observation
+
+    def fork(self, *, seed: int | None = None) -> "Rollout":
+        """Branch here; a new seed gives the branch noise of its own."""
+        body = ForkRequest(seed=seed).model_dump_json().encode()
+        reply = self._link.request("POST", f"/v1/rollouts/{self.id}/fork", body=body)
+        info = _parsed(RolloutInfo, reply)
+        answer = RolloutAnswer(info, self.observation, self.told, self._origin)
+        return Rollout(self._link, self._query, answer, self._origin)
+
+    def close(self) -> None:
+        """End it at the service; an expired rollout counts as ended."""
+        try:
+            self._link.request("DELETE", f"/v1/rollouts/{self.id}")
+        except NotFoundError:
+            return
+
+    def __enter__(self) -> "Rollout":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+
+def _start_request(**fields: object) -> StartRequest:
+    try:
+        return StartRequest.model_validate(fields)
+    except ValidationError as error:
+        raise InvalidInputError(f"start: {first_problems(error)}") from error
+
+
+def _query(selector: ReturnSelector) -> str:
+    cameras = [] if selector.cameras is None else [("cameras", name) for name in selector.cameras]
+    return urlencode([("steps", selector.steps), *cameras])
+
+
+def _parsed(model: type[ModelT], reply: Reply) -> ModelT:
+    try:
+        return model.model_validate_json(reply.body)
+    except ValidationError as error:
+        raise UnavailableError(
+            f"answer: {first_problems(error)}; is a DexTouch service of this version there?"
+        ) from error

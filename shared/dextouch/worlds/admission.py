@@ -1,0 +1,120 @@
+"""Requests and answers of a rollout against what its world says of itself: pass, or a refusal."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import (
+    DexTouchError,
+    InvalidInputError,
+    LimitExceededError,
+    ShapeError,
+    UnknownNameError,
+)
+from dextouch.hands.actions import check_actions
+from dextouch.schemas.rollouts import (
+    Observation,
+    ReturnSelector,
+    RolloutStart,
+    WorldDescription,
+    check_observation,
+)
+
+
+def check_start(start: RolloutStart, description: WorldDescription) -> RolloutStart:
+    """The start with images of this world's cameras only, or a refusal.
+
+    Raises:
+        UnknownNameError: task or action kind.
+        InvalidInputError: an observation where a seed is needed or the other way round.
+        ShapeError: an observation that does not fit the world.
+    """
+    if start.task not in description.tasks:
+        raise UnknownNameError("task", start.task, list(description.tasks))
+    if start.action_kind not in description.action_kinds:
+        raise UnknownNameError("action kind", start.action_kind, list(description.action_kinds))
+    way = "task_seed" if start.observation is None else "observation"
+    if way not in description.starts_from:
+        raise InvalidInputError(
+            f"world {description.name}: got a start from {way}, expected one of "
+            f"{', '.join(description.starts_from)}"
+        )
+    if start.observation is None:
+        return start
+    if len(start.observation) != 1:
+        raise ShapeError(f"start: observation has {len(start.observation)} steps, expected 1")
+    images = start.observation.images
+    wanted = {camera: images[camera] for camera in description.cameras if camera in images}
+    observation = replace(start.observation, images=wanted)
+    _check_fits(observation, description, where="start")
+    return replace(start, observation=observation)
+
+
+def check_chunk(
+    actions: np.ndarray, description: WorldDescription
+) -> Float64[np.ndarray, "steps 67"]:
+    """The chunk as float64, or a refusal.
+
+    Raises:
+        ShapeError: not [K, 67], or K no multiple of the world's chunk.
+        NonFiniteError: NaN or infinity.
+        LimitExceededError: longer than the world takes at once.
+    """
+    checked = check_actions(actions, where="chunk")
+    if len(checked) % description.chunk_multiple:
+        raise ShapeError(
+            f"chunk: got {len(checked)} steps, expected a multiple of {description.chunk_multiple}",
+            got=len(checked),
+            multiple=description.chunk_multiple,
+        )
+    if len(checked) > description.max_chunk_steps:
+        raise LimitExceededError(
+            f"chunk: got {len(checked)} steps, expected at most {description.max_chunk_steps}",
+            got=len(checked),
+            maximum=description.max_chunk_steps,
+        )
+    return checked
+
+
+def check_selector(selector: ReturnSelector, description: WorldDescription) -> None:
+    """Refuse cameras that the world does not have."""
+    for camera in selector.cameras or ():
+        if camera not in description.cameras:
+            raise UnknownNameError("camera", camera, list(description.cameras))
+
+
+def check_answer(
+    observation: Observation, description: WorldDescription, *, first_step: int, num_steps: int
+) -> None:
+    """Refuse what a world must not answer.
+
+    Raises:
+        NonFiniteError: NaN or infinity in what it gives, as wild actions may bring about.
+        DexTouchError: wrong length, size or place: the world broke its promise.
+    """
+    where = f"answer of world {description.name} (the rollout stays as it was)"
+    if (observation.first_step, len(observation)) != (first_step, num_steps):
+        raise DexTouchError(
+            f"{where}: got {len(observation)} steps from {observation.first_step}, expected "
+            f"{num_steps} from {first_step}"
+        )
+    try:
+        _check_fits(observation, description, where=where)
+    except ShapeError as error:
+        raise DexTouchError(error.message) from error
+
+
+def _check_fits(observation: Observation, description: WorldDescription, *, where: str) -> None:
+    check_observation(observation, where=where)
+    if set(observation.images) != set(description.cameras):
+        raise ShapeError(
+            f"{where}: got images of {sorted(observation.images)}, expected of "
+            f"{sorted(description.cameras)}"
+        )
+    expected = (description.image_height_px, description.image_width_px)
+    for camera, images in observation.images.items():
+        if images.shape[1:3] != expected:
+            raise ShapeError(
+                f"{where}: images of {camera} are {images.shape[1:3]} px, expected {expected}"
+            )

@@ -1,0 +1,103 @@
+"""The baseline that every world must beat: it repeats the first image and touch for ever."""
+
+import hashlib
+from dataclasses import replace
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import check_actions
+from dextouch.schemas.rollout_codec import decode_observation, encode_observation
+from dextouch.worlds.world import (
+    Observation,
+    RolloutStart,
+    StartedRollout,
+    SteppedRollout,
+    WorldDescription,
+)
+
+MAX_SNAPSHOT_BYTES = 2**28
+
+
+class CopyFirstWorld:
+    """Starts from an observation and repeats it; the actions it was given count as reached.
+
+    Its state is what was seen last, as an observation of one step.
+    """
+
+    def __init__(
+        self,
+        *,
+        tasks: tuple[str, ...],
+        cameras: tuple[str, ...] = ("camera_head",),
+        image_height_px: int = 64,
+        image_width_px: int = 64,
+        model_rate_hz: float = 15.0,
+    ) -> None:
+        shape = (tasks, cameras, image_height_px, image_width_px, model_rate_hz)
+        self._description = WorldDescription(
+            name="copy-first",
+            kind="baseline",
+            digest=hashlib.sha256(f"copy-first/1 {shape}".encode()).hexdigest(),
+            tasks=tasks,
+            cameras=cameras,
+            image_height_px=image_height_px,
+            image_width_px=image_width_px,
+            model_rate_hz=model_rate_hz,
+            action_kinds=("measured", "commanded"),
+            starts_from=("observation",),
+        )
+
+    @staticmethod
+    def beside(other: WorldDescription) -> "CopyFirstWorld":
+        """The baseline for the tasks and cameras of another world."""
+        return CopyFirstWorld(
+            tasks=other.tasks,
+            cameras=other.cameras,
+            image_height_px=other.image_height_px,
+            image_width_px=other.image_width_px,
+            model_rate_hz=other.model_rate_hz,
+        )
+
+    @property
+    def description(self) -> WorldDescription:
+        """See World."""
+        return self._description
+
+    def reset(self, start: RolloutStart) -> StartedRollout[Observation]:
+        """See World; the observation is the start's own."""
+        if start.observation is None or start.anchor is None or start.K_head is None:
+            raise InvalidInputError(
+                "world copy-first: got a start without observation, anchor and K_head; it begins "
+                "only from an observation made in another world or episode"
+            )
+        state = replace(
+            start.observation.last(), first_step=0, reached_is_measured=False, success=None
+        )
+        return StartedRollout(state, state, start.anchor, start.K_head)
+
+    def step(
+        self, state: Observation, actions: np.ndarray, *, seed: int
+    ) -> SteppedRollout[Observation]:
+        """See World; there is no noise, so `seed` changes nothing."""
+        del seed
+        reached = np.array(check_actions(actions, where="world copy-first: actions"))
+        seen = Observation(
+            first_step=state.first_step + 1,
+            images={
+                camera: np.repeat(images, len(reached), axis=0)
+                for camera, images in state.images.items()
+            },
+            tactile_kpa=np.repeat(state.tactile_kpa, len(reached), axis=0),
+            action_reached=reached,
+            reached_is_measured=False,
+        )
+        return SteppedRollout(seen.last(), seen)
+
+    def snapshot(self, state: Observation) -> bytes:
+        """See World."""
+        return encode_observation(state)
+
+    def restore(self, data: bytes) -> Observation:
+        """See World."""
+        return decode_observation(data, max_bytes=MAX_SNAPSHOT_BYTES)

@@ -1,0 +1,161 @@
+"""Steps of many rollouts to one world's own thread: whatever waits is taken together, no timer."""
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import LimitExceededError, UnavailableError
+from dextouch.worlds.world import BatchWorld, State, SteppedRollout, World
+
+ResultT = TypeVar("ResultT")
+
+
+@dataclass(frozen=True)
+class StepJob(Generic[State]):
+    """One rollout's next chunk."""
+
+    state: State
+    actions: Float64[np.ndarray, "steps 67"]
+    seed: int
+
+
+@dataclass(frozen=True)
+class StepOutcome(Generic[State]):
+    """The step, its state as bytes, and where the time went."""
+
+    stepped: SteppedRollout[State]
+    snapshot: bytes
+    queued_s: float
+    device_s: float
+
+
+@dataclass
+class _Waiting(Generic[State]):
+    job: StepJob[State]
+    since_s: float
+    outcome: "asyncio.Future[StepOutcome[State]]"
+
+
+class WorldWorker(Generic[State]):
+    """One world, one thread, one queue.
+
+    A world with `step_batch` gets all waiting chunks of one length at once; others one by one.
+    Belongs to the event loop that first uses it.
+    """
+
+    def __init__(self, world: World[State], *, max_waiting: int = 256, max_batch: int = 32) -> None:
+        self.world = world
+        self._max_waiting = max_waiting
+        self._max_batch = max_batch if isinstance(world, BatchWorld) else 1
+        self._waiting: deque[_Waiting[State]] = deque()
+        self._drain: asyncio.Task[None] | None = None
+        self._executor = ThreadPoolExecutor(
+            max_workers=1, thread_name_prefix=f"world-{world.description.name}"
+        )
+
+    async def call(self, function: Callable[..., ResultT], *arguments: Any) -> ResultT:  # noqa: ANN401
+        """Run a function that uses the world in the world's thread."""
+        loop = asyncio.get_running_loop()
+        return await loop.run_in_executor(self._executor, function, *arguments)
+
+    async def step(self, job: StepJob[State]) -> StepOutcome[State]:
+        """Advance one rollout.
+
+        Raises:
+            LimitExceededError: too many chunks wait already.
+            DexTouchError: what the world raised.
+        """
+        if len(self._waiting) >= self._max_waiting:
+            raise LimitExceededError(
+                f"world {self.world.description.name}: {len(self._waiting)} chunks wait, "
+                f"expected at most {self._max_waiting}; try again",
+                retry_after_s=1,
+            )
+        outcome = asyncio.get_running_loop().create_future()
+        self._waiting.append(_Waiting(job, time.perf_counter(), outcome))
+        if self._drain is None or self._drain.done():
+            self._drain = asyncio.create_task(self._run_waiting())
+        return await outcome
+
+    def close(self) -> None:
+        """Let the running step end, start no other."""
+        if self._drain is not None:
+            self._drain.cancel()
+        while self._waiting:
+            _fail(self._waiting.popleft(), UnavailableError("the service is shutting down"))
+        self._executor.shutdown(wait=True, cancel_futures=True)
+
+    async def _run_waiting(self) -> None:
+        while self._waiting:
+            batch = self._take_batch()
+            (result,) = await asyncio.gather(
+                self.call(self._step_all, [entry.job for entry in batch]), return_exceptions=True
+            )
+            if not isinstance(result, BaseException):
+                self._answer(batch, result)
+            elif len(batch) == 1:
+                _fail(batch[0], result)
+            else:
+                await self._one_by_one(batch)
+
+    def _take_batch(self) -> list[_Waiting[State]]:
+        """The oldest waiting chunk and, up to the limit, others of its length."""
+        num_steps = len(self._waiting[0].job.actions)
+        batch: list[_Waiting[State]] = []
+        others: deque[_Waiting[State]] = deque()
+        while self._waiting:
+            entry = self._waiting.popleft()
+            fits = len(entry.job.actions) == num_steps and len(batch) < self._max_batch
+            (batch if fits else others).append(entry)
+        self._waiting = others
+        return batch
+
+    async def _one_by_one(self, batch: Sequence[_Waiting[State]]) -> None:
+        """After a failed batch: who failed fails alone."""
+        for entry in batch:
+            (result,) = await asyncio.gather(
+                self.call(self._step_all, [entry.job]), return_exceptions=True
+            )
+            if isinstance(result, BaseException):
+                _fail(entry, result)
+            else:
+                self._answer([entry], result)
+
+    def _step_all(
+        self, jobs: Sequence[StepJob[State]]
+    ) -> tuple[float, float, list[tuple[SteppedRollout[State], bytes]]]:
+        """In the world's thread: when it began, how long it took, steps and snapshots."""
+        began_s = time.perf_counter()
+        if isinstance(self.world, BatchWorld) and len(jobs) > 1:
+            stepped = self.world.step_batch(
+                [job.state for job in jobs],
+                np.stack([job.actions for job in jobs]),
+                seeds=[job.seed for job in jobs],
+            )
+        else:
+            stepped = [self.world.step(job.state, job.actions, seed=job.seed) for job in jobs]
+        results = [(one, self.world.snapshot(one.state)) for one in stepped]
+        return began_s, time.perf_counter() - began_s, results
+
+    @staticmethod
+    def _answer(
+        batch: Sequence[_Waiting[State]],
+        result: tuple[float, float, list[tuple[SteppedRollout[State], bytes]]],
+    ) -> None:
+        began_s, device_s, steps = result
+        for entry, (stepped, snapshot) in zip(batch, steps, strict=True):
+            if not entry.outcome.done():
+                queued_s = began_s - entry.since_s
+                entry.outcome.set_result(StepOutcome(stepped, snapshot, queued_s, device_s))
+
+
+def _fail(entry: _Waiting[Any], error: BaseException) -> None:
+    if not entry.outcome.done():
+        entry.outcome.set_exception(error)

@@ -1,0 +1,115 @@
+"""A rollout as its store keeps it: where it stands, the world's snapshot, and the last answer."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dextouch.errors import NotFoundError
+from dextouch.schemas.rollouts import RolloutInfo
+from dextouch.serving.state import StateStore
+from dextouch.streams.packing import pack, unpack
+
+KEY_PREFIX = "rollout:"
+MAX_RECORD_BYTES = 2**30
+
+
+@dataclass(frozen=True)
+class LastAnswer:
+    """What the newest chunk was asked and answered, for a client that missed the answer."""
+
+    request_sha256: str
+    payload: bytes
+
+
+@dataclass(frozen=True)
+class RolloutRecord:
+    """Everything another process needs to go on with a rollout."""
+
+    info: RolloutInfo
+    snapshot: bytes
+    last_answer: LastAnswer | None = None
+
+    def to_bytes(self) -> bytes:
+        """Inverse of `from_bytes`."""
+        last = self.last_answer
+        arrays = {"snapshot": np.frombuffer(self.snapshot, np.uint8)}
+        if last is not None:
+            arrays["payload"] = np.frombuffer(last.payload, np.uint8)
+        fields = {
+            "info": self.info.model_dump(mode="json"),
+            "request_sha256": None if last is None else last.request_sha256,
+        }
+        return pack(fields, arrays)
+
+    @staticmethod
+    def from_bytes(data: bytes) -> "RolloutRecord":
+        """The record that a store kept."""
+        fields, arrays = unpack(data, max_bytes=MAX_RECORD_BYTES)
+        last = None
+        if fields["request_sha256"] is not None:
+            last = LastAnswer(fields["request_sha256"], arrays["payload"].tobytes())
+        info = RolloutInfo.model_validate(fields["info"])
+        return RolloutRecord(info, arrays["snapshot"].tobytes(), last)
+
+
+@dataclass(frozen=True)
+class StoredRecord:
+    """A record with the version it has in the store."""
+
+    record: RolloutRecord
+    version: int
+
+
+class RecordStore:
+    """Rollout records in a state store; every write starts their time to live anew."""
+
+    def __init__(self, store: StateStore, *, ttl_s: float) -> None:
+        self._store = store
+        self._ttl_s = ttl_s
+
+    async def read(self, rollout_id: str) -> StoredRecord:
+        """The newest record.
+
+        Raises:
+            NotFoundError: there is none (any more).
+        """
+        stored = await self._store.get(KEY_PREFIX + rollout_id)
+        if stored is None:
+            raise _unknown(rollout_id)
+        return StoredRecord(RolloutRecord.from_bytes(stored.value), stored.version)
+
+    async def write(self, record: RolloutRecord, *, over_version: int) -> int:
+        """Write over the version it was computed from (0: a new rollout); the new version.
+
+        Raises:
+            ConflictError: another version is stored.
+        """
+        return await self._store.set(
+            KEY_PREFIX + record.info.id,
+            record.to_bytes(),
+            expected_version=over_version,
+            ttl_s=self._ttl_s,
+        )
+
+    async def delete(self, rollout_id: str) -> None:
+        """Forget a rollout.
+
+        Raises:
+            NotFoundError: there is none (any more).
+        """
+        if not await self._store.delete(KEY_PREFIX + rollout_id):
+            raise _unknown(rollout_id)
+
+    async def count(self) -> int:
+        """How many rollouts are alive."""
+        return len(await self._store.keys(KEY_PREFIX))
+
+    async def ping(self) -> None:
+        """Raise UnavailableError when the store cannot be reached."""
+        await self._store.ping()
+
+
+def _unknown(rollout_id: str) -> NotFoundError:
+    return NotFoundError(
+        f"rollout {rollout_id!r}: unknown, deleted or expired; start a new one", got=rollout_id
+    )

@@ -1,0 +1,301 @@
+"""Starts and numbered action chunks to observations: commit, replay, branch and expiry.
+
+The state store is the truth, the live state in this process only saves a restore. A chunk counts
+when its record was written over the version it was computed from; until then nothing happened.
+"""
+
+import asyncio
+import hashlib
+import secrets
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+from weakref import WeakValueDictionary
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field
+
+from dextouch.errors import (
+    ConflictError,
+    LimitExceededError,
+    UnknownNameError,
+)
+from dextouch.schemas.rollout_codec import Origin, encode_answer
+from dextouch.schemas.rollouts import (
+    MAX_SEED,
+    ReturnSelector,
+    RolloutInfo,
+    RolloutStart,
+    WorldDescription,
+)
+from dextouch.serving.state import StateStore
+from dextouch.worlds.admission import check_answer, check_chunk, check_selector, check_start
+from dextouch.worlds.batcher import StepJob, WorldWorker
+from dextouch.worlds.records import LastAnswer, RecordStore, RolloutRecord, StoredRecord
+from dextouch.worlds.world import StartedRollout, World
+
+
+class RolloutLimits(BaseModel):
+    """What this installation allows; `ttl_s` begins anew with every chunk."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    max_rollouts: int = Field(default=64, ge=1)
+    max_chunks: int = Field(default=1000, ge=1)
+    ttl_s: float = Field(default=600.0, gt=0)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """An encoded answer; `replayed` when it was computed for an earlier, equal request."""
+
+    payload: bytes
+    replayed: bool = False
+    queued_s: float = 0.0
+    device_s: float = 0.0
+
+
+@dataclass(frozen=True)
+class _ChunkRequest:
+    """A checked chunk and what is to be told about it."""
+
+    actions: Float64[np.ndarray, "steps 67"]
+    selector: ReturnSelector
+
+    def sha256(self) -> str:
+        """Equal for equal requests only."""
+        asked = self.selector.model_dump_json().encode()
+        return hashlib.sha256(asked + self.actions.astype("<f8").tobytes()).hexdigest()
+
+
+class RolloutService:
+    """Every rollout of one process; several processes may share one store.
+
+    Belongs to one event loop. `close` ends the worlds' threads, not the store.
+    """
+
+    def __init__(
+        self,
+        worlds: Mapping[str, World[Any]],
+        store: StateStore,
+        limits: RolloutLimits | None = None,
+    ) -> None:
+        self.limits = limits or RolloutLimits()
+        self._workers = {name: WorldWorker(world) for name, world in worlds.items()}
+        self._records = RecordStore(store, ttl_s=self.limits.ttl_s)
+        self._live = _LiveStates(capacity=self.limits.max_rollouts)
+        self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
+
+    def worlds(self) -> list[WorldDescription]:
+        """What can be asked for."""
+        return [worker.world.description for worker in self._workers.values()]
+
+    async def ping(self) -> None:
+        """Raise UnavailableError when the store cannot be reached."""
+        await self._records.ping()
+
+    async def start(self, world: str, start: RolloutStart, selector: ReturnSelector) -> Answer:
+        """Begin a rollout.
+
+        Raises:
+            UnknownNameError: world, task, camera or action kind.
+            InvalidInputError: a start the world cannot begin from.
+            LimitExceededError: as many rollouts as allowed are alive.
+        """
+        worker = self._worker(world)
+        description = worker.world.description
+        begin = check_start(start, description)
+        check_selector(selector, description)
+        await self._check_room()
+
+        def reset() -> tuple[StartedRollout[Any], bytes]:
+            started = worker.world.reset(begin)
+            return started, worker.world.snapshot(started.state)
+
+        started, snapshot = await worker.call(reset)
+        check_answer(started.observation, description, first_step=0, num_steps=1)
+        info = RolloutInfo(
+            id=secrets.token_hex(16),
+            world=world,
+            world_digest=description.digest,
+            task=start.task,
+            instruction=start.instruction,
+            seed=start.seed,
+            action_kind=start.action_kind,
+            next_chunk=0,
+            last_step=0,
+            ttl_s=self.limits.ttl_s,
+        )
+        version = await self._records.write(RolloutRecord(info, snapshot), over_version=0)
+        self._live.put(info.id, version, started.state)
+        origin = Origin(started.anchor, started.K_head)
+        return Answer(encode_answer(info, started.observation, selector=selector, origin=origin))
+
+    async def get(self, rollout_id: str) -> RolloutInfo:
+        """Where a rollout stands; does not prolong its life."""
+        return (await self._records.read(rollout_id)).record.info
+
+    async def step(
+        self, rollout_id: str, chunk: int, actions: np.ndarray, selector: ReturnSelector
+    ) -> Answer:
+        """Advance by a numbered chunk, or give the newest one's answer again.
+
+        Raises:
+            NotFoundError: no such rollout (any more).
+            ConflictError: another chunk is expected; `expected` tells which.
+            ShapeError, NonFiniteError, InvalidInputError: actions that do not fit.
+            LimitExceededError: the rollout is as long as allowed, or too much waits.
+        """
+        lock = self._locks.setdefault(rollout_id, asyncio.Lock())
+        async with lock:
+            stored = await self._records.read(rollout_id)
+            worker = self._worker_of(stored.record.info)
+            description = worker.world.description
+            check_selector(selector, description)
+            request = _ChunkRequest(check_chunk(actions, description), selector)
+            replayed = _replay(stored.record, chunk, request)
+            if replayed is not None:
+                return replayed
+            self._check_length(stored.record.info)
+            try:
+                return await self._advance(stored, worker, request)
+            except ConflictError:
+                # Another process was faster: its answer stands, if it was to the same request.
+                replayed = _replay((await self._records.read(rollout_id)).record, chunk, request)
+                if replayed is None:
+                    raise
+                return replayed
+
+    async def fork(self, rollout_id: str, *, seed: int | None = None) -> RolloutInfo:
+        """Branch at the current step: the copy has the same past and goes on by itself.
+
+        Args:
+            rollout_id: of the rollout that is branched; it stays as it is.
+            seed: of the branch's noise; None keeps the rollout's own.
+        """
+        parent = (await self._records.read(rollout_id)).record
+        self._worker_of(parent.info)
+        await self._check_room()
+        changed = {"id": secrets.token_hex(16)} | ({} if seed is None else {"seed": seed})
+        info = parent.info.model_copy(update=changed)
+        await self._records.write(RolloutRecord(info, parent.snapshot), over_version=0)
+        return info
+
+    async def delete(self, rollout_id: str) -> None:
+        """End a rollout."""
+        self._live.drop(rollout_id)
+        await self._records.delete(rollout_id)
+
+    def close(self) -> None:
+        """End the worlds' threads; rollouts stay in the store."""
+        for worker in self._workers.values():
+            worker.close()
+
+    async def _advance(
+        self, stored: StoredRecord, worker: WorldWorker[Any], request: _ChunkRequest
+    ) -> Answer:
+        """Compute a chunk and write it over the version it was computed from."""
+        before = stored.record.info
+        state = self._live.get(before.id, stored.version)
+        if state is None:
+            state = await worker.call(worker.world.restore, stored.record.snapshot)
+        seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
+        outcome = await worker.step(StepJob(state, request.actions, seed))
+        seen, num_steps = outcome.stepped.observation, len(request.actions)
+        check_answer(
+            seen, worker.world.description, first_step=before.last_step + 1, num_steps=num_steps
+        )
+        info = before.model_copy(
+            update={
+                "next_chunk": before.next_chunk + 1,
+                "last_step": before.last_step + num_steps,
+            }
+        )
+        told = outcome.stepped.info
+        payload = encode_answer(info, seen, selector=request.selector, info=told)
+        last = LastAnswer(request.sha256(), payload)
+        record = RolloutRecord(info, outcome.snapshot, last)
+        version = await self._records.write(record, over_version=stored.version)
+        self._live.put(info.id, version, outcome.stepped.state)
+        return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
+
+    def _worker(self, world: str) -> WorldWorker[Any]:
+        if world not in self._workers:
+            raise UnknownNameError("world", world, list(self._workers))
+        return self._workers[world]
+
+    def _worker_of(self, info: RolloutInfo) -> WorldWorker[Any]:
+        worker = self._worker(info.world)
+        digest = worker.world.description.digest
+        if digest != info.world_digest:
+            raise ConflictError(
+                f"rollout {info.id}: began in world {info.world} of digest "
+                f"{info.world_digest[:12]}, this process has {digest[:12]}; start a new rollout",
+                expected=info.world_digest,
+                got=digest,
+            )
+        return worker
+
+    async def _check_room(self) -> None:
+        alive = await self._records.count()
+        if alive >= self.limits.max_rollouts:
+            raise LimitExceededError(
+                f"{alive} rollouts are alive, expected at most {self.limits.max_rollouts}; delete "
+                f"one, or wait: they expire after {self.limits.ttl_s:g} s without a chunk",
+                retry_after_s=1,
+            )
+
+    def _check_length(self, info: RolloutInfo) -> None:
+        if info.next_chunk >= self.limits.max_chunks:
+            raise LimitExceededError(
+                f"rollout {info.id}: has {info.next_chunk} chunks, expected at most "
+                f"{self.limits.max_chunks}; start a new one"
+            )
+
+
+class _LiveStates:
+    """The newest states of the rollouts of this process; the least recently used go first."""
+
+    def __init__(self, *, capacity: int) -> None:
+        self._capacity = capacity
+        self._states: OrderedDict[str, tuple[int, Any]] = OrderedDict()
+
+    def get(self, rollout_id: str, version: int) -> Any | None:  # noqa: ANN401 - states are opaque
+        """The state of exactly this version, if it is here."""
+        held, state = self._states.get(rollout_id, (0, None))
+        return state if held == version else None
+
+    def put(self, rollout_id: str, version: int, state: object) -> None:
+        """Keep a state."""
+        self._states[rollout_id] = (version, state)
+        self._states.move_to_end(rollout_id)
+        if len(self._states) > self._capacity:
+            self._states.popitem(last=False)
+
+    def drop(self, rollout_id: str) -> None:
+        """Forget a state, if it is here."""
+        self._states.pop(rollout_id, None)
+
+
+def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:
+    """Seed of a chunk's noise: the same whoever computes it, whatever else is computed."""
+    text = f"{rollout_seed}/{chunk}/{world_digest}".encode()
+    return int.from_bytes(hashlib.sha256(text).digest()[:8], "big") & MAX_SEED
+
+
+def _replay(record: RolloutRecord, chunk: int, request: _ChunkRequest) -> Answer | None:
+    """The kept answer if it was to this very request; None if the chunk is the next one."""
+    info, last = record.info, record.last_answer
+    if chunk == info.next_chunk:
+        return None
+    is_newest = chunk == info.next_chunk - 1
+    if is_newest and last is not None and last.request_sha256 == request.sha256():
+        return Answer(last.payload, replayed=True)
+    why = "again with another body" if is_newest else "out of turn"
+    raise ConflictError(
+        f"rollout {info.id}: got chunk {chunk} {why}, expected chunk {info.next_chunk}",
+        expected=info.next_chunk,
+        got=chunk,
+    )

@@ -1,0 +1,188 @@
+"""The HTTP resource /v1/rollouts: requests to the rollout service, its answers to bytes.
+
+Documented in docs/rollout_api.md.
+"""
+
+import base64
+import json
+from email.message import Message
+from typing import Annotated, Literal, TypeVar
+
+import numpy as np
+from fastapi import APIRouter, Depends, Query, Request, Response
+from jaxtyping import Shaped
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands.actions import ACTION_DIM
+from dextouch.schemas.problems import first_problems
+from dextouch.schemas.rollout_codec import decode_start, start_from
+from dextouch.schemas.rollouts import (
+    ForkRequest,
+    ReturnSelector,
+    RolloutInfo,
+    RolloutStart,
+    StartRequest,
+    WorldList,
+)
+from dextouch.serving.access import RequireScope
+from dextouch.serving.middleware import timed
+from dextouch.streams.packing import unpack
+from dextouch.worlds.rollouts import Answer, RolloutService
+
+MSGPACK = "application/msgpack"
+JSON = "application/json"
+OCTETS = "application/octet-stream"
+SCOPE = "rollout"
+REPLAYED_HEADER = "dextouch-replayed"
+MAX_BODY_BYTES = 2**28
+BodyT = TypeVar("BodyT", bound=BaseModel)
+
+
+class ActionsBody(BaseModel):
+    """A chunk as JSON: rows of 67 numbers."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    actions: list[list[float]]
+
+
+def selector_of(
+    cameras: Annotated[list[str] | None, Query()] = None,
+    steps: Literal["last", "all"] = "all",
+    tactile: bool = True,  # noqa: FBT001, FBT002 - a query parameter
+) -> ReturnSelector:
+    """The return selector from the query: ?steps=last&cameras=camera_head&tactile=false."""
+    return ReturnSelector(
+        cameras=None if cameras is None else tuple(cameras), steps=steps, tactile=tactile
+    )
+
+
+Selector = Annotated[ReturnSelector, Depends(selector_of)]
+
+
+def rollout_router(service: RolloutService) -> APIRouter:
+    """The routes of one rollout service."""
+    router = APIRouter(prefix="/v1", tags=["rollouts"], dependencies=[Depends(RequireScope(SCOPE))])
+
+    @router.get("/worlds")
+    async def worlds() -> WorldList:
+        """What can be rolled out here."""
+        return WorldList(worlds=tuple(service.worlds()))
+
+    @router.post("/rollouts", status_code=201)
+    async def start(request: Request, selector: Selector) -> Response:
+        """Begin a future from a task and seed, or from an observation."""
+        with timed(request, "decode"):
+            asked, begin = await _start_of(request)
+        with timed(request, "world"):
+            answer = await service.start(asked.world, begin, selector)
+        return _response(request, answer, status=201)
+
+    @router.get("/rollouts/{rollout_id}")
+    async def get(rollout_id: str) -> RolloutInfo:
+        """Where a rollout stands."""
+        return await service.get(rollout_id)
+
+    @router.delete("/rollouts/{rollout_id}", status_code=204)
+    async def delete(rollout_id: str) -> None:
+        """End a rollout."""
+        await service.delete(rollout_id)
+
+    @router.post("/rollouts/{rollout_id}/chunks/{chunk}")
+    async def step(rollout_id: str, chunk: int, request: Request, selector: Selector) -> Response:
+        """Advance by the numbered action chunk."""
+        with timed(request, "decode"):
+            actions = await _actions_of(request)
+        answer = await service.step(rollout_id, chunk, actions, selector)
+        request.state.timings_s |= {"queue": answer.queued_s, "device": answer.device_s}
+        return _response(request, answer)
+
+    @router.post("/rollouts/{rollout_id}/fork", status_code=201)
+    async def fork(rollout_id: str, asked: ForkRequest) -> RolloutInfo:
+        """Branch at the current step."""
+        return await service.fork(rollout_id, seed=asked.seed)
+
+    return router
+
+
+async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
+    kind, _ = _content_type(request)
+    body = await request.body()
+    if kind == MSGPACK:
+        return decode_start(body, max_bytes=MAX_BODY_BYTES)
+    if kind == JSON:
+        asked = _from_json(StartRequest, body)
+        return asked, start_from(asked)
+    raise _unknown_kind(kind, JSON, MSGPACK)
+
+
+async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
+    kind, parameters = _content_type(request)
+    body = await request.body()
+    if kind == JSON:
+        rows = _from_json(ActionsBody, body).actions
+        if any(len(row) != ACTION_DIM for row in rows) or not rows:
+            lengths = sorted({len(row) for row in rows})
+            raise ShapeError(f"chunk: got rows of {lengths} numbers, expected {ACTION_DIM}")
+        return np.array(rows, dtype=np.float64)
+    if kind == OCTETS:
+        dtype = parameters.get("dtype", "")
+        if dtype not in {"float32", "float64"}:
+            raise InvalidInputError(
+                f"chunk: got dtype {dtype!r}, expected the header "
+                f"'Content-Type: {OCTETS}; dtype=float32' or float64"
+            )
+        row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
+        if not body or len(body) % row_bytes:
+            raise ShapeError(
+                f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
+                f"([K, {ACTION_DIM}] {dtype}, little endian)"
+            )
+        return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
+    raise _unknown_kind(kind, OCTETS, JSON)
+
+
+def _response(request: Request, answer: Answer, *, status: int = 200) -> Response:
+    headers = {REPLAYED_HEADER: "true" if answer.replayed else "false"}
+    accepted = request.headers.get("accept", MSGPACK)
+    if JSON in accepted and MSGPACK not in accepted:
+        with timed(request, "encode"):
+            content, media_type = _as_json(answer.payload), JSON
+        return Response(content, status, headers, media_type)
+    return Response(answer.payload, status, headers, MSGPACK)
+
+
+def _as_json(payload: bytes) -> bytes:
+    """The same answer to look at: the packing's layout, the data of each array in base64."""
+    fields, arrays = unpack(payload, max_bytes=len(payload))
+    shown = {
+        name: {
+            "dtype": array.dtype.name,
+            "shape": list(array.shape),
+            "data": base64.b64encode(array.tobytes()).decode(),
+        }
+        for name, array in arrays.items()
+    }
+    return json.dumps({"fields": fields, "arrays": shown}).encode()
+
+
+def _content_type(request: Request) -> tuple[str, dict[str, str]]:
+    """Media type and its parameters, both in lower case."""
+    header = Message()
+    header["content-type"] = request.headers.get("content-type", "none/none")
+    parameters = {name.lower(): value.lower() for name, value in header.get_params() or []}
+    return header.get_content_type(), parameters
+
+
+def _from_json(model: type[BodyT], body: bytes) -> BodyT:
+    try:
+        return model.model_validate_json(body)
+    except ValidationError as error:
+        raise InvalidInputError(f"body: {first_problems(error)}") from error
+
+
+def _unknown_kind(kind: str, *expected: str) -> InvalidInputError:
+    return InvalidInputError(
+        f"body: got Content-Type {kind!r}, expected {' or '.join(expected)}", got=kind
+    )

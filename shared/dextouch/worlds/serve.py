@@ -1,0 +1,58 @@
+"""Worlds and settings to a rollout service: the application, or a process that serves it."""
+
+from collections.abc import AsyncIterator, Mapping
+from contextlib import asynccontextmanager
+from importlib.metadata import version
+from typing import Any
+
+from fastapi import FastAPI
+
+from dextouch.serving.app import create_service_app
+from dextouch.serving.logs import configure_logging
+from dextouch.serving.settings import ServiceSettings, run
+from dextouch.serving.state import open_state
+from dextouch.worlds.rollouts import RolloutLimits, RolloutService
+from dextouch.worlds.routes import rollout_router
+from dextouch.worlds.world import World
+
+
+class WorldServiceSettings(ServiceSettings):
+    """What a service that serves worlds has; derive to add the world's own."""
+
+    state_url: str = "memory://"
+    limits: RolloutLimits = RolloutLimits()
+
+
+def create_world_app(
+    worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
+) -> FastAPI:
+    """The application that serves worlds; shutting it down ends their threads."""
+    store = open_state(settings.state_url)
+    service = RolloutService(worlds, store, settings.limits)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        yield
+        service.close()
+        await store.close()
+
+    async def readiness() -> list[str]:
+        await service.ping()
+        return []
+
+    return create_service_app(
+        name=name,
+        version=version("dextouch-wm"),
+        settings=settings,
+        routers=[rollout_router(service)],
+        lifespan=lifespan,
+        readiness=readiness,
+    )
+
+
+def serve_worlds(
+    worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
+) -> None:
+    """Serve worlds until SIGINT or SIGTERM."""
+    configure_logging(service=name, log_format=settings.log_format, level=settings.log_level)
+    run(create_world_app(worlds, settings, name=name), settings)
