@@ -1,0 +1,124 @@
+"""What a take holds and what its devices counted come in; whether it is complete goes out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dextouch.schemas.recordings import LedgerEntry
+from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.counters import StreamCounters
+from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.schemas import StreamTake, TakeCheck, TakeProblem
+
+RATE_WARN = 0.02
+RATE_ERROR = 0.10
+LOSS_WARN = 0.001
+LOSS_ERROR = 0.05
+# Shorter takes say nothing about rates and loss ratios.
+MIN_JUDGED_S = 1.0
+MAX_GAP_S = {"image": 0.5}
+MAX_GAP_OTHERS_S = 0.2
+
+
+@dataclass(frozen=True)
+class TakeSpan:
+    """Start and end of a take on the host's clock."""
+
+    start_t_host_ns: int
+    stop_t_host_ns: int
+
+    @property
+    def duration_s(self) -> float:
+        """Length of the take."""
+        return (self.stop_t_host_ns - self.start_t_host_ns) / 1e9
+
+
+@dataclass(frozen=True)
+class StreamFacts:
+    """One stream of a take, with what its device's decoder counted during the take."""
+
+    descriptor: StreamDescriptor
+    counters: StreamCounters
+    decoder: DecoderStatistics
+
+    def rate_hz(self) -> float | None:
+        """Mean rate between the first and the last sample; None of less than two."""
+        first_ns, last_ns = self.counters.first_t_host_ns, self.counters.last_t_host_ns
+        if first_ns is None or last_ns is None or last_ns <= first_ns:
+            return None
+        return (self.counters.num_samples - 1) * 1e9 / (last_ns - first_ns)
+
+    def largest_gap_s(self, span: TakeSpan) -> float:
+        """Longest time without a sample, the take's ends included."""
+        first_ns, last_ns = self.counters.first_t_host_ns, self.counters.last_t_host_ns
+        if first_ns is None or last_ns is None:
+            return span.duration_s
+        edges = (first_ns - span.start_t_host_ns, span.stop_t_host_ns - last_ns)
+        return max(self.counters.largest_gap_ns, *edges) / 1e9
+
+
+def check_take(facts: Sequence[StreamFacts], span: TakeSpan) -> TakeCheck:
+    """Judge a take: complete means no problem of level ERROR."""
+    problems = [problem for fact in facts for problem in _problems(fact, span)]
+    streams = [
+        StreamTake(
+            stream=fact.descriptor.name,
+            num_samples=fact.counters.num_samples,
+            rate_hz=fact.rate_hz(),
+            largest_gap_s=fact.largest_gap_s(span),
+            lost=fact.decoder.lost,
+            crc_errors=fact.decoder.crc_errors,
+        )
+        for fact in facts
+    ]
+    return TakeCheck(
+        complete=all(problem.level != "ERROR" for problem in problems),
+        duration_s=span.duration_s,
+        streams=tuple(streams),
+        problems=tuple(problems),
+    )
+
+
+def take_ledger(facts: Sequence[StreamFacts]) -> tuple[LedgerEntry, ...]:
+    """What was noticed during the take, counted, for the recording's attributes."""
+    entries = []
+    for fact in facts:
+        counted: Mapping[str, int] = {
+            "lost": fact.decoder.lost,
+            "crc_errors": fact.decoder.crc_errors,
+            "length_errors": fact.decoder.length_errors,
+            "resync_bytes": fact.decoder.resync_bytes,
+            "refused": fact.decoder.refused,
+        }
+        name = fact.descriptor.name
+        entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
+    return tuple(entries)
+
+
+def _problems(fact: StreamFacts, span: TakeSpan) -> list[TakeProblem]:
+    descriptor, found = fact.descriptor, []
+    if fact.counters.num_samples == 0:
+        return [_problem(fact, "missing_stream", "ERROR", "no sample arrived; is it connected?")]
+    max_gap_s = MAX_GAP_S.get(descriptor.kind, MAX_GAP_OTHERS_S)
+    gap_s = fact.largest_gap_s(span)
+    if gap_s > max_gap_s:
+        text = f"{gap_s:.2f} s without a sample, expected at most {max_gap_s} s"
+        found.append(_problem(fact, "gap", "ERROR", text))
+    if span.duration_s < MIN_JUDGED_S:
+        return found
+    rate_hz = fact.rate_hz() or 0.0
+    off = abs(rate_hz / descriptor.nominal_rate_hz - 1.0)
+    if off > RATE_WARN:
+        text = f"{rate_hz:.1f} Hz, expected {descriptor.nominal_rate_hz:g} Hz"
+        found.append(_problem(fact, "rate", "ERROR" if off > RATE_ERROR else "WARN", text))
+    loss = fact.decoder.lost / max(1, fact.decoder.lost + fact.decoder.packets)
+    if loss > LOSS_WARN:
+        text = f"{fact.decoder.lost} packets lost ({loss:.1%}), {fact.decoder.crc_errors} bad sums"
+        found.append(_problem(fact, "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text))
+    return found
+
+
+def _problem(fact: StreamFacts, code: str, level: str, text: str) -> TakeProblem:
+    name = fact.descriptor.name
+    return TakeProblem.model_validate(
+        {"stream": name, "code": code, "level": level, "message": f"{name}: {text}"}
+    )

@@ -1,0 +1,109 @@
+"""What every driver shares: a transport and a decoder come in, stamped samples by stream go out."""
+
+from typing import Protocol, runtime_checkable
+
+from dextouch.errors import DeviceError
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import Sample
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.packets import SOURCES, VERSION, DecoderStatistics, Packet
+from services.acquisition.transports.base import Transport, TransportInfo
+
+Readings = dict[str, list[Sample]]
+
+
+@runtime_checkable
+class Decoder(Protocol):
+    """Bytes of one device → samples by stream."""
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """What was seen so far."""
+        ...
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The streams it gives."""
+        ...
+
+    def reset(self) -> None:
+        """Forget half a packet, since the link was lost."""
+        ...
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """Samples completed by `data`, which arrived at `t_host_ns`."""
+        ...
+
+
+class Driver:
+    """One device: opens its transport, stamps what arrives, decodes it.
+
+    The stamp is taken right after `read` returns; all packets of one read share it.
+    """
+
+    def __init__(
+        self, name: str, *, transport: Transport, decoder: Decoder, clock: StationClock
+    ) -> None:
+        self.name = name
+        self.transport = transport
+        self.decoder = decoder
+        self._clock = clock
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The streams of this device."""
+        return self.decoder.descriptors
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """The decoder's counters."""
+        return self.decoder.statistics
+
+    @property
+    def info(self) -> TransportInfo:
+        """Where the device is."""
+        return self.transport.info
+
+    def open(self) -> None:
+        """Open the transport.
+
+        Raises:
+            DeviceError: the device is not there.
+        """
+        self.decoder.reset()
+        self.transport.open()
+
+    def read(self) -> Readings:
+        """New samples by stream; empty when nothing came.
+
+        Raises:
+            DeviceError: the device is gone or speaks another protocol.
+        """
+        data = self.transport.read()
+        t_host_ns = self._clock.now_ns()
+        return self.decoder.decode(data, t_host_ns) if data else {}
+
+    def close(self) -> None:
+        """Close the transport."""
+        self.transport.close()
+
+
+def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
+    """Refuse what a device of another version, or of the other hand, sends.
+
+    Raises:
+        DeviceError: version or source differ.
+    """
+    if packet.version != VERSION:
+        raise DeviceError(
+            f"{device}: speaks packet version {packet.version}, expected {VERSION}; update the "
+            "device or this station",
+            device=device,
+        )
+    if source is not None and packet.source != SOURCES[source]:
+        names = {number: name for name, number in SOURCES.items()}
+        got = names.get(packet.source, str(packet.source))
+        raise DeviceError(
+            f"{device}: says it is {got!r}, expected {source!r}; is the wrong one plugged in?",
+            device=device,
+        )

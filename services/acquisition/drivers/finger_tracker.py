@@ -1,0 +1,166 @@
+"""Finger tracker over HID: reports come in, 25 keypoints a sample (m, wrist frame) go out."""
+
+import struct
+from typing import Final
+
+import numpy as np
+
+from dextouch.errors import DeviceError, PacketError
+from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, NODE_INDEX, NUM_KEYPOINTS, WRIST
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import Sample
+from dextouch.tactile.layout import Side
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver, Readings, check_packet
+from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+from services.acquisition.drivers.reports import (
+    DESCRIPTOR_REPORT,
+    REPORT_BYTES,
+    ReportReassembler,
+)
+from services.acquisition.transports.base import Transport
+
+MAGIC = b"DXFT"
+DESCRIPTOR_MAGIC = b"DXFD"
+NOMINAL_RATE_HZ = 120.0
+CHAIN_IDS: Final = {name: index for index, name in enumerate((WRIST, *CHAINS))}
+JOINT_IDS: Final = {name: index for index, name in enumerate((WRIST, *FINGER_JOINTS))}
+VALIDITY = struct.Struct("<I")
+PAYLOAD_BYTES = VALIDITY.size + NUM_KEYPOINTS * 12
+DESCRIPTOR_BYTES = 2 * NUM_KEYPOINTS
+DESCRIPTOR_READS = 200
+
+
+def keypoints_descriptor(side: Side) -> StreamDescriptor:
+    """The stream of one tracked hand; a node the device does not see is NaN."""
+    return StreamDescriptor(
+        name=f"keypoints_{side}",
+        kind="keypoints",
+        shape=(NUM_KEYPOINTS, 3),
+        dtype="float32",
+        unit="m",
+        nominal_rate_hz=NOMINAL_RATE_HZ,
+        frame=f"wrist_{side}",
+        side=side,
+        device=f"finger_tracker_{side}",
+        capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
+    )
+
+
+def parse_node_order(payload: bytes) -> list[int]:
+    """Our keypoint index of each node, in the device's order.
+
+    Raises:
+        PacketError: a node unknown to us, or not each of the 25 exactly once.
+    """
+    nodes = {(CHAIN_IDS[c], JOINT_IDS[j]): index for (c, j), index in NODE_INDEX.items()}
+    pairs = [(payload[at], payload[at + 1]) for at in range(0, len(payload) - 1, 2)]
+    order = [nodes[pair] for pair in pairs if pair in nodes]
+    if sorted(order) != list(range(NUM_KEYPOINTS)) or len(pairs) != NUM_KEYPOINTS:
+        raise PacketError(
+            f"descriptor: got nodes {pairs}, expected each of the {NUM_KEYPOINTS} (chain, joint) "
+            "ids once"
+        )
+    return order
+
+
+class FingerTrackerDecoder:
+    """Joins reports, resolves nodes by the descriptor's ids, marks unseen nodes with NaN."""
+
+    def __init__(self, side: Side) -> None:
+        self._side = side
+        self._device = f"finger_tracker_{side}"
+        self.reports = ReportReassembler()
+        self._data = PacketDecoder(MAGIC, min_payload=PAYLOAD_BYTES, max_payload=PAYLOAD_BYTES)
+        self._descriptor = PacketDecoder(
+            DESCRIPTOR_MAGIC, min_payload=DESCRIPTOR_BYTES, max_payload=DESCRIPTOR_BYTES
+        )
+        self._order: list[int] | None = None
+        self.undescribed = 0
+        self.unseen_nodes = 0
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """Counters of the data packets."""
+        return self._data.statistics
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The keypoint stream."""
+        return (keypoints_descriptor(self._side),)
+
+    @property
+    def described(self) -> bool:
+        """Whether the node order is known."""
+        return self._order is not None
+
+    def reset(self) -> None:
+        """Forget half a message and the node order (another device may answer now)."""
+        self.reports.reset()
+        self._data.reset()
+        self._descriptor.reset()
+        self._order = None
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """Keypoints (float32 [25, 3], m) completed by one report.
+
+        Raises:
+            DeviceError: another version, the other hand, or nodes we do not know.
+        """
+        message = self.reports.feed(data)
+        if message is None:
+            return {}
+        report_id, body = message
+        if report_id == DESCRIPTOR_REPORT:
+            self._describe(body)
+            return {}
+        samples = []
+        for packet in self._data.feed(body):
+            check_packet(packet, device=self._device, source=self._side)
+            if self._order is None:
+                self.undescribed += 1
+                continue
+            keypoints = self._keypoints(packet.payload, self._order)
+            samples.append(Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence))
+        return {f"keypoints_{self._side}": samples} if samples else {}
+
+    def _keypoints(self, payload: bytes, order: list[int]) -> np.ndarray:
+        (valid_bits,) = VALIDITY.unpack_from(payload)
+        points = np.frombuffer(payload, dtype="<f4", offset=VALIDITY.size).reshape(-1, 3)
+        keypoints = np.empty((NUM_KEYPOINTS, 3), dtype=np.float32)
+        keypoints[order] = points
+        if valid_bits != (1 << NUM_KEYPOINTS) - 1:
+            unseen = [order[i] for i in range(NUM_KEYPOINTS) if not valid_bits >> i & 1]
+            keypoints[unseen] = np.nan
+            self.unseen_nodes += len(unseen)
+        return keypoints
+
+    def _describe(self, body: bytes) -> None:
+        for packet in self._descriptor.feed(body):
+            check_packet(packet, device=self._device, source=self._side)
+            try:
+                self._order = parse_node_order(packet.payload)
+            except PacketError as error:
+                raise DeviceError(f"{self._device}: {error.message}") from error
+
+
+class FingerTracker(Driver):
+    """A finger tracker asks for the node descriptor before it reads."""
+
+    def __init__(self, name: str, side: Side, *, transport: Transport, clock: StationClock) -> None:
+        self._nodes = FingerTrackerDecoder(side)
+        super().__init__(name, transport=transport, decoder=self._nodes, clock=clock)
+
+    def open(self) -> None:
+        """Open and learn the node order.
+
+        Raises:
+            DeviceError: absent, or it does not describe its nodes.
+        """
+        super().open()
+        self.transport.write(bytes([DESCRIPTOR_REPORT]).ljust(REPORT_BYTES, b"\0"))
+        for _ in range(DESCRIPTOR_READS):
+            super().read()
+            if self._nodes.described:
+                return
+        raise DeviceError(f"{self.name}: {self.info} sends no node descriptor; wrong firmware?")

@@ -1,0 +1,89 @@
+"""Robot state over a socket: packets come in, six streams of joints and wrist poses go out."""
+
+import struct
+from typing import Literal
+
+import numpy as np
+
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor, StreamKind
+from dextouch.streams.samples import Sample
+from services.acquisition.drivers.base import Readings, check_packet
+from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+
+MAGIC = b"DXRS"
+NUM_JOINTS = 40
+NOMINAL_RATE_HZ = 100.0
+DEVICE = "robot_state"
+# The order in the packet: all float64.
+STREAM_SIZES = {
+    "joints_measured": NUM_JOINTS,
+    "joints_commanded": NUM_JOINTS,
+    "wrist_left": 7,
+    "wrist_right": 7,
+    "wrist_left_commanded": 7,
+    "wrist_right_commanded": 7,
+}
+PAYLOAD = struct.Struct(f"<{sum(STREAM_SIZES.values())}d")
+
+
+def robot_descriptor(stream: str) -> StreamDescriptor:
+    """One of the six streams: joints in rad (left 20, then right 20), poses in the world frame."""
+    is_pose = stream.startswith("wrist")
+    kind: StreamKind = "pose" if is_pose else "robot_state"
+    side: Literal["left", "right"] | None = None
+    if is_pose:
+        side = "left" if "left" in stream else "right"
+    return StreamDescriptor(
+        name=stream,
+        kind=kind,
+        shape=(STREAM_SIZES[stream],),
+        dtype="float64",
+        unit="pose_m_wxyz" if is_pose else "rad",
+        nominal_rate_hz=NOMINAL_RATE_HZ,
+        frame="world" if is_pose else None,
+        side=side,
+        device=DEVICE,
+        capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
+    )
+
+
+class RobotStateDecoder:
+    """One packet gives one sample of each stream, all with the same stamps."""
+
+    def __init__(self) -> None:
+        self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """What was seen so far; `refused` counts states that are not finite."""
+        return self._packets.statistics
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The six streams."""
+        return tuple(robot_descriptor(stream) for stream in STREAM_SIZES)
+
+    def reset(self) -> None:
+        """Forget half a packet."""
+        self._packets.reset()
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """Samples of all six streams completed by `data`.
+
+        Raises:
+            DeviceError: another packet version.
+        """
+        readings: Readings = {}
+        for packet in self._packets.feed(data):
+            check_packet(packet, device=DEVICE, source=None)
+            numbers = np.frombuffer(packet.payload, dtype="<f8")
+            if not np.all(np.isfinite(numbers)):
+                self.statistics.refused += 1
+                continue
+            start = 0
+            for stream, size in STREAM_SIZES.items():
+                values = numbers[start : start + size]
+                sample = Sample(t_host_ns, values, packet.t_device_ns, packet.sequence)
+                readings.setdefault(stream, []).append(sample)
+                start += size
+        return readings

@@ -1,0 +1,77 @@
+"""Tactile glove: bytes of our glove packet come in, 360 raw counts a sample go out."""
+
+import numpy as np
+
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import Sample
+from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
+from services.acquisition.drivers.base import Readings, check_packet
+from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+
+MAGIC = b"DXTG"
+PAYLOAD_BYTES = 2 * NUM_RAW_TAXELS
+NOMINAL_RATE_HZ = 60.0
+FULL_SCALE_COUNTS = 65_535
+
+
+def glove_descriptor(side: Side) -> StreamDescriptor:
+    """The raw stream of one glove."""
+    return StreamDescriptor(
+        name=f"tactile_{side}",
+        kind="tactile",
+        shape=(NUM_RAW_TAXELS,),
+        dtype="uint16",
+        unit="counts",
+        nominal_rate_hz=NOMINAL_RATE_HZ,
+        side=side,
+        device=f"glove_{side}",
+        capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
+    )
+
+
+class TactileGloveDecoder:
+    """Decodes one glove's byte stream.
+
+    Args:
+        side: which glove it must be; None takes any.
+    """
+
+    def __init__(self, side: Side | None = None) -> None:
+        self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD_BYTES, max_payload=PAYLOAD_BYTES)
+        self._side: Side | None = side
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """What was seen so far."""
+        return self._packets.statistics
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The raw stream (named for the left hand when the side is open)."""
+        return (glove_descriptor(self._side or "left"),)
+
+    def reset(self) -> None:
+        """Forget half a packet."""
+        self._packets.reset()
+
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+        """Samples (uint16 counts [360], raw scan order) completed by `data`.
+
+        Args:
+            data: the next bytes of the stream, in any portion.
+            t_host_ns: when they arrived; 0 where only the content matters (a file of bytes).
+
+        Raises:
+            DeviceError: another packet version or the other hand's glove.
+        """
+        samples = []
+        for packet in self._packets.feed(data):
+            check_packet(packet, device=f"glove_{self._side or 'any'}", source=self._side)
+            counts = np.frombuffer(packet.payload, dtype="<u2")
+            samples.append(Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence))
+        return samples
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """The same by stream name."""
+        samples = self.feed(data, t_host_ns)
+        return {self.descriptors[0].name: samples} if samples else {}

@@ -1,0 +1,101 @@
+"""What mocks did to every packet comes in; the truth to score counters against goes out."""
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.errors import CorruptDataError, UnknownNameError
+
+FORMAT = "dextouch mock ledger 1"
+
+
+class Fate(StrEnum):
+    """What became of one packet."""
+
+    SENT = "sent"
+    DROPPED = "dropped"
+    CORRUPTED = "corrupted"
+    UNPLUGGED = "unplugged"
+    OVERRUN = "overrun"
+
+
+@dataclass
+class DeviceLedger:
+    """One device's packets, column by column; times on the host's clock except `t_device_ns`."""
+
+    path_delay_ns: int = 0
+    sequence: list[int] = field(default_factory=list)
+    t_true_ns: list[int] = field(default_factory=list)
+    t_device_ns: list[int] = field(default_factory=list)
+    t_arrival_ns: list[int] = field(default_factory=list)
+    fate: list[str] = field(default_factory=list)
+    flipped_bits: list[int] = field(default_factory=list)
+
+    def note(self, sequence: int, times_ns: tuple[int, int, int], fate: Fate, flips: int) -> None:
+        """Add a packet with its true, device and arrival times."""
+        self.sequence.append(sequence)
+        self.t_true_ns.append(times_ns[0])
+        self.t_device_ns.append(times_ns[1])
+        self.t_arrival_ns.append(times_ns[2])
+        self.fate.append(fate.value)
+        self.flipped_bits.append(flips)
+
+    def count(self, fate: Fate) -> int:
+        """How many packets met this fate."""
+        return Counter(self.fate)[fate.value]
+
+    def count_lost_between(self) -> int:
+        """Packets lost between the first and the last that arrived whole: what sequences show."""
+        whole = [index for index, fate in enumerate(self.fate) if fate == Fate.SENT]
+        return whole[-1] - whole[0] + 1 - len(whole) if whole else 0
+
+    def true_times_ns(self, sequences: np.ndarray) -> Int64[np.ndarray, " n"]:
+        """True host time of the samples with these sequence numbers."""
+        times = dict(zip(self.sequence, self.t_true_ns, strict=True))
+        return np.array([times[int(sequence)] for sequence in sequences], dtype=np.int64)
+
+
+@dataclass
+class Ledger:
+    """Everything the mocks of one take did."""
+
+    seed: int
+    start_host_ns: int
+    devices: dict[str, DeviceLedger] = field(default_factory=dict)
+
+    def of(self, device: str) -> DeviceLedger:
+        """One device's packets.
+
+        Raises:
+            UnknownNameError: no such device took part.
+        """
+        if device not in self.devices:
+            raise UnknownNameError("device", device, list(self.devices))
+        return self.devices[device]
+
+    def save(self, path: Path) -> None:
+        """Write it as JSON."""
+        path.write_text(json.dumps({"format": FORMAT, **asdict(self)}), encoding="utf-8")
+
+    @staticmethod
+    def load(path: Path) -> "Ledger":
+        """Read what `save` wrote.
+
+        Raises:
+            CorruptDataError: not such a file.
+        """
+        try:
+            content = json.loads(path.read_text(encoding="utf-8"))
+            if content.pop("format") != FORMAT:
+                raise CorruptDataError(f"{path}: not a {FORMAT!r}")
+            devices = {
+                name: DeviceLedger(**columns) for name, columns in content["devices"].items()
+            }
+            return Ledger(content["seed"], content["start_host_ns"], devices)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
+            raise CorruptDataError(f"{path}: not a {FORMAT!r} ({error})") from error

@@ -1,0 +1,237 @@
+"""The device's end of a pty, HID device or socket: bytes in, read by a real transport."""
+
+import contextlib
+import errno
+import os
+import select
+import socket
+import threading
+import tty
+from collections import deque
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from dextouch.errors import DeviceError
+from services.acquisition.mocks.link import Link, WatchedTransport
+from services.acquisition.transports.base import Transport
+from services.acquisition.transports.hid import HidDevice, HidTransport
+from services.acquisition.transports.serial import SerialTransport
+from services.acquisition.transports.socket import SocketTransport
+
+SEND_TIMEOUT_S = 1.0
+HID_RING_REPORTS = 63
+
+
+@runtime_checkable
+class MockPort(Protocol):
+    """The device's end."""
+
+    link: Link
+
+    @property
+    def transport(self) -> Transport:
+        """The host's end, not opened."""
+        ...
+
+    def send(self, unit: bytes) -> bool:
+        """Send bytes or one report; False when the host's buffer was full."""
+        ...
+
+    def plug(self) -> None:
+        """Become visible to the host."""
+        ...
+
+    def unplug(self) -> None:
+        """Vanish."""
+        ...
+
+
+class PtyPort:
+    """A serial device: a pseudo terminal with a new name at every plugging."""
+
+    def __init__(self, name: str) -> None:
+        self.link = Link()
+        self._name = name
+        self._master: int | None = None
+        self._slave: int | None = None
+        self._transport = WatchedTransport(
+            SerialTransport(self._find, serial_number=name), self.link
+        )
+
+    @property
+    def transport(self) -> Transport:
+        """A real serial transport on the terminal."""
+        return self._transport
+
+    def plug(self) -> None:
+        """Create the terminal."""
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+
+    def unplug(self) -> None:
+        """Hang up."""
+        for descriptor in (self._master, self._slave):
+            if descriptor is not None:
+                os.close(descriptor)
+        self._master = self._slave = None
+
+    def send(self, unit: bytes) -> bool:
+        """Write; what does not fit into the kernel's buffer within a second is lost."""
+        rest = memoryview(unit)
+        self.link.add_sent(len(unit))
+        while rest and self._master is not None:
+            if not select.select([], [self._master], [], SEND_TIMEOUT_S)[1]:
+                self.link.add_sent(-len(rest))
+                return False
+            rest = rest[os.write(self._master, rest) :]
+        return True
+
+    def _find(self) -> str:
+        if self._slave is None:
+            raise DeviceError(f"serial device {self._name!r} is not plugged in")
+        return os.ttyname(self._slave)
+
+
+class FakeHid:
+    """Behaves like an opened hidapi device.
+
+    `read` gives [] when idle and OSError when unplugged; a ring keeps 63 reports and silently
+    loses the newest; `write` counts one byte more than it was given.
+    """
+
+    def __init__(self) -> None:
+        self.on_write: Callable[[bytes], None] | None = None
+        self._ring: deque[bytes] = deque()
+        self._changed = threading.Condition()
+        self._plugged = False
+
+    def open(self) -> HidDevice:
+        """What hidapi's open does: reports that came before are not seen."""
+        with self._changed:
+            self._check()
+            self._ring.clear()
+        return self
+
+    def set_plugged(self, *, plugged: bool) -> None:
+        """Plug it in or out."""
+        with self._changed:
+            self._plugged = plugged
+            self._changed.notify_all()
+
+    def push(self, report: bytes) -> bool:
+        """A report from the device; False when the ring was full."""
+        with self._changed:
+            if len(self._ring) >= HID_RING_REPORTS:
+                return False
+            self._ring.append(report)
+            self._changed.notify_all()
+            return True
+
+    def read(self, max_length: int, timeout_ms: int = 0) -> list[int]:
+        """One report or []."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._ring or not self._plugged, timeout_ms / 1000)
+            self._check()
+            return list(self._ring.popleft()[:max_length]) if self._ring else []
+
+    def write(self, buff: bytes) -> int:
+        """A report to the device."""
+        with self._changed:
+            self._check()
+        if self.on_write is not None:
+            self.on_write(bytes(buff))
+        return len(buff) + 1
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+    def _check(self) -> None:
+        if not self._plugged:
+            raise OSError(errno.EIO, "read error")
+
+
+class HidPort:
+    """A HID device whose host end is the real HID transport on a `FakeHid`."""
+
+    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
+        self.link = Link()
+        self.device = FakeHid()
+        if answer is not None:
+            self.device.on_write = lambda report: self._send_all(answer(report))
+        transport = HidTransport(self.device.open, address=f"mock:{name}", serial_number=name)
+        self._transport = WatchedTransport(transport, self.link)
+
+    @property
+    def transport(self) -> Transport:
+        """A real HID transport."""
+        return self._transport
+
+    def plug(self) -> None:
+        """Plug in."""
+        self.device.set_plugged(plugged=True)
+
+    def unplug(self) -> None:
+        """Pull out."""
+        self.device.set_plugged(plugged=False)
+
+    def send(self, unit: bytes) -> bool:
+        """Push a report into the ring."""
+        self.link.add_sent(len(unit))
+        taken = self.device.push(unit)
+        if not taken:
+            self.link.add_sent(-len(unit))
+        return taken
+
+    def _send_all(self, reports: list[bytes]) -> None:
+        for report in reports:
+            self.send(report)
+
+
+class SocketPort:
+    """A device behind a socket: every connection of the host is a new pair."""
+
+    def __init__(self, name: str) -> None:
+        self.link = Link()
+        self._plugged = False
+        self._device_end: socket.socket | None = None
+        transport = SocketTransport(self._connect, address=f"mock:{name}")
+        self._transport = WatchedTransport(transport, self.link)
+
+    @property
+    def transport(self) -> Transport:
+        """A real socket transport."""
+        return self._transport
+
+    def plug(self) -> None:
+        """Accept connections."""
+        self._plugged = True
+
+    def unplug(self) -> None:
+        """Close the connection and refuse new ones."""
+        self._plugged = False
+        if self._device_end is not None:
+            self._device_end.close()
+            self._device_end = None
+
+    def send(self, unit: bytes) -> bool:
+        """Send all; a host that takes nothing for a second loses it."""
+        if self._device_end is None:
+            return False
+        self.link.add_sent(len(unit))
+        try:
+            self._device_end.sendall(unit)
+        except OSError:
+            self.link.add_sent(-len(unit))
+            return False
+        return True
+
+    def _connect(self) -> socket.socket:
+        if not self._plugged:
+            raise ConnectionRefusedError(errno.ECONNREFUSED, "the mock device is unplugged")
+        if self._device_end is not None:
+            with contextlib.suppress(OSError):
+                self._device_end.close()
+        self._device_end, host_end = socket.socketpair()
+        self._device_end.settimeout(SEND_TIMEOUT_S)
+        return host_end

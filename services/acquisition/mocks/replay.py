@@ -1,0 +1,183 @@
+"""An episode's stream as plain arrays comes in; a device that plays it as packets goes out."""
+
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.mocks.faults import (
+    DeviceFaults,
+    Schedule,
+    boot_time_ns,
+    flip_bits,
+    make_schedule,
+)
+from services.acquisition.mocks.ledger import DeviceLedger, Fate
+from services.acquisition.mocks.ports import MockPort
+
+
+@dataclass(frozen=True)
+class ReplayStream:
+    """One stream of a truth or recorded episode, ready to be played by a mock device.
+
+    Raises:
+        ShapeError: values that do not fit the descriptor or the times.
+        NonFiniteError: NaN or infinity.
+        InvalidInputError: no sample, or times that do not grow from 0 on.
+    """
+
+    descriptor: StreamDescriptor
+    t_ns: Int64[np.ndarray, " n"]
+    values: Shaped[np.ndarray, "n ..."]
+
+    def __post_init__(self) -> None:
+        name, shape = self.descriptor.name, self.descriptor.shape
+        if self.values.shape != (len(self.t_ns), *shape):
+            raise ShapeError(
+                f"replay stream {name!r}: got values {self.values.shape}, expected "
+                f"{(len(self.t_ns), *shape)}"
+            )
+        if len(self.t_ns) == 0 or self.t_ns[0] < 0 or np.any(np.diff(self.t_ns) <= 0):
+            raise InvalidInputError(f"replay stream {name!r}: expected times growing from 0 on")
+        if self.values.dtype.kind == "f" and not np.all(np.isfinite(self.values)):
+            raise NonFiniteError(f"replay stream {name!r}: NaN or infinity in the values")
+
+
+@runtime_checkable
+class PacketSource(Protocol):
+    """What one device says: packets made from replay streams."""
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each sample is taken."""
+        ...
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """The packet of sample `index`, as the units that the port sends (reports, or one)."""
+        ...
+
+
+class _Event(NamedTuple):
+    """Something a device does at a time counted from the start of the take."""
+
+    t_ns: int
+    plug: bool | None
+    sample_index: int
+
+
+class MockDevice:
+    """Plays a packet source through a port, disturbed by its faults, keeping a ledger.
+
+    Args:
+        name: of the device.
+        source: what it says.
+        port: where it says it.
+        faults: what goes wrong.
+        seed: of everything random here.
+    """
+
+    def __init__(
+        self, name: str, *, source: PacketSource, port: MockPort, faults: DeviceFaults, seed: int
+    ) -> None:
+        self.name = name
+        self.source = source
+        self.port = port
+        self.faults = faults
+        self._rng = device_rng(seed, name)
+        self._boot_ns = boot_time_ns(self._rng)
+        self._next_sequence = 0
+        self._start_host_ns = 0
+        self.ledger = self._new_ledger()
+
+    def play(
+        self, clock: StationClock, waiter: Waiter, *, start_host_ns: int, offset_ns: int = 0
+    ) -> bool:
+        """Play the whole source once; the ledger is that of the last play.
+
+        Args:
+            clock: a virtual one makes the device wait for the host after each packet.
+            waiter: of the calling thread.
+            start_host_ns: when the take starts; the device's clock counts from there.
+            offset_ns: shift of this play, for one that goes round and round.
+
+        Returns:
+            False when the waiter was cancelled.
+        """
+        lockstep = isinstance(clock, VirtualClock)
+        self._start_host_ns = start_host_ns
+        self.ledger = self._new_ledger()
+        schedule = make_schedule(
+            self.source.t_ns + offset_ns, self.faults, boot_ns=self._boot_ns, rng=self._rng
+        )
+        for event in self._events(schedule):
+            if not waiter.wait_until(start_host_ns + event.t_ns):
+                return False
+            self._do(event, schedule)
+            if lockstep:
+                self._let_host_keep_up(event)
+        return True
+
+    def _do(self, event: _Event, schedule: Schedule) -> None:
+        if event.plug is None:
+            self._send(event.sample_index, schedule)
+        elif event.plug:
+            self.port.plug()
+        else:
+            self.port.unplug()
+
+    def _let_host_keep_up(self, event: _Event) -> None:
+        if event.plug is False:
+            self.port.link.wait_closed()
+        else:
+            self.port.link.wait_consumed()
+
+    def _events(self, schedule: Schedule) -> Iterator[_Event]:
+        events = [
+            _Event(int(t_ns), None, index) for index, t_ns in enumerate(schedule.t_arrival_ns)
+        ]
+        span = (schedule.t_true_ns[0], schedule.t_arrival_ns[-1])
+        for window_s in self.faults.unplugged_s:
+            for edge_s, plug in zip(window_s, (False, True), strict=True):
+                t_ns = round(edge_s * 1e9)
+                if span[0] <= t_ns <= span[1]:
+                    events.append(_Event(t_ns, plug, -1))
+        # A stable sort by time alone keeps the packets in order.
+        return iter(sorted(events, key=lambda event: event.t_ns))
+
+    def _send(self, index: int, schedule: Schedule) -> None:
+        sequence = self._next_sequence
+        self._next_sequence += 1
+        t_device_ns = int(schedule.t_device_ns[index])
+        fate, flips = Fate.SENT, 0
+        if schedule.is_unplugged[index] or not self.port.link.is_open:
+            fate = Fate.UNPLUGGED
+        elif schedule.is_dropped[index]:
+            fate = Fate.DROPPED
+        else:
+            for unit in self.source.units(index, sequence, t_device_ns):
+                damaged, num_flips = flip_bits(unit, self.faults.bit_error_rate, self._rng)
+                flips += num_flips
+                if not self.port.send(damaged):
+                    fate = Fate.OVERRUN
+            if flips and fate is Fate.SENT:
+                fate = Fate.CORRUPTED
+        times_ns = (
+            self._start_host_ns + int(schedule.t_true_ns[index]),
+            t_device_ns,
+            self._start_host_ns + int(schedule.t_arrival_ns[index]),
+        )
+        self.ledger.note(sequence, times_ns, fate, flips)
+
+    def _new_ledger(self) -> DeviceLedger:
+        return DeviceLedger(path_delay_ns=round(self.faults.path_delay_ms * 1e6))
+
+
+def device_rng(seed: int, name: str) -> np.random.Generator:
+    """The same random numbers for the same seed and device, whatever other devices there are."""
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])

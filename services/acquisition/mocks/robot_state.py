@@ -1,0 +1,43 @@
+"""Joint and pose streams of a robot come in; its state packets go out."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.errors import InvalidInputError
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.drivers.robot_state import MAGIC, STREAM_SIZES
+from services.acquisition.mocks.replay import ReplayStream
+
+
+class RobotStateSource:
+    """Packets of one robot.
+
+    Args:
+        streams: the six of `STREAM_SIZES`, all with the same times.
+
+    Raises:
+        InvalidInputError: one is missing, or their times differ.
+    """
+
+    def __init__(self, streams: Mapping[str, ReplayStream]) -> None:
+        missing = sorted(set(STREAM_SIZES) - set(streams))
+        if missing:
+            raise InvalidInputError(f"robot state: streams {missing} are missing")
+        parts = [streams[name] for name in STREAM_SIZES]
+        if any(not np.array_equal(part.t_ns, parts[0].t_ns) for part in parts):
+            raise InvalidInputError("robot state: the six streams have different times")
+        self._t_ns = parts[0].t_ns
+        self._numbers = np.concatenate([part.values for part in parts], axis=1).astype("<f8")
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each sample is taken."""
+        return self._t_ns
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet."""
+        payload = self._numbers[index].tobytes()
+        packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, payload)
+        return [encode_packet(MAGIC, packet)]

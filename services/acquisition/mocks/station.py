@@ -1,0 +1,190 @@
+"""Streams of an episode, faults and a clock come in; a whole station recording them goes out."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+
+from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.schemas.episodes import Matrix
+from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.drivers.camera import ImageEncoding
+from services.acquisition.mocks.devices import MockFactory, MockPair, duration_ns
+from services.acquisition.mocks.faults import FaultScript
+from services.acquisition.mocks.ledger import Ledger
+from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.schemas import SaveTake, TakeCheck, TakePrompt
+from services.acquisition.station import Station
+
+LEDGER_FILE = "mock_ledger.json"
+LEAD_NS = 20_000_000
+LIVE_LEAD_NS = 200_000_000
+
+
+@dataclass(frozen=True)
+class MockTake:
+    """A recorded take: where it lies, what was done to it, what the check found."""
+
+    recording_id: str
+    spool_path: Path
+    ledger: Ledger
+    check: TakeCheck
+
+
+class MockStation:
+    """A station whose devices are mocks that play one episode.
+
+    Args:
+        streams: of the episode.
+        faults: what disturbs the devices.
+        seed: of everything random.
+        clock: a `VirtualClock` records a take in a fraction of its length, exactly repeatable; a
+            `RealClock` lets real time and the operating system play their part.
+        spool_root: folder of the takes.
+        name: of the station.
+        calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
+        image_encoding: of the cameras on the wire.
+    """
+
+    def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
+        self,
+        streams: Sequence[ReplayStream],
+        faults: FaultScript,
+        seed: int,
+        clock: StationClock,
+        *,
+        spool_root: Path,
+        name: str = "mock_station",
+        calibration: Mapping[str, Matrix] | None = None,
+        image_encoding: ImageEncoding = "rgb8",
+    ) -> None:
+        factory = MockFactory(
+            streams, faults=faults, seed=seed, clock=clock, image_encoding=image_encoding
+        )
+        self.pairs = factory.build()
+        self._clock = clock
+        self._seed = seed
+        self._lap_ns = duration_ns({s.descriptor.name: s for s in streams})
+        self.station = Station(
+            name=name,
+            drivers=[pair.driver for pair in self.pairs],
+            spool_root=spool_root,
+            clock=clock,
+            calibration={
+                **factory.calibration(),
+                **factory.latencies(self.pairs),
+                **(calibration or {}),
+            },
+        )
+        self._players: list[tuple[threading.Thread, Waiter]] = []
+        self._failures: list[str] = []
+
+    def __enter__(self) -> "MockStation":
+        self.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def start(self) -> None:
+        """Plug every device in and start the station."""
+        for pair in self.pairs:
+            pair.device.port.plug()
+        self.station.start()
+        self.station.wait_connected()
+
+    def stop(self) -> None:
+        """Stop players, station and devices."""
+        for _, waiter in self._players:
+            waiter.cancel()
+        for thread, _ in self._players:
+            thread.join()
+        self.station.stop()
+        for pair in self.pairs:
+            pair.device.port.unplug()
+
+    def run_take(
+        self, prompt: TakePrompt, *, recording_id: str | None = None, how: SaveTake | None = None
+    ) -> MockTake:
+        """Record the whole episode once and save it.
+
+        Args:
+            prompt: task and instruction.
+            recording_id: chosen by the recorder if None.
+            how: how it is saved; incomplete takes are accepted if None.
+
+        Raises:
+            ConflictError: the recorder is busy.
+            DeviceError: a mock could not play (its reader is stuck).
+        """
+        recorder = self.station.recorder
+        recorder.arm(prompt)
+        status = recorder.record(recording_id)
+        start_ns = self._clock.now_ns() + LEAD_NS
+        self._play(start_ns, laps=1)
+        for thread, _ in self._players:
+            thread.join()
+        self._drain()
+        check = recorder.stop().check
+        recorder.save(how or SaveTake(accept_incomplete=True))
+        if self._failures or check is None or status.recording_id is None:
+            raise DeviceError(f"mock station: {'; '.join(self._failures) or 'no take'}")
+        devices = {pair.device.name: pair.device.ledger for pair in self.pairs}
+        ledger = Ledger(self._seed, start_ns, devices)
+        path = recorder.spool_root / status.recording_id
+        ledger.save(path / LEDGER_FILE)
+        return MockTake(status.recording_id, path, ledger, check)
+
+    def play_forever(self) -> None:
+        """Let the devices go round and round, for a station that an operator uses.
+
+        Raises:
+            InvalidInputError: the clock is virtual; it would run away.
+        """
+        if isinstance(self._clock, VirtualClock):
+            raise InvalidInputError("play_forever: needs a real clock")
+        self._play(self._clock.now_ns() + LIVE_LEAD_NS, laps=None)
+
+    def _play(self, start_ns: int, *, laps: int | None) -> None:
+        # All waiters exist before the first thread runs: a virtual clock waits for all of them.
+        waiters = [self._clock.waiter(drives_time=True) for _ in self.pairs]
+        self._players = [
+            (
+                threading.Thread(
+                    target=self._run,
+                    args=(pair, waiter, start_ns, laps),
+                    name=f"mock-{pair.device.name}",
+                    daemon=True,
+                ),
+                waiter,
+            )
+            for pair, waiter in zip(self.pairs, waiters, strict=True)
+        ]
+        for thread, _ in self._players:
+            thread.start()
+
+    def _run(self, pair: MockPair, waiter: Waiter, start_ns: int, laps: int | None) -> None:
+        with closing(waiter):
+            lap = 0
+            try:
+                while laps is None or lap < laps:
+                    offset_ns = lap * self._lap_ns
+                    if not pair.device.play(
+                        self._clock, waiter, start_host_ns=start_ns, offset_ns=offset_ns
+                    ):
+                        return
+                    lap += 1
+            except DeviceError as error:
+                self._failures.append(f"{pair.device.name}: {error.message}")
+
+    def _drain(self) -> None:
+        for pair in self.pairs:
+            if pair.device.port.link.is_open:
+                pair.device.port.link.wait_consumed()

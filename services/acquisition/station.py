@@ -1,0 +1,82 @@
+"""Drivers come in, a running station goes out: supervisors, recorder and live views together."""
+
+import threading
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from dextouch.errors import DeviceError
+from dextouch.schemas.episodes import Matrix
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.health import HealthMonitor
+from services.acquisition.live import LiveView
+from services.acquisition.recorder import Recorder
+from services.acquisition.supervisor import DeviceSupervisor
+
+CONNECT_TIMEOUT_S = 10.0
+
+
+class Station:
+    """Everything that runs beside the devices.
+
+    Args:
+        name: of the station.
+        drivers: of its devices.
+        spool_root: folder of the takes.
+        clock: stamps and waits.
+        calibration: matrices that travel with every recording.
+    """
+
+    def __init__(
+        self,
+        *,
+        name: str,
+        drivers: Sequence[Driver],
+        spool_root: Path,
+        clock: StationClock,
+        calibration: Mapping[str, Matrix],
+    ) -> None:
+        self.name = name
+        self.clock = clock
+        self.recorder = Recorder(
+            station=name,
+            spool_root=spool_root,
+            drivers=drivers,
+            clock=clock,
+            calibration=calibration,
+        )
+        self.live = LiveView(drivers, calibration)
+        self.supervisors = [
+            DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
+        ]
+        self.health = HealthMonitor(self.supervisors, live=self.live, clock=clock, station=name)
+
+    def start(self) -> None:
+        """Start all readers and the health evaluation."""
+        for supervisor in self.supervisors:
+            supervisor.start()
+        self.health.start()
+
+    def wait_connected(self, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
+        """Block until every device answers.
+
+        Raises:
+            DeviceError: some do not; the message names them.
+        """
+        missing = [s.driver.name for s in self.supervisors if not s.connected.wait(timeout_s)]
+        if missing:
+            raise DeviceError(f"devices {missing} did not connect within {timeout_s:g} s")
+
+    def stop(self) -> None:
+        """Stop everything; an unsaved take stays in the spool."""
+        self.health.stop()
+        stoppers = [threading.Thread(target=supervisor.stop) for supervisor in self.supervisors]
+        for stopper in stoppers:
+            stopper.start()
+        for stopper in stoppers:
+            stopper.join()
+        self.recorder.close()
+
+    def _accept(self, device: str, readings: Readings) -> None:
+        self.recorder.accept(device, readings)
+        self.live.accept(device, readings)

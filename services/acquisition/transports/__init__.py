@@ -1,0 +1,1 @@
+"""Transports: four methods that move bytes between a driver and a port, device or socket."""

@@ -1,0 +1,112 @@
+"""A HID device by hidapi's hidraw backend: something that opens it comes in, reports go out."""
+
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
+from dextouch.errors import DeviceError
+from services.acquisition.transports.base import TransportInfo
+
+READ_TIMEOUT_MS = 100
+MAX_REPORT_BYTES = 64
+
+
+@runtime_checkable
+class HidDevice(Protocol):
+    """What we use of an opened hidapi device."""
+
+    def read(self, max_length: int, timeout_ms: int = 0) -> list[int]:
+        """One report; [] when none has come yet; OSError when unplugged."""
+        ...
+
+    def write(self, buff: bytes) -> int:
+        """Send a report, its id first; the number of bytes, or -1."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+def hid_opener(
+    *, vendor_id: int, product_id: int, serial_number: str | None = None
+) -> Callable[[], HidDevice]:
+    """What opens the real device of these ids (hidraw; the libusb backend detaches other users)."""
+
+    def open_device() -> HidDevice:
+        import hidraw
+
+        device = hidraw.device()
+        device.open(vendor_id, product_id, serial_number)
+        return device
+
+    return open_device
+
+
+class HidTransport:
+    """One HID device; `read` gives one report, and b"" means nothing yet (never: stale)."""
+
+    def __init__(
+        self,
+        open_device: Callable[[], HidDevice],
+        *,
+        address: str,
+        serial_number: str | None = None,
+    ) -> None:
+        self._open_device = open_device
+        self._address = address
+        self._serial_number = serial_number
+        self._device: HidDevice | None = None
+
+    @property
+    def info(self) -> TransportInfo:
+        """Vendor and product."""
+        return TransportInfo("hid", self._address, self._serial_number)
+
+    def open(self) -> None:
+        """Open the device.
+
+        Raises:
+            DeviceError: absent or not permitted.
+        """
+        self.close()
+        try:
+            self._device = self._open_device()
+        except OSError as error:
+            raise DeviceError(
+                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
+            ) from error
+
+    def read(self) -> bytes:
+        """One report, waiting up to 0.1 s.
+
+        Raises:
+            DeviceError: the device is gone.
+        """
+        try:
+            return bytes(self._opened().read(MAX_REPORT_BYTES, READ_TIMEOUT_MS))
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
+
+    def write(self, data: bytes) -> None:
+        """Send one report; its first byte is the report id.
+
+        Raises:
+            DeviceError: the device is gone or takes no such report.
+        """
+        try:
+            written = self._opened().write(data)
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while writing ({error})") from error
+        if written < len(data):
+            raise DeviceError(f"{self.info}: wrote {written} bytes, expected at least {len(data)}")
+
+    def close(self) -> None:
+        """Close the device."""
+        if self._device is not None:
+            self._device.close()
+            self._device = None
+
+    def _opened(self) -> HidDevice:
+        if self._device is None:
+            raise DeviceError(f"{self.info}: not open")
+        return self._device

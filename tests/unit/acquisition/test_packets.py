@@ -1,0 +1,136 @@
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from dextouch.errors import DeviceError, InvalidInputError
+from services.acquisition.drivers.packets import (
+    SOURCES,
+    DecoderStatistics,
+    Packet,
+    PacketDecoder,
+    encode_packet,
+)
+from services.acquisition.drivers.tactile_glove import MAGIC, PAYLOAD_BYTES, TactileGloveDecoder
+
+
+def glove_packet(sequence, rng, *, version=1, source=SOURCES["left"]):
+    counts = rng.integers(0, 65536, 360, dtype=np.uint16)
+    payload = counts.astype("<u2").tobytes()
+    return encode_packet(MAGIC, Packet(version, source, sequence, 10**9 + sequence, payload))
+
+
+def flip_bits(data, rate, rng):
+    damaged = np.frombuffer(data, np.uint8).copy()
+    flips = rng.choice(8 * len(data), rng.binomial(8 * len(data), rate), replace=False)
+    np.bitwise_xor.at(damaged, flips // 8, (1 << flips % 8).astype(np.uint8))
+    return damaged.tobytes()
+
+
+def decode(data, sizes):
+    decoder = TactileGloveDecoder("left")
+    found = []
+    position = 0
+    while position < len(data):
+        size = sizes[len(found) % len(sizes)] if sizes else len(data)
+        found.extend(decoder.feed(data[position : position + size]))
+        position += size
+    return [(s.sequence, s.t_device_ns, s.values.tobytes()) for s in found], decoder.statistics
+
+
+def test_header_is_as_documented(rng):
+    packet = glove_packet(7, rng)
+    assert len(packet) == 746
+    assert packet[:4] == b"DXTG"
+    assert struct.unpack_from("<BBIIQ", packet, 4) == (1, 1, 720, 7, 10**9 + 7)
+
+
+def test_samples_carry_counts_and_stamps(rng):
+    decoder = TactileGloveDecoder()
+    data = glove_packet(3, rng)
+    (sample,) = decoder.feed(data, 55)
+    assert sample.t_host_ns == 55
+    assert sample.t_device_ns == 10**9 + 3
+    assert sample.sequence == 3
+    assert sample.values.dtype == np.uint16
+    assert sample.values.tobytes() == data[22:742]
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    sizes=st.lists(st.integers(1, 2000), min_size=1, max_size=30),
+    rate=st.sampled_from([0.0, 1e-5, 1e-4, 1e-3]),
+)
+def test_portions_do_not_matter(seed, sizes, rate):
+    rng = np.random.default_rng(seed)
+    data = b"".join(glove_packet(i, rng) for i in range(6)) + rng.bytes(3)
+    data = flip_bits(data, rate, rng)
+    assert decode(data, sizes) == decode(data, [])
+
+
+@settings(max_examples=40, deadline=None)
+@given(data=st.binary(max_size=3000))
+def test_no_bytes_break_it(data):
+    decoder = TactileGloveDecoder("left")
+    decoder.feed(b"DXTG" + data)
+    assert decoder.statistics.packets == 0
+
+
+def test_no_wrong_packet_under_bit_errors(rng):
+    sent = [glove_packet(i, rng) for i in range(4000)]
+    received = [flip_bits(packet, 1e-5, rng) for packet in sent]
+    intact = [i for i, (a, b) in enumerate(zip(sent, received, strict=True)) if a == b]
+    assert len(intact) < len(sent)
+    samples, statistics = decode(b"".join(received), [512])
+    assert [s[0] for s in samples] == intact
+    assert all(values == sent[i][22:742] for i, _, values in samples)
+    assert statistics.lost == intact[-1] - intact[0] + 1 - len(intact)
+    assert statistics.packets == len(intact)
+    assert 0 < statistics.crc_errors + statistics.length_errors <= len(sent) - len(intact)
+
+
+def test_lost_bytes_cost_one_packet(rng):
+    packets = [glove_packet(i, rng) for i in range(5)]
+    packets[2] = packets[2][:100] + packets[2][101:]
+    samples, statistics = decode(b"".join(packets), [])
+    assert [s[0] for s in samples] == [0, 1, 3, 4]
+    assert statistics.lost == 1
+    assert statistics.resync_bytes == 745
+
+
+def test_sequence_wraps_and_restarts(rng):
+    sequences = [2**32 - 2, 2**32 - 1, 0, 2, 2, 0]
+    _, statistics = decode(b"".join(glove_packet(s, rng) for s in sequences), [])
+    assert statistics == DecoderStatistics(packets=6, lost=1, repeated=1, restarts=1)
+
+
+def test_magic_inside_the_payload_is_payload():
+    payload = (MAGIC * PAYLOAD_BYTES)[:PAYLOAD_BYTES]
+    data = encode_packet(MAGIC, Packet(1, 1, 0, 0, payload))
+    samples, statistics = decode(data * 3, [5])
+    assert len(samples) == 3
+    assert statistics.resync_bytes == 0
+
+
+@pytest.mark.parametrize(("version", "source", "words"), [(2, 1, "version 2"), (1, 2, "'right'")])
+def test_foreign_glove_is_refused(rng, version, source, words):
+    data = glove_packet(0, rng, version=version, source=source)
+    with pytest.raises(DeviceError, match=words):
+        TactileGloveDecoder("left").feed(data)
+
+
+def test_magic_must_have_four_bytes():
+    with pytest.raises(InvalidInputError, match="4 bytes"):
+        encode_packet(b"DX", Packet(1, 0, 0, 0, b""))
+
+
+def test_reset_forgets_half_a_packet(rng):
+    decoder = PacketDecoder(MAGIC, min_payload=720, max_payload=720)
+    packet = glove_packet(0, rng)
+    decoder.feed(packet[:300])
+    decoder.reset()
+    assert len(decoder.feed(packet)) == 1
+    assert decoder.statistics.resync_bytes == 300
