@@ -1,0 +1,196 @@
+"""A compose file in, its services as plain processes on free loopback ports out."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import yaml
+
+VARIABLE = re.compile(r"\$\{(\w+)(?::([-?])([^}]*))?\}")
+CONTAINER_PORTS = {"redis": 6379}
+SERVICE_PORT = 8000
+HEALTH_TIMEOUT_S = 60.0
+STOP_TIMEOUT_S = 10.0
+
+
+def free_port():
+    """A port that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+def interpolate(value, variables):
+    """`${NAME}`, `${NAME:-default}` and `${NAME:?reason}` as compose reads them."""
+
+    def fill(match):
+        name, kind, text = match.groups()
+        if variables.get(name):
+            return variables[name]
+        if kind == "-":
+            return text
+        raise KeyError(f"{name}: {text or 'not set'}")
+
+    return VARIABLE.sub(fill, value)
+
+
+@dataclass
+class Running:
+    """One service as a process."""
+
+    name: str
+    port: int
+    environment: dict
+    log_path: Path
+    process: subprocess.Popen
+    exit_s: float | None = None
+
+    @property
+    def url(self):
+        return f"http://127.0.0.1:{self.port}"
+
+    def log_tail(self, num_lines=40):
+        return "\n".join(self.log_path.read_text(errors="replace").splitlines()[-num_lines:])
+
+
+@dataclass
+class ComposeProcesses:
+    """Starts what `docker compose up` would start, in its order; stops it in reverse."""
+
+    path: Path
+    folder: Path
+    variables: dict
+    running: dict = field(default_factory=dict)
+
+    def __post_init__(self):
+        self.services = {
+            name: service
+            for name, service in yaml.safe_load(self.path.read_text())["services"].items()
+            if not service.get("profiles")
+        }
+        self.ports = {name: free_port() for name in self.services}
+
+    def order(self):
+        """Names so that each comes after what it depends on."""
+        done = []
+
+        def visit(name, path=()):
+            assert name not in path, f"depends_on runs in a circle: {path}"
+            for other in self.services[name].get("depends_on", {}):
+                visit(other, (*path, name))
+            if name not in done:
+                done.append(name)
+
+        for name in self.services:
+            visit(name)
+        return done
+
+    def start(self):
+        """Start all, waiting for the health of what others depend on."""
+        for name in self.order():
+            depends_on = self.services[name].get("depends_on", {})
+            for other, rule in depends_on.items():
+                if rule["condition"] == "service_healthy":
+                    self.wait_healthy(other)
+            self._start(name)
+        for name in self.running:
+            self.wait_healthy(name)
+
+    def _start(self, name):
+        service = self.services[name]
+        environment = self._environment(name)
+        log_path = self.folder / f"{name}.log"
+        working_folder = self.folder / name
+        working_folder.mkdir()
+        with log_path.open("wb") as log:
+            process = subprocess.Popen(
+                self._command(name, service["command"]),
+                env=environment,
+                cwd=working_folder,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+        self.running[name] = Running(name, self.ports[name], environment, log_path, process)
+
+    def _command(self, name, command):
+        words = [self._local(interpolate(word, self.variables), name) for word in command]
+        if words[0] == "python":
+            return [sys.executable, *words[1:]]
+        if words[0] == "redis-server":
+            port = ["--port", str(self.ports[name]), "--bind", "127.0.0.1"]
+            return [shutil.which("redis-server"), *words[1:], *port]
+        raise AssertionError(f"{name}: a command this test cannot start: {command}")
+
+    def _environment(self, name):
+        kept = ("PATH", "HOME", "LANG", "OMP_NUM_THREADS")
+        environment = {key: os.environ[key] for key in kept if key in os.environ}
+        environment["PYTHONUNBUFFERED"] = "1"
+        for key, value in self.services[name].get("environment", {}).items():
+            environment[key] = self._local(interpolate(str(value), self.variables), name)
+            if key.endswith("_PORT"):
+                environment[key] = str(self.ports[name])
+        return environment
+
+    def _local(self, text, name):
+        """Hosts, ports and folders of containers → those of this machine."""
+        for other, port in self.ports.items():
+            inside = CONTAINER_PORTS.get(other, SERVICE_PORT)
+            text = text.replace(f"//{other}:{inside}", f"//127.0.0.1:{port}")
+        text = text.replace(f"127.0.0.1:{SERVICE_PORT}", f"127.0.0.1:{self.ports[name]}")
+        if text == "0.0.0.0":  # noqa: S104 - it is replaced, not bound
+            return "127.0.0.1"
+        for volume in self.services[name].get("volumes", []):
+            source, inside = volume.split(":")[:2]
+            folder = self.folder / "volumes" / source
+            folder.mkdir(parents=True, exist_ok=True)
+            text = text.replace(inside, str(folder))
+        return text
+
+    def wait_healthy(self, name):
+        """Run the compose file's own health check until it passes."""
+        running = self.running[name]
+        test = self.services[name]["healthcheck"]["test"]
+        assert test[0] == "CMD", f"{name}: health checks are written as CMD lists"
+        command = [sys.executable if word == "python" else word for word in test[1:]]
+        if command[0] == "redis-cli":
+            command = [shutil.which("redis-cli"), "-p", str(running.port), *command[1:]]
+        deadline_s = time.monotonic() + HEALTH_TIMEOUT_S
+        while True:
+            assert running.process.poll() is None, f"{name} ended by itself\n{running.log_tail()}"
+            check = subprocess.run(
+                command, env=running.environment, capture_output=True, timeout=10, check=False
+            )
+            if check.returncode == 0:
+                return
+            assert time.monotonic() < deadline_s, (
+                f"{name} not healthy after {HEALTH_TIMEOUT_S:g} s: "
+                f"{check.stderr.decode(errors='replace')[-300:]}\n{running.log_tail()}"
+            )
+            time.sleep(0.2)
+
+    def stop(self):
+        """SIGTERM in reverse order; seconds each needed, None for one that had to be killed."""
+        for name in reversed(list(self.running)):
+            running = self.running[name]
+            if running.process.poll() is not None:
+                continue
+            started_s = time.monotonic()
+            running.process.send_signal(signal.SIGTERM)
+            try:
+                running.process.wait(STOP_TIMEOUT_S)
+                running.exit_s = time.monotonic() - started_s
+            except subprocess.TimeoutExpired:
+                os.killpg(running.process.pid, signal.SIGKILL)
+                running.process.wait()
+
+    def logs(self):
+        """The end of every log, for a failure's report."""
+        return "\n".join(f"--- {name}\n{r.log_tail()}" for name, r in self.running.items())
