@@ -1,7 +1,5 @@
 """Every number that fixes the network's shape and sampling: in from settings or a checkpoint."""
 
-from typing import Self
-
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 
@@ -30,7 +28,7 @@ class NetworkConfig(BaseModel):
     model_rate_hz: float = Field(default=15.0, gt=0)
 
     @model_validator(mode="after")
-    def _sizes_fit(self) -> Self:
+    def _sizes_fit(self) -> "NetworkConfig":
         if (self.max_steps - 1) % FRAMES_PER_LATENT:
             raise ValueError(f"max_steps: got {self.max_steps}, expected 1 + 4k")
         if self.image_px % (2 * self.patch_px):

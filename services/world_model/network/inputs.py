@@ -39,6 +39,9 @@ from services.world_model.network.pose_raster import pose_raster
 MAX_TRANSLATION_M = 2.0
 MAX_JOINT_RAD = 2.0 * np.pi
 MAX_PRESSURE_KPA = 1e5
+# Poses and angles are rounded to a nanometre and a nanoradian: finer differences only tell how
+# often a pose was re-anchored on its way here.
+DECIMALS = 9
 ACTION_KINDS: tuple[ActionKind, ActionKind] = ("measured", "commanded")
 
 
@@ -156,7 +159,7 @@ def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.nd
                 f"{MAX_JOINT_RAD:.3g}; angles are in radians",
                 got=angle_rad,
             )
-    return actions
+    return actions.round(DECIMALS) + 0.0
 
 
 def _checked_anchor(anchor: AnchorPoses) -> np.ndarray:
@@ -172,7 +175,7 @@ def _checked_anchor(anchor: AnchorPoses) -> np.ndarray:
             f"anchor: no rigid transform (RᵀR differs from the identity by {error:.2g}), "
             "expected T_world_wrist_left, T_world_wrist_right, T_world_camera_head"
         )
-    return Ts
+    return Ts.round(DECIMALS) + 0.0
 
 
 def _checked_camera(K_head: np.ndarray) -> np.ndarray:

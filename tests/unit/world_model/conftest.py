@@ -4,13 +4,22 @@ import numpy as np
 import pytest
 import torch
 
+from dextouch.episodes import EpisodeStore
 from dextouch.geometry.cameras import pinhole_matrix, project
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import apply, invert, transform
 from dextouch.hands.actions import HandTrajectory, actions_from_poses
+from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams.descriptors import StreamDescriptor
+from services.world_model.checkpoints import (
+    CheckpointMetadata,
+    read_checkpoint,
+    write_checkpoint,
+)
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
-from services.world_model.training.dataset import EpisodeArrays
+from services.world_model.settings import OptimizerSettings, TrainSettings, WindowSettings
+from services.world_model.training.dataset import EpisodeArrays, WindowSampler
 
 PX = 32
 K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))
@@ -127,3 +136,79 @@ def _touch(trajectory, box_m):
         depth = np.clip(-gap_m, 0, None).astype(np.float32)
         touch[:, hand] = 400.0 * depth[:, None] * profile
     return touch
+
+
+def write_episode(store, episode):
+    """The toy episode in a real store: every stream at the model rate."""
+    stamps = (np.arange(len(episode)) * 1_000_000_000) // 15
+    streams = {
+        "tactile_left": ("tactile", episode.tactile_kpa[:, 0], "kPa"),
+        "tactile_right": ("tactile", episode.tactile_kpa[:, 1], "kPa"),
+        "camera_head": ("image", episode.images, "rgb8"),
+        "action": ("robot_state", episode.actions["measured"], "action67"),
+        "action_commanded": ("robot_state", episode.actions["commanded"], "action67"),
+    }
+    attributes = EpisodeAttributes(
+        episode_id=episode.episode_id,
+        task=episode.task,
+        instruction=episode.instruction,
+        domain="robot",
+        origin="twin",
+        seed=episode.seed,
+        model_rate_hz=episode.model_rate_hz,
+        anchor=StoredAnchor.from_poses(episode.anchor),
+        K_head=matrix_rows(episode.K_head),
+    )
+    with store.writer(attributes=attributes) as writer:
+        for name, (kind, values, unit) in streams.items():
+            writer.add_stream(
+                StreamDescriptor(
+                    name=name, kind=kind, shape=values.shape[1:], dtype=values.dtype.name,
+                    unit=unit, nominal_rate_hz=15.0,
+                )
+            )  # fmt: skip
+            writer.append(name, values=values, t_ref_ns=stamps)
+
+
+@pytest.fixture
+def toy_store(tmp_path, toy_episodes):
+    store = EpisodeStore(tmp_path / "store")
+    for episode in toy_episodes:
+        write_episode(store, episode)
+    return store
+
+
+@pytest.fixture
+def train_settings(tmp_path, tiny_config):
+    return TrainSettings(
+        episodes=str(tmp_path / "store"),
+        output=tmp_path / "model.safetensors",
+        network=tiny_config,
+        optimizer=OptimizerSettings(batch=4, warmup_steps=10),
+        windows=WindowSettings(fit_windows=16),
+        max_steps=12,
+    )
+
+
+@pytest.fixture
+def checkpoint(tiny_model, toy_episodes, tmp_path):
+    """An untrained but fitted model, through a file."""
+    batch = WindowSampler(toy_episodes, np.random.default_rng(0), max_steps=17).draw(16, 17)
+    tiny_model.codec.fit(batch.images)
+    tiny_model.tokenizer.fit(batch.tactile_kpa.flatten(0, 1))
+    path = tmp_path / "untrained.safetensors"
+    write_checkpoint(path, tiny_model, make_metadata(tiny_model.config))
+    return read_checkpoint(path)
+
+
+def make_metadata(config):
+    return CheckpointMetadata(
+        name="tiny", network=config, tasks=("push_box",), command="test", seed=0,
+        training_steps=0, training_cpu_s=0.0, train_episode_ids=(), train_fingerprints=(),
+        data_hash="0",
+    )  # fmt: skip
+
+
+@pytest.fixture
+def metadata(tiny_config):
+    return make_metadata(tiny_config)

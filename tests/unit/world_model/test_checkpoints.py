@@ -1,0 +1,140 @@
+"""A checkpoint comes back as it was stored, or not at all."""
+
+import json
+
+import pytest
+import torch
+from safetensors.torch import load, save
+
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    LimitExceededError,
+    NonFiniteError,
+    NotFoundError,
+    UnknownNameError,
+)
+from services.world_model import checkpoints
+from services.world_model.checkpoints import (
+    METADATA_KEY,
+    find_checkpoint,
+    list_checkpoints,
+    read_checkpoint,
+    to_bytes,
+    write_checkpoint,
+)
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "a.safetensors"
+
+
+def _damage(path, model, metadata, *, change=None, notes=None):
+    tensors = load(to_bytes(model, metadata))
+    if change is not None:
+        change(tensors)
+    note = metadata.model_dump_json() if notes is None else notes
+    path.write_bytes(save(tensors, {METADATA_KEY: note} if note else None))
+    return path
+
+
+def test_weights_and_history_come_back(path, tiny_model, metadata):
+    digest = write_checkpoint(path, tiny_model, metadata)
+    loaded = read_checkpoint(path)
+    assert loaded.digest == digest
+    assert loaded.metadata == metadata
+    for name, tensor in tiny_model.state_dict().items():
+        stored = loaded.model.state_dict()[name]
+        assert stored.dtype == torch.float32
+        torch.testing.assert_close(stored, tensor, rtol=1e-3, atol=1e-6)
+
+
+def test_storing_what_was_loaded_gives_the_same_bytes(path, tiny_model, metadata):
+    write_checkpoint(path, tiny_model, metadata)
+    assert to_bytes(read_checkpoint(path).model, metadata) == path.read_bytes()
+
+
+def test_statistics_keep_their_full_precision(path, tiny_model, metadata):
+    tiny_model.codec.mean.fill_(1 / 3)
+    write_checkpoint(path, tiny_model, metadata)
+    assert torch.equal(read_checkpoint(path).model.codec.mean, tiny_model.codec.mean)
+
+
+def test_missing_foreign_and_misshapen_tensors_are_named(path, tiny_model, metadata):
+    with pytest.raises(InvalidInputError, match=r"missing \['video.places'\]"):
+        read_checkpoint(_damage(path, tiny_model, metadata, change=lambda t: t.pop("video.places")))
+    with pytest.raises(InvalidInputError, match=r"foreign \['extra'\]"):
+        read_checkpoint(
+            _damage(path, tiny_model, metadata, change=lambda t: t.update(extra=torch.ones(2)))
+        )
+    with pytest.raises(InvalidInputError, match=r"video.places is .* \(2,\)"):
+        read_checkpoint(
+            _damage(
+                path,
+                tiny_model,
+                metadata,
+                change=lambda t: t.update({"video.places": torch.ones(2)}),
+            )
+        )
+    with pytest.raises(InvalidInputError, match=r"int64"):
+        read_checkpoint(
+            _damage(
+                path,
+                tiny_model,
+                metadata,
+                change=lambda t: t.update({"video.places": t["video.places"].long()}),
+            )
+        )
+
+
+def test_weights_that_are_no_numbers_are_refused_both_ways(path, tiny_model, metadata):
+    def poison(tensors):
+        tensors["tactile.hands"][0, 0] = float("nan")
+
+    with pytest.raises(NonFiniteError, match=r"tactile.hands"):
+        read_checkpoint(_damage(path, tiny_model, metadata, change=poison))
+    with torch.no_grad():
+        tiny_model.tactile.hands[0, 0] = 1e6
+    with pytest.raises(NonFiniteError, match="to be written"):
+        to_bytes(tiny_model, metadata)
+
+
+def test_foreign_files_are_refused(path, tiny_model, metadata, monkeypatch):
+    with pytest.raises(NotFoundError):
+        read_checkpoint(path)
+    path.write_bytes(b"not a checkpoint at all")
+    with pytest.raises(CorruptDataError, match="no safetensors"):
+        read_checkpoint(path)
+    with pytest.raises(CorruptDataError, match="no 'dextouch_world_model'"):
+        read_checkpoint(_damage(path, tiny_model, metadata, notes=""))
+    with pytest.raises(CorruptDataError, match="unreadable"):
+        read_checkpoint(_damage(path, tiny_model, metadata, notes="{"))
+    newer = json.dumps({**metadata.model_dump(mode="json"), "format_version": 2})
+    with pytest.raises(InvalidInputError, match="format version 2"):
+        read_checkpoint(_damage(path, tiny_model, metadata, notes=newer))
+    monkeypatch.setattr(checkpoints, "MAX_CHECKPOINT_BYTES", 100)
+    with pytest.raises(LimitExceededError):
+        read_checkpoint(path)
+
+
+def test_a_cut_off_file_is_refused(path, tiny_model, metadata):
+    write_checkpoint(path, tiny_model, metadata)
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(CorruptDataError):
+        read_checkpoint(path)
+
+
+def test_checkpoints_are_found_by_digest(tmp_path, tiny_model, metadata):
+    a = write_checkpoint(tmp_path / "a.safetensors", tiny_model, metadata)
+    b = write_checkpoint(
+        tmp_path / "b.safetensors", tiny_model, metadata.model_copy(update={"seed": 1})
+    )
+    assert a != b
+    assert find_checkpoint(tmp_path, a).name == "a.safetensors"
+    assert find_checkpoint(tmp_path, b[:10].upper()).name == "b.safetensors"
+    assert sorted(list_checkpoints(tmp_path).values()) == sorted([a, b])
+    with pytest.raises(UnknownNameError, match=a[:12]):
+        find_checkpoint(tmp_path, "0" * 64)
+    with pytest.raises(InvalidInputError, match="at least 8"):
+        find_checkpoint(tmp_path, a[:4])

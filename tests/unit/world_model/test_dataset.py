@@ -1,0 +1,114 @@
+"""Windows cut from memory are the reader's windows; the split and the hash know the content."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import InvalidInputError
+from services.world_model.training.dataset import (
+    WindowSampler,
+    combined_hash,
+    cut_window,
+    fingerprint,
+)
+from services.world_model.training.episodes import load_episodes, read_episode, split_by_hash
+
+
+@pytest.mark.parametrize("kind", ["measured", "commanded"])
+@pytest.mark.parametrize(("start", "num_steps"), [(0, 17), (7, 9), (24, 17)])
+def test_a_cut_window_is_the_readers_window(toy_store, kind, start, num_steps):
+    reader = toy_store.open("toy-2")
+    cut = cut_window(read_episode(reader), start, num_steps, action_kind=kind)
+    read = reader.window(start, num_steps, action_kind=kind)
+    np.testing.assert_array_equal(cut.images, read.images["camera_head"])
+    np.testing.assert_array_equal(cut.tactile_kpa, read.tactile_kpa)
+    np.testing.assert_array_equal(cut.tactile_valid, read.tactile_valid)
+    np.testing.assert_allclose(cut.request.actions, read.actions, atol=1e-12)
+    for ours, theirs in zip(cut.request.anchor.as_tuple(), read.anchor.as_tuple(), strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-12)
+    assert cut.request.instruction == read.instruction
+
+
+def test_a_chained_window_starts_where_the_command_was(toy_episode):
+    episode = toy_episode(1)
+    cut = cut_window(episode, 6, 9, action_kind="commanded", from_command=True)
+    np.testing.assert_allclose(cut.request.actions[0, :3], 0, atol=1e-12)
+    plain = cut_window(episode, 6, 9, action_kind="commanded")
+    gap_m = np.linalg.norm(
+        cut.request.anchor.T_world_wrist_left[:3, 3]
+        - plain.request.anchor.T_world_wrist_left[:3, 3]
+    )
+    assert gap_m > 1e-3
+    # Both describe the same absolute path.
+    ends = [
+        (w.request.anchor.T_world_wrist_left @ np.append(w.request.actions[-1, :3], 1.0))[:3]
+        for w in (cut, plain)
+    ]
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
+
+
+def test_slices_and_kinds_that_do_not_exist_are_refused(toy_episode):
+    episode = toy_episode(0)
+    with pytest.raises(InvalidInputError, match="steps 30"):
+        cut_window(episode, 30, 17)
+    human = replace(episode, actions={"measured": episode.actions["measured"]})
+    with pytest.raises(InvalidInputError, match="no commanded"):
+        cut_window(human, 0, 17, action_kind="commanded")
+
+
+def test_the_sampler_repeats_itself_and_mixes_kinds(toy_episodes):
+    def draw():
+        return WindowSampler(toy_episodes, np.random.default_rng(4), max_steps=17).draw(24, 9)
+
+    a, b = draw(), draw()
+    assert torch.equal(a.images, b.images)
+    kinds = {request.action_kind for request in a.requests}
+    assert kinds == {"measured", "commanded"}
+    assert a.images.shape == (24, 9, 32, 32, 3)
+
+
+def test_episodes_without_commands_still_train(toy_episodes):
+    human = [replace(e, actions={"measured": e.actions["measured"]}) for e in toy_episodes]
+    batch = WindowSampler(human, np.random.default_rng(0), max_steps=17).draw(8, 5)
+    assert {request.action_kind for request in batch.requests} == {"measured"}
+
+
+def test_too_short_episodes_and_none_are_refused(toy_episode):
+    with pytest.raises(InvalidInputError, match="shorter than 17"):
+        WindowSampler([toy_episode(0, 12)], np.random.default_rng(0), max_steps=17)
+    with pytest.raises(InvalidInputError, match="got 0"):
+        WindowSampler([], np.random.default_rng(0), max_steps=17)
+
+
+def test_the_fingerprint_is_of_the_content_not_the_name(toy_episode):
+    episode = toy_episode(0)
+    assert fingerprint(replace(episode, episode_id="other", seed=99)) == fingerprint(episode)
+    touched = episode.tactile_kpa.copy()
+    touched[3, 1, 7] += 1e-3
+    assert fingerprint(replace(episode, tactile_kpa=touched)) != fingerprint(episode)
+    assert combined_hash(["a", "b"]) == combined_hash(["b", "a"]) != combined_hash(["a"])
+
+
+def test_the_split_depends_on_content_alone(toy_episode):
+    episodes = [toy_episode(seed, 17) for seed in range(30)]
+    trained, heldout = split_by_hash(episodes, heldout_percent=30)
+    again = split_by_hash(episodes[::-1], heldout_percent=30)[1]
+    assert {e.episode_id for e in heldout} == {e.episode_id for e in again}
+    assert len(trained) + len(heldout) == 30
+    with pytest.raises(InvalidInputError, match="at least one each"):
+        split_by_hash(trained[:1], heldout_percent=30)
+
+
+def test_an_empty_store_is_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match="holds none"):
+        load_episodes(str(tmp_path))
+
+
+def test_a_store_is_loaded_whole(toy_store, toy_episodes):
+    loaded = load_episodes(str(toy_store.root))
+    assert [e.episode_id for e in loaded] == [e.episode_id for e in toy_episodes]
+    assert fingerprint(loaded[2]) == fingerprint(toy_episodes[2])
+    assert isinstance(toy_store, EpisodeStore)

@@ -1,0 +1,130 @@
+"""Training moves the loss, repeats itself, and never judges what it has seen."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from safetensors import safe_open
+
+from dextouch.errors import InvalidInputError
+from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
+from services.world_model.network.inputs import build_inputs
+from services.world_model.training.dataset import cut_window, fingerprint, stack_windows
+from services.world_model.training.evaluation import evaluate_prediction
+from services.world_model.training.objective import losses
+from services.world_model.training.trainer import (
+    TrainingRun,
+    check_disjoint,
+    learning_rate,
+    train,
+    train_on,
+)
+
+
+@pytest.fixture
+def heldout(toy_episode):
+    return [toy_episode(seed, 25) for seed in (10_000, 10_001)]
+
+
+def test_the_loss_falls(toy_episodes, train_settings):
+    run = TrainingRun(toy_episodes, train_settings.model_copy(update={"max_steps": 80}))
+    run.fit_codecs()
+    log = run.run()
+    assert log[-1].loss_tactile < 0.7 * log[0].loss_tactile
+    assert log[-1].loss_video < log[0].loss_video
+    assert log[-1].share == 1.0
+
+
+def test_the_same_seed_gives_the_same_weights(toy_episodes, train_settings):
+    def weights():
+        run = TrainingRun(toy_episodes, train_settings)
+        run.fit_codecs()
+        run.run()
+        return run.averaged.state_dict()
+
+    a, b = weights(), weights()
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_a_report_holds_what_was_measured_on_the_stored_weights(
+    toy_store, toy_episodes, heldout, train_settings
+):
+    seen = []
+    report = train_on(toy_episodes, heldout, train_settings, seen.append)
+    stored = read_checkpoint(report.checkpoint)
+    assert stored.digest == report.digest
+    assert stored.metadata.metrics == report.metrics
+    assert stored.metadata.train_fingerprints == tuple(sorted(map(fingerprint, toy_episodes)))
+    assert stored.metadata.tasks == ("push_box",)
+    assert seen == report.log
+    again = evaluate_prediction(
+        stored.model, heldout, train_fingerprints=stored.metadata.train_fingerprints
+    )
+    assert again == report.metrics
+    names = {
+        "psnr", "psnr_copy", "psnr_codec", "psnr_wrong_actions", "tactile_mse",
+        "tactile_mse_zero", "tactile_mse_copy", "contact_f1", "contact_f1_copy",
+    }  # fmt: skip
+    assert names <= report.metrics.keys()
+    assert all(np.isfinite(value) for value in report.metrics.values())
+    assert report.metrics["num_windows"] == 4
+    with safe_open(report.checkpoint, framework="np") as file:
+        assert json.loads(file.metadata()[METADATA_KEY])["data_hash"] == stored.metadata.data_hash
+
+
+def test_training_from_a_store_splits_it_by_hash(toy_store, train_settings):
+    settings = train_settings.model_copy(update={"heldout_percent": 50, "max_steps": 2})
+    report = train(settings)
+    metadata = read_checkpoint(report.checkpoint).metadata
+    assert not set(metadata.train_episode_ids) & set(metadata.heldout_episode_ids)
+    assert len(metadata.train_episode_ids) + len(metadata.heldout_episode_ids) == 6
+
+
+def test_held_out_episodes_cannot_be_trained_on(toy_episodes, heldout, train_settings):
+    check_disjoint(toy_episodes, heldout)
+    renamed = replace(toy_episodes[0], episode_id="new-name", seed=777)
+    with pytest.raises(InvalidInputError, match="new-name"):
+        check_disjoint(toy_episodes, [*heldout, renamed])
+    # Another recording of the same task and seed is the same scene.
+    same_seed = replace(heldout[0], seed=toy_episodes[1].seed)
+    with pytest.raises(InvalidInputError, match="same task and seed"):
+        train_on(toy_episodes, [same_seed], train_settings)
+
+
+def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
+    prints = [fingerprint(toy_episodes[2])]
+    with pytest.raises(InvalidInputError, match="toy-2"):
+        evaluate_prediction(tiny_model, toy_episodes, train_fingerprints=prints)
+    with pytest.raises(InvalidInputError, match="no window"):
+        evaluate_prediction(tiny_model, [], train_fingerprints=prints)
+
+
+def test_copy_and_zero_are_what_they_say(tiny_model, heldout):
+    figures = evaluate_prediction(tiny_model, heldout, train_fingerprints=(), stride=25)
+    touch = np.stack([e.tactile_kpa[:17] for e in heldout]).astype(np.float64)
+    assert figures["tactile_mse_zero"] == pytest.approx((touch[:, 1:] ** 2).mean())
+    assert figures["tactile_mse_copy"] == pytest.approx(((touch[:, 1:] - touch[:, :1]) ** 2).mean())
+    assert figures["num_windows"] == 2
+
+
+def test_invalid_touch_is_not_learned_from(tiny_model, toy_episodes):
+    def loss(*, valid):
+        windows = [cut_window(episode, 0, 9) for episode in toy_episodes]
+        windows = [replace(w, tactile_valid=np.full((9, 2), valid)) for w in windows]
+        batch = stack_windows(windows)
+        inputs = build_inputs(batch.requests, tiny_model.config)
+        return losses(tiny_model, inputs, batch, generator=torch.Generator().manual_seed(0))
+
+    assert loss(valid=True).tactile > 0
+    assert loss(valid=False).tactile == 0
+    assert loss(valid=True).video == loss(valid=False).video
+
+
+def test_the_learning_rate_warms_up_and_falls(train_settings):
+    settings = train_settings.optimizer
+    rates = [learning_rate(settings, step, step / 100) for step in range(101)]
+    assert rates[0] < rates[5] < rates[10]
+    assert max(rates) <= settings.learning_rate
+    assert 0 < rates[-1] < 0.02 * settings.learning_rate
