@@ -60,13 +60,13 @@ def normalize_hand(
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
         raise ShapeError(f"keypoints: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
-    seen: np.ndarray = np.isfinite(keypoints).all(axis=-1)
+    seen = np.asarray(np.isfinite(keypoints).all(axis=-1))
     if valid is not None:
         if np.shape(valid) != seen.shape:
             raise ShapeError(f"keypoints: got valid {np.shape(valid)}, expected {seen.shape}")
         seen &= np.asarray(valid, dtype=bool)
     points = np.where(seen[..., None], keypoints, 0.0)[:, _SOLVER_NODES]
-    complete = seen[:, _SOLVER_NODES].all(axis=-1)
+    complete = np.asarray(seen[:, _SOLVER_NODES].all(axis=-1))
     bones = np.diff(points, axis=2)
     lengths = np.linalg.norm(bones, axis=-1)
     _check_unit(lengths[:, _INDEX_FINGER, 0][complete[:, _INDEX_FINGER]])

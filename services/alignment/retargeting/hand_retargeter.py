@@ -87,7 +87,7 @@ class HandRetargeter:
             InvalidInputError: wrong unit, or a finger that is not tracked in any step.
         """
         targets = normalize_hand(keypoints_m, self.hand, valid)
-        never: np.ndarray = ~targets.usable.any(axis=0)
+        never = np.asarray(~targets.usable.any(axis=0))
         if never.any():
             names = ", ".join(name for name, gone in zip(CHAINS, never, strict=True) if gone)
             raise InvalidInputError(

@@ -1,0 +1,24 @@
+"""What a person may choose about an alignment goes in; checked, frozen options come out."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class AlignmentOptions(BaseModel):
+    """Options of one alignment; they are part of the episode's identity.
+
+    Args:
+        model_rate_hz: of the action grid.
+        max_gap_ms: two samples further apart than this are not interpolated between.
+        min_num_steps: shorter stretches without a gap are no episode.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model_rate_hz: float = Field(default=15.0, gt=0, le=1000)
+    max_gap_ms: float = Field(default=50.0, gt=0, le=10_000)
+    min_num_steps: int = Field(default=17, ge=2)
+
+    @property
+    def max_gap_ns(self) -> int:
+        """The largest gap in nanoseconds."""
+        return round(self.max_gap_ms * 1e6)

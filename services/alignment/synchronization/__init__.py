@@ -1,0 +1,1 @@
+"""Synchronization: streams with clocks of their own to one reference clock and one grid."""

@@ -1,0 +1,121 @@
+"""Aligned streams and the steps of the grid in, hand trajectories and 67-D actions out."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
+from dextouch.hands.robot_hand import NUM_JOINTS
+from dextouch.schemas.episodes import Domain
+from dextouch.tactile.layout import SIDES
+from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetStatus
+from services.alignment.synchronization.recorded_streams import AlignedStream
+from services.alignment.synchronization.resampling import (
+    GridPlacement,
+    place_on_grid,
+    poses_on_grid,
+    vectors_on_grid,
+)
+
+POSE_STREAMS = ("wrist_left", "wrist_right", "head")
+COMMANDED_STREAMS = ("joints_commanded", "wrist_left_commanded", "wrist_right_commanded")
+REQUIRED: Mapping[Domain, tuple[str, ...]] = {
+    "human": (*POSE_STREAMS, "keypoints_left", "keypoints_right"),
+    "robot": (*POSE_STREAMS, "joints_measured"),
+}
+
+
+@dataclass(frozen=True)
+class GriddedStreams:
+    """Streams that actions are made of, and where the grid's steps fall among their samples.
+
+    `valid` tells at which steps every one of them can be read without reaching across a gap.
+    """
+
+    grid_ns: Int64[np.ndarray, " n"]
+    streams: Mapping[str, AlignedStream]
+    at: Mapping[str, GridPlacement]
+    valid: Bool[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class GridActions:
+    """Actions on the grid; `commanded` is None where nothing was commanded."""
+
+    anchor: AnchorPoses
+    measured: Float64[np.ndarray, "n 67"]
+    commanded: Float64[np.ndarray, "n 67"] | None
+    quality: dict[str, float]
+
+
+def place_streams(
+    streams: Mapping[str, AlignedStream], grid_ns: np.ndarray, *, max_gap_ns: int
+) -> GriddedStreams:
+    """Find every stream's neighbours of every step."""
+    at = {
+        name: place_on_grid(
+            stream.t_ns, grid_ns, period_ns=stream.descriptor.period_ns(), max_gap_ns=max_gap_ns
+        )
+        for name, stream in streams.items()
+    }
+    valid = np.ones(len(grid_ns), dtype=bool)
+    for placement in at.values():
+        valid &= placement.valid
+    return GriddedStreams(grid_ns, streams, at, valid)
+
+
+def make_actions(gridded: GriddedStreams, domain: Domain) -> GridActions:
+    """Measured and, where recorded, commanded actions, all relative to the measured first step.
+
+    Args:
+        gridded: valid at every step.
+        domain: "human" hands are retargeted, "robot" joints taken as they are.
+    """
+    left, right, head = (_poses(gridded, name) for name in POSE_STREAMS)
+    if domain == "human":
+        joints, quality = _retargeted_joints(gridded)
+    else:
+        joints, quality = _joints(gridded, "joints_measured"), {}
+    trajectory = _trajectory((left, right, head), joints)
+    anchor = trajectory.anchor(0)
+    commanded = None
+    if all(name in gridded.streams for name in COMMANDED_STREAMS):
+        wrists = [_poses(gridded, f"wrist_{side}_commanded") for side in SIDES]
+        # Nobody commands the head: where it was is where it should have been.
+        wanted = _trajectory((*wrists, head), _joints(gridded, "joints_commanded"))
+        commanded = actions_from_poses(wanted, anchor)
+    return GridActions(anchor, actions_from_poses(trajectory, anchor), commanded, quality)
+
+
+def _trajectory(poses: Sequence[np.ndarray], joints_rad: np.ndarray) -> HandTrajectory:
+    """From the poses of left wrist, right wrist and head, and 40 joint angles."""
+    left, right, head = poses
+    joints_left_rad, joints_right_rad = np.split(joints_rad, 2, axis=1)
+    return HandTrajectory(left, right, joints_left_rad, joints_right_rad, head)
+
+
+def _poses(gridded: GriddedStreams, name: str) -> Float64[np.ndarray, "n 4 4"]:
+    return poses_on_grid(gridded.streams[name].values, gridded.at[name])
+
+
+def _joints(gridded: GriddedStreams, name: str) -> Float64[np.ndarray, "n 40"]:
+    return vectors_on_grid(gridded.streams[name].values, gridded.at[name])
+
+
+def _retargeted_joints(
+    gridded: GriddedStreams,
+) -> tuple[Float64[np.ndarray, "n 40"], dict[str, float]]:
+    joints = np.empty((len(gridded.grid_ns), 2 * NUM_JOINTS))
+    quality = {}
+    for index, side in enumerate(SIDES):
+        name = f"keypoints_{side}"
+        keypoints_m = vectors_on_grid(gridded.streams[name].values, gridded.at[name])
+        result = HandRetargeter(side).retarget(keypoints_m)
+        joints[:, index * NUM_JOINTS : (index + 1) * NUM_JOINTS] = result.joints_rad
+        unsolved = result.status != RetargetStatus.SOLVED
+        quality[f"retargeting_{side}_num_steps_not_solved"] = float(unsolved.sum())
+        errors_m = result.tip_error_m[result.solved]
+        quality[f"retargeting_{side}_tip_error_mm"] = float(errors_m.mean() * 1e3)
+    return joints, quality

@@ -1,0 +1,127 @@
+"""A recording in, its streams dated on the host's clock and converted to episode units out."""
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
+from dextouch.schemas.episodes import Matrix
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import SampleBatch
+from dextouch.tactile.layout import NUM_TAXELS
+from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.synchronization.stream_clock import TimedStream, time_stream
+
+# Where the tracked body sits in what the tracker follows, by stream.
+MOUNTS = {
+    "wrist_left": "T_tracker_left_wrist_left",
+    "wrist_right": "T_tracker_right_wrist_right",
+    "head": "T_tracker_head_camera_head",
+}
+
+
+@runtime_checkable
+class Recording(Protocol):
+    """What alignment reads of a recording (`dextouch.episodes.RecordingReader`)."""
+
+    @property
+    def attributes(self) -> RecordingAttributes:
+        """Task, calibration, domain."""
+
+    @property
+    def streams(self) -> dict[str, StreamDescriptor]:
+        """Descriptors by name."""
+
+    @property
+    def content_sha256(self) -> str:
+        """Content hash."""
+
+    def read(self, name: str) -> SampleBatch:
+        """All samples of a stream."""
+
+
+@dataclass(frozen=True)
+class AlignedStream:
+    """One stream on a common clock, in the units of an episode.
+
+    `values` may hold NaN (keypoints that were not seen); `quality` are figures for the record.
+    """
+
+    descriptor: StreamDescriptor
+    t_ns: Int64[np.ndarray, " n"]
+    values: Shaped[np.ndarray, "n ..."]
+    timing: TimedStream
+    quality: dict[str, float]
+
+    @property
+    def name(self) -> str:
+        """The stream's name."""
+        return self.descriptor.name
+
+    def complete(self) -> "AlignedStream":
+        """Without samples that hold NaN or infinity."""
+        if self.values.dtype.kind != "f":
+            return self
+        whole = np.isfinite(self.values).reshape(len(self.values), -1).all(axis=1)
+        return AlignedStream(
+            self.descriptor, self.t_ns[whole], self.values[whole], self.timing, self.quality
+        )
+
+
+def read_stream(recording: Recording, name: str) -> AlignedStream:
+    """Read, date and convert one stream.
+
+    Raises:
+        ClockFitError: its stamps fit no clock.
+        InvalidInputError: calibration is missing or of the wrong shape.
+        UnknownNameError: the recording has no such stream.
+    """
+    descriptor, batch = recording.streams[name], recording.read(name)
+    calibration = recording.attributes.calibration
+    timing = time_stream(batch, descriptor, latency_ns=_latency_ns(calibration, name))
+    values = batch.values[timing.kept]
+    quality: dict[str, float] = {}
+    if descriptor.kind == "tactile" and descriptor.unit == "counts":
+        descriptor, values, quality = _pressures(descriptor, values, calibration)
+    elif descriptor.kind == "keypoints":
+        descriptor = descriptor.model_copy(update={"dtype": "float64"})
+        values = values.astype(np.float64)
+    elif descriptor.kind == "pose" and MOUNTS.get(name) in calibration:
+        values = _move_to_body(values, calibration[MOUNTS[name]])
+    elif descriptor.kind == "image":
+        descriptor = descriptor.model_copy(update={"unit": "rgb8"})
+    return AlignedStream(descriptor, timing.t_host_ns, values, timing, quality)
+
+
+def _latency_ns(calibration: dict[str, Matrix], name: str) -> int:
+    matrix = calibration.get(f"{name}_latency_ns", ((0.0,),))
+    if np.shape(matrix) != (1, 1):
+        raise InvalidInputError(
+            f"calibration '{name}_latency_ns': got {np.shape(matrix)}, expected (1, 1)"
+        )
+    return round(matrix[0][0])
+
+
+def _pressures(
+    descriptor: StreamDescriptor, counts: np.ndarray, calibration: dict[str, Matrix]
+) -> tuple[StreamDescriptor, np.ndarray, dict[str, float]]:
+    if descriptor.side is None:
+        raise InvalidInputError(f"stream {descriptor.name!r}: has no side, expected left or right")
+    glove = TactileCalibration.from_record(calibration, descriptor.side)
+    dead = glove.dead_taxels(counts)
+    converted = descriptor.model_copy(
+        update={"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
+    )
+    quality = {f"{descriptor.name}_num_dead_taxels": float(dead.sum())}
+    return converted, glove.to_kpa(counts, dead=dead), quality
+
+
+def _move_to_body(poses: np.ndarray, mount: Matrix) -> np.ndarray:
+    T_tracker_body = np.array(mount)
+    if T_tracker_body.shape != (4, 4):
+        raise InvalidInputError(f"calibration: a mount is {T_tracker_body.shape}, expected (4, 4)")
+    return pose_from_transform(transform_from_pose(poses) @ T_tracker_body)

@@ -1,0 +1,77 @@
+"""Sample times of streams in, values at the steps of a common grid out, never across a gap."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from dextouch.geometry.interpolation import bracket, interpolate_linear, interpolate_poses
+from dextouch.geometry.transforms import transform_from_pose
+
+# How far beyond its first and last sample a stream may be continued, in nominal periods.
+EDGE_PERIODS = 1.5
+
+
+@dataclass(frozen=True)
+class GridPlacement:
+    """Where each grid step falls among the samples of one stream.
+
+    `weight` of the right neighbour lies in [0, 1] inside the samples; within `EDGE_PERIODS`
+    of the ends it may lie outside (the line through the last two samples goes on).
+    """
+
+    left: Int64[np.ndarray, " n"]
+    weight: Float64[np.ndarray, " n"]
+    valid: Bool[np.ndarray, " n"]
+
+
+def grid_times_ns(num_steps: int, rate_hz: float) -> Int64[np.ndarray, " n"]:
+    """Times of steps 0 … num_steps - 1; step k at k / rate, rounded to the nanosecond."""
+    return np.rint(np.arange(num_steps) * (1e9 / rate_hz)).astype(np.int64)
+
+
+def place_on_grid(
+    t_ns: np.ndarray, grid_ns: np.ndarray, *, period_ns: int, max_gap_ns: int
+) -> GridPlacement:
+    """Neighbours and weights of grid times.
+
+    Args:
+        t_ns: sample times, strictly increasing; fewer than two make every step invalid.
+        grid_ns: times of the steps.
+        period_ns: the stream's nominal period.
+        max_gap_ns: two samples further apart are not connected.
+    """
+    t_ns, grid_ns = np.asarray(t_ns, dtype=np.int64), np.asarray(grid_ns, dtype=np.int64)
+    if t_ns.size < 2:
+        nowhere = np.zeros(grid_ns.size, dtype=np.int64)
+        return GridPlacement(nowhere, nowhere.astype(np.float64), nowhere.astype(bool))
+    left, weight, valid = bracket(t_ns, grid_ns, max_gap_ns=max_gap_ns)
+    span = t_ns[left + 1] - t_ns[left]
+    reach_ns = EDGE_PERIODS * period_ns
+    outside = (grid_ns < t_ns[0]) | (grid_ns > t_ns[-1])
+    near = (grid_ns >= t_ns[0] - reach_ns) & (grid_ns <= t_ns[-1] + reach_ns)
+    continued = outside & near & (span <= max_gap_ns)
+    weight = np.where(continued, (grid_ns - t_ns[left]) / span, weight)
+    return GridPlacement(left, weight, valid | continued)
+
+
+def vectors_on_grid(values: np.ndarray, at: GridPlacement) -> Float64[np.ndarray, "n ..."]:
+    """Values [m, …] at the steps, linearly; meaningless where `at.valid` is False."""
+    return interpolate_linear(values, at.left, at.weight)
+
+
+def poses_on_grid(poses: np.ndarray, at: GridPlacement) -> Float64[np.ndarray, "n 4 4"]:
+    """Transforms at the steps from tracker poses [m, 7]: linear translation, SLERP rotation."""
+    return interpolate_poses(transform_from_pose(poses), at.left, at.weight)
+
+
+def longest_run(valid: np.ndarray) -> tuple[int, int]:
+    """First and one past the last index of the longest stretch of True; (0, 0) if there is none."""
+    edges = np.flatnonzero(
+        np.diff(np.concatenate([[False], np.asarray(valid, dtype=bool), [False]]))
+    )
+    runs = edges.reshape(-1, 2)
+    if not len(runs):
+        return 0, 0
+    start, stop = runs[np.argmax(runs[:, 1] - runs[:, 0])]
+    return int(start), int(stop)
