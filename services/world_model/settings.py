@@ -4,9 +4,11 @@ import sys
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
+from pydantic_settings import BaseSettings
 
-from dextouch.serving.settings import ServiceSettings, service_config
-from services.world_model.checkpoints import default_checkpoint
+from dextouch.serving.settings import service_config
+from dextouch.worlds.serve import WorldServiceSettings
+from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
 
 
@@ -58,7 +60,24 @@ class TrainSettings(BaseModel):
     windows: WindowSettings = WindowSettings()
 
 
-class WorldModelSettings(ServiceSettings):
+class TrainCommand(BaseSettings, TrainSettings):
+    """`train` on the command line; the report is also written to `json_path`, if given."""
+
+    model_config = service_config("world_model_train")
+
+    json_path: Path | None = Field(default=None, alias="json")
+
+
+class ShowCommand(BaseSettings):
+    """`show` on the command line: a checkpoint file, or a folder of them."""
+
+    model_config = service_config("world_model_show")
+
+    checkpoint: Path = PRETRAINED
+    json_path: Path | None = Field(default=None, alias="json")
+
+
+class WorldModelSettings(WorldServiceSettings):
     """A served world model."""
 
     model_config = service_config("world_model")

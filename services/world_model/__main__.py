@@ -1,0 +1,131 @@
+"""`train`, `serve` or `show` and flags in; a checkpoint, a running service or a description out."""
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from typing import TypeVar
+
+from pydantic import ValidationError
+from pydantic_settings import BaseSettings, CliApp
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from dextouch.errors import InvalidInputError
+from dextouch.serving.settings import load_settings
+from dextouch.worlds.serve import serve_worlds
+from services.world_model.checkpoints import list_checkpoints, read_checkpoint
+from services.world_model.settings import ShowCommand, TrainCommand, WorldModelSettings
+from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
+from services.world_model.world import open_world
+
+USAGE = """usage: world_model train|serve|show [flags]
+
+  train   learn from the episodes of a store and write a measured checkpoint
+  serve   serve a checkpoint's rollouts over HTTP
+  show    say where a checkpoint comes from and how good it is
+
+Flags: world_model COMMAND --help"""
+EXIT_USAGE = 2
+SettingsT = TypeVar("SettingsT", bound=BaseSettings)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command; returns its exit status, 2 for a word that is none."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    commands: dict[str, Callable[[list[str]], int]] = {
+        "train": run_train,
+        "serve": run_serve,
+        "show": run_show,
+    }
+    word, *rest = arguments or ["--help"]
+    if word in {"-h", "--help"}:
+        print(USAGE)
+        return 0
+    if word not in commands:
+        print(f"world_model: unknown command {word!r}\n\n{USAGE}", file=sys.stderr)
+        return EXIT_USAGE
+    return commands[word](rest)
+
+
+def run_train(arguments: list[str]) -> int:
+    """Train with a progress bar; the report goes to the terminal and, if asked, to a file."""
+    settings = _parse(TrainCommand, arguments)
+    columns = (
+        TextColumn("training"),
+        BarColumn(),
+        TextColumn("step {task.fields[step]}  sight {task.fields[video]:.3f}"),
+        TextColumn("touch {task.fields[tactile]:.3f}"),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns) as bar:
+        task = bar.add_task("training", total=1.0, step=0, video=float("nan"), tactile=float("nan"))
+
+        def on_progress(now: TrainingProgress) -> None:
+            bar.update(
+                task,
+                completed=now.share,
+                step=now.step,
+                video=now.loss_video,
+                tactile=now.loss_tactile,
+            )
+
+        report = train(settings, on_progress)
+    print(_table(report))
+    if settings.json_path is not None:
+        written = {**asdict(report), "checkpoint": str(report.checkpoint)}
+        settings.json_path.write_text(json.dumps(written, indent=2))
+    return 0
+
+
+def run_serve(arguments: list[str]) -> int:
+    """Serve one checkpoint until SIGINT or SIGTERM."""
+    import torch
+
+    settings = load_settings(WorldModelSettings, arguments)
+    torch.set_num_threads(settings.num_threads)
+    world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
+    serve_worlds({world.description.name: world}, settings, name="world_model")
+    return 0
+
+
+def run_show(arguments: list[str]) -> int:
+    """Print the history of one checkpoint, or of every one in a folder."""
+    settings = _parse(ShowCommand, arguments)
+    path = settings.checkpoint
+    found = []
+    for file in list_checkpoints(path) if path.is_dir() else [path]:
+        checkpoint = read_checkpoint(file)
+        history = checkpoint.metadata.model_dump(mode="json", exclude={"train_fingerprints"})
+        found.append({"file": file.name, "digest": checkpoint.digest, **history})
+    print(json.dumps(found, indent=2))
+    if settings.json_path is not None:
+        settings.json_path.write_text(json.dumps(found, indent=2))
+    return 0
+
+
+def _parse(kind: type[SettingsT], arguments: list[str]) -> SettingsT:
+    try:
+        return CliApp.run(kind, cli_args=arguments)
+    except ValidationError as error:
+        found = "; ".join(
+            f"{'.'.join(map(str, item['loc'])) or 'settings'}: {item['msg']}"
+            for item in error.errors(include_input=False, include_url=False)
+        )
+        raise InvalidInputError(f"{kind.__name__}: {found}") from error
+
+
+def _table(report: TrainingReport) -> str:
+    rows = [
+        ("checkpoint", str(report.checkpoint)),
+        ("digest", report.digest[:16]),
+        ("parameters", f"{report.num_parameters:,}"),
+        ("steps", f"{report.steps} in {report.cpu_s:.0f} CPU s"),
+        ("episodes", f"{report.num_train_episodes}, held out {report.num_heldout_episodes}"),
+        *((name, f"{value:.3f}") for name, value in report.metrics.items()),
+    ]
+    width = max(len(name) for name, _ in rows)
+    return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+"""The command line: train writes a checkpoint and a report, show reads it, nonsense is refused."""
+
+import json
+
+import pytest
+
+from dextouch.errors import InvalidInputError
+from services.world_model.__main__ import main
+
+
+def test_train_then_show(toy_store, tmp_path, capsys):
+    output, report = tmp_path / "m.safetensors", tmp_path / "report.json"
+    flags = {
+        "episodes": toy_store.root, "output": output, "json": report, "max_steps": 3,
+        "heldout_percent": 50, "network.image_px": 32, "network.video_width": 16,
+        "network.tactile_width": 16, "network.num_layers": 1, "network.num_heads": 1,
+        "network.codec_channels": 8, "windows.fit_windows": 8, "optimizer.batch": 2,
+    }  # fmt: skip
+    arguments = [f"--{name}={value}" for name, value in flags.items()]
+    assert main(["train", *arguments]) == 0
+    written = json.loads(report.read_text())
+    assert written["steps"] == 3
+    assert "psnr_copy" in written["metrics"]
+    assert written["digest"][:16] in capsys.readouterr().out
+    assert main(["show", "--checkpoint", str(output)]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown[0]["digest"] == written["digest"]
+    assert shown[0]["metrics"] == written["metrics"]
+
+
+def test_nonsense_is_refused(capsys, tmp_path):
+    assert main(["sing"]) == 2
+    assert "unknown command" in capsys.readouterr().err
+    assert main([]) == 0
+    assert "train|serve|show" in capsys.readouterr().out
+    with pytest.raises(InvalidInputError, match="seed"):
+        main(["train", "--episodes", str(tmp_path), "--seed", "-1"])
+    with pytest.raises(SystemExit):
+        main(["train", "--episodes", str(tmp_path), "--sed", "1"])
