@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
 from dextouch.streams.packing import pack, unpack
 from dextouch.worlds.world import (
     Observation,
@@ -78,11 +78,12 @@ class SumWorld:
         return self._description
 
     def reset(self, start: RolloutStart) -> StartedRollout[SumState]:
-        state = SumState(0, float(start.seed))
+        state = SumState(0, float(start.seed % 1000))
         first = self._seen(state, np.array([state.total]), actions(1))
         return StartedRollout(state, first, anchor(), K_HEAD)
 
     def step(self, state: SumState, actions: np.ndarray, *, seed: int) -> SteppedRollout[SumState]:
+        actions = check_actions(actions)
         if (actions == 1e6).any():
             raise InvalidInputError("sum: joint 1e6 cannot be reached")
         if (actions == 2e6).any():

@@ -12,7 +12,8 @@ from fastapi import FastAPI
 @contextmanager
 def served(app: FastAPI) -> Iterator[str]:
     """The application's address while it is served."""
-    with socket.socket() as listening:
+    # With the protocol named, asyncio switches Nagle's delay off; without, answers take 40 ms.
+    with socket.socket(proto=socket.IPPROTO_TCP) as listening:
         listening.bind(("127.0.0.1", 0))
         listening.listen()
         config = uvicorn.Config(app, log_config=None, access_log=False, lifespan="on")
