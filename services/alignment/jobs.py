@@ -8,7 +8,11 @@ from dextouch.episodes import EpisodeStore, RecordingReader
 from dextouch.errors import ConflictError
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport, report_of
-from services.alignment.synchronization.episode_builder import build_episode
+from services.alignment.synchronization.episode_builder import (
+    Progress,
+    build_episode,
+    check_complete,
+)
 
 logger = structlog.get_logger(__name__)
 
@@ -18,12 +22,21 @@ MAX_STEM = 100
 
 
 def align_recording(
-    store: EpisodeStore, recording_id: str, options: AlignmentOptions
+    store: EpisodeStore,
+    recording_id: str,
+    options: AlignmentOptions,
+    tell: Progress | None = None,
 ) -> AlignmentReport:
     """Align one recording and write the episode.
 
     The episode's id follows from the recording's content and the options: doing it again, even
     from two processes at once, gives the same episode and writes nothing.
+
+    Args:
+        store: where the recording lies and the episode goes.
+        recording_id: of a finished recording.
+        options: of the alignment.
+        tell: called with the progress, 0 … 1.
 
     Raises:
         NotFoundError: no such recording.
@@ -34,8 +47,20 @@ def align_recording(
     episode_id = episode_id_of(recording, options)
     created = False
     if not store.exists(episode_id):
-        created = _write(store, recording, episode_id, options)
+        created = _write(store, recording, episode_id, options, tell or _silent)
     return report_of(store.open(episode_id), recording_id=recording_id, created=created)
+
+
+def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
+    """The id of the episode-to-be, after a look at what the recording says about itself.
+
+    Raises:
+        NotFoundError: no such recording.
+        InvalidInputError: streams or calibration that every episode needs are missing.
+    """
+    recording = store.recording(recording_id)
+    check_complete(recording)
+    return episode_id_of(recording, options)
 
 
 def episode_id_of(recording: RecordingReader, options: AlignmentOptions) -> str:
@@ -46,9 +71,13 @@ def episode_id_of(recording: RecordingReader, options: AlignmentOptions) -> str:
 
 
 def _write(
-    store: EpisodeStore, recording: RecordingReader, episode_id: str, options: AlignmentOptions
+    store: EpisodeStore,
+    recording: RecordingReader,
+    episode_id: str,
+    options: AlignmentOptions,
+    tell: Progress,
 ) -> bool:
-    episode = build_episode(recording, episode_id=episode_id, options=options)
+    episode = build_episode(recording, episode_id=episode_id, options=options, tell=tell)
     try:
         with store.writer(kind="episode", attributes=episode.attributes) as writer:
             for stream in episode.streams:
@@ -63,3 +92,7 @@ def _write(
         "recording_aligned", recording_id=recording.attributes.recording_id, episode_id=episode_id
     )
     return True
+
+
+def _silent(_: float) -> None:
+    """Nobody asked for progress."""

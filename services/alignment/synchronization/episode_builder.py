@@ -1,6 +1,6 @@
 """A recording in, an episode on one reference clock out, not yet written anywhere."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +34,11 @@ from services.alignment.synchronization.resampling import (
     longest_run,
 )
 
+Progress = Callable[[float], None]
+# How much of the work is done when all streams are read, and when the actions are made.
+READING_SHARE = 0.5
+BUILT_SHARE = 0.8
+
 
 @dataclass(frozen=True)
 class EpisodeStream:
@@ -53,7 +58,11 @@ class BuiltEpisode:
 
 
 def build_episode(
-    recording: Recording, *, episode_id: str, options: AlignmentOptions
+    recording: Recording,
+    *,
+    episode_id: str,
+    options: AlignmentOptions,
+    tell: Progress = lambda _: None,
 ) -> BuiltEpisode:
     """Date all streams, find the longest stretch without a gap, and put actions on its grid.
 
@@ -66,8 +75,12 @@ def build_episode(
         ClockFitError: a stream whose stamps fit no clock.
     """
     attributes = recording.attributes
-    _check_complete(recording)
-    streams = {name: read_stream(recording, name) for name in recording.streams}
+    check_complete(recording)
+    streams = {}
+    for number, name in enumerate(recording.streams):
+        tell(READING_SHARE * number / len(recording.streams))
+        streams[name] = read_stream(recording, name)
+    tell(READING_SHARE)
     names = [*REQUIRED[attributes.domain], *COMMANDED_STREAMS]
     parts = {name: _seen(streams[name]) for name in names if name in streams}
     origin_ns, gridded = _common_stretch(parts, options, attributes.recording_id)
@@ -76,6 +89,7 @@ def build_episode(
         raise InvalidInputError(_too_short(gridded, run, options, attributes.recording_id))
     chosen = _slice(gridded, run)
     actions = make_actions(chosen, attributes.domain)
+    tell(BUILT_SHARE)
     origin_ns += int(chosen.grid_ns[0])
     grid_ns = chosen.grid_ns - chosen.grid_ns[0]
     written = [
@@ -122,7 +136,12 @@ def _episode_attributes(
     )
 
 
-def _check_complete(recording: Recording) -> None:
+def check_complete(recording: Recording) -> None:
+    """Refuse a recording from which no episode can be made.
+
+    Raises:
+        InvalidInputError: names the streams or the calibration that are missing.
+    """
     attributes = recording.attributes
     missing = [name for name in REQUIRED[attributes.domain] if name not in recording.streams]
     if missing:
