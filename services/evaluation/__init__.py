@@ -1,0 +1,1 @@
+"""Policies, success probes, closed-loop evaluation of worlds, and the report about all of it."""

@@ -1,0 +1,123 @@
+"""An episode store in; robot episodes as plain arrays on the model grid out."""
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError, NotFoundError
+from services.evaluation.starts import start_digest
+
+CAMERA = "camera_head"
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One robot episode: what was seen, felt, reached and commanded at every step.
+
+    Both actions are relative to the measured poses of step 0.
+    """
+
+    episode_id: str
+    task: str
+    instruction: str
+    seed: int
+    success: bool
+    images: UInt8[np.ndarray, "steps h w 3"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+    measured: Float64[np.ndarray, "steps 67"]
+    commanded: Float64[np.ndarray, "steps 67"]
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of the model grid, the first included."""
+        return len(self.measured)
+
+    @property
+    def start_digest(self) -> str:
+        """Digest of the first observation."""
+        return start_digest(self.images[0], self.tactile_kpa[0])
+
+
+def read_demonstration(reader: EpisodeReader) -> Demonstration:
+    """One robot episode with a known outcome as arrays.
+
+    Raises:
+        InvalidInputError: the episode does not say whether it succeeded, or has no seed.
+    """
+    attributes = reader.attributes
+    if attributes.success is None or attributes.seed is None:
+        raise InvalidInputError(
+            f"episode {attributes.episode_id!r}: success {attributes.success}, seed "
+            f"{attributes.seed}; expected both known, as in episodes of the twin"
+        )
+    measured = reader.window(0, num_steps=reader.num_steps, cameras=(CAMERA,))
+    return Demonstration(
+        attributes.episode_id,
+        attributes.task,
+        attributes.instruction,
+        attributes.seed,
+        attributes.success,
+        measured.images[CAMERA],
+        measured.tactile_kpa,
+        measured.actions,
+        reader.read("action_commanded").values,
+    )
+
+
+def read_demonstrations(store: EpisodeStore, *, tasks: Sequence[str] = ()) -> list[Demonstration]:
+    """All robot episodes of a store, in the order of their ids.
+
+    Args:
+        store: where to read.
+        tasks: only these; empty for all.
+
+    Raises:
+        NotFoundError: not one such episode.
+    """
+    demonstrations = []
+    for episode_id in sorted(store.list(kind="episode")):
+        reader = store.open(episode_id)
+        attributes = reader.attributes
+        if attributes.domain == "robot" and (not tasks or attributes.task in tasks):
+            demonstrations.append(read_demonstration(reader))
+    if not demonstrations:
+        raise NotFoundError(
+            f"no robot episode of {', '.join(tasks) or 'any task'} in the store; "
+            "record some with the twin first"
+        )
+    return demonstrations
+
+
+def data_hash(demonstrations: Iterable[Demonstration]) -> str:
+    """sha256 over everything that training sees, in the order of the episode ids."""
+    digest = hashlib.sha256()
+    for item in sorted(demonstrations, key=lambda d: d.episode_id):
+        digest.update(repr((item.episode_id, item.task, item.instruction, item.success)).encode())
+        for array in (item.images, item.tactile_kpa, item.measured, item.commanded):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def split_by_seed(
+    demonstrations: Sequence[Demonstration], *, held_out_share: float
+) -> tuple[list[Demonstration], list[Demonstration]]:
+    """Training and held-out episodes; all episodes of a task and seed fall on the same side.
+
+    The side is decided by a hash of task and seed, so it never changes when episodes are added.
+    """
+    training: list[Demonstration] = []
+    held_out: list[Demonstration] = []
+    for item in demonstrations:
+        digest = hashlib.sha256(f"{item.task}/{item.seed}".encode()).digest()
+        share = int.from_bytes(digest[:4], "big") / 2**32
+        (held_out if share < held_out_share else training).append(item)
+    if not training or not held_out:
+        raise InvalidInputError(
+            f"split: {len(training)} training and {len(held_out)} held-out episodes of "
+            f"{len(demonstrations)}; expected both sides, record more seeds"
+        )
+    return training, held_out

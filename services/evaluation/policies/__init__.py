@@ -1,0 +1,1 @@
+"""Policies that act on observations: still, replayed, and learned by behaviour cloning."""

@@ -1,0 +1,176 @@
+"""Observations in, action chunks out: a network that imitates demonstrations, in closed loop."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float64, UInt8
+from pydantic import BaseModel, ConfigDict
+
+from dextouch.clients.policy import PolicyStart
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.hands.actions import (
+    AnchorPoses,
+    actions_from_poses,
+    pose_from_9d,
+    poses_from_actions,
+    unpack_action,
+)
+from dextouch.schemas.rollouts import Observation
+from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
+from services.evaluation.demonstrations import CAMERA
+from services.evaluation.features import pad_features
+from services.evaluation.policies.cloning_network import (
+    CloningBatch,
+    CloningNetwork,
+    phase_features,
+)
+
+KIND = "behaviour-cloning-policy"
+
+
+class CloningShape(BaseModel):
+    """What the network looks like; kept in the checkpoint."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tasks: tuple[str, ...]
+    num_components: int = 48
+    hidden: int = 256
+    horizon_steps: int = 80
+    image_size_px: int = 64
+
+    def network(self) -> CloningNetwork:
+        """A network of this shape, not trained yet."""
+        return CloningNetwork(
+            num_tasks=len(self.tasks), num_components=self.num_components, hidden=self.hidden
+        )
+
+
+@dataclass(frozen=True)
+class CloningInput:
+    """What the policy looks at in one moment."""
+
+    first_image: UInt8[np.ndarray, "h w 3"]
+    image: UInt8[np.ndarray, "h w 3"]
+    tactile_kpa: np.ndarray
+    reached: Float64[np.ndarray, "67"]
+    reached_is_measured: bool
+    step: int
+    task: str
+
+
+def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> CloningBatch:
+    """Network tensors of moments; the same code serves training and acting.
+
+    Raises:
+        UnknownNameError: a task the network was not made for.
+        InvalidInputError: images of another size.
+    """
+    size = (shape.image_size_px, shape.image_size_px, 3)
+    for item in inputs:
+        if item.task not in shape.tasks:
+            raise UnknownNameError("task of the cloned policy", item.task, list(shape.tasks))
+        if item.image.shape != size or item.first_image.shape != size:
+            raise InvalidInputError(
+                f"cloned policy: got images {item.first_image.shape} and {item.image.shape}, "
+                f"expected {size}"
+            )
+    images = np.stack([np.concatenate([i.image, i.first_image], axis=-1) for i in inputs])
+    state = np.concatenate(
+        [
+            pad_features(np.stack([i.tactile_kpa for i in inputs])),
+            np.stack([i.reached for i in inputs]),
+            phase_features(np.array([i.step for i in inputs]), horizon_steps=shape.horizon_steps),
+            np.array([[float(i.reached_is_measured)] for i in inputs]),
+        ],
+        axis=1,
+    )
+    return CloningBatch(
+        torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255 - 0.5,
+        torch.tensor(state, dtype=torch.float32),
+        torch.tensor([shape.tasks.index(i.task) for i in inputs]),
+    )
+
+
+def chunk_from_start(chunk: np.ndarray, reached: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
+    """A chunk relative to the current pose as one relative to the rollout's step 0.
+
+    Args:
+        chunk: [K, 67], relative to the poses of `reached`.
+        reached: [67], where the hands are, relative to step 0.
+    """
+    now = unpack_action(reached)
+    here = AnchorPoses(
+        pose_from_9d(now.wrist_left), pose_from_9d(now.wrist_right), pose_from_9d(now.camera_head)
+    )
+    origin = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
+    return actions_from_poses(poses_from_actions(chunk, here), origin)
+
+
+class BehaviourCloningPolicy:
+    """Looks at the newest image, touch and pose, and sends the next 16 actions.
+
+    Between `reset` calls it remembers the first image of the rollout, nothing else.
+
+    Args:
+        checkpoint: from `load_checkpoint` or straight from training.
+
+    Raises:
+        CorruptDataError: weights that do not fit the shape in the metadata.
+    """
+
+    def __init__(self, checkpoint: Checkpoint) -> None:
+        self.metadata = checkpoint.metadata
+        self.shape = CloningShape.model_validate(checkpoint.metadata.settings["shape"])
+        self._network = self.shape.network()
+        load_weights(self._network, checkpoint, prefix="network")
+        self._network.eval()
+        self._task: str | None = None
+        self._first_image: np.ndarray | None = None
+
+    @classmethod
+    def load(cls, path: Path) -> "BehaviourCloningPolicy":
+        """A policy from its file."""
+        return cls(load_checkpoint(path, kind=KIND))
+
+    def reset(self, start: PolicyStart) -> None:
+        """Forget the last rollout.
+
+        Raises:
+            UnknownNameError: a task the network was not made for.
+        """
+        if start.task not in self.shape.tasks:
+            raise UnknownNameError("task of the cloned policy", start.task, list(self.shape.tasks))
+        self._task = start.task
+        self._first_image = None
+
+    def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
+        """The next 16 commanded actions, relative to the rollout's step 0.
+
+        Raises:
+            InvalidInputError: not reset, or images of another size.
+            UnknownNameError: the observation has no head camera.
+        """
+        if self._task is None:
+            raise InvalidInputError("cloned policy: act before reset; call reset with the start")
+        if CAMERA not in observation.images:
+            raise UnknownNameError("camera", CAMERA, list(observation.images))
+        image = observation.images[CAMERA][-1]
+        if self._first_image is None:
+            self._first_image = observation.images[CAMERA][0]
+        moment = CloningInput(
+            self._first_image,
+            image,
+            observation.tactile_kpa[-1],
+            observation.action_reached[-1],
+            observation.reached_is_measured,
+            observation.first_step + len(observation) - 1,
+            self._task,
+        )
+        with torch.no_grad():
+            coefficients = self._network(cloning_batch([moment], self.shape))
+            chunk = self._network.codec.decode(coefficients)[0].double().numpy()
+        return chunk_from_start(chunk, moment.reached)

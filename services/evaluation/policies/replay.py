@@ -1,0 +1,76 @@
+"""Recorded demonstrations in; a policy that plays their commanded actions, whatever it sees."""
+
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.clients.policy import PolicyStart
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.hands.actions import check_actions
+from dextouch.schemas.rollouts import Observation
+from services.evaluation.demonstrations import Demonstration
+
+
+class ReplayPolicy:
+    """Open loop: the scripted demonstrator, as good as its noise level lets it be.
+
+    Args:
+        actions: for every (task, seed) the commanded actions [T, 67] of steps 1 … T, relative to
+            the measured poses of step 0.
+        chunk_steps: length of its chunks, a multiple of 4.
+    """
+
+    def __init__(
+        self, actions: Mapping[tuple[str, int], np.ndarray], *, chunk_steps: int = 16
+    ) -> None:
+        if chunk_steps < 4 or chunk_steps % 4:
+            raise InvalidInputError(
+                f"replay policy: got chunks of {chunk_steps} steps, expected a multiple of 4"
+            )
+        self.chunk_steps = chunk_steps
+        self._actions = {
+            (task, seed): check_actions(rows, where=f"replay of {task!r}, seed {seed}")
+            for (task, seed), rows in actions.items()
+        }
+        self._playing: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, demonstrations: Iterable[Demonstration]) -> "ReplayPolicy":
+        """The policy that plays these episodes.
+
+        Raises:
+            ConflictError: two episodes of one task and seed.
+        """
+        actions: dict[tuple[str, int], np.ndarray] = {}
+        for item in demonstrations:
+            key = (item.task, item.seed)
+            if key in actions:
+                raise ConflictError(
+                    f"replay policy: two episodes of task {item.task!r} with seed {item.seed}; "
+                    "expected one noise level a policy"
+                )
+            actions[key] = item.commanded[1:]
+        return cls(actions)
+
+    def reset(self, start: PolicyStart) -> None:
+        """Take out the episode of this task and seed.
+
+        Raises:
+            NotFoundError: there is none.
+        """
+        key = (start.task, start.seed)
+        if key not in self._actions:
+            raise NotFoundError(
+                f"replay policy: no episode of task {start.task!r} with seed {start.seed}; "
+                "record it first"
+            )
+        self._playing = self._actions[key]
+
+    def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
+        """The actions of the steps after the newest one; at the end it stays where it is."""
+        if self._playing is None:
+            raise InvalidInputError("replay policy: act before reset; call reset with the start")
+        step = observation.first_step + len(observation) - 1
+        wanted = np.arange(step, step + self.chunk_steps)
+        return self._playing[np.minimum(wanted, len(self._playing) - 1)]

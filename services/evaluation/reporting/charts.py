@@ -1,0 +1,151 @@
+"""Numbers in; small SVG charts out that take their colours from the page."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup, escape
+
+MAX_POINTS = 600
+NUM_STYLES = 8
+_LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 10, 36
+
+
+@dataclass(frozen=True)
+class Line:
+    """One curve; `style` picks its colour on the page, `dashed` sets it apart."""
+
+    label: str
+    x: np.ndarray
+    y: np.ndarray
+    style: int = 0
+    dashed: bool = False
+
+
+@dataclass(frozen=True)
+class Point:
+    """One policy in two worlds, with the interval of each score."""
+
+    label: str
+    real: float
+    imagined: float
+    real_interval: tuple[float, float]
+    imagined_interval: tuple[float, float]
+    style: int = 0
+
+
+@dataclass(frozen=True)
+class _Axes:
+    """Where numbers lie on the picture."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    width: int
+    height: int
+
+    def to_px(self, x: float, y: float) -> tuple[float, float]:
+        right, bottom = self.width - _RIGHT, self.height - _BOTTOM
+        return (
+            _LEFT + (x - self.x[0]) / (self.x[1] - self.x[0]) * (right - _LEFT),
+            bottom - (y - self.y[0]) / (self.y[1] - self.y[0]) * (bottom - _TOP),
+        )
+
+
+def ticks(low: float, high: float, *, about: int = 5) -> list[float]:
+    """Round numbers inside low … high, roughly `about` of them."""
+    step = 10.0 ** math.floor(math.log10((high - low) / about))
+    for factor in (1, 2, 5, 10):
+        if (high - low) / (step * factor) <= about + 1:
+            step *= factor
+            break
+    first = math.ceil(low / step - 1e-9)
+    return [k * step for k in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def line_chart(
+    lines: Sequence[Line], *, x_label: str, y_label: str, width: int = 560, height: int = 240
+) -> Markup:
+    """Curves over a common axis; long ones are thinned to at most 600 points each."""
+    x = np.concatenate([line.x for line in lines])
+    y = np.concatenate([line.y for line in lines])
+    axes = _Axes(_range(x, margin=0.0), _range(y, margin=0.06), width, height)
+    body = [_grid(axes, x_label, y_label)]
+    for line in lines:
+        stride = max(1, -(-len(line.x) // MAX_POINTS))
+        points = " ".join(
+            "{:.1f},{:.1f}".format(*axes.to_px(float(a), float(b)))
+            for a, b in zip(line.x[::stride], line.y[::stride], strict=True)
+        )
+        dash = ' stroke-dasharray="4 3"' if line.dashed else ""
+        body.append(
+            f'<polyline class="curve s{line.style % NUM_STYLES}"{dash} points="{points}">'
+            f"<title>{escape(line.label)}</title></polyline>"
+        )
+    return _svg(body, axes, f"{y_label} over {x_label}")
+
+
+def agreement_chart(points: Sequence[Point], *, size: int = 300) -> Markup:
+    """Imagined over real success, both 0 … 1, with intervals and the line of agreement."""
+    axes = _Axes((-0.04, 1.04), (-0.04, 1.04), size + _LEFT - _TOP, size)
+    (x0, y0), (x1, y1) = axes.to_px(0.0, 0.0), axes.to_px(1.0, 1.0)
+    body = [
+        _grid(axes, "success in the twin", "success imagined"),
+        f'<line class="guide" x1="{x0:.1f}" y1="{y0:.1f}" x2="{x1:.1f}" y2="{y1:.1f}"/>',
+    ]
+    for point in points:
+        x, y = axes.to_px(point.real, point.imagined)
+        low_x, low_y = axes.to_px(point.real_interval[0], point.imagined_interval[0])
+        high_x, high_y = axes.to_px(point.real_interval[1], point.imagined_interval[1])
+        body.append(
+            f'<g class="s{point.style % NUM_STYLES}"><path class="whisker" '
+            f'd="M{low_x:.1f} {y:.1f}H{high_x:.1f}M{x:.1f} {low_y:.1f}V{high_y:.1f}"/>'
+            f'<circle class="dot" cx="{x:.1f}" cy="{y:.1f}" r="5">'
+            f"<title>{escape(point.label)}: real {point.real:.2f}, "
+            f"imagined {point.imagined:.2f}</title></circle></g>"
+        )
+    return _svg(body, axes, "imagined over real success of each policy")
+
+
+def _range(values: np.ndarray, *, margin: float) -> tuple[float, float]:
+    """Smallest and largest number with some room; flat data gets a range of its own."""
+    low, high = float(values.min()), float(values.max())
+    room = (high - low) * margin
+    if high - low < 1e-12:
+        room = max(abs(high), 1.0) * 0.5
+    return low - room, high + room
+
+
+def _grid(axes: _Axes, x_label: str, y_label: str) -> str:
+    right, bottom = axes.width - _RIGHT, axes.height - _BOTTOM
+    parts = []
+    for value in ticks(*axes.y):
+        _, y = axes.to_px(axes.x[0], value)
+        parts.append(
+            f'<path class="grid" d="M{_LEFT} {y:.1f}H{right}"/>'
+            f'<text class="tick" x="{_LEFT - 6}" y="{y + 3.5:.1f}" text-anchor="end">'
+            f"{value:.4g}</text>"
+        )
+    for value in ticks(*axes.x):
+        x, _ = axes.to_px(value, axes.y[0])
+        parts.append(
+            f'<text class="tick" x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">'
+            f"{value:.4g}</text>"
+        )
+    middle_x, middle_y = (_LEFT + right) / 2, (_TOP + bottom) / 2
+    parts.append(
+        f'<path class="axis" d="M{_LEFT} {bottom}H{right}"/>'
+        f'<text class="label" x="{middle_x:.0f}" y="{axes.height - 4}" text-anchor="middle">'
+        f"{escape(x_label)}</text>"
+        f'<text class="label" transform="translate(12 {middle_y:.0f}) rotate(-90)" '
+        f'text-anchor="middle">{escape(y_label)}</text>'
+    )
+    return "".join(parts)
+
+
+def _svg(body: Sequence[str], axes: _Axes, title: str) -> Markup:
+    # Every label went through escape; the rest are our own numbers.
+    return Markup(  # noqa: S704
+        f'<svg class="chart" viewBox="0 0 {axes.width} {axes.height}" role="img" '
+        f'aria-label="{escape(title)}">{"".join(body)}</svg>'
+    )

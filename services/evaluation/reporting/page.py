@@ -1,0 +1,66 @@
+"""A report (what report.json holds) and its pictures in; one HTML file that stands alone out.
+
+Every section is optional: what a run did not do is not on the page. The report may hold
+`about`, `stages`, `errors`, `world_model`, `policies` and `agreement`; unknown keys only appear in
+the raw figures at the end.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined, select_autoescape
+
+from services.evaluation.reporting.drawings import (
+    action_charts,
+    clock_chart,
+    policy_panels,
+    strips,
+)
+from services.evaluation.reporting.pictures import ReportPictures
+from services.evaluation.reporting.sections import (
+    comparison_bars,
+    error_rows,
+    figure,
+    stage_bars,
+    tiles,
+)
+
+
+def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
+    """Write the page, whole or not at all.
+
+    Args:
+        report: figures; NaN and None are shown as "undefined".
+        pictures: arrays to draw.
+        path: of the HTML file; its folder is created.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = path.with_suffix(".unfinished")
+    unfinished.write_text(render_report(report, pictures), encoding="utf-8")
+    unfinished.replace(path)
+
+
+def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
+    """The page as text."""
+    environment = Environment(
+        loader=PackageLoader("services.evaluation.reporting"),
+        autoescape=select_autoescape(["j2"], default=True),
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters["figure"] = figure
+    return environment.get_template("report.html.j2").render(
+        about=report.get("about", {}),
+        tiles=tiles(report),
+        stages=stage_bars(report.get("stages", [])),
+        errors=error_rows(report.get("errors", {})),
+        clock_chart=clock_chart(pictures),
+        action_charts=action_charts(pictures.actions),
+        comparisons=comparison_bars(report.get("world_model", {})),
+        policies=policy_panels(report),
+        strips=strips(pictures),
+        raw=json.dumps(report, indent=1, default=str, ensure_ascii=False),
+    )

@@ -1,0 +1,84 @@
+"""Arrays of a run, as the report shows them: images, taxel maps, residuals and actions."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.tactile.layout import SIDES
+from services.evaluation.reporting.png import data_address
+
+
+@dataclass(frozen=True)
+class EpisodePicture:
+    """A few moments of one episode."""
+
+    title: str
+    times_s: Float64[np.ndarray, " n"]
+    images: UInt8[np.ndarray, "n h w 3"]
+    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+
+
+@dataclass(frozen=True)
+class ActionPicture:
+    """The actions of one episode on the model grid; commanded ones only of a robot."""
+
+    times_s: Float64[np.ndarray, " n"]
+    measured: Float64[np.ndarray, "n 67"]
+    commanded: Float64[np.ndarray, "n 67"] | None = None
+
+
+@dataclass(frozen=True)
+class PredictionPicture:
+    """A few moments of one held-out window, true and imagined."""
+
+    title: str
+    times_s: Float64[np.ndarray, " n"]
+    true_images: UInt8[np.ndarray, "n h w 3"]
+    predicted_images: UInt8[np.ndarray, "n h w 3"]
+    true_tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    predicted_tactile_kpa: Float32[np.ndarray, "n 2 320"]
+
+
+@dataclass(frozen=True)
+class ReportPictures:
+    """Everything of a report that is not a figure; what is absent is left out of the page.
+
+    `clock_residuals_ms` maps a stream to its reference times (s) and residuals (ms), [2, n].
+    """
+
+    episodes: tuple[EpisodePicture, ...] = ()
+    clock_residuals_ms: Mapping[str, Float64[np.ndarray, "2 n"]] = field(default_factory=dict)
+    actions: ActionPicture | None = None
+    predictions: tuple[PredictionPicture, ...] = ()
+
+
+@dataclass(frozen=True)
+class Moment:
+    """One column of a strip: a caption, the head image, and the taxel maps of both hands."""
+
+    caption: str
+    image: str
+    touch: str
+
+
+def moments(times_s: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray) -> list[Moment]:
+    """Columns of a strip, as addresses of embedded images."""
+    return [
+        Moment(f"{time:.2f} s", data_address(image), data_address(touch_image(taxels)))
+        for time, image, taxels in zip(times_s, images, tactile_kpa, strict=True)
+    ]
+
+
+def touch_image(tactile_kpa: np.ndarray, *, scale: int = 3) -> UInt8[np.ndarray, "h w 4"]:
+    """Both hands [2, 320] side by side in hand layout; transparent where there is no taxel."""
+    hands = [
+        hand_canvas(taxels, side=side) for taxels, side in zip(tactile_kpa, SIDES, strict=True)
+    ]
+    gap = np.full((hands[0].shape[0], 2), np.nan, dtype=np.float32)
+    canvas = np.concatenate([hands[0], gap, hands[1]], axis=1)
+    opacity = np.where(np.isnan(canvas), 0, 255).astype(np.uint8)
+    both = np.concatenate([colour(canvas), opacity[..., None]], axis=-1)
+    return both.repeat(scale, axis=0).repeat(scale, axis=1)

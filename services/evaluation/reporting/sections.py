@@ -1,0 +1,173 @@
+"""Figures of a report in; the tiles, bars and error rows of the page out."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+UNDEFINED = "undefined"
+# Figure, its name on the page, its unit, and the bound it should keep, if any.
+ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
+    ("taxel_iou", "Contact agreement (IoU)", "", ("≥", 0.98)),
+    ("taxel_mae_kpa", "Taxel error", "kPa", None),
+    ("wrist_error_mm", "Wrist position error", "mm", ("≤", 1.0)),
+    ("wrist_error_deg", "Wrist rotation error", "°", ("≤", 0.1)),
+    ("fingertip_error_mm", "Fingertip error", "mm", None),
+)
+CLOCK_BOUND_MS = 1.0
+# Title, unit, what is better, and the bars: figure and name.
+COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
+    (
+        "Images, PSNR",
+        "dB",
+        "more is better",
+        (
+            ("psnr", "world model"),
+            ("psnr_copy", "copy the first image"),
+            ("psnr_wrong_actions", "model, wrong actions"),
+            ("psnr_codec", "codec alone (limit)"),
+        ),
+    ),
+    (
+        "Touch, mean squared error",
+        "kPa²",
+        "less is better",
+        (
+            ("tactile_mse", "world model"),
+            ("tactile_mse_copy", "copy the first touch"),
+            ("tactile_mse_zero", "predict no touch"),
+        ),
+    ),
+    (
+        "Contact, F1",
+        "",
+        "more is better",
+        (("contact_f1", "world model"), ("contact_f1_copy", "copy the first touch")),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A named amount; `share` of the longest bar, `main` for the one that matters."""
+
+    name: str
+    value: float
+    share: float
+    main: bool = False
+
+
+@dataclass(frozen=True)
+class BarGroup:
+    """Bars of one unit below a title."""
+
+    title: str
+    unit: str
+    note: str
+    bars: list[Bar]
+
+
+@dataclass(frozen=True)
+class ErrorRow:
+    """One error with its bound; `holds` is None where there is no bound or no figure."""
+
+    name: str
+    value: Any
+    unit: str
+    bound: str
+    holds: bool | None
+
+
+@dataclass(frozen=True)
+class Tile:
+    """One headline figure."""
+
+    name: str
+    value: str
+    note: str
+
+
+def is_number(value: object) -> bool:
+    """Whether a figure is a finite number."""
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def figure(value: object, digits: int = 3) -> str:
+    """A figure with three significant digits; what is not a finite number is "undefined"."""
+    if not is_number(value):
+        return UNDEFINED
+    number = float(str(value))
+    if number != 0 and not 1e-3 <= abs(number) < 1e5:
+        return f"{number:.{digits - 1}e}"
+    decimals = digits - 1 - math.floor(math.log10(abs(number))) if number else 1
+    return f"{number:.{max(0, min(decimals, 4))}f}"
+
+
+def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
+    """Seconds of every stage."""
+    longest = max((float(s["seconds"]) for s in stages), default=1.0) or 1.0
+    return [Bar(str(s["name"]), float(s["seconds"]), float(s["seconds"]) / longest) for s in stages]
+
+
+def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
+    """The world model beside the predictors that it must beat."""
+    groups = []
+    for title, unit, note, entries in COMPARISONS:
+        known = [
+            (name, float(figures[key])) for key, name in entries if is_number(figures.get(key))
+        ]
+        if not known or known[0][0] != entries[0][1]:
+            continue
+        longest = max(value for _, value in known) or 1.0
+        bars = [Bar(n, v, max(0.0, v / longest), main=i == 0) for i, (n, v) in enumerate(known)]
+        groups.append(BarGroup(title, unit, note, bars))
+    return groups
+
+
+def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
+    """Errors of the recording path against the twin's truth, with their bounds."""
+    rows = []
+    for stream, value in dict(errors.get("clock_rms_ms", {})).items():
+        holds = value <= CLOCK_BOUND_MS if is_number(value) else None
+        rows.append(ErrorRow(f"Clock of {stream}, RMS", value, "ms", "≤ 1", holds))
+    for key, name, unit, bound in ERRORS:
+        if key not in errors:
+            continue
+        value, holds = errors[key], None
+        if bound and is_number(value):
+            holds = value >= bound[1] if bound[0] == "≥" else value <= bound[1]
+        rows.append(ErrorRow(name, value, unit, f"{bound[0]} {bound[1]:g}" if bound else "", holds))
+    return rows
+
+
+def tiles(report: Mapping[str, Any]) -> list[Tile]:
+    """The headline figures that this report has."""
+    found = []
+    stages, errors = report.get("stages", []), report.get("errors", {})
+    model, agreement = report.get("world_model", {}), report.get("agreement", {})
+    if stages:
+        total = sum(float(s["seconds"]) for s in stages)
+        found.append(Tile("from bytes to score", f"{figure(total)} s", f"{len(stages)} stages"))
+    clocks = [v for v in dict(errors.get("clock_rms_ms", {})).values() if is_number(v)]
+    if clocks:
+        found.append(Tile("worst clock", f"{figure(max(clocks))} ms", "RMS, delay removed"))
+    if is_number(errors.get("taxel_iou")):
+        found.append(Tile("touch recorded", figure(errors["taxel_iou"]), "contact IoU with truth"))
+    if is_number(model.get("psnr")) and is_number(model.get("psnr_copy")):
+        gain = model["psnr"] - model["psnr_copy"]
+        found.append(Tile("images foreseen", f"{gain:+.1f} dB", "PSNR over copying"))
+    if is_number(model.get("tactile_mse")):
+        best = min(
+            (model[k] for k in ("tactile_mse_zero", "tactile_mse_copy") if is_number(model.get(k))),
+            default=0.0,
+        )
+        if best > 0:
+            ratio = model["tactile_mse"] / best
+            found.append(Tile("touch foreseen", f"{ratio:.0%}", "of the best baseline's error"))
+    defined = [a["pearson"] for a in agreement.values() if is_number(a.get("pearson"))]
+    if agreement:
+        value = figure(sum(defined) / len(defined)) if defined else UNDEFINED
+        found.append(
+            Tile("worlds agree", value, f"Pearson, {len(defined)} of {len(agreement)} tasks")
+        )
+    return found

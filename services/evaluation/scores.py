@@ -1,0 +1,144 @@
+"""Outcomes of single rollouts in; success rates, intervals and agreement of worlds out."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.metrics.policy import bias, kendall, mean_absolute_error, mmrv, pearson, spearman
+from services.evaluation.statistics import bootstrap_agreement, wilson_interval
+
+REAL = "real"
+UNDEFINED = "undefined"
+_BOOTSTRAP_SEED = 0
+
+
+@dataclass(frozen=True)
+class RolloutScore:
+    """How one rollout ended.
+
+    `success` is the world's own verdict in the real world and the probe's decision elsewhere;
+    `probability` is always the probe's, so that the probe itself can be judged.
+    """
+
+    world: str
+    policy: str
+    task: str
+    seed: int
+    start_digest: str
+    success: bool
+    probability: float
+
+
+@dataclass(frozen=True)
+class ClosedLoopReport:
+    """Every rollout of an evaluation; the first imagined world is the one that is reported."""
+
+    scores: tuple[RolloutScore, ...]
+    imagined_worlds: tuple[str, ...]
+    policies: tuple[str, ...]
+
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """In the order of the rollouts."""
+        return tuple(dict.fromkeys(score.task for score in self.scores))
+
+    def outcomes(self, world: str, task: str) -> Float64[np.ndarray, "policies starts"]:
+        """Success (1 or 0) of every policy from every start.
+
+        Raises:
+            InvalidInputError: a policy that was not rolled out from the same starts as the others.
+        """
+        rows, digests = [], set()
+        for policy in self.policies:
+            mine = [s for s in self._of(world, task) if s.policy == policy]
+            rows.append([float(s.success) for s in mine])
+            digests.add(tuple(s.start_digest for s in mine))
+        if len(digests) != 1 or not rows[0]:
+            raise InvalidInputError(
+                f"scores of {world!r} in {task!r}: the policies began from different starts"
+            )
+        return np.array(rows)
+
+    def _of(self, world: str, task: str) -> list[RolloutScore]:
+        return [s for s in self.scores if s.world == world and s.task == task]
+
+    def policy_rows(self) -> list[dict[str, Any]]:
+        """One row a policy and task: real and imagined success rate with Wilson intervals."""
+        rows = []
+        for task in self.tasks:
+            for policy in self.policies:
+                row: dict[str, Any] = {"policy": policy, "task": task}
+                for name, world in ((REAL, REAL), ("imagined", self.imagined_worlds[0])):
+                    row |= self._cell(name, world, task, policy)
+                row["other_worlds"] = {
+                    world: self._cell("success", world, task, policy)
+                    for world in self.imagined_worlds[1:]
+                }
+                rows.append(row)
+        return rows
+
+    def _cell(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
+        mine = [s for s in self._of(world, task) if s.policy == policy]
+        successes = sum(s.success for s in mine)
+        interval = wilson_interval(successes, len(mine))
+        return {
+            name: successes / len(mine),
+            f"{name}_interval": [interval.low, interval.high],
+            f"{name}_probability": float(np.mean([s.probability for s in mine])),
+            f"{name}_rollouts": len(mine),
+        }
+
+    def agreement(self, world: str) -> dict[str, dict[str, Any]]:
+        """How the policies' success rates in a world agree with the real ones, by task."""
+        return {task: self._agreement(world, task) for task in self.tasks}
+
+    def _agreement(self, world: str, task: str) -> dict[str, Any]:
+        real, imagined = self.outcomes(REAL, task), self.outcomes(world, task)
+        pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
+        found: dict[str, Any] = {
+            "pearson": defined(pearson(**pair)),
+            "mmrv": defined(mmrv(**pair)),
+            "spearman": defined(spearman(**pair)),
+            "kendall": defined(kendall(**pair)),
+            "bias": bias(**pair),
+            "mean_absolute_error": mean_absolute_error(**pair),
+            "num_policies": len(real),
+            "num_starts": real.shape[1],
+        }
+        for measure in ("pearson", "mmrv"):
+            drawn = bootstrap_agreement(
+                real=real,
+                imagined=imagined,
+                measure=measure,
+                generator=np.random.default_rng(_BOOTSTRAP_SEED),
+            )
+            interval = drawn.interval
+            found[f"{measure}_interval"] = [interval.low, interval.high] if interval else UNDEFINED
+            found[f"{measure}_undefined_share"] = drawn.undefined_share
+        return found
+
+    def probe_accuracy(self) -> float:
+        """Share of real rollouts whose outcome the probe's probability tells rightly."""
+        real = [s for s in self.scores if s.world == REAL]
+        return float(np.mean([(s.probability >= 0.5) == s.success for s in real]))
+
+    def to_report(self) -> dict[str, Any]:
+        """What a report holds of it: `policies`, `agreement` and the rest, as plain JSON."""
+        first, *others = self.imagined_worlds
+        return {
+            "policies": self.policy_rows(),
+            "agreement": self.agreement(first),
+            "agreement_of_other_worlds": {world: self.agreement(world) for world in others},
+            "imagined_world": first,
+            "probe_accuracy_on_real": self.probe_accuracy(),
+            "rollouts": [asdict(score) for score in self.scores],
+        }
+
+
+def defined(value: float) -> float | str:
+    """The figure, or the word "undefined" where there is none: JSON has no NaN."""
+    return value if math.isfinite(value) else UNDEFINED

@@ -1,0 +1,133 @@
+"""Successes and scores in; intervals and the uncertainty of agreement figures out."""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from statistics import NormalDist
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.metrics.policy import mmrv, pearson
+
+AGREEMENT_MEASURES: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
+    "pearson": lambda real, imagined: pearson(real=real, imagined=imagined),
+    "mmrv": lambda real, imagined: mmrv(real=real, imagined=imagined),
+}
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A confidence interval."""
+
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class AgreementInterval:
+    """How sure an agreement figure is.
+
+    `interval` is None when too few draws were defined; `undefined_share` is the share of draws
+    in which the figure had no value (all scores of one side equal).
+    """
+
+    interval: Interval | None
+    undefined_share: float
+
+
+def _check_confidence(confidence: float) -> None:
+    if not 0 < confidence < 1:
+        raise InvalidInputError(f"confidence: got {confidence}, expected between 0 and 1")
+
+
+def wilson_interval(successes: int, trials: int, *, confidence: float = 0.95) -> Interval:
+    """Wilson score interval of a success rate, inside 0 … 1 (Wilson 1927).
+
+    Raises:
+        InvalidInputError: no trials, or more successes than trials.
+    """
+    _check_confidence(confidence)
+    if trials < 1 or not 0 <= successes <= trials:
+        raise InvalidInputError(
+            f"Wilson interval: got {successes} successes of {trials} trials, "
+            "expected at least one trial and 0 … trials successes"
+        )
+    z = NormalDist().inv_cdf(0.5 + confidence / 2)
+    rate = successes / trials
+    spread = z * math.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials * trials))
+    shrink = 1 + z * z / trials
+    centre = rate + z * z / (2 * trials)
+    return Interval(
+        max(0.0, (centre - spread) / shrink) if successes else 0.0,
+        min(1.0, (centre + spread) / shrink) if successes < trials else 1.0,
+    )
+
+
+def bootstrap_mean_interval(
+    values: np.ndarray,
+    generator: np.random.Generator,
+    *,
+    num_draws: int = 2000,
+    confidence: float = 0.95,
+) -> Interval:
+    """Percentile interval of the mean of independent values [n].
+
+    Raises:
+        ShapeError: not one axis with at least one value.
+    """
+    _check_confidence(confidence)
+    checked = np.asarray(values, dtype=np.float64)
+    if checked.ndim != 1 or len(checked) == 0:
+        raise ShapeError(f"bootstrap: got shape {checked.shape}, expected [n ≥ 1]")
+    drawn = generator.integers(0, len(checked), (num_draws, len(checked)))
+    return _percentiles(checked[drawn].mean(axis=1), confidence)
+
+
+def bootstrap_agreement(
+    *,
+    real: np.ndarray,
+    imagined: np.ndarray,
+    measure: str,
+    generator: np.random.Generator,
+    num_draws: int = 2000,
+) -> AgreementInterval:
+    """95 % percentile interval of an agreement figure, drawing the matched starts anew.
+
+    Args:
+        real: scores [policies, starts]; column k of both arrays began from the same start.
+        imagined: scores [policies, starts].
+        measure: "pearson" or "mmrv" of the policies' means.
+        generator: source of the draws; every policy sees the same drawn starts.
+        num_draws: number of draws.
+
+    Raises:
+        ShapeError: different shapes or not two axes.
+        InvalidInputError: another measure.
+    """
+    real, imagined = np.asarray(real, dtype=np.float64), np.asarray(imagined, dtype=np.float64)
+    if real.shape != imagined.shape or real.ndim != 2 or real.size == 0:
+        raise ShapeError(
+            f"agreement: got shapes {real.shape} and {imagined.shape}, "
+            "expected the same [policies, starts]"
+        )
+    if measure not in AGREEMENT_MEASURES:
+        raise InvalidInputError(
+            f"agreement measure: got {measure!r}, expected one of {sorted(AGREEMENT_MEASURES)}"
+        )
+    num_starts = real.shape[1]
+    figures = np.empty(num_draws)
+    for draw in range(num_draws):
+        columns = generator.integers(0, num_starts, num_starts)
+        figures[draw] = AGREEMENT_MEASURES[measure](
+            real[:, columns].mean(axis=1), imagined[:, columns].mean(axis=1)
+        )
+    defined = figures[np.isfinite(figures)]
+    undefined_share = 1 - len(defined) / num_draws
+    enough = undefined_share < 0.5
+    return AgreementInterval(_percentiles(defined, 0.95) if enough else None, undefined_share)
+
+
+def _percentiles(draws: np.ndarray, confidence: float) -> Interval:
+    low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(float(low), float(high))

@@ -1,0 +1,30 @@
+"""Networks trained once on toy demonstrations, for all tests of this folder."""
+
+import pytest
+import torch
+
+from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
+from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
+from tests.unit.evaluation import toy
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _one_thread():
+    torch.set_num_threads(1)
+
+
+@pytest.fixture(scope="session")
+def demonstrations():
+    return toy.demonstrations(range(45), noise_m=0.03)
+
+
+@pytest.fixture(scope="session")
+def policy_checkpoint(demonstrations):
+    settings = CloningSettings(num_training_steps=250, batch_size=32, learning_rate=3e-3)
+    return train_cloned_policy(demonstrations, settings, command="a test")
+
+
+@pytest.fixture(scope="session")
+def probe_checkpoint(demonstrations):
+    settings = ProbeSettings(num_training_steps=350, batch_size=32, shift_px=1, learning_rate=3e-3)
+    return train_success_probe(demonstrations, settings, command="a test")

@@ -1,0 +1,218 @@
+"""The HTML report: it stands alone, shows what there is, escapes, and never shows NaN."""
+
+import base64
+import json
+import re
+import zlib
+from html.parser import HTMLParser
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+from dextouch.errors import ShapeError
+from services.evaluation.reporting import (
+    ActionPicture,
+    EpisodePicture,
+    PredictionPicture,
+    ReportPictures,
+    write_report,
+)
+from services.evaluation.reporting.charts import Line, Point, agreement_chart, line_chart, ticks
+from services.evaluation.reporting.pictures import touch_image
+from services.evaluation.reporting.png import data_address, encode_png
+from services.evaluation.reporting.sections import error_rows, figure, tiles
+
+rng = np.random.default_rng(11)
+TIMES = np.linspace(0, 5, 4)
+IMAGES = rng.integers(0, 256, (4, 16, 16, 3), dtype=np.uint8)
+TOUCH = rng.uniform(0, 30, (4, 2, 320)).astype(np.float32)
+ACTIONS = np.tile(np.eye(1, 67, 3)[0], (20, 1)) + rng.normal(0, 0.1, (20, 67))
+REPORT = {
+    "about": {"machine": "<script>alert(1)</script>"},
+    "stages": [{"name": "record", "seconds": 12.5}, {"name": "imagine", "seconds": 40.0}],
+    "errors": {
+        "clock_rms_ms": {"tactile_left": 0.31, "camera_head": 1.7},
+        "taxel_iou": 0.991, "taxel_mae_kpa": 0.02, "wrist_error_mm": float("nan"),
+    },
+    "world_model": {
+        "psnr": 25.5, "psnr_copy": 24.0, "psnr_codec": 31.0, "psnr_wrong_actions": 22.0,
+        "tactile_mse": 0.5, "tactile_mse_zero": 2.0, "tactile_mse_copy": 1.0,
+    },
+    "policies": [
+        {"policy": "script-0mm", "task": "stand_bottle", "real": 1.0, "imagined": 0.9,
+         "real_interval": [0.7, 1.0], "imagined_interval": [0.6, 0.98]},
+        {"policy": "hold", "task": "stand_bottle", "real": 0.0, "imagined": float("nan")},
+    ],
+    "agreement": {"stand_bottle": {"pearson": "undefined", "mmrv": 0.0}},
+}  # fmt: skip
+PICTURES = ReportPictures(
+    episodes=(EpisodePicture("an episode", TIMES, IMAGES, TOUCH),),
+    clock_residuals_ms={"tactile_left": np.stack([TIMES, TIMES * 0.01])},
+    actions=ActionPicture(np.arange(20) / 15, ACTIONS, ACTIONS + 0.01),
+    predictions=(PredictionPicture("a window", TIMES, IMAGES, IMAGES, TOUCH, TOUCH),),
+)
+
+EMPTY = ReportPictures()
+
+
+class Tags(HTMLParser):
+    """Collects tags, and checks that they nest."""
+
+    VOID = frozenset({"meta", "img", "link", "br"})
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.seen: list[str] = []
+        self.addresses: list[str] = []
+
+    def handle_starttag(self, tag, attributes):
+        self.seen.append(tag)
+        self.addresses += [v for k, v in attributes if k in {"src", "href"}]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag, attributes):
+        self.seen.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+
+def page(tmp_path, report, pictures=EMPTY) -> tuple[str, Tags]:
+    path = tmp_path / "deep" / "report.html"
+    write_report(report, pictures, path)
+    text = path.read_text(encoding="utf-8")
+    tags = Tags()
+    tags.feed(text)
+    assert tags.open == []
+    assert [p.name for p in path.parent.iterdir()] == ["report.html"]
+    return text, tags
+
+
+def test_a_full_report_stands_alone(tmp_path):
+    text, tags = page(tmp_path, REPORT, PICTURES)
+    assert all(address.startswith("data:image/") for address in tags.addresses)
+    assert not re.search(r"https?://|@import|url\(", text)
+    assert "script" not in tags.seen
+    assert "prefers-color-scheme: dark" in text
+    assert tags.seen.count("img") == 2 * (4 + 8)
+    assert tags.seen.count("svg") == 1 + 4 + 1
+    for words in ("an episode", "a window", "script-0mm", "tactile_left", "0.70\u20131.00"):
+        assert words in text
+
+
+def test_an_empty_report_is_a_page_too(tmp_path):
+    text, tags = page(tmp_path, {})
+    assert "img" not in tags.seen
+    assert "Policies" not in text
+
+
+@pytest.mark.parametrize("part", [k for k in REPORT if k != "about"])
+def test_every_part_may_come_alone_or_be_missing(tmp_path, part):
+    page(tmp_path, {part: REPORT[part]})
+    page(tmp_path, {k: v for k, v in REPORT.items() if k != part}, PICTURES)
+
+
+def test_undefined_figures_say_so(tmp_path):
+    text, _ = page(tmp_path, REPORT)
+    shown = text.split("<details")[0]
+    assert "undefined" in shown
+    assert not re.search(r"\bnan\b", shown, re.IGNORECASE)
+
+
+def test_raw_figures_come_along(tmp_path):
+    report = {k: v for k, v in REPORT.items() if k in {"stages", "world_model"}}
+    text, _ = page(tmp_path, report)
+    raw = re.search(r"<pre>(.*?)</pre>", text, re.DOTALL)[1].replace("&#34;", '"')
+    assert json.loads(raw) == report
+
+
+def test_bounds_are_judged():
+    rows = {row.name: row.holds for row in error_rows(REPORT["errors"])}
+    assert rows["Clock of tactile_left, RMS"] is True
+    assert rows["Clock of camera_head, RMS"] is False
+    assert rows["Contact agreement (IoU)"] is True
+    assert rows["Wrist position error"] is None
+
+
+def test_headlines():
+    shown = {tile.name: tile.value for tile in tiles(REPORT)}
+    assert shown == {
+        "from bytes to score": "52.5 s",
+        "worst clock": "1.70 ms",
+        "touch recorded": "0.991",
+        "images foreseen": "+1.5 dB",
+        "touch foreseen": "50%",
+        "worlds agree": "undefined",
+    }
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [(0, "0.0"), (0.9912, "0.991"), (12.34, "12.3"), (1234.5, "1234"), (-3.14159, "-3.14"),
+     (2e-5, "2.00e-05"), (None, "undefined"), ("undefined", "undefined"), (np.inf, "undefined")],
+)  # fmt: skip
+def test_figures_have_three_digits(value, shown):
+    assert figure(value) == shown
+
+
+@pytest.mark.parametrize("channels", [3, 4])
+def test_png_decodes_to_the_same_pixels(channels):
+    image = rng.integers(0, 256, (5, 7, channels), dtype=np.uint8)
+    data = encode_png(image)
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = (int.from_bytes(data[k : k + 4], "big") for k in (16, 20))
+    assert (height, width) == (5, 7)
+    start = data.index(b"IDAT")
+    size = int.from_bytes(data[start - 4 : start], "big")
+    body = data[start : start + 4 + size]
+    assert int.from_bytes(data[start + 4 + size : start + 8 + size], "big") == zlib.crc32(body)
+    rows = np.frombuffer(zlib.decompress(body[4:]), np.uint8).reshape(5, 1 + 7 * channels)
+    np.testing.assert_array_equal(rows[:, 1:].reshape(image.shape), image)
+
+
+def test_large_photographs_travel_as_jpeg():
+    address = data_address(np.zeros((300, 20, 3), np.uint8))
+    kind, _, data = address.partition(";base64,")
+    assert kind == "data:image/jpeg"
+    assert base64.b64decode(data)[:2] == b"\xff\xd8"
+    with pytest.raises(ShapeError):
+        encode_png(np.zeros((4, 4, 3)))
+
+
+def test_taxel_maps_are_transparent_where_there_is_no_taxel():
+    image = touch_image(TOUCH[0], scale=1)
+    assert np.count_nonzero(image[..., 3]) == 640
+    assert image.shape[2] == 4
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [(0.0, 1.0, [0, 0.2, 0.4, 0.6, 0.8, 1.0]), (-3.0, 8.0, [-2, 0, 2, 4, 6, 8]),
+     (0.01, 0.03, [0.01, 0.015, 0.02, 0.025, 0.03])],
+)  # fmt: skip
+def test_ticks_are_round(low, high, expected):
+    assert ticks(low, high) == pytest.approx(expected)
+
+
+def test_charts_are_well_formed_and_inside():
+    flat = line_chart(
+        [Line("a < b & c", np.arange(5.0), np.zeros(5)), Line("d", np.arange(5.0), np.zeros(5), 9)],
+        x_label="t", y_label="y",
+    )  # fmt: skip
+    root = ET.fromstring(flat)  # noqa: S314
+    width, height = map(float, root.attrib["viewBox"].split()[2:])
+    for line in root.iter("polyline"):
+        for point in line.attrib["points"].split():
+            x, y = map(float, point.split(","))
+            assert 0 <= x <= width
+            assert 0 <= y <= height
+    assert [line.attrib["class"] for line in root.iter("polyline")] == ["curve s0", "curve s1"]
+    ET.fromstring(agreement_chart([Point("p", 1.0, 0.0, (0.5, 1.0), (0.0, 0.5))]))  # noqa: S314
+
+
+def test_long_curves_are_thinned():
+    chart = line_chart([Line("long", np.arange(1e5), np.arange(1e5))], x_label="x", y_label="y")
+    assert len(chart) < 20_000

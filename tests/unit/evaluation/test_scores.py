@@ -1,0 +1,69 @@
+"""Rates, matched starts and agreement of hand-made rollouts."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from services.evaluation.scores import ClosedLoopReport, RolloutScore
+
+
+def report(outcomes: dict[str, dict[str, str]]) -> ClosedLoopReport:
+    """Outcomes as {world: {policy: "1101"}}; one task, starts numbered."""
+    scores = [
+        RolloutScore(
+            world, policy, "stand", k, f"start {k}", mark == "1", 0.9 if mark == "1" else 0.2
+        )
+        for world, policies in outcomes.items()
+        for policy, marks in policies.items()
+        for k, mark in enumerate(marks)
+    ]
+    worlds = tuple(w for w in outcomes if w != "real")
+    return ClosedLoopReport(tuple(scores), worlds, tuple(outcomes["real"]))
+
+
+GOOD = {
+    "real": {"a": "1111", "b": "1100", "c": "0000"},
+    "model": {"a": "1110", "b": "1101", "c": "1000"},
+    "copy": {"a": "0000", "b": "0000", "c": "0000"},
+}
+
+
+def test_rates_and_intervals():
+    row = report(GOOD).policy_rows()[0]
+    assert (row["policy"], row["task"], row["real"], row["imagined"]) == ("a", "stand", 1.0, 0.75)
+    assert row["real_interval"] == pytest.approx([0.510, 1.0], abs=1e-3)
+    assert row["imagined_rollouts"] == 4
+    assert row["imagined_probability"] == pytest.approx((3 * 0.9 + 0.2) / 4)
+    assert row["other_worlds"]["copy"]["success"] == 0.0
+
+
+def test_agreement_by_hand():
+    found = report(GOOD).agreement("model")["stand"]
+    real, imagined = [1, 0.5, 0], [0.75, 0.75, 0.25]
+    assert found["pearson"] == pytest.approx(np.corrcoef(real, imagined)[0, 1])
+    assert found["mmrv"] == 0.0
+    assert found["bias"] == pytest.approx(0.25 / 3)
+
+
+def test_a_world_without_spread_is_undefined_in_plain_json():
+    whole = report(GOOD).to_report()
+    copy = whole["agreement_of_other_worlds"]["copy"]["stand"]
+    assert copy["pearson"] == "undefined"
+    assert copy["pearson_interval"] == "undefined"
+    assert copy["mmrv"] == 0.0
+    assert whole["imagined_world"] == "model"
+    json.dumps(whole, allow_nan=False)
+
+
+def test_probe_is_judged_on_real_rollouts():
+    assert report(GOOD).to_report()["probe_accuracy_on_real"] == 1.0
+
+
+def test_different_starts_are_not_compared():
+    whole = report(GOOD)
+    moved = [replace(s, start_digest="another") if s.policy == "c" else s for s in whole.scores]
+    with pytest.raises(InvalidInputError, match="different starts"):
+        ClosedLoopReport(tuple(moved), whole.imagined_worlds, whole.policies).agreement("model")

@@ -1,0 +1,91 @@
+"""Intervals against published values, coverage, and the undefined cases."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError, ShapeError
+from services.evaluation.statistics import (
+    bootstrap_agreement,
+    bootstrap_mean_interval,
+    wilson_interval,
+)
+
+
+def test_wilson_of_nine_in_ten():
+    interval = wilson_interval(9, 10)
+    assert (interval.low, interval.high) == pytest.approx((0.596, 0.982), abs=5e-4)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 1), (0, 10), (10, 10), (5, 10), (1, 1000)])
+def test_wilson_stays_inside_and_around_the_rate(successes, trials):
+    interval = wilson_interval(successes, trials)
+    assert 0 <= interval.low <= successes / trials <= interval.high <= 1
+    mirrored = wilson_interval(trials - successes, trials)
+    assert (mirrored.low, mirrored.high) == pytest.approx((1 - interval.high, 1 - interval.low))
+
+
+def test_wilson_solves_its_equation():
+    p, n, z = 0.3, 20, 1.959964
+    interval = wilson_interval(6, 20)
+    for bound in (interval.low, interval.high):
+        assert (bound - p) ** 2 == pytest.approx(z**2 * bound * (1 - bound) / n, rel=1e-5)
+
+
+@pytest.mark.parametrize(("successes", "trials"), [(0, 0), (3, 2), (-1, 5)])
+def test_impossible_counts_are_refused(successes, trials):
+    with pytest.raises(InvalidInputError, match="Wilson"):
+        wilson_interval(successes, trials)
+
+
+def test_bootstrap_of_the_mean_covers():
+    rng = np.random.default_rng(1)
+    hits = 0
+    for _ in range(200):
+        interval = bootstrap_mean_interval(rng.normal(3.0, 1.0, 30), rng, num_draws=400)
+        hits += interval.low <= 3.0 <= interval.high
+    assert 175 <= hits <= 199
+
+
+def test_bootstrap_refuses_nothing_and_tables():
+    rng = np.random.default_rng(1)
+    for values in (np.array([]), np.zeros((2, 2))):
+        with pytest.raises(ShapeError):
+            bootstrap_mean_interval(values, rng)
+    with pytest.raises(InvalidInputError, match="confidence"):
+        bootstrap_mean_interval(np.ones(3), rng, confidence=1.0)
+
+
+def test_agreement_of_identical_worlds_is_sure():
+    rng = np.random.default_rng(2)
+    real = (rng.random((4, 20)) < np.array([[0.1], [0.4], [0.7], [0.95]])).astype(float)
+    drawn = bootstrap_agreement(
+        real=real, imagined=real, measure="pearson", generator=rng, num_draws=200
+    )
+    assert drawn.interval is not None
+    assert drawn.interval.low == pytest.approx(1.0)
+    assert drawn.undefined_share < 0.05
+
+
+def test_agreement_without_spread_is_undefined():
+    flat = np.ones((3, 10))
+    drawn = bootstrap_agreement(
+        real=flat,
+        imagined=flat,
+        measure="pearson",
+        generator=np.random.default_rng(0),
+        num_draws=50,
+    )
+    assert drawn.interval is None
+    assert drawn.undefined_share == 1.0
+
+
+def test_agreement_checks_its_input():
+    rng = np.random.default_rng(0)
+    with pytest.raises(ShapeError, match="policies, starts"):
+        bootstrap_agreement(
+            real=np.ones((3, 4)), imagined=np.ones((3, 5)), measure="mmrv", generator=rng
+        )
+    with pytest.raises(InvalidInputError, match="mmrv"):
+        bootstrap_agreement(
+            real=np.ones((3, 4)), imagined=np.ones((3, 4)), measure="luck", generator=rng
+        )

@@ -1,0 +1,84 @@
+"""The success probe: accuracy on held-out toys, balance, and honest refusals."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError, UnknownNameError
+from services.evaluation.demonstrations import data_hash, split_by_seed
+from services.evaluation.success_probe import ProbeShape, SuccessProbe
+from services.evaluation.success_probe_training import (
+    ProbeSettings,
+    final_ending,
+    labelled_endings,
+    train_success_probe,
+)
+from tests.unit.evaluation import toy
+
+
+def test_held_out_accuracy_is_kept_in_the_checkpoint(probe_checkpoint):
+    metrics = probe_checkpoint.metadata.metrics
+    for task in toy.TASKS:
+        assert metrics[f"held_out_balanced_accuracy_{task}"] >= 0.8
+        assert metrics[f"num_held_out_failures_{task}"] > 0
+
+
+def test_it_tells_new_successes_from_failures(probe_checkpoint):
+    probe = SuccessProbe(probe_checkpoint)
+    fresh = [toy.demonstration(t, s, noise_m=n) for t in toy.TASKS for s in range(500, 510)
+             for n in (0.0, 0.06)]  # fmt: skip
+    told = probe.probabilities([final_ending(d, d.num_steps - 1) for d in fresh]) > 0.5
+    assert np.mean(told == [d.success for d in fresh]) >= 0.85
+    untouched = [final_ending(d, 2) for d in fresh]
+    assert np.mean(probe.probabilities(untouched) > 0.5) <= 0.15
+
+
+def test_one_and_many_agree(probe_checkpoint):
+    probe = SuccessProbe(probe_checkpoint)
+    endings = [final_ending(toy.demonstration("reach", s), 80) for s in range(4)]
+    together = probe.probabilities(endings)
+    assert together == pytest.approx([probe.probability(e) for e in endings], abs=1e-6)
+
+
+def test_both_outcomes_weigh_the_same(demonstrations):
+    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    labelled = labelled_endings(demonstrations, shape, with_early=True)
+    for task in range(2):
+        of_task = labelled.batch.task == task
+        wins = labelled.success > 0.5
+        assert float(labelled.weight[of_task & wins].sum()) == pytest.approx(
+            float(labelled.weight[of_task & ~wins].sum()), rel=1e-4
+        )
+
+
+def test_one_sided_data_is_refused():
+    with pytest.raises(InvalidInputError, match=r"no failed episode of 'reach'"):
+        train_success_probe(toy.demonstrations(range(20)), ProbeSettings(), command="x")
+
+
+def test_foreign_input_is_refused(probe_checkpoint):
+    probe = SuccessProbe(probe_checkpoint)
+    ending = final_ending(toy.demonstration("reach", 0), 80)
+    with pytest.raises(UnknownNameError, match="juggle"):
+        probe.probability(toy.replace(ending, task="juggle"))
+    with pytest.raises(InvalidInputError, match="no endings"):
+        probe.probabilities([])
+    large = np.zeros((3, 64, 64, 3), np.uint8)
+    with pytest.raises(InvalidInputError, match="32, 32"):
+        probe.probability(toy.replace(ending, images=large))
+
+
+def test_a_start_never_stands_on_both_sides(demonstrations):
+    twice = demonstrations + [
+        toy.replace(d, episode_id=f"{d.episode_id}-b") for d in demonstrations
+    ]
+    training, held_out = split_by_seed(twice, held_out_share=0.3)
+    assert len(training) + len(held_out) == len(twice)
+    assert not {d.start_digest for d in training} & {d.start_digest for d in held_out}
+
+
+def test_data_hash_sees_every_change(demonstrations):
+    few = demonstrations[:3]
+    assert data_hash(few) == data_hash(few[::-1])
+    touched = few[0].tactile_kpa.copy()
+    touched[40, 1, 5] += 0.5
+    assert data_hash([toy.replace(few[0], tactile_kpa=touched), *few[1:]]) != data_hash(few)
