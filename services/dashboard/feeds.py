@@ -4,6 +4,8 @@ import asyncio
 from collections.abc import Mapping
 from typing import Any
 
+import structlog
+
 from dextouch.errors import DexTouchError, NotFoundError
 from dextouch.streams.packing import unpack
 from dextouch.tactile.layout import SIDES
@@ -18,6 +20,8 @@ from services.dashboard.views import (
     taxel_message,
     unreachable_station,
 )
+
+logger = structlog.get_logger(__name__)
 
 MAX_TAXEL_BYTES = 64 * 1024
 NUM_TAKES = 8
@@ -81,9 +85,11 @@ class Feeds:
                 store.json("GET", store_api.RECORDINGS_PATH),
                 store.json("GET", store_api.EPISODES_PATH),
             )
-        except DexTouchError:
-            return []  # the services topic tells that the store is away
-        return store_api.take_views(recordings, episodes, newest=NUM_TAKES)
+            return store_api.take_views(recordings, episodes, newest=NUM_TAKES)
+        except DexTouchError as error:
+            # The services topic tells operators; the log keeps the reason.
+            logger.warning("takes_not_listed", error=error.message)
+            return []
 
     async def operate(self, action: str, body: Mapping[str, Any]) -> dict[str, object]:
         """One recorder action; the recorder's new state."""

@@ -34,37 +34,37 @@ class StreamHealth(_Answer):
     """One stream as acquisition judges it; clock figures only where a clock is being fitted."""
 
     stream: str
+    device: str
     level: Level
     reasons: tuple[str, ...] = ()
     rate_hz: float | None = None
     nominal_rate_hz: float | None = None
     age_s: float | None = None
-    drop_ratio: float | None = None
+    received: int | None = None
+    lost: int | None = None
     skew_ppm: float | None = None
     clock_residual_ms: float | None = None
 
 
 class DeviceHealth(_Answer):
-    """One device with its streams."""
+    """One device."""
 
     device: str
-    level: Level
-    lost: int | None = None
     reconnects: int = 0
-    dead_taxels: int = 0
     last_error: str | None = None
-    streams: tuple[StreamHealth, ...] = ()
 
 
 class StationHealth(_Answer):
-    """All devices."""
+    """All streams and devices."""
 
-    devices: tuple[DeviceHealth, ...]
+    streams: tuple[StreamHealth, ...]
+    devices: tuple[DeviceHealth, ...] = ()
 
 
 class TakeProblem(_Answer):
     """Something found in a take right after its end."""
 
+    level: str
     message: str
 
 
@@ -81,23 +81,15 @@ class RecorderStatus(_Answer):
     state: str
     actions: tuple[str, ...]
     recording_id: str | None = None
-    elapsed_s: float | None = None
-    failure: str | None = None
+    duration_s: float | None = None
+    problems: tuple[str, ...] = ()
     check: TakeCheck | None = None
-
-
-class CameraLive(_Answer):
-    """A camera whose newest image can be had."""
-
-    name: str
-    sequence: int
-    age_s: float | None = None
 
 
 class CameraList(_Answer):
     """Cameras that have sent an image."""
 
-    cameras: tuple[CameraLive, ...]
+    cameras: tuple[CameraView, ...]
 
 
 def action_path(action: str) -> str:
@@ -122,8 +114,9 @@ def station_view(health: object, recorder: object) -> StationView:
     Raises:
         UnavailableError: answers in a form this version does not know.
     """
-    devices = _read(StationHealth, health).devices
-    streams = tuple(_stream_view(device, item) for device in devices for item in device.streams)
+    station = _read(StationHealth, health)
+    devices = {device.device: device for device in station.devices}
+    streams = tuple(_stream_view(item, devices.get(item.device)) for item in station.streams)
     levels = [stream.level for stream in streams]
     return StationView(
         reachable=True,
@@ -138,46 +131,44 @@ def station_view(health: object, recorder: object) -> StationView:
 def recorder_view(answer: object) -> RecorderView:
     """The recorder from its own answer."""
     recorder = _read(RecorderStatus, answer)
+    found = recorder.check.problems if recorder.check else ()
     complete = recorder.check is None or recorder.check.complete
-    words = [recorder.failure] if recorder.failure else []
-    if recorder.check is not None:
-        words += [problem.message for problem in recorder.check.problems]
-        words += [] if words else ["complete"]
-    named = [recorder.recording_id] if recorder.recording_id else []
+    words = [*recorder.problems, *(problem.message for problem in found)]
+    if recorder.check is not None and not words:
+        words = ["complete"]
+    level: Level = "OK"
+    if recorder.problems or found:
+        level = "WARN" if complete and not recorder.problems else "ERROR"
     return RecorderView(
         state=recorder.state,
         actions=recorder.actions,
-        elapsed_s=recorder.elapsed_s,
-        level="ERROR" if recorder.failure else "OK" if complete else "WARN",
+        elapsed_s=recorder.duration_s,
+        level=level,
         complete=complete,
-        note=" · ".join([*named, *words]),
+        note=" · ".join([recorder.recording_id, *words] if recorder.recording_id else words),
     )
 
 
 def camera_views(answer: object) -> list[CameraView]:
     """The cameras from the answer at CAMERAS_PATH."""
-    return [
-        CameraView(name=camera.name, image_index=camera.sequence, age_s=camera.age_s)
-        for camera in _read(CameraList, answer).cameras
-    ]
+    return list(_read(CameraList, answer).cameras)
 
 
-def _stream_view(device: DeviceHealth, item: StreamHealth) -> StreamView:
+def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
     words = list(item.reasons)
-    if device.reconnects:
+    if device is not None and device.reconnects:
         words.append(f"{device.reconnects} reconnects")
-    if device.dead_taxels:
-        words.append(f"{device.dead_taxels} dead taxels")
-    if device.last_error and item.level in {"ERROR", "STALE"}:
+    if device is not None and device.last_error and item.level in {"ERROR", "STALE"}:
         words.append(device.last_error)
+    offered = (item.received or 0) + (item.lost or 0)
     return StreamView(
         name=item.stream,
         level=item.level,
         message=" · ".join(words),
         rate_hz=item.rate_hz,
         nominal_rate_hz=item.nominal_rate_hz,
-        dropped=device.lost,
-        drop_percent=None if item.drop_ratio is None else 100 * item.drop_ratio,
+        dropped=item.lost,
+        drop_percent=None if item.lost is None or not offered else 100 * item.lost / offered,
         age_s=item.age_s,
         skew_ppm=item.skew_ppm,
         clock_error_ms=item.clock_residual_ms,

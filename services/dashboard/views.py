@@ -84,7 +84,7 @@ class TakeView(BaseModel):
 class CameraView(BaseModel):
     """One camera whose newest image can be had."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
     name: str
     image_index: int

@@ -24,7 +24,8 @@ export function showCameras(section, row, cameras) {
     const figure = known.get(camera.name) ?? row.appendChild(element("figure", { "data-name": camera.name },
       element("img", { alt: `newest image of ${camera.name}` }), element("figcaption", {})));
     figure.querySelector("img").src = `/v1/cameras/${encodeURIComponent(camera.name)}.jpg?at=${camera.image_index}`;
-    figure.querySelector("figcaption").textContent = `${camera.name} · ${age(camera.age_s)}`;
+    const caption = figure.querySelector("figcaption");
+    caption.replaceChildren(camera.name.replace(/^camera_/, "").replaceAll("_", " "), element("span", { class: "quiet" }, age(camera.age_s)));
     known.delete(camera.name);
   }
   for (const figure of known.values()) figure.remove();

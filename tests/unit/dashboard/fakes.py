@@ -28,10 +28,11 @@ class FakeServices:
     """Acquisition and store in one; tests change `health`, `recorder` and read `asked`."""
 
     def __init__(self):
-        self.stream = {"stream": "tactile_left", "level": "OK", "reasons": [], "rate_hz": 59.9}
-        self.stream |= {"nominal_rate_hz": 60.0, "age_s": 0.01, "drop_ratio": 0.002}
-        device = {"device": "glove_left", "level": "OK", "lost": 2, "streams": [self.stream]}
-        self.health = {"station": "one", "level": "OK", "devices": [device]}
+        self.stream = {"stream": "tactile_left", "device": "glove_left", "level": "OK"}
+        self.stream |= {"reasons": [], "rate_hz": 59.9, "nominal_rate_hz": 60.0, "age_s": 0.01}
+        self.stream |= {"received": 998, "lost": 2}
+        self.device = {"device": "glove_left", "reconnects": 0, "last_error": None}
+        self.health = {"streams": [self.stream], "devices": [self.device]}
         self.recorder = {"state": "idle", "actions": ["arm"]}
         self.asked = []
         self.app = FastAPI()
@@ -42,7 +43,7 @@ class FakeServices:
         self.app.get(station_api.TAXELS_PATH)(self._taxels)
         self.app.post(station_api.RECORDER_PATH + "/{action}")(self._act)
         self.app.get("/v1/episodes")(lambda: {"episodes": [EPISODE], "num_matching": 1})
-        self.app.get("/v1/recordings")(lambda: {"recordings": []})
+        self.app.get("/v1/recordings")(lambda: {"recordings": [], "num_matching": 0})
 
     async def _note(self, request, call_next):
         self.asked.append(request.url.path)

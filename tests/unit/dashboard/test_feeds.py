@@ -27,16 +27,16 @@ async def test_station(feeds):
 
 async def test_worst_level_leads(feeds, services):
     levels = ("OK", "STALE", "WARN")
-    services.health["devices"][0]["streams"] = [services.stream | {"level": it} for it in levels]
+    services.health["streams"] = [services.stream | {"level": it} for it in levels]
     view = await feeds.station()
     assert (view.level, view.summary) == ("STALE", "1 STALE · 1 WARN · 1 OK")
 
 
 async def test_what_ails_a_device_is_said(feeds, services):
     services.stream |= {"level": "STALE", "reasons": ["no sample for 2.0 s"]}
-    services.health["devices"][0] |= {"reconnects": 3, "dead_taxels": 16, "last_error": "gone"}
+    services.device |= {"reconnects": 3, "last_error": "gone"}
     (stream,) = (await feeds.station()).streams
-    assert stream.message == "no sample for 2.0 s · 3 reconnects · 16 dead taxels · gone"
+    assert stream.message == "no sample for 2.0 s · 3 reconnects · gone"
 
 
 async def test_incomplete_take_is_shown(feeds, services):
@@ -45,11 +45,11 @@ async def test_incomplete_take_is_shown(feeds, services):
         "state": "checking",
         "actions": ["save", "discard"],
         "recording_id": "take-7",
-        "elapsed_s": 5.5,
+        "duration_s": 5.5,
         "check": {"complete": False, "problems": [problem]},
     }
     recorder = (await feeds.station()).recorder
-    assert (recorder.complete, recorder.level, recorder.elapsed_s) == (False, "WARN", 5.5)
+    assert (recorder.complete, recorder.level, recorder.elapsed_s) == (False, "ERROR", 5.5)
     assert recorder.note == "take-7 · head: 0.4 s gap"
 
 
@@ -62,7 +62,7 @@ async def test_absent_station_shows_no_numbers():
 
 
 async def test_answer_of_another_form_is_named(feeds, services):
-    services.health = {"devices": [{"device": "x", "level": "FINE"}]}
+    services.health = {"streams": [{"stream": "x", "device": "y", "level": "FINE"}]}
     view = await feeds.station()
     assert not view.reachable
     assert "answer of an unknown form" in view.note
