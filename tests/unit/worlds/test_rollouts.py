@@ -1,0 +1,270 @@
+"""The rollout service: numbering, replay, branches, expiry, and going on in another process."""
+
+import asyncio
+
+import numpy as np
+import pytest
+
+from dextouch.errors import (
+    ConflictError,
+    DexTouchError,
+    InvalidInputError,
+    LimitExceededError,
+    NonFiniteError,
+    NotFoundError,
+    UnknownNameError,
+)
+from dextouch.schemas.rollout_codec import decode_answer
+from dextouch.schemas.rollouts import MAX_SEED, ReturnSelector, RolloutStart
+from dextouch.serving.state import MemoryState
+from dextouch.worlds.rollouts import RolloutLimits, RolloutService, chunk_seed
+from tests.unit.worlds.fakes import (
+    K_HEAD,
+    BatchSumWorld,
+    SumWorld,
+    actions,
+    anchor,
+    observation,
+)
+
+ALL = ReturnSelector()
+START = RolloutStart("stand_bottle", 3, "stand the bottle")
+
+
+def service(store=None, world=None, **limits) -> RolloutService:
+    served = world or SumWorld()
+    return RolloutService({"sum": served}, store or MemoryState(), RolloutLimits(**limits))
+
+
+def decoded(answer):
+    return decode_answer(answer.payload, max_bytes=10**7)
+
+
+async def begin(made, start=START) -> str:
+    return decoded(await made.start("sum", start, ALL)).rollout.id
+
+
+async def test_chunks_count_up_and_steps_follow():
+    made = service()
+    rollout_id = await begin(made)
+    for chunk, (num_steps, first_step) in enumerate([(4, 1), (16, 5), (8, 21)]):
+        answer = decoded(await made.step(rollout_id, chunk, actions(num_steps), ALL))
+        assert answer.observation.first_step == first_step
+        assert answer.rollout.next_chunk == chunk + 1
+    info = await made.get(rollout_id)
+    assert (info.next_chunk, info.last_step) == (3, 28)
+    made.close()
+
+
+async def test_the_same_request_again_is_replayed_byte_for_byte():
+    world = SumWorld()
+    made = service(world=world)
+    rollout_id = await begin(made)
+    first = await made.step(rollout_id, 0, actions(4, 0.5), ALL)
+    again = await made.step(rollout_id, 0, actions(4, 0.5), ALL)
+    assert (first.replayed, again.replayed) == (False, True)
+    assert again.payload == first.payload
+    assert (await made.get(rollout_id)).next_chunk == 1
+    made.close()
+
+
+@pytest.mark.parametrize("chunk", [-1, 0, 1, 3, 10**30])
+async def test_any_other_number_or_body_is_a_conflict(chunk):
+    made = service()
+    rollout_id = await begin(made)
+    for i in range(2):
+        await made.step(rollout_id, i, actions(4), ALL)
+    with pytest.raises(ConflictError, match="expected chunk 2") as caught:
+        await made.step(rollout_id, chunk, actions(4, 0.5), ALL)
+    assert caught.value.details == {"expected": 2, "got": chunk}
+    with pytest.raises(ConflictError):
+        await made.step(rollout_id, 1, actions(4), ReturnSelector(steps="last"))
+    assert (await made.get(rollout_id)).next_chunk == 2
+    made.close()
+
+
+@pytest.mark.parametrize(
+    ("value", "error"), [(1e6, InvalidInputError), (2e6, RuntimeError), (3e6, NonFiniteError)]
+)
+async def test_a_failed_step_changes_nothing(value, error):
+    made, plain = service(), service()
+    rollout_id, expected_id = await begin(made), await begin(plain)
+    with pytest.raises(error):
+        await made.step(rollout_id, 0, actions(4, value), ALL)
+    one = decoded(await made.step(rollout_id, 0, actions(4), ALL)).observation
+    other = decoded(await plain.step(expected_id, 0, actions(4), ALL)).observation
+    np.testing.assert_array_equal(one.tactile_kpa, other.tactile_kpa)
+    made.close()
+    plain.close()
+
+
+async def test_a_world_that_breaks_its_promise_is_not_believed():
+    class Short(SumWorld):
+        def step(self, state, actions, *, seed):
+            return super().step(state, actions[:-1], seed=seed)
+
+    made = service(world=Short())
+    rollout_id = await begin(made)
+    with pytest.raises(DexTouchError, match="got 3 steps from 1, expected 4 from 1"):
+        await made.step(rollout_id, 0, actions(4), ALL)
+    assert (await made.get(rollout_id)).next_chunk == 0
+    made.close()
+
+
+async def test_another_process_goes_on_where_the_first_was(state):
+    alone = service()
+    alone_id = await begin(alone)
+    first, second = service(state), service(state)
+    rollout_id = await begin(first)
+    for chunk in range(4):
+        here = first if chunk % 2 == 0 else second
+        one = decoded(await here.step(rollout_id, chunk, actions(4, 0.1), ALL)).observation
+        other = decoded(await alone.step(alone_id, chunk, actions(4, 0.1), ALL)).observation
+        np.testing.assert_array_equal(one.tactile_kpa, other.tactile_kpa)
+    assert first._workers["sum"].world.num_restores == 1
+    assert second._workers["sum"].world.num_restores == 2
+    # The second process also knows the last answer of the first.
+    replayed = await first.step(rollout_id, 3, actions(4, 0.1), ALL)
+    assert replayed.replayed
+    await second.delete(rollout_id)
+    with pytest.raises(NotFoundError):
+        await first.step(rollout_id, 4, actions(4), ALL)
+    for made in (alone, first, second):
+        made.close()
+
+
+async def test_two_processes_that_take_the_same_chunk_agree(state):
+    first, second = service(state), service(state)
+    rollout_id = await begin(first)
+    answers = await asyncio.gather(
+        *(made.step(rollout_id, 0, actions(4), ALL) for made in (first, second))
+    )
+    assert answers[0].payload == answers[1].payload
+    assert sorted(answer.replayed for answer in answers) == [False, True]
+    different = await asyncio.gather(
+        first.step(rollout_id, 1, actions(4, 0.1), ALL),
+        second.step(rollout_id, 1, actions(4, 0.2), ALL),
+        return_exceptions=True,
+    )
+    assert [isinstance(one, ConflictError) for one in different].count(True) == 1
+    assert (await first.get(rollout_id)).next_chunk == 2
+    first.close()
+    second.close()
+
+
+async def test_a_retry_while_the_first_try_runs_waits_and_is_replayed():
+    made = service()
+    rollout_id = await begin(made)
+    answers = await asyncio.gather(*(made.step(rollout_id, 0, actions(4), ALL) for _ in range(3)))
+    assert [answer.replayed for answer in answers] == [False, True, True]
+    made.close()
+
+
+async def test_rollouts_expire_without_chunks():
+    now_s = [0.0]
+    made = service(MemoryState(clock_s=lambda: now_s[0]), ttl_s=10.0)
+    rollout_id = await begin(made)
+    now_s[0] = 9.0
+    await made.get(rollout_id)
+    await made.step(rollout_id, 0, actions(4), ALL)
+    now_s[0] = 18.0
+    await made.step(rollout_id, 1, actions(4), ALL)
+    now_s[0] = 28.0
+    with pytest.raises(NotFoundError, match="expired"):
+        await made.step(rollout_id, 2, actions(4), ALL)
+    made.close()
+
+
+async def test_limits_on_number_and_length():
+    now_s = [0.0]
+    made = service(MemoryState(clock_s=lambda: now_s[0]), max_rollouts=2, max_chunks=2, ttl_s=10.0)
+    first = await begin(made)
+    await made.fork(first)
+    for refused in (begin(made), made.fork(first)):
+        with pytest.raises(LimitExceededError, match="2 rollouts are alive"):
+            await refused
+    for chunk in range(2):
+        await made.step(first, chunk, actions(4), ALL)
+    with pytest.raises(LimitExceededError, match="has 2 chunks"):
+        await made.step(first, 2, actions(4), ALL)
+    now_s[0] = 11.0
+    await begin(made)
+    made.close()
+
+
+async def test_memory_stays_flat_over_abandoned_rollouts():
+    now_s = [0.0]
+    store = MemoryState(clock_s=lambda: now_s[0])
+    made = service(store, max_rollouts=4, ttl_s=1.0)
+    for _ in range(300):
+        await begin(made)
+        now_s[0] += 0.5
+    assert len(made._live._states) <= 4
+    assert len(await store.keys("")) <= 3
+    assert len(made._locks) == 0
+    made.close()
+
+
+async def test_a_branch_has_the_same_past_and_its_own_future():
+    made = service()
+    rollout_id = await begin(made)
+    await made.step(rollout_id, 0, actions(4), ALL)
+    same = (await made.fork(rollout_id)).id
+    other = (await made.fork(rollout_id, seed=8)).id
+    one, two, three = [
+        decoded(await made.step(name, 1, actions(4), ALL)).observation.tactile_kpa
+        for name in (rollout_id, same, other)
+    ]
+    np.testing.assert_array_equal(one, two)
+    assert np.abs(one - three).max() > 1e-3
+    assert (await made.get(other)).seed == 8
+    made.close()
+
+
+async def test_answers_do_not_depend_on_who_else_is_served():
+    alone, shared = service(world=SumWorld()), service(world=BatchSumWorld())
+    alone_id = await begin(alone)
+    expected = decoded(await alone.step(alone_id, 0, actions(4), ALL)).observation.tactile_kpa
+    ids = [await begin(shared) for _ in range(8)]
+    answers = await asyncio.gather(*(shared.step(one, 0, actions(4), ALL) for one in ids))
+    for answer in answers:
+        got = decoded(answer).observation.tactile_kpa
+        # Another world digest would be another noise: both worlds say digest d1.
+        np.testing.assert_array_equal(got, expected)
+    assert max(shared._workers["sum"].world.batch_sizes) > 1
+    alone.close()
+    shared.close()
+
+
+async def test_a_rollout_of_another_checkpoint_is_refused(state):
+    old, new = service(state), service(state, world=SumWorld(digest="d2"))
+    rollout_id = await begin(old)
+    with pytest.raises(ConflictError, match="start a new rollout"):
+        await new.step(rollout_id, 0, actions(4), ALL)
+    old.close()
+    new.close()
+
+
+async def test_starts_are_checked_against_the_world():
+    made = service()
+    bad_task = RolloutStart("juggle", 1, "x")
+    with pytest.raises(UnknownNameError, match="task 'juggle'; valid: stack_bowls, stand_bottle"):
+        await made.start("sum", bad_task, ALL)
+    with pytest.raises(UnknownNameError, match="action kind 'measured'; valid: commanded"):
+        await made.start("sum", RolloutStart("stand_bottle", 1, "x", "measured"), ALL)
+    with pytest.raises(UnknownNameError, match="camera 'ceiling'"):
+        await made.start("sum", START, ReturnSelector(cameras=("ceiling",)))
+    two = RolloutStart(
+        "stand_bottle", 1, "x", observation=observation(2), anchor=anchor(), K_head=K_HEAD
+    )
+    with pytest.raises(InvalidInputError, match="2 steps, expected 1"):
+        await made.start("sum", two, ALL)
+    made.close()
+
+
+def test_chunk_seeds_are_stable_and_differ():
+    # Fixed for ever: stored rollouts and published scores depend on it.
+    assert chunk_seed(3, 0, "d1") == 3293921974459185955
+    seeds = {chunk_seed(a, b, c) for a in range(4) for b in range(4) for c in ("d1", "d2")}
+    assert len(seeds) == 32
+    assert all(0 <= seed <= MAX_SEED for seed in seeds)
