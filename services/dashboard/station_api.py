@@ -133,12 +133,13 @@ def recorder_view(answer: object) -> RecorderView:
     recorder = _read(RecorderStatus, answer)
     found = recorder.check.problems if recorder.check else ()
     complete = recorder.check is None or recorder.check.complete
-    words = [*recorder.problems, *(problem.message for problem in found)]
+    # What the check found is also among the problems: say it once.
+    words = list(dict.fromkeys([*recorder.problems, *(problem.message for problem in found)]))
     if recorder.check is not None and not words:
         words = ["complete"]
     level: Level = "OK"
-    if recorder.problems or found:
-        level = "WARN" if complete and not recorder.problems else "ERROR"
+    if words and words != ["complete"]:
+        level = "WARN" if complete else "ERROR"
     return RecorderView(
         state=recorder.state,
         actions=recorder.actions,

@@ -11,7 +11,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas.problems import first_problems
 
 MIN_KEY_CHARACTERS = 16
-SettingsT = TypeVar("SettingsT", bound="ServiceSettings")
+SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
 class ApiKey(BaseModel):
