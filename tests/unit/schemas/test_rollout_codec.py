@@ -1,0 +1,194 @@
+"""The rollout codec: round trips, the golden bytes of the documented format, and refusals."""
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
+from dextouch.schemas.rollout_codec import (
+    Origin,
+    decode_answer,
+    decode_observation,
+    decode_start,
+    encode_answer,
+    encode_observation,
+    encode_start,
+)
+from dextouch.schemas.rollouts import (
+    Observation,
+    ReturnSelector,
+    RolloutInfo,
+    RolloutStart,
+    StartRequest,
+    check_observation_arrays,
+)
+from dextouch.streams.packing import pack, unpack
+from tests.unit.worlds.fakes import CAMERAS, K_HEAD, anchor, observation
+
+GOLDEN = Path(__file__).parent / "golden"
+INFO = RolloutInfo(
+    id="0" * 32,
+    world="twin",
+    world_digest="d" * 64,
+    task="stand_bottle",
+    instruction="stand the bottle",
+    seed=3,
+    action_kind="commanded",
+    next_chunk=1,
+    last_step=2,
+    ttl_s=600.0,
+)
+REQUEST = StartRequest(world="twin", task="stand_bottle", seed=3, instruction="stand the bottle")
+
+
+def golden_observation() -> Observation:
+    """Two steps of numbers that can be checked by eye."""
+    return Observation(
+        first_step=1,
+        images={"camera_head": np.arange(2 * 2 * 2 * 3, dtype=np.uint8).reshape(2, 2, 2, 3)},
+        tactile_kpa=np.linspace(0, 10, 1280, dtype=np.float32).reshape(2, 2, 320),
+        action_reached=np.linspace(-1, 1, 134).reshape(2, 67),
+        reached_is_measured=True,
+        success=False,
+    )
+
+
+def assert_same(one: Observation, other: Observation) -> None:
+    for field in ("first_step", "reached_is_measured", "success"):
+        assert getattr(one, field) == getattr(other, field)
+    assert set(one.images) == set(other.images)
+    for camera, images in one.images.items():
+        np.testing.assert_array_equal(images, other.images[camera])
+    np.testing.assert_array_equal(one.tactile_kpa, other.tactile_kpa)
+    np.testing.assert_array_equal(one.action_reached, other.action_reached)
+
+
+@given(
+    num_steps=st.integers(1, 5),
+    seed=st.integers(0, 9),
+    first_step=st.integers(0, 10**6),
+    success=st.sampled_from([None, True, False]),
+)
+def test_observations_come_back_exactly(num_steps, seed, first_step, success):
+    seen = dataclasses.replace(observation(num_steps, seed, first_step), success=success)
+    back = decode_observation(encode_observation(seen), max_bytes=10**6)
+    assert_same(seen, back)
+    assert encode_observation(back) == encode_observation(seen)
+
+
+def test_answers_come_back_with_info_and_origin():
+    seen, origin = observation(4), Origin(anchor(), K_HEAD)
+    data = encode_answer(INFO, seen, info={"contacts": 2.0}, origin=origin)
+    answer = decode_answer(data, max_bytes=10**6)
+    assert answer.rollout == INFO
+    assert answer.info == {"contacts": 2.0}
+    assert_same(answer.observation, seen)
+    for one, other in zip(answer.origin.anchor.as_tuple(), anchor().as_tuple(), strict=True):
+        np.testing.assert_array_equal(one, other)
+    assert decode_answer(encode_answer(INFO, seen), max_bytes=10**6).origin is None
+
+
+def test_last_step_and_one_camera():
+    seen = observation(4, first_step=5)
+    selector = ReturnSelector(cameras=(CAMERAS[1],), steps="last")
+    got = decode_answer(encode_answer(INFO, seen, selector=selector), max_bytes=10**6).observation
+    assert (got.first_step, len(got), set(got.images)) == (8, 1, {CAMERAS[1]})
+    np.testing.assert_array_equal(got.tactile_kpa[0], seen.tactile_kpa[-1])
+    np.testing.assert_array_equal(got.images[CAMERAS[1]][0], seen.images[CAMERAS[1]][-1])
+
+
+def test_starts_come_back():
+    plain = RolloutStart("stand_bottle", 3, "stand the bottle")
+    request, back = decode_start(encode_start(REQUEST, plain), max_bytes=10**6)
+    assert (request, back) == (REQUEST, plain)
+    full = dataclasses.replace(plain, observation=observation(), anchor=anchor(), K_head=K_HEAD)
+    _, back = decode_start(encode_start(REQUEST, full), max_bytes=10**6)
+    assert_same(back.observation, full.observation)
+    np.testing.assert_array_equal(back.K_head, K_HEAD)
+    with pytest.raises(InvalidInputError, match="anchor and K_head"):
+        encode_start(REQUEST, dataclasses.replace(full, anchor=None))
+
+
+@pytest.mark.parametrize(
+    ("name", "encode"),
+    [
+        ("answer", lambda: encode_answer(INFO, golden_observation(), info={"contacts": 2.0})),
+        (
+            "first_answer",
+            lambda: encode_answer(
+                INFO.model_copy(update={"next_chunk": 0, "last_step": 0}),
+                dataclasses.replace(golden_observation().last(), first_step=0),
+                origin=Origin(anchor(), K_HEAD),
+            ),
+        ),
+        ("start", lambda: encode_start(REQUEST, RolloutStart("stand_bottle", 3, "x"))),
+    ],
+)
+def test_the_documented_format_does_not_change(name, encode):
+    # A change here is a change of docs/rollout_api.md and of its version.
+    path = GOLDEN / f"{name}.msgpack"
+    assert unpack_all(encode()) == unpack_all(path.read_bytes())
+    assert encode() == path.read_bytes()
+
+
+def unpack_all(data: bytes) -> dict[str, object]:
+    fields, arrays = unpack(data, max_bytes=10**6)
+    return {"fields": fields, **{name: array.tolist() for name, array in arrays.items()}}
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "says"),
+    [
+        ({"tactile_kpa": np.zeros((1, 2, 360), np.float32)}, ShapeError, "360"),
+        ({"tactile_kpa": np.zeros((1, 2, 320))}, ShapeError, "float64"),
+        ({"tactile_kpa": np.zeros((), np.float32)}, ShapeError, "0 steps"),
+        ({"tactile_kpa": np.full((1, 2, 320), np.nan, np.float32)}, NonFiniteError, "tactile"),
+        ({"action_reached": np.zeros((2, 67))}, ShapeError, "action_reached"),
+        ({"action_reached": np.full((1, 67), np.inf)}, NonFiniteError, "action_reached"),
+        ({"images": {"a": np.zeros((1, 3, 8, 8), np.uint8)}}, ShapeError, "images of a"),
+        ({"images": {"a": np.zeros((2, 8, 8, 3), np.uint8)}}, ShapeError, "images of a"),
+        ({"images": {"a": np.zeros((8, 8, 3), np.uint8)}}, ShapeError, "images of a"),
+        ({"images": {"a": np.zeros((1, 8, 8, 3), np.float32)}}, ShapeError, "float32"),
+        (
+            {
+                "images": {
+                    "a": np.zeros((1, 8, 8, 3), np.uint8),
+                    "b": np.zeros((1, 9, 8, 3), np.uint8),
+                }
+            },
+            ShapeError,
+            "images of b",
+        ),
+    ],
+)
+def test_arrays_that_do_not_fit_are_named(changed, error, says):
+    seen = observation()
+    good = {
+        "images": seen.images,
+        "tactile_kpa": seen.tactile_kpa,
+        "action_reached": seen.action_reached,
+    }
+    check_observation_arrays(**good, where="test")
+    with pytest.raises(error, match=says):
+        check_observation_arrays(**(good | changed), where="test")
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "error"),
+    [
+        ("T_world_camera_head", np.diag([2.0, 1, 1, 1]), DegenerateRotationError),
+        ("T_world_camera_head", np.diag([-1.0, 1, 1, 1]), DegenerateRotationError),
+        ("T_world_wrist_left", np.full((4, 4), np.nan), ShapeError),
+        ("T_world_wrist_left", np.eye(3), ShapeError),
+        ("K_head", np.eye(3, dtype=np.float32), ShapeError),
+    ],
+)
+def test_poses_that_are_none_are_refused(name, value, error):
+    start = RolloutStart("t", 1, "x", "commanded", observation(), anchor(), K_HEAD)
+    fields, arrays = unpack(encode_start(REQUEST, start), max_bytes=10**6)
+    with pytest.raises(error, match=name):
+        decode_start(pack(fields, arrays | {name: value}), max_bytes=10**6)
