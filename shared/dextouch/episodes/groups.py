@@ -89,6 +89,11 @@ class GroupReader(Generic[A]):
         stamp = STAMPS[self._kind][0]
         return self._record.arrays[f"{self._stream(name).name}_{stamp}"].shape[0]
 
+    def count(self, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> int:
+        """How many samples `read` would give; only stamps are read."""
+        low, high = self._range(name, start_ns, stop_ns)
+        return high - low
+
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record.
 

@@ -5,6 +5,7 @@ until it is finished. `jpeg` streams travel as object arrays of JPEG bytes.
 """
 
 import os
+import shutil
 from pathlib import Path
 from types import TracebackType
 
@@ -180,12 +181,15 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
             f"spool {attributes.recording_id!r}: a recording without a stream; "
             "name at least one in its attributes"
         )
+    # Under another name first, so that a spool that is seen has its attributes.
+    unborn = path.with_name(path.name + ".new")
     with disk_errors(f"create spool {path.name}"):
-        try:
-            path.mkdir(parents=True)
-        except FileExistsError as error:
-            raise ConflictError(f"spool {path.name!r} exists; resume or remove it") from error
-        write_file(path / RECORDING_FILE, attributes.model_dump_json().encode())
+        if path.exists():
+            raise ConflictError(f"spool {path.name!r} exists; resume or remove it")
+        shutil.rmtree(unborn, ignore_errors=True)
+        unborn.mkdir(parents=True)
+        write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
+        unborn.rename(path)
 
 
 def _payloads(descriptor: StreamDescriptor, values: np.ndarray) -> list[bytes]:

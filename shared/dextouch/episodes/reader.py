@@ -57,8 +57,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
 
     @property
     def num_steps(self) -> int:
-        """Steps of the model grid: the rows of `action`."""
-        return self.num_samples("action")
+        """Steps of the model grid: the rows of `action`; 0 without that stream."""
+        return self.num_samples("action") if "action" in self.streams else 0
 
     def read(
         self, name: str, start_ns: int | None = None, stop_ns: int | None = None
@@ -120,7 +120,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         if num_steps < 1 or start < 0 or start + num_steps > self.num_steps:
             raise InvalidInputError(
                 f"{self._what}: got window of steps {start} … {start + num_steps - 1}, "
-                f"expected within 0 … {self.num_steps - 1}"
+                f"expected within its {self.num_steps} steps"
             )
         self._check_cameras(cameras)
         if action_kind not in ACTION_STREAMS:

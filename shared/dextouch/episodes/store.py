@@ -90,6 +90,15 @@ class EpisodeStore:
         """Whether an id is committed."""
         return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
 
+    def revision(self, item_id: str, *, kind: Kind = "episode") -> int:
+        """A number that changes when an id is deleted and written again.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        with disk_errors(f"look at {kind} {item_id}"):
+            return (self._existing(kind, item_id) / COMMIT_FILE).stat().st_mtime_ns
+
     def list(self, *, kind: Kind = "episode") -> list[str]:
         """Committed ids in order."""
         if kind not in KINDS:

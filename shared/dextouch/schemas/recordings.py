@@ -97,8 +97,9 @@ class RecordingSummary(BaseModel):
 
 
 class RecordingList(BaseModel):
-    """Finished recordings, by id."""
+    """One page of the finished recordings, by id, and how many there are in all."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     recordings: tuple[RecordingSummary, ...]
+    num_matching: int

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError
+from dextouch.images.jpeg import jpeg_size
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 
@@ -22,7 +23,7 @@ def check_batch(
 
     Raises:
         ShapeError: another dtype or shape.
-        InvalidInputError: stamps that go back, or an empty image.
+        InvalidInputError: stamps that go back, or bytes that are no JPEG image.
     """
     values, name = batch.values, descriptor.name
     for stamp in ("t_host_ns", "t_device_ns", "sequence"):
@@ -30,7 +31,7 @@ def check_batch(
         if column.dtype != np.int64 or column.shape != (len(batch),):
             raise ShapeError(f"{name}: {stamp} is {column.dtype} {column.shape}, expected int64")
     if descriptor.unit == JPEG_UNIT:
-        _check_images(name, values)
+        _check_images(descriptor, values)
     elif values.dtype != descriptor.numpy_dtype() or values.shape[1:] != descriptor.shape:
         raise ShapeError(
             f"{name}: got values {values.dtype} {values.shape}, expected {descriptor.dtype} "
@@ -51,12 +52,20 @@ def check_batch(
         )
 
 
-def _check_images(name: str, values: np.ndarray) -> None:
+def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
+    name = descriptor.name
     if values.dtype != object or values.ndim != 1:
         raise ShapeError(
             f"{name}: got values {values.dtype} {values.shape}, expected an object array of "
             "JPEG bytes (see dextouch.images.jpeg.jpeg_values)"
         )
     for index, data in enumerate(values):
-        if not isinstance(data, bytes) or not data:
-            raise InvalidInputError(f"{name}: image {index} is no JPEG bytes")
+        where = f"{name}: image {index} of the batch"
+        if not isinstance(data, bytes):
+            raise ShapeError(f"{where} is {type(data).__name__}, expected JPEG bytes")
+        try:
+            size = jpeg_size(data, where=where)
+        except CorruptDataError as error:
+            raise InvalidInputError(error.message) from error
+        if size != descriptor.shape[:2]:
+            raise ShapeError(f"{where} is {size} pixels, expected {descriptor.shape[:2]}")

@@ -40,7 +40,7 @@ def pose_batch(count=3):
 
 def camera_batch():
     k = np.arange(2, dtype=np.int64)
-    return SampleBatch(k, k - 1, k, jpeg_values([b"not really", b"a jpeg"]))
+    return SampleBatch(k, k - 1, k, jpeg_values([(GOLDEN / "image.jpg").read_bytes()] * 2))
 
 
 CASES = {"batch_v1": (POSE, pose_batch()), "batch_jpeg_v1": (CAMERA, camera_batch())}
@@ -114,13 +114,28 @@ def test_whole_bytes_with_wrong_content_are_refused(fields, arrays):
         wire.decode_batch(framed(pack(fields, arrays)), POSE, number=0)
 
 
-@pytest.mark.parametrize("ends", [[4, 3], [0, 8], [4, 9], [4], [-1, 8]])
-def test_image_ends_must_fit(ends):
-    arrays = STAMPS | {"image_bytes": np.zeros(8, "u1"), "image_end": np.array(ends)}
-    with pytest.raises(InvalidInputError):
+def test_bytes_that_are_no_image_are_refused():
+    arrays = STAMPS | {"image_bytes": np.zeros(8, "u1"), "image_end": np.array([4, 8])}
+    with pytest.raises(InvalidInputError, match="image 0 of the batch: 4 bytes are no JPEG"):
         wire.decode_batch(
             framed(pack({"stream": "camera_head", "number": 0}, arrays)), CAMERA, number=0
         )
+
+
+@pytest.mark.parametrize("ends", [[4, 3], [0, 8], [4, 9], [4], [-1, 8]])
+def test_image_ends_must_fit(ends):
+    arrays = STAMPS | {"image_bytes": np.zeros(8, "u1"), "image_end": np.array(ends)}
+    with pytest.raises(InvalidInputError, match=r"image_end|like the values"):
+        wire.decode_batch(
+            framed(pack({"stream": "camera_head", "number": 0}, arrays)), CAMERA, number=0
+        )
+
+
+def test_usual_batches_fit_into_one_request():
+    raw = CAMERA.model_copy(update={"unit": "rgb8", "shape": (1080, 1920, 3)})
+    assert wire.samples_per_batch(POSE) == 60
+    assert wire.samples_per_batch(raw) == 1
+    assert wire.samples_per_batch(raw.model_copy(update={"shape": (480, 640, 3)})) == 4
 
 
 def test_limits():

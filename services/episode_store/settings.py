@@ -1,0 +1,22 @@
+"""Environment and flags in (DEXTOUCH_EPISODE_STORE_…), what the store keeps and allows out."""
+
+from pydantic import Field
+
+from dextouch.serving.settings import ServiceSettings, service_config
+
+
+class EpisodeStoreSettings(ServiceSettings):
+    """Where episodes lie, and the bounds of one request.
+
+    `store_url` is a local folder or file:///…; uploads that are not finished lie below it too.
+    `max_body_bytes` must hold one batch of the wire format.
+    """
+
+    model_config = service_config("episode_store")
+
+    store_url: str = Field(default="data/store", min_length=1)
+    sync_uploads: bool = True
+    max_open_uploads: int = Field(default=16, ge=1, le=1024)
+    max_page: int = Field(default=1000, ge=1, le=100_000)
+    max_window_steps: int = Field(default=321, ge=1, le=10_000)
+    max_answer_bytes: int = Field(default=64 * 2**20, ge=1024)

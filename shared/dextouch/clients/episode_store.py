@@ -1,0 +1,265 @@
+"""The store over HTTP: attributes and batches in, receipts, lists, windows and samples out."""
+
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TypeVar
+from urllib.parse import quote
+
+import httpx
+import numpy as np
+from pydantic import BaseModel, ValidationError
+
+from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.window import StreamData, Window
+from dextouch.episodes.window_codec import decode_window
+from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
+from dextouch.schemas.episodes import EpisodeDetail, EpisodeList
+from dextouch.schemas.problems import Problem, error_from_problem
+from dextouch.schemas.recordings import (
+    BatchReceipt,
+    FinishRecording,
+    LedgerEntry,
+    RecordingAttributes,
+    RecordingList,
+    RecordingStatus,
+)
+from dextouch.schemas.rollouts import ActionKind
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.packing import unpack
+from dextouch.streams.samples import SampleBatch
+from dextouch.streams.wire import encode_batch, samples_per_batch
+
+M = TypeVar("M", bound=BaseModel)
+Query = Mapping[str, str | int | None]
+MAX_ANSWER_BYTES = 128 * 2**20
+DEFAULT_TIMEOUT_S = 30.0
+
+
+class EpisodeStoreClient:
+    """One store service. Every call is safe to repeat after UnavailableError.
+
+    Args:
+        url: of the service.
+        api_key: if it asks for one.
+        timeout_s: of one request.
+        transport: another way to reach the service (an application in this process).
+    """
+
+    def __init__(
+        self,
+        url: str,
+        api_key: str | None = None,
+        *,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
+        headers = {"authorization": f"Bearer {api_key}"} if api_key else {}
+        self._http = httpx.Client(
+            base_url=url.rstrip("/"),
+            headers=headers,
+            timeout=timeout_s,
+            transport=transport,
+            trust_env=False,
+        )
+
+    def close(self) -> None:
+        """Give the connections back."""
+        self._http.close()
+
+    def __enter__(self) -> "EpisodeStoreClient":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def create(self, attributes: RecordingAttributes) -> RecordingStatus:
+        """Begin an upload, or learn where it stands."""
+        return self._model(
+            RecordingStatus, "POST", "/v1/recordings", content=attributes.model_dump_json()
+        )
+
+    def status(self, recording_id: str) -> RecordingStatus:
+        """Which batch each stream of an upload expects next."""
+        return self._model(RecordingStatus, "GET", f"/v1/recordings/{_part(recording_id)}")
+
+    def send_batch(
+        self, recording_id: str, descriptor: StreamDescriptor, batch: SampleBatch, *, number: int
+    ) -> BatchReceipt:
+        """Send batch `number` of a stream; the store keeps it when this returns."""
+        path = (
+            f"/v1/recordings/{_part(recording_id)}/streams/{_part(descriptor.name)}"
+            f"/batches/{number}"
+        )
+        data = encode_batch(descriptor, batch, number=number)
+        return self._model(BatchReceipt, "POST", path, content=data)
+
+    def finish(
+        self,
+        recording_id: str,
+        num_batches: Mapping[str, int],
+        *,
+        success: bool | None = None,
+        ledger: tuple[LedgerEntry, ...] = (),
+    ) -> RecordingStatus:
+        """Say how many batches each stream has; the recording becomes visible."""
+        body = FinishRecording(num_batches=dict(num_batches), success=success, ledger=ledger)
+        path = f"/v1/recordings/{_part(recording_id)}/finish"
+        return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
+
+    def upload(self, spool: SpoolReader) -> RecordingStatus:
+        """Send a closed spool, from where an earlier attempt ended.
+
+        Raises:
+            InvalidInputError: a spool that is still written.
+            UnavailableError: the store does not answer; call again later.
+        """
+        if not spool.closed:
+            raise InvalidInputError(f"spool {spool.path.name!r}: close or recover it first")
+        recording_id = spool.attributes.recording_id
+        status = self.create(spool.attributes)
+        if status.state == "finished":
+            return status
+        num_batches = {}
+        for name, descriptor in spool.streams.items():
+            number = status.next_batch[name]
+            for batch in spool.batches(
+                name, num_samples=samples_per_batch(descriptor), first=number
+            ):
+                self.send_batch(recording_id, descriptor, batch, number=number)
+                number += 1
+            num_batches[name] = number
+        return self.finish(recording_id, num_batches)
+
+    def recordings(self) -> RecordingList:
+        """Finished recordings."""
+        return self._model(RecordingList, "GET", "/v1/recordings")
+
+    def recording_attributes(self, recording_id: str) -> RecordingAttributes:
+        """What a finished recording says about itself."""
+        path = f"/v1/recordings/{_part(recording_id)}/attributes"
+        return self._model(RecordingAttributes, "GET", path)
+
+    def recording_samples(
+        self,
+        recording_id: str,
+        stream: str,
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> SampleBatch:
+        """Samples of a finished recording with start_ns ≤ t_host_ns < stop_ns."""
+        path = f"/v1/recordings/{_part(recording_id)}/streams/{_part(stream)}"
+        arrays = self._arrays(path, {"start_ns": start_ns, "stop_ns": stop_ns})
+        return SampleBatch(
+            arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], arrays["values"]
+        )
+
+    def episodes(
+        self, *, task: str | None = None, domain: str | None = None, origin: str | None = None
+    ) -> EpisodeList:
+        """Episodes that match every given filter."""
+        query = {"task": task, "domain": domain, "origin": origin}
+        return self._model(EpisodeList, "GET", "/v1/episodes", query=query)
+
+    def episode(self, episode_id: str) -> EpisodeDetail:
+        """What an episode says about itself."""
+        return self._model(EpisodeDetail, "GET", f"/v1/episodes/{_part(episode_id)}")
+
+    def episode_samples(
+        self,
+        episode_id: str,
+        stream: str,
+        *,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> StreamData:
+        """Samples of an episode with start_ns ≤ t_ref_ns < stop_ns."""
+        path = f"/v1/episodes/{_part(episode_id)}/streams/{_part(stream)}"
+        arrays = self._arrays(path, {"start_ns": start_ns, "stop_ns": stop_ns})
+        return StreamData(arrays["t_ref_ns"], arrays["values"])
+
+    def window(
+        self,
+        episode_id: str,
+        start: int,
+        num_steps: int = 17,
+        *,
+        cameras: tuple[str, ...] = ("camera_head",),
+        action_kind: ActionKind = "measured",
+    ) -> Window:
+        """A window on the model grid, as `EpisodeReader.window` gives it."""
+        query: Query = {
+            "start": start,
+            "num_steps": num_steps,
+            "cameras": ",".join(cameras),
+            "action_kind": action_kind,
+        }
+        response = self._send("GET", f"/v1/episodes/{_part(episode_id)}/windows", query=query)
+        return decode_window(response.content, max_bytes=MAX_ANSWER_BYTES)
+
+    def _arrays(self, path: str, query: Query) -> dict[str, np.ndarray]:
+        response = self._send("GET", path, query=query)
+        return unpack(response.content, max_bytes=MAX_ANSWER_BYTES)[1]
+
+    def _model(
+        self,
+        model: type[M],
+        method: str,
+        path: str,
+        *,
+        query: Query | None = None,
+        content: bytes | str | None = None,
+    ) -> M:
+        response = self._send(method, path, query=query, content=content)
+        try:
+            return model.model_validate_json(response.content)
+        except ValidationError as error:
+            raise UnavailableError(
+                f"episode store: {method} {path} answered in an unknown form ({error})"
+            ) from error
+
+    def _send(
+        self,
+        method: str,
+        path: str,
+        *,
+        query: Query | None = None,
+        content: bytes | str | None = None,
+    ) -> httpx.Response:
+        kind = "application/octet-stream" if isinstance(content, bytes) else "application/json"
+        asked = {key: value for key, value in (query or {}).items() if value is not None}
+        try:
+            response = self._http.request(
+                method,
+                path,
+                params=httpx.QueryParams(asked),
+                content=content,
+                headers={"content-type": kind} if content is not None else {},
+            )
+        except httpx.TransportError as error:
+            raise UnavailableError(
+                f"episode store at {self._http.base_url}: {method} {path} got no answer "
+                f"({type(error).__name__}: {error}); check the address or try again later"
+            ) from error
+        if response.is_success:
+            return response
+        raise _refusal(response)
+
+
+def _refusal(response: httpx.Response) -> DexTouchError:
+    try:
+        return error_from_problem(Problem.model_validate_json(response.content))
+    except ValidationError:
+        return UnavailableError(
+            f"episode store: {response.request.method} {response.request.url.path} answered "
+            f"{response.status_code} without a reason"
+        )
+
+
+def _part(text: str) -> str:
+    return quote(text, safe="")

@@ -1,0 +1,84 @@
+"""A window ↔ bytes (msgpack): what the store answers and what a trainer elsewhere reads."""
+
+from typing import get_args
+
+import numpy as np
+
+from dextouch.episodes.window import Window
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.rollouts import ActionKind
+from dextouch.streams.packing import pack, unpack
+
+_IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
+
+
+def encode_window(window: Window) -> bytes:
+    """Bytes of a window."""
+    arrays = {
+        "tactile_kpa": window.tactile_kpa,
+        "tactile_valid": window.tactile_valid,
+        "actions": window.actions,
+        "t_ref_ns": window.t_ref_ns,
+        "anchor": np.stack(window.anchor.as_tuple()),
+        "K_head": window.K_head,
+    }
+    for camera, images in window.images.items():
+        arrays[_IMAGES + camera] = images
+        arrays[_IMAGE_DT + camera] = window.image_dt_ns[camera]
+    return pack({"action_kind": window.action_kind, "instruction": window.instruction}, arrays)
+
+
+def decode_window(data: bytes, *, max_bytes: int) -> Window:
+    """The window of bytes that came from elsewhere; arrays are read-only.
+
+    Raises:
+        LimitExceededError: more bytes than allowed.
+        InvalidInputError: bytes that are no window.
+    """
+    fields, arrays = unpack(data, max_bytes=max_bytes)
+    cameras = [name.removeprefix(_IMAGES) for name in arrays if name.startswith(_IMAGES)]
+    _check_arrays(arrays, cameras)
+    action_kind, instruction = fields.get("action_kind"), fields.get("instruction")
+    if action_kind not in get_args(ActionKind) or not isinstance(instruction, str):
+        raise InvalidInputError(
+            f"window: got action kind {action_kind!r} and instruction {instruction!r}, "
+            f"expected one of {get_args(ActionKind)} and a text"
+        )
+    known_kind: ActionKind = fields["action_kind"]
+    left, right, camera_head = arrays["anchor"]
+    return Window(
+        images={camera: arrays[_IMAGES + camera] for camera in cameras},
+        image_dt_ns={camera: arrays[_IMAGE_DT + camera] for camera in cameras},
+        tactile_kpa=arrays["tactile_kpa"],
+        tactile_valid=arrays["tactile_valid"],
+        actions=arrays["actions"],
+        action_kind=known_kind,
+        instruction=instruction,
+        t_ref_ns=arrays["t_ref_ns"],
+        anchor=AnchorPoses(left, right, camera_head),
+        K_head=arrays["K_head"],
+    )
+
+
+def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
+    n = len(arrays["t_ref_ns"]) if "t_ref_ns" in arrays and arrays["t_ref_ns"].ndim else 0
+    expected: dict[str, tuple[str, tuple[int, ...]]] = {
+        "tactile_kpa": ("float32", (n, 2, 320)),
+        "tactile_valid": ("bool", (n, 2)),
+        "actions": ("float64", (n, 67)),
+        "t_ref_ns": ("int64", (n,)),
+        "anchor": ("float64", (3, 4, 4)),
+        "K_head": ("float64", (3, 3)),
+    }
+    for camera in cameras:
+        # Height and width are the camera's own.
+        expected[_IMAGES + camera] = ("uint8", (n, *arrays[_IMAGES + camera].shape[1:3], 3))
+        expected[_IMAGE_DT + camera] = ("int64", (n,))
+    got = {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
+    for name in sorted(expected.keys() | got.keys()):
+        if name not in got or name not in expected or got[name] != expected[name]:
+            raise InvalidInputError(
+                f"window: array {name!r} is {got.get(name, 'missing')}, "
+                f"expected {expected.get(name, 'none')}"
+            )

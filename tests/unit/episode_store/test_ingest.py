@@ -1,0 +1,259 @@
+"""Uploads: exactly once whatever is repeated, lost or killed between; gaps and changes refused."""
+
+import httpx
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.errors import (
+    ConflictError,
+    InvalidInputError,
+    NotFoundError,
+    PacketError,
+    StorageFullError,
+    UnavailableError,
+    UnknownNameError,
+)
+from dextouch.schemas.recordings import FinishRecording, LedgerEntry
+from dextouch.streams.samples import SampleBatch
+from dextouch.streams.wire import encode_batch
+from services.episode_store import ingest as ingest_module
+from services.episode_store.ingest import Ingest
+
+
+@pytest.fixture
+def store(settings):
+    return EpisodeStore(settings.store_url)
+
+
+@pytest.fixture
+def ingest(store):
+    ours = Ingest(store, sync=False, max_open_uploads=2)
+    yield ours
+    ours.close()
+
+
+@pytest.fixture
+def send(attributes, batch_of):
+    """Send glove batch n, five samples each."""
+
+    def sender(ingest, number):
+        data = encode_batch(attributes.streams[0], batch_of(5 * number, 5), number=number)
+        return ingest.put_batch(attributes.recording_id, "glove_left", number, data)
+
+    return sender
+
+
+def finish(ingest, num_batches, **more):
+    counts = {"glove_left": num_batches, "wrist_left": 0}
+    return ingest.finish("take-1", FinishRecording(num_batches=counts, **more))
+
+
+def assert_complete(store, batch_of, count):
+    got = store.recording("take-1").read("glove_left")
+    expected = batch_of(0, count)
+    np.testing.assert_array_equal(got.values, expected.values)
+    np.testing.assert_array_equal(got.t_host_ns, expected.t_host_ns)
+    np.testing.assert_array_equal(got.t_device_ns, expected.t_device_ns)
+    np.testing.assert_array_equal(got.sequence, expected.sequence)
+
+
+def test_a_whole_upload(ingest, store, attributes, send, batch_of):
+    status = ingest.create(attributes)
+    assert status.next_batch == {"glove_left": 0, "wrist_left": 0}
+    receipts = [send(ingest, number) for number in range(3)]
+    assert [r.num_samples for r in receipts] == [5, 5, 5]
+    assert not any(r.replayed for r in receipts)
+    ledger = (LedgerEntry(stream="glove_left", event="dropped", count=2),)
+    assert finish(ingest, 3, ledger=ledger, success=True).state == "finished"
+    assert_complete(store, batch_of, 15)
+    reader = store.recording("take-1")
+    reader.verify()
+    assert reader.attributes.ledger == ledger
+    assert reader.attributes.success is True
+    assert reader.num_samples("wrist_left") == 0
+    assert not (store.root / ".uploads" / "take-1").exists()
+
+
+def test_repeats_change_nothing(ingest, store, attributes, send, batch_of):
+    ingest.create(attributes)
+    send(ingest, 0)
+    assert ingest.create(attributes).next_batch["glove_left"] == 1
+    assert send(ingest, 0).replayed
+    send(ingest, 1)
+    assert send(ingest, 0).num_samples == 5
+    finish(ingest, 2)
+    finish(ingest, 2)
+    assert ingest.create(attributes).state == "finished"
+    assert ingest.status("take-1").state == "finished"
+    assert_complete(store, batch_of, 10)
+
+
+def test_gaps_changes_and_strangers_are_refused(ingest, attributes, send, batch_of):
+    with pytest.raises(NotFoundError):
+        send(ingest, 0)
+    ingest.create(attributes)
+    send(ingest, 0)
+    with pytest.raises(ConflictError, match="got batch 2, expected 1") as caught:
+        send(ingest, 2)
+    assert caught.value.details == {"got": 2, "expected": 1}
+    other = encode_batch(attributes.streams[0], batch_of(1, 5), number=0)
+    with pytest.raises(ConflictError, match="other bytes"):
+        ingest.put_batch("take-1", "glove_left", 0, other)
+    with pytest.raises(UnknownNameError, match="wrist_left"):
+        ingest.put_batch("take-1", "glove", 0, other)
+    with pytest.raises(PacketError):
+        ingest.put_batch("take-1", "glove_left", 1, other[:-1])
+    with pytest.raises(InvalidInputError, match="batch 0 of stream"):
+        ingest.put_batch("take-1", "glove_left", 1, other)
+    with pytest.raises(ConflictError, match="other attributes"):
+        ingest.create(attributes.model_copy(update={"task": "stack_bowls"}))
+    with pytest.raises(InvalidInputError):
+        ingest.status("../take-1")
+    # Nothing of all this counted.
+    assert ingest.status("take-1").next_batch["glove_left"] == 1
+
+
+def test_only_complete_uploads_finish(ingest, store, attributes, send):
+    ingest.create(attributes)
+    with pytest.raises(InvalidInputError, match="without a sample"):
+        finish(ingest, 0)
+    send(ingest, 0)
+    with pytest.raises(ConflictError, match="glove_left has 1 of 2 batches"):
+        finish(ingest, 2)
+    with pytest.raises(ConflictError, match="glove_left has 1 of 0 batches"):
+        finish(ingest, 0)
+    with pytest.raises(InvalidInputError, match="announce 0"):
+        ingest.finish("take-1", FinishRecording(num_batches={"glove_left": 1}))
+    with pytest.raises(InvalidInputError, match="without a stream"):
+        ingest.create(attributes.model_copy(update={"recording_id": "empty", "streams": ()}))
+    assert store.list(kind="recording") == []
+    finish(ingest, 1)
+    with pytest.raises(ConflictError, match="finished"):
+        send(ingest, 1)
+
+
+def test_a_restart_keeps_what_was_acknowledged(store, attributes, send, batch_of):
+    first = Ingest(store, sync=False, max_open_uploads=2)
+    first.create(attributes)
+    send(first, 0)
+    first.close()
+    second = Ingest(store, sync=False, max_open_uploads=2)
+    assert second.status("take-1").next_batch == {"glove_left": 1, "wrist_left": 0}
+    assert send(second, 0).replayed
+    send(second, 1)
+    finish(second, 2)
+    assert_complete(store, batch_of, 10)
+
+
+def test_a_crash_between_data_and_receipt_counts_once(
+    store, attributes, send, batch_of, monkeypatch
+):
+    first = Ingest(store, sync=False, max_open_uploads=2)
+    first.create(attributes)
+    send(first, 0)
+    with monkeypatch.context() as patch:
+        # The process dies after the samples were spooled and before the receipt was written.
+        patch.setattr(ingest_module.Receipts, "append", _die)
+        patch.setattr(ingest_module.SpoolWriter, "truncate", lambda *_: None)
+        with pytest.raises(KeyboardInterrupt):
+            send(first, 1)
+    first.close()
+    second = Ingest(store, sync=False, max_open_uploads=2)
+    assert second.status("take-1").next_batch["glove_left"] == 1
+    send(second, 1)
+    finish(second, 2)
+    assert_complete(store, batch_of, 10)
+
+
+def _die(*_args, **_kwargs):
+    raise KeyboardInterrupt
+
+
+def test_a_crash_after_the_commit_is_finished_by_repeating(
+    store, attributes, send, batch_of, monkeypatch
+):
+    first = Ingest(store, sync=False, max_open_uploads=2)
+    first.create(attributes)
+    send(first, 0)
+    with monkeypatch.context() as patch:
+        patch.setattr(ingest_module.shutil, "rmtree", _die)
+        with pytest.raises(KeyboardInterrupt):
+            finish(first, 1)
+    second = Ingest(store, sync=False, max_open_uploads=2)
+    finish(second, 1)
+    assert_complete(store, batch_of, 5)
+    assert not (store.root / ".uploads" / "take-1").exists()
+
+
+def test_a_full_disk_refuses_the_batch_and_keeps_the_rest(
+    ingest, store, attributes, send, batch_of, file_size_limit
+):
+    ingest.create(attributes)
+    send(ingest, 0)
+    with file_size_limit(5000), pytest.raises(StorageFullError):
+        send(ingest, 1)
+    assert ingest.status("take-1").next_batch["glove_left"] == 1
+    send(ingest, 1)
+    finish(ingest, 2)
+    assert_complete(store, batch_of, 10)
+
+
+def test_many_uploads_share_few_open_files(ingest, store, attributes, send, batch_of):
+    for index in range(5):
+        ingest.create(attributes.model_copy(update={"recording_id": f"take-{index}"}))
+    assert len(ingest._open) == 2
+    for number in range(2):
+        for index in range(5):
+            data = encode_batch(attributes.streams[0], batch_of(5 * number, 5), number=number)
+            ingest.put_batch(f"take-{index}", "glove_left", number, data)
+    finish(ingest, 2)
+    assert_complete(store, batch_of, 10)
+
+
+def spool_of(path, attributes, batch_of, count):
+    with SpoolWriter(path, attributes, sync=False) as writer:
+        writer.append("glove_left", batch_of(0, count))
+        k = np.arange(3)
+        writer.append("wrist_left", SampleBatch(k, k, k, np.ones((3, 7))))
+    return SpoolReader(path)
+
+
+def test_an_upload_broken_anywhere_ends_without_duplicates(
+    start, settings, attributes, batch_of, tmp_path
+):
+    """The connection breaks before or after each request in turn; the station just tries again."""
+    spool = spool_of(tmp_path / "spool", attributes, batch_of, 150)
+    client, attempts = start(), 0
+    whole = client._http._transport
+    for broken_request in range(6):
+        for answered in (False, True):
+            client._http._transport = Breaking(whole, broken_request, answered)
+            attempts += 1
+            try:
+                client.upload(spool)
+            except UnavailableError:
+                continue
+    assert attempts == 12
+    client._http._transport = whole
+    assert client.upload(spool).state == "finished"
+    assert_complete(EpisodeStore(settings.store_url), batch_of, 150)
+
+
+class Breaking:
+    """A transport that loses the n-th request, or its answer."""
+
+    def __init__(self, inner, number, answered):
+        self.inner, self.left, self.answered = inner, number, answered
+
+    def handle_request(self, request):
+        self.left -= 1
+        if self.left == -1:
+            if self.answered:
+                self.inner.handle_request(request)
+            raise httpx.ReadError("connection lost")
+        return self.inner.handle_request(request)
+
+    def close(self):
+        self.inner.close()
