@@ -14,7 +14,11 @@ def lines(capsys):
     """What is written to stderr, as lines; logging is put back afterwards."""
     root = logging.getLogger()
     handlers, level = list(root.handlers), root.level
-    yield lambda: capsys.readouterr().err.splitlines()
+
+    def written() -> list[str]:
+        return capsys.readouterr().err.splitlines()
+
+    yield written
     root.handlers[:] = handlers
     root.setLevel(level)
     structlog.reset_defaults()
