@@ -121,3 +121,11 @@ def split_by_seed(
             f"{len(demonstrations)}; expected both sides, record more seeds"
         )
     return training, held_out
+
+
+def instructions_of(demonstrations: Iterable[Demonstration]) -> dict[str, str]:
+    """The sentence of every task, as the first episode of it has it."""
+    found: dict[str, str] = {}
+    for item in demonstrations:
+        found.setdefault(item.task, item.instruction)
+    return found

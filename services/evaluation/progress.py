@@ -1,11 +1,14 @@
 """Steps of a long job in; a progress bar on a terminal, silence elsewhere."""
 
-import sys
 from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, TextColumn, TimeRemainingColumn
+from rich.progress import Progress as RichProgress
 
 
 class Progress:
-    """A one-line progress bar on standard error, drawn only when a person is looking.
+    """A progress bar on standard error, drawn only when a person is looking.
 
     Args:
         title: what is going on.
@@ -13,13 +16,18 @@ class Progress:
     """
 
     def __init__(self, title: str, total: int) -> None:
-        self.title = title
-        self.total = total
-        self.done = 0
-        self._shown_percent = -1
-        self._visible = sys.stderr.isatty()
+        console = Console(stderr=True)
+        columns = (
+            TextColumn(title),
+            BarColumn(),
+            TextColumn("{task.fields[told]}"),
+            TimeRemainingColumn(),
+        )
+        self._bar = RichProgress(*columns, console=console, disable=not console.is_terminal)
+        self._task = self._bar.add_task(title, total=total, told="")
 
     def __enter__(self) -> "Progress":
+        self._bar.start()
         return self
 
     def __exit__(
@@ -28,17 +36,9 @@ class Progress:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        if self._visible:
-            sys.stderr.write("\n")
+        self._bar.stop()
 
     def advance(self, **figures: float) -> None:
         """One step is done; the figures are shown beside the bar."""
-        self.done += 1
-        percent = 100 * self.done // self.total
-        if not self._visible or percent == self._shown_percent:
-            return
-        self._shown_percent = percent
-        bar = "█" * (percent // 4) + "·" * (25 - percent // 4)
-        told = " ".join(f"{name} {value:.3g}" for name, value in figures.items())
-        sys.stderr.write(f"\r{self.title} {bar} {percent:3d} % {told}   ")
-        sys.stderr.flush()
+        told = "  ".join(f"{name} {value:.3g}" for name, value in figures.items())
+        self._bar.update(self._task, advance=1, told=told)

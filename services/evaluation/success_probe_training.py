@@ -11,7 +11,12 @@ from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
-from services.evaluation.demonstrations import Demonstration, data_hash, split_by_seed
+from services.evaluation.demonstrations import (
+    Demonstration,
+    data_hash,
+    instructions_of,
+    split_by_seed,
+)
 from services.evaluation.progress import Progress
 from services.evaluation.success_probe import (
     KIND,
@@ -131,7 +136,11 @@ def train_success_probe(
         tasks=tasks,
         training_episodes=tuple(d.episode_id for d in training),
         training_starts=tuple(sorted({d.start_digest for d in training})),
-        settings={"shape": shape.model_dump(), "training": settings.model_dump()},
+        settings={
+            "shape": shape.model_dump(),
+            "training": settings.model_dump(),
+            "instructions": instructions_of(demonstrations),
+        },
         metrics={
             "training_seconds": round(seconds, 1),
             "num_training_episodes": len(training),

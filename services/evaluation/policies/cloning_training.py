@@ -11,7 +11,12 @@ from pydantic import BaseModel, ConfigDict, Field
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT, reanchor
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
-from services.evaluation.demonstrations import Demonstration, data_hash, split_by_seed
+from services.evaluation.demonstrations import (
+    Demonstration,
+    data_hash,
+    instructions_of,
+    split_by_seed,
+)
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
     CloningInput,
@@ -115,7 +120,11 @@ def train_cloned_policy(
         tasks=tasks,
         training_episodes=tuple(d.episode_id for d in training),
         training_starts=tuple(sorted({d.start_digest for d in training})),
-        settings={"shape": shape.model_dump(), "training": settings.model_dump()},
+        settings={
+            "shape": shape.model_dump(),
+            "training": settings.model_dump(),
+            "instructions": instructions_of(demonstrations),
+        },
         metrics={
             "num_training_decisions": len(learned),
             "num_held_out_decisions": len(tested),
