@@ -9,10 +9,9 @@ import httpx
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.log import SpoolReader
 from dextouch.episodes.window import StreamData, Window
 from dextouch.episodes.window_codec import decode_window
-from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
+from dextouch.errors import DexTouchError, UnavailableError
 from dextouch.schemas.episodes import EpisodeDetail, EpisodeList
 from dextouch.schemas.problems import Problem, error_from_problem
 from dextouch.schemas.recordings import (
@@ -27,7 +26,7 @@ from dextouch.schemas.rollouts import ActionKind
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.packing import unpack
 from dextouch.streams.samples import SampleBatch
-from dextouch.streams.wire import encode_batch, samples_per_batch
+from dextouch.streams.wire import encode_batch
 
 M = TypeVar("M", bound=BaseModel)
 Query = Mapping[str, str | int | None]
@@ -110,30 +109,6 @@ class EpisodeStoreClient:
         body = FinishRecording(num_batches=dict(num_batches), success=success, ledger=ledger)
         path = f"/v1/recordings/{_part(recording_id)}/finish"
         return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
-
-    def upload(self, spool: SpoolReader) -> RecordingStatus:
-        """Send a closed spool, from where an earlier attempt ended.
-
-        Raises:
-            InvalidInputError: a spool that is still written.
-            UnavailableError: the store does not answer; call again later.
-        """
-        if not spool.closed:
-            raise InvalidInputError(f"spool {spool.path.name!r}: close or recover it first")
-        recording_id = spool.attributes.recording_id
-        status = self.create(spool.attributes)
-        if status.state == "finished":
-            return status
-        num_batches = {}
-        for name, descriptor in spool.streams.items():
-            number = status.next_batch[name]
-            for batch in spool.batches(
-                name, num_samples=samples_per_batch(descriptor), first=number
-            ):
-                self.send_batch(recording_id, descriptor, batch, number=number)
-                number += 1
-            num_batches[name] = number
-        return self.finish(recording_id, num_batches)
 
     def recordings(self) -> RecordingList:
         """Finished recordings."""

@@ -23,12 +23,14 @@ DEFAULT_BATCH_SAMPLES = 60
 class SpoolReader:
     """Reads a spool, even while it is written: every sample whose row is whole.
 
+    A stream's journal is read when the stream is first asked for; what comes later is not seen.
+
     Args:
         path: of the spool.
 
     Raises:
         NotFoundError: no spool there.
-        CorruptDataError: damage that is no torn end.
+        CorruptDataError: its attributes are damaged.
     """
 
     def __init__(self, path: Path) -> None:
@@ -36,13 +38,15 @@ class SpoolReader:
         self.attributes = read_attributes(path)
         self.closed = (path / CLOSED_FILE).exists()
         self.streams = {d.name: d for d in self.attributes.streams}
-        self._rows = {
-            name: read_rows(path, name) if journal_path(path, name).exists() else None
-            for name in self.streams
-        }
+        self._rows: dict[str, np.ndarray] = {}
 
     def num_samples(self, stream_name: str) -> int:
-        """How many samples a stream held when this reader was made."""
+        """How many samples a stream held when it was first asked for.
+
+        Raises:
+            UnknownNameError: no such stream.
+            CorruptDataError: damage that is no torn end.
+        """
         return len(self._stream_rows(stream_name))
 
     def read(self, stream_name: str, start: int = 0, stop: int | None = None) -> SampleBatch:
@@ -81,12 +85,13 @@ class SpoolReader:
                 yield self.read(stream_name, start, min(stop, total))
 
     def _stream_rows(self, name: str) -> np.ndarray:
+        if name not in self.streams:
+            raise UnknownNameError("stream", name, list(self.streams))
         if name not in self._rows:
-            raise UnknownNameError("stream", name, list(self._rows))
-        rows = self._rows[name]
-        if rows is None:
-            raise CorruptDataError(f"spool {self.path.name!r}: journal of {name!r} is missing")
-        return rows
+            if not journal_path(self.path, name).exists():
+                raise CorruptDataError(f"spool {self.path.name!r}: journal of {name!r} is missing")
+            self._rows[name] = read_rows(self.path, name)
+        return self._rows[name]
 
 
 def read_attributes(path: Path) -> RecordingAttributes:

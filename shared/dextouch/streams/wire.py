@@ -6,7 +6,6 @@ body u32, then the body: `dextouch.streams.packing` of fields and arrays. See do
 
 import struct
 from itertools import pairwise
-from math import prod
 
 import google_crc32c
 import numpy as np
@@ -23,16 +22,8 @@ VERSION = 1
 HEADER = struct.Struct("<4sHHII")
 MAX_BATCH_BYTES = 16 * 2**20
 MAX_BATCH_SAMPLES = 65_536
-USUAL_BATCH_BYTES = 4 * 2**20
-USUAL_BATCH_SAMPLES = 60
 _STAMPS = ("t_host_ns", "t_device_ns", "sequence")
 _FIELDS = {"stream", "number"}
-
-
-def samples_per_batch(descriptor: StreamDescriptor) -> int:
-    """How many samples of a stream go into one batch: a fixed number, so that batch n is too."""
-    sample_bytes = prod(descriptor.shape) * descriptor.numpy_dtype().itemsize
-    return max(1, min(USUAL_BATCH_SAMPLES, USUAL_BATCH_BYTES // max(1, sample_bytes)))
 
 
 def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: int) -> bytes:

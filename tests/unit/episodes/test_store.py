@@ -1,6 +1,8 @@
 """Writing whole, reading slices, and refusing all that is damaged or does not fit."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -19,6 +21,7 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
+from dextouch.images.jpeg import decode_jpeg
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 
@@ -67,6 +70,20 @@ def test_zarr_python_opens_it_as_it_stands(made, store):
         np.testing.assert_array_equal(group[name][:], values)
         np.testing.assert_array_equal(group[f"{name}_t_ref_ns"][:], made.stamps_ns[name])
         assert group[name].metadata.dimension_names[0] == f"{name}_time"
+
+
+def test_zarr_python_reads_jpeg_bytes_and_empty_streams(make_episode, store):
+    made = make_episode(camera_unit="jpeg")
+    made.descriptors.append(scalar_stream("dead"))
+    made.values["dead"] = np.zeros((0, 2), "f4")
+    made.stamps_ns["dead"] = np.zeros(0, np.int64)
+    reader = made.write(store)
+    group = zarr.open_group(store.root / "episodes" / "stand-bottle-0003", mode="r")
+    ends = group["camera_head_end"][:]
+    second = group["camera_head"][ends[0] : ends[1]].tobytes()
+    assert [second] == reader.encoded_images("camera_head", 1, 2)
+    np.testing.assert_array_equal(decode_jpeg(second), reader.read("camera_head").values[1])
+    assert group["dead"][:].shape == (0, 2)
 
 
 def test_same_content_gives_same_bytes(made, store, tmp_path):
@@ -281,3 +298,33 @@ def test_a_full_disk_is_said_and_nothing_appears(made, store, file_size_limit):
     with file_size_limit(4096), pytest.raises(StorageFullError, match="no space left"):
         made.write(store)
     assert store.list() == []
+
+
+CHILD = """
+import sys
+import numpy as np
+from dextouch.episodes import EpisodeStore
+from dextouch.schemas.recordings import RecordingAttributes
+
+attributes = RecordingAttributes.model_validate_json(sys.argv[2])
+with EpisodeStore(sys.argv[1]).writer(kind="recording", attributes=attributes) as writer:
+    writer.append("force", values=np.ones((90, 2), "f4"), t_host_ns=np.arange(90))
+    print("written", flush=True)
+    sys.stdin.read()
+"""
+
+
+def test_a_killed_writer_leaves_nothing_to_see(store):
+    attributes = recording_attributes(streams=(scalar_stream(),))
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(store.root), attributes.model_dump_json()],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert child.stdout.readline() == b"written\n"
+    assert store.sweep() == 0
+    child.kill()
+    child.communicate()
+    assert store.list(kind="recording") == []
+    assert store.sweep() == 1
+    assert list((store.root / ".staging").iterdir()) == []

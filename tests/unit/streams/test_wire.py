@@ -131,13 +131,6 @@ def test_image_ends_must_fit(ends):
         )
 
 
-def test_usual_batches_fit_into_one_request():
-    raw = CAMERA.model_copy(update={"unit": "rgb8", "shape": (1080, 1920, 3)})
-    assert wire.samples_per_batch(POSE) == 60
-    assert wire.samples_per_batch(raw) == 1
-    assert wire.samples_per_batch(raw.model_copy(update={"shape": (480, 640, 3)})) == 4
-
-
 def test_limits():
     with pytest.raises(InvalidInputError, match="empty"):
         wire.encode_batch(POSE, pose_batch(0), number=0)
