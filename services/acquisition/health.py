@@ -23,7 +23,7 @@ RAISE_AFTER = 2
 CLEAR_AFTER = 5
 RATE_LIMITS = (0.02, 0.10)
 DROP_LIMITS = (0.001, 0.01)
-DEAD_LIMITS = (1, 18)  # taxels of 360: any, 5 %
+DEAD_LIMITS = (1.0, 18.0)  # taxels of 360: any, 5 %
 STALE_AFTER_NS = {"image": 500_000_000}
 STALE_AFTER_OTHERS_NS = 200_000_000
 LATE_PERIODS = 3
@@ -188,7 +188,7 @@ class HealthMonitor:
         num_dead = int(np.logical_and.reduce(list(state.pinned)).sum())
         if num_dead < DEAD_LIMITS[0]:
             return []
-        return [_finding(num_dead, DEAD_LIMITS, f"{num_dead} taxels dead or saturated")]
+        return [_finding(float(num_dead), DEAD_LIMITS, f"{num_dead} taxels dead or saturated")]
 
     def _stream_health(
         self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor, now_ns: int

@@ -3,8 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import Matrix, matrix_rows
 from dextouch.tactile.layout import SIDES, Side
@@ -95,11 +93,7 @@ class MockFactory:
         return pairs
 
     def calibration(self) -> dict[str, Matrix]:
-        """What a calibrated station knows: glove tare and gain, each stream's path delay.
-
-        `latency_ns_<stream>` is [[value, sigma]]; the value is off by about its sigma, as a
-        measured one would be.
-        """
+        """What a calibrated station knows of its gloves: tare and gain of the 360 cells."""
         record: dict[str, Matrix] = {}
         for side in SIDES:
             if f"tactile_{side}" in self._streams:
@@ -110,7 +104,7 @@ class MockFactory:
         return record
 
     def latencies(self, pairs: Sequence[MockPair]) -> dict[str, Matrix]:
-        """Path delay of each stream, as a measurement would tell."""
+        """Path delay of each stream, wrong by about its sigma as a measured one would be."""
         record: dict[str, Matrix] = {}
         for pair in pairs:
             rng = device_rng(self._seed, f"latency_{pair.device.name}")
@@ -118,8 +112,9 @@ class MockFactory:
             error_ms = LATENCY_SIGMA_MS * rng.standard_normal() if faults.path_delay_ms else 0.0
             measured_ns = round(max(0.0, faults.path_delay_ms + error_ms) * 1e6)
             for descriptor in pair.driver.descriptors:
-                row = np.array([[measured_ns, LATENCY_SIGMA_MS * 1e6]])
-                record[f"latency_ns_{descriptor.name}"] = matrix_rows(row)
+                sigma_ns = LATENCY_SIGMA_MS * 1e6
+                record[f"{descriptor.name}_latency_ns"] = ((float(measured_ns),),)
+                record[f"{descriptor.name}_latency_sigma_ns"] = ((sigma_ns,),)
         return record
 
     def _hand(self, side: Side) -> list[MockPair]:

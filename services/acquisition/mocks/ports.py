@@ -24,9 +24,10 @@ HID_RING_REPORTS = 63
 
 @runtime_checkable
 class MockPort(Protocol):
-    """The device's end."""
+    """The device's end; `has_bit_errors` where no checksum below ours guards the line."""
 
     link: Link
+    has_bit_errors: bool
 
     @property
     def transport(self) -> Transport:
@@ -48,6 +49,8 @@ class MockPort(Protocol):
 
 class PtyPort:
     """A serial device: a pseudo terminal with a new name at every plugging."""
+
+    has_bit_errors = True
 
     def __init__(self, name: str) -> None:
         self.link = Link()
@@ -154,6 +157,8 @@ class FakeHid:
 class HidPort:
     """A HID device whose host end is the real HID transport on a `FakeHid`."""
 
+    has_bit_errors = False
+
     def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
         self.link = Link()
         self.device = FakeHid()
@@ -190,6 +195,8 @@ class HidPort:
 
 class SocketPort:
     """A device behind a socket: every connection of the host is a new pair."""
+
+    has_bit_errors = False
 
     def __init__(self, name: str) -> None:
         self.link = Link()

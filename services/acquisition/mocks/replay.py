@@ -91,6 +91,7 @@ class MockDevice:
         self.faults = faults
         self._rng = device_rng(seed, name)
         self._boot_ns = boot_time_ns(self._rng)
+        self._bit_error_rate = faults.bit_error_rate if port.has_bit_errors else 0.0
         self._next_sequence = 0
         self._start_host_ns = 0
         self.ledger = self._new_ledger()
@@ -161,7 +162,7 @@ class MockDevice:
             fate = Fate.DROPPED
         else:
             for unit in self.source.units(index, sequence, t_device_ns):
-                damaged, num_flips = flip_bits(unit, self.faults.bit_error_rate, self._rng)
+                damaged, num_flips = flip_bits(unit, self._bit_error_rate, self._rng)
                 flips += num_flips
                 if not self.port.send(damaged):
                     fate = Fate.OVERRUN

@@ -1,0 +1,24 @@
+"""`python -m services.acquisition`: flags and environment in, a station out."""
+
+import sys
+from collections.abc import Sequence
+
+from dextouch.serving.logs import configure_logging
+from dextouch.serving.settings import load_settings, run
+from services.acquisition.app import create_app
+from services.acquisition.settings import AcquisitionSettings
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the station until SIGINT or SIGTERM."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    settings = load_settings(AcquisitionSettings, arguments)
+    configure_logging(
+        service="acquisition", log_format=settings.log_format, level=settings.log_level
+    )
+    run(create_app(settings), settings)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

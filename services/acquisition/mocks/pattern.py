@@ -1,0 +1,117 @@
+"""A length comes in; made-up streams of two moving, pressing hands go out."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float32, Float64, Int64, UInt8
+
+from dextouch.hands.skeleton import CHAINS, NUM_KEYPOINTS, chain_indices
+from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, join_pads
+from services.acquisition.mocks.replay import ReplayStream
+
+IMAGE_PX = 64
+PEAK_KPA = 30.0
+ROUND_S = 8.0
+
+
+def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
+    """All human streams of one round; the end meets the beginning."""
+    streams = []
+    for index, side in enumerate(SIDES):
+        phase_rad = np.pi * index
+
+        def tactile(turn_rad: np.ndarray, phase_rad: float = phase_rad) -> np.ndarray:
+            return _pressures(turn_rad + phase_rad)
+
+        def keypoints(turn_rad: np.ndarray, mirror: float = 1.0 - 2.0 * index) -> np.ndarray:
+            return _keypoints(turn_rad) * np.array([mirror, 1.0, 1.0])
+
+        def wrist(turn_rad: np.ndarray, x_m: float = 0.4 * index - 0.2) -> np.ndarray:
+            return _poses(turn_rad, np.array([x_m, 0.3, 1.0]))
+
+        streams += [
+            _stream(f"tactile_{side}", "tactile", (60.0, "kPa"), round_s, tactile),
+            _stream(f"keypoints_{side}", "keypoints", (120.0, "m"), round_s, keypoints),
+            _stream(f"wrist_{side}", "pose", (100.0, "pose_m_wxyz"), round_s, wrist),
+            _stream(f"camera_wrist_{side}", "image", (30.0, "rgb8"), round_s, _images),
+        ]
+
+    def head(turn_rad: np.ndarray) -> np.ndarray:
+        return _poses(0.2 * np.sin(turn_rad), np.array([0.0, -0.2, 1.5]))
+
+    streams.append(_stream("head", "pose", (100.0, "pose_m_wxyz"), round_s, head))
+    streams.append(_stream("camera_head", "image", (30.0, "rgb8"), round_s, _images))
+    return streams
+
+
+def _stream(
+    name: str,
+    kind: StreamKind,
+    rate_and_unit: tuple[float, str],
+    round_s: float,
+    make: Callable[[np.ndarray], np.ndarray],
+) -> ReplayStream:
+    rate_hz, unit = rate_and_unit
+    count = round(rate_hz * round_s)
+    t_ns: Int64[np.ndarray, " n"] = np.rint(np.arange(count) * (1e9 / rate_hz)).astype(np.int64)
+    values = make(2 * np.pi * np.arange(count) / count)
+    descriptor = StreamDescriptor.model_validate(
+        {
+            "name": name,
+            "kind": kind,
+            "shape": values.shape[1:],
+            "dtype": values.dtype.name,
+            "unit": unit,
+            "nominal_rate_hz": rate_hz,
+        }
+    )
+    return ReplayStream(descriptor, t_ns, values)
+
+
+def _pressures(turn_rad: np.ndarray) -> Float32[np.ndarray, "n 320"]:
+    """Fingers press one after the other; a bump wanders around the palm."""
+    finger_rad = turn_rad[:, None] - np.arange(5) * (2 * np.pi / 5)
+    force = np.maximum(0.0, np.cos(finger_rad)) ** 2
+    rows, columns = np.mgrid[0:4, 0:4]
+    tip = np.exp(-((rows - 1.5) ** 2 + (columns - 1.5) ** 2) / 3.0)
+    tips = force[..., None, None] * tip
+    rows, columns = np.mgrid[0:15, 0:16]
+    centre_row = 7 + 4 * np.cos(turn_rad)[:, None, None]
+    centre_column = 7.5 + 5 * np.sin(turn_rad)[:, None, None]
+    palm = np.exp(-((rows - centre_row) ** 2 + (columns - centre_column) ** 2) / 6.0)
+    pressures = PEAK_KPA * join_pads(tips, palm)
+    return pressures.reshape(len(turn_rad), NUM_TAXELS).astype(np.float32)
+
+
+def _keypoints(turn_rad: np.ndarray) -> Float64[np.ndarray, "n 25 3"]:
+    """A hand that opens and closes: each chain bends towards +y."""
+    points = np.zeros((len(turn_rad), NUM_KEYPOINTS, 3))
+    bend_rad = 0.35 * (1 - np.cos(turn_rad))
+    for chain_index, chain in enumerate(CHAINS):
+        position = np.tile([0.03 - 0.018 * chain_index, 0.0, -0.03], (len(turn_rad), 1))
+        for joint, keypoint in enumerate(chain_indices(chain)):
+            points[:, keypoint] = position
+            angle_rad = joint * bend_rad
+            step = np.stack([0 * angle_rad, np.sin(angle_rad), -np.cos(angle_rad)], axis=-1)
+            position = position + 0.03 * step
+    return points
+
+
+def _poses(turn_rad: np.ndarray, centre_m: np.ndarray) -> Float64[np.ndarray, "n 7"]:
+    poses = np.zeros((len(turn_rad), 7))
+    circle = np.stack([np.cos(turn_rad), np.sin(turn_rad), np.sin(2 * turn_rad)], axis=-1)
+    poses[:, :3] = centre_m + 0.05 * circle
+    angle_rad = 0.3 * np.sin(turn_rad)
+    poses[:, 3], poses[:, 6] = np.cos(angle_rad / 2), np.sin(angle_rad / 2)
+    return poses
+
+
+def _images(turn_rad: np.ndarray) -> UInt8[np.ndarray, "n 64 64 3"]:
+    rows, columns = np.mgrid[0:IMAGE_PX, 0:IMAGE_PX]
+    centre_row = IMAGE_PX * (0.5 + 0.3 * np.sin(turn_rad))[:, None, None]
+    centre_column = IMAGE_PX * (0.5 + 0.3 * np.cos(turn_rad))[:, None, None]
+    ball = np.hypot(rows - centre_row, columns - centre_column) < IMAGE_PX / 8
+    ground = np.broadcast_to(60 + rows + columns, ball.shape)
+    red = np.where(ball, 230, ground)
+    return np.stack([red, np.where(ball, 120, ground), ground], axis=-1).astype(np.uint8)

@@ -1,0 +1,98 @@
+"""An operator's way through a take over HTTP, on a station with mock devices."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import httpx
+import numpy as np
+import pytest
+
+from dextouch.episodes.log import SpoolReader
+from dextouch.streams.packing import unpack
+from services.acquisition.app import create_app
+from services.acquisition.settings import AcquisitionSettings
+
+PROMPT = {"task": "stack_bowls", "instruction": "stack the bowls"}
+
+
+@asynccontextmanager
+async def station(tmp_path, **options):
+    settings = AcquisitionSettings(spool=tmp_path, mock=True, mock_faults="none", **options)
+    app = create_app(settings)
+    async with app.router.lifespan_context(app):
+        transport = httpx.ASGITransport(app)
+        async with httpx.AsyncClient(transport=transport, base_url="http://station") as client:
+            yield client
+
+
+async def until_samples(client, count):
+    async with asyncio.timeout(20):
+        while True:
+            answer = (await client.get("/v1/recorder")).json()
+            if min(answer["num_samples"].values(), default=0) >= count:
+                return
+            await asyncio.sleep(0.02)
+
+
+async def test_a_take_over_http(tmp_path):
+    async with station(tmp_path) as client:
+        assert (await client.get("/readyz")).status_code == 200
+        assert (await client.get("/v1/recorder")).json()["state"] == "idle"
+        assert (await client.post("/v1/recorder/arm", json=PROMPT)).json()["state"] == "armed"
+        recording_id = (await client.post("/v1/recorder/record")).json()["recording_id"]
+        await until_samples(client, 5)
+        stopped = (await client.post("/v1/recorder/stop")).json()
+        assert stopped["state"] == "checking"
+        assert set(stopped["actions"]) == {"save", "discard"}
+        body = {"success": True, "accept_incomplete": True}
+        assert (await client.post("/v1/recorder/save", json=body)).json()["state"] == "saved"
+        spool = SpoolReader(tmp_path / recording_id)
+        assert spool.closed
+        assert spool.attributes.success
+        uploads = (await client.get("/v1/uploads")).json()
+        assert [u["recording_id"] for u in uploads] == [recording_id]
+
+        health = (await client.get("/v1/health")).json()
+        assert {s["stream"] for s in health["streams"]} == set(spool.streams)
+        assert all(d["connected"] for d in health["devices"])
+        fields, arrays = unpack((await client.get("/v1/live/taxels")).content, max_bytes=10_000)
+        assert fields == {}
+        assert arrays["tactile_left"].shape == (320,)
+        assert arrays["tactile_left"].dtype == np.float32
+        cameras = (await client.get("/v1/live/cameras")).json()["cameras"]
+        assert [c["name"] for c in cameras] == [
+            "camera_head",
+            "camera_wrist_left",
+            "camera_wrist_right",
+        ]
+        image = await client.get("/v1/live/cameras/camera_head")
+        assert image.headers["content-type"] == "image/jpeg"
+        assert image.content[:2] == b"\xff\xd8"
+
+
+async def test_refusals_are_problems(tmp_path):
+    async with station(tmp_path) as client:
+        answer = await client.post("/v1/recorder/record")
+        assert answer.status_code == 409
+        assert answer.headers["content-type"] == "application/problem+json"
+        assert "possible now: arm" in answer.json()["detail"]
+        answer = await client.post("/v1/recorder/arm", json={"task": "a"})
+        assert answer.status_code == 422
+        assert "instruction" in answer.json()["detail"]
+        answer = await client.get("/v1/live/cameras/nowhere")
+        assert answer.status_code == 404
+
+
+async def test_keys_are_asked_for(tmp_path):
+    key = {"name": "desk", "key": "x" * 20, "scopes": ["station"]}
+    async with station(tmp_path, api_keys=(key,)) as client:
+        assert (await client.get("/v1/recorder")).status_code == 401
+        headers = {"authorization": "Bearer " + "x" * 20}
+        assert (await client.get("/v1/recorder", headers=headers)).status_code == 200
+
+
+def test_a_station_without_devices_is_refused(tmp_path):
+    from dextouch.errors import InvalidInputError
+
+    with pytest.raises(InvalidInputError, match="at least one"):
+        create_app(AcquisitionSettings(spool=tmp_path))

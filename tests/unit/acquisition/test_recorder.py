@@ -1,0 +1,162 @@
+import errno
+import os
+
+import numpy as np
+import pytest
+
+from dextouch.episodes.log import SpoolReader
+from dextouch.errors import ConflictError
+from dextouch.streams.samples import Sample
+from services.acquisition.clock import VirtualClock
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
+from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
+from services.acquisition.mocks.ports import HidPort, PtyPort
+from services.acquisition.recorder import Recorder
+from services.acquisition.schemas import SaveTake, TakePrompt
+
+PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up", consent=True)
+ANYWAY = SaveTake(accept_incomplete=True)
+
+
+@pytest.fixture
+def clock():
+    return VirtualClock(10**9)
+
+
+@pytest.fixture
+def recorder(tmp_path, clock):
+    glove, tracker = TactileGloveDecoder("left"), PoseTrackerDecoder("head")
+    drivers = [
+        Driver("glove_left", transport=PtyPort("a").transport, decoder=glove, clock=clock),
+        Driver("pose_tracker_head", transport=HidPort("b").transport, decoder=tracker, clock=clock),
+    ]
+    return Recorder(
+        station="test",
+        spool_root=tmp_path,
+        drivers=drivers,
+        clock=clock,
+        calibration={"K_head": ((1.0,),)},
+    )
+
+
+def advance(clock, duration_ns):
+    waiter = clock.waiter(drives_time=True)
+    waiter.wait_until(clock.now_ns() + duration_ns)
+    waiter.close()
+
+
+def play(recorder, clock, seconds, streams=("tactile_left", "head")):
+    counts, pose = np.zeros(360, np.uint16), np.array([0.0, 0, 0, 1, 0, 0, 0])
+    for index in range(round(seconds * 100)):
+        now_ns = clock.now_ns()
+        if "head" in streams:
+            recorder.accept("pose_tracker_head", {"head": [Sample(now_ns, pose, 5, index)]})
+        if "tactile_left" in streams and index % 5 in (0, 1, 3):
+            recorder.accept("glove_left", {"tactile_left": [Sample(now_ns, counts, 5, index)]})
+        advance(clock, 10_000_000)
+
+
+def take(recorder, clock, seconds=2.0, **options):
+    recorder.arm(PROMPT)
+    recorder.record("take")
+    play(recorder, clock, seconds, **options)
+    return recorder.stop()
+
+
+def test_a_take_from_prompt_to_spool(recorder, clock, tmp_path):
+    assert recorder.status().state == "idle"
+    assert recorder.arm(PROMPT).state == "armed"
+    play(recorder, clock, 0.1)
+    assert recorder.record("take").state == "recording"
+    play(recorder, clock, 2.0)
+    assert recorder.status().duration_s == pytest.approx(2.0)
+    status = recorder.stop()
+    assert status.state == "checking"
+    assert status.check.complete
+    assert status.num_samples == {"tactile_left": 120, "head": 200}
+    assert recorder.save(SaveTake(success=True)).state == "saved"
+    spool = SpoolReader(tmp_path / "take")
+    assert spool.closed
+    assert spool.attributes.success
+    assert spool.attributes.task == "stand_bottle"
+    assert spool.attributes.consent
+    assert spool.attributes.started_t_host_ns == 10**9 + 100_000_000
+    assert spool.attributes.calibration == {"K_head": ((1.0,),)}
+    assert spool.num_samples("tactile_left") == 120
+    assert recorder.arm(PROMPT).recording_id is None
+
+
+@pytest.mark.parametrize("action", ["record", "stop", "discard"])
+def test_order_of_actions_is_kept(recorder, action):
+    with pytest.raises(ConflictError, match="possible now: arm"):
+        getattr(recorder, action)()
+
+
+def test_recording_cannot_be_armed_or_saved(recorder):
+    recorder.arm(PROMPT)
+    recorder.record()
+    with pytest.raises(ConflictError, match="while recording"):
+        recorder.arm(PROMPT)
+    with pytest.raises(ConflictError, match="possible now: stop, discard"):
+        recorder.save(SaveTake())
+
+
+def test_discarded_takes_leave_nothing(recorder, clock, tmp_path):
+    take(recorder, clock)
+    assert recorder.discard().state == "discarded"
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_missing_stream_is_named_and_not_saved_unasked(recorder, clock):
+    status = take(recorder, clock, streams=("head",))
+    assert [(p.stream, p.code) for p in status.check.problems] == [
+        ("tactile_left", "missing_stream")
+    ]
+    assert "tactile_left" in status.problems[0]
+    with pytest.raises(ConflictError, match="incomplete: tactile_left"):
+        recorder.save(SaveTake())
+    assert recorder.status().state == "checking"
+    assert recorder.save(ANYWAY).state == "saved"
+
+
+def test_gap_and_rate_are_found(recorder, clock):
+    recorder.arm(PROMPT)
+    recorder.record()
+    play(recorder, clock, 1.0)
+    play(recorder, clock, 0.5, streams=("head",))
+    play(recorder, clock, 1.0)
+    codes = {(p.stream, p.code, p.level) for p in recorder.stop().check.problems}
+    assert codes == {("tactile_left", "gap", "ERROR"), ("tactile_left", "rate", "ERROR")}
+
+
+def test_full_disk_keeps_what_is_there(recorder, clock, tmp_path, monkeypatch):
+    recorder.arm(PROMPT)
+    recorder.record("take")
+    play(recorder, clock, 0.5)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    play(recorder, clock, 0.1)
+    monkeypatch.undo()
+    status = recorder.status()
+    assert status.state == "checking"
+    assert "space" in status.problems[0].lower()
+    play(recorder, clock, 0.1)
+    assert recorder.save(ANYWAY).state == "saved"
+    assert SpoolReader(tmp_path / "take").num_samples("head") == 50
+
+
+def test_unsaved_takes_stay_in_the_spool(recorder, clock, tmp_path):
+    take(recorder, clock)
+    recorder.close()
+    spool = SpoolReader(tmp_path / "take")
+    assert not spool.closed
+    assert spool.num_samples("head") == 200
+
+
+def test_prompt_needs_an_instruction():
+    with pytest.raises(ValueError, match="instruction"):
+        TakePrompt(task="a", instruction="")

@@ -1,0 +1,167 @@
+import numpy as np
+import pytest
+
+from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.errors import ConflictError, UnavailableError
+from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import SampleBatch
+from services.acquisition.uploader import UPLOADED_FILE, Uploader, batch_samples, recover_spool
+
+STREAMS = tuple(
+    StreamDescriptor(
+        name=name, kind="pose", shape=(7,), dtype="float64", unit="pose_m_wxyz", nominal_rate_hz=100
+    )
+    for name in ("head", "wrist_left")
+)
+
+
+def spool(root, name="take", count=150, *, close=True):
+    attributes = RecordingAttributes(
+        recording_id=name, task="t", instruction="i", domain="human", station="s", streams=STREAMS
+    )
+    writer = SpoolWriter(root / name, attributes)
+    stamps = np.arange(count, dtype=np.int64)
+    for stream in STREAMS:
+        values = np.arange(count * 7.0).reshape(count, 7)
+        writer.append(stream.name, SampleBatch(stamps, stamps, stamps, values))
+    if close:
+        writer.close()
+    else:
+        writer.abandon()
+    return root / name
+
+
+class FakeStore:
+    """Keeps batches like the store, and fails when told to."""
+
+    def __init__(self):
+        self.batches = {}
+        self.finished = {}
+        self.replies_until_failure = None
+
+    def _reply(self):
+        if self.replies_until_failure is not None:
+            if self.replies_until_failure == 0:
+                raise UnavailableError("store: no answer")
+            self.replies_until_failure -= 1
+
+    def create(self, attributes):
+        self._reply()
+        self.batches.setdefault(attributes.recording_id, {s.name: [] for s in attributes.streams})
+        return self._status(attributes.recording_id)
+
+    def send_batch(self, recording_id, descriptor, batch, *, number):
+        self._reply()
+        kept = self.batches[recording_id][descriptor.name]
+        assert number == len(kept), "batch sent twice or out of order"
+        kept.append(batch)
+        return BatchReceipt(
+            recording_id=recording_id,
+            stream=descriptor.name,
+            number=number,
+            num_samples=len(batch),
+            replayed=False,
+        )
+
+    def finish(self, recording_id, num_batches, *, success=None, ledger=()):
+        self._reply()
+        assert num_batches == {n: len(b) for n, b in self.batches[recording_id].items()}
+        self.finished[recording_id] = (success, ledger)
+        return self._status(recording_id)
+
+    def _status(self, recording_id):
+        return RecordingStatus(
+            recording_id=recording_id,
+            state="finished" if recording_id in self.finished else "open",
+            next_batch={n: len(b) for n, b in self.batches[recording_id].items()},
+        )
+
+    def samples(self, recording_id, stream):
+        return np.concatenate([b.values for b in self.batches[recording_id][stream]])
+
+
+@pytest.mark.parametrize("failure", range(8))
+def test_every_interruption_is_made_up_for(tmp_path, failure):
+    path = spool(tmp_path)
+    store = FakeStore()
+    store.replies_until_failure = failure
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    assert uploader.upload_all() == []
+    assert not (path / UPLOADED_FILE).exists()
+    (status,) = uploader.status()
+    assert (status.uploaded, status.error) == (False, "store: no answer")
+    store.replies_until_failure = None
+    assert Uploader(tmp_path, store, period_s=1.0).upload_all() == ["take"]
+    for stream in STREAMS:
+        expected = SpoolReader(path).read(stream.name).values
+        np.testing.assert_array_equal(store.samples("take", stream.name), expected)
+    assert uploader.upload_all() == []
+    assert uploader.status()[0].uploaded
+
+
+def test_open_takes_wait(tmp_path):
+    spool(tmp_path, close=False)
+    store = FakeStore()
+    assert Uploader(tmp_path, store, period_s=1.0).upload_all() == []
+    assert store.batches == {}
+
+
+def test_uploaded_takes_are_removed_when_asked(tmp_path):
+    path = spool(tmp_path)
+    Uploader(tmp_path, FakeStore(), period_s=1.0, keep_uploaded=False).upload_all()
+    assert not path.exists()
+
+
+def test_one_refused_take_does_not_hold_up_the_next(tmp_path):
+    spool(tmp_path, "a")
+    spool(tmp_path, "b")
+    store = FakeStore()
+    create = store.create
+
+    def refuse_a(attributes):
+        if attributes.recording_id == "a":
+            raise ConflictError("a: exists with other attributes")
+        return create(attributes)
+
+    store.create = refuse_a
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    assert uploader.upload_all() == ["b"]
+    assert [status.error for status in uploader.status()] == [
+        "a: exists with other attributes",
+        None,
+    ]
+
+
+def test_thread_uploads_and_stops(tmp_path):
+    spool(tmp_path)
+    store = FakeStore()
+    uploader = Uploader(tmp_path, store, period_s=0.01)
+    uploader.start()
+    while not (tmp_path / "take" / UPLOADED_FILE).exists():
+        uploader._stopping.wait(0.005)
+    uploader.stop()
+    assert "take" in store.finished
+
+
+def test_recovery_closes_what_was_left_open(tmp_path):
+    spool(tmp_path, "left", close=False)
+    spool(tmp_path, "empty", count=0, close=False)
+    spool(tmp_path, "whole")
+    assert recover_spool(tmp_path) == ["left"]
+    left = SpoolReader(tmp_path / "left")
+    assert left.closed
+    assert {(e.stream, e.event) for e in left.attributes.ledger} == {
+        ("head", "interrupted"),
+        ("wrist_left", "interrupted"),
+    }
+    assert not (tmp_path / "empty").exists()
+    assert SpoolReader(tmp_path / "whole").attributes.ledger == ()
+    assert recover_spool(tmp_path) == []
+    assert recover_spool(tmp_path / "nowhere") == []
+
+
+def test_batches_of_large_images_are_small():
+    image = STREAMS[0].model_copy(update={"shape": (480, 640, 3), "dtype": "uint8"})
+    assert batch_samples(image) == 4
+    assert batch_samples(STREAMS[0]) == 60
