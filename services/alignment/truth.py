@@ -29,6 +29,9 @@ NS_PER_MS = 1e6
 NEAR_NS = 60_000_000
 FAR_NS = 1_500_000_000
 MAX_COMPARED_SAMPLES = 400
+# Another sample than the nearest is believed only if its values fit this much better: a hand at
+# rest looks the same at every moment, up to noise.
+CLEARLY_BETTER = 0.5
 
 
 @runtime_checkable
@@ -97,15 +100,16 @@ def compare_with_truth(
         for name, stream in episode.streams.items()
         if name in truth.streams and stream.unit != "action"
     ]
-    matches = {name: match_samples(episode, truth, name, origin_in_truth_ns) for name in shared}
-    if not matches:
+    if not shared:
         raise InvalidInputError(
             f"truth: the episode has {sorted(episode.streams)}, the truth "
             f"{sorted(truth.streams)}; expected common streams"
         )
     origin_ns = origin_in_truth_ns
     if origin_ns is None:
-        origin_ns = -round(float(np.median([m.mean_offset_ns for m in matches.values()])))
+        found = [match_samples(episode, truth, n, 0, FAR_NS).mean_offset_ns for n in shared]
+        origin_ns = -round(float(np.median(found)))
+    matches = {name: match_samples(episode, truth, name, origin_ns, NEAR_NS) for name in shared}
     left = {name: (m.mean_offset_ns + origin_ns) / NS_PER_MS for name, m in matches.items()}
     known = {report.stream: report.latency_ms or 0.0 for report in episode.attributes.clocks}
     return {
@@ -120,30 +124,33 @@ def compare_with_truth(
 
 
 def match_samples(
-    episode: Episode, truth: Episode, name: str, origin_in_truth_ns: int | None = None
+    episode: Episode, truth: Episode, name: str, origin_ns: int, reach_ns: int
 ) -> Match:
     """Find the true sample of every sample: near in time, and equal in what they hold.
 
-    The constant delay may be longer than a period, so whole periods are tried and the one with
-    the smallest difference of values wins; of equal ones the smallest.
+    A constant delay may be longer than a period, so moving the stream by whole periods, up to
+    `reach_ns`, is tried too, and believed where the values then fit clearly better.
     """
     mine, true = episode.read(name), truth.read(name)
     period_ns = truth.streams[name].period_ns()
-    start_ns = 0 if origin_in_truth_ns is None else origin_in_truth_ns
-    reach = round((FAR_NS if origin_in_truth_ns is None else NEAR_NS) / period_ns)
+    num = round(reach_ns / period_ns)
+    shifts_ns = [origin_ns + period_ns * shift for shift in sorted(range(-num, num + 1), key=abs)]
+    differences = np.array([_difference(mine, true, shift_ns, period_ns) for shift_ns in shifts_ns])
+    best = int(np.argmin(differences))
+    if not differences[best] < CLEARLY_BETTER * differences[0]:
+        best = 0
+    return _pair(mine, true, shifts_ns[best])
+
+
+def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: int) -> float:
+    """Mean difference of values if the stream is moved; infinite if it then lies elsewhere."""
     step = max(1, len(mine) // MAX_COMPARED_SAMPLES)
-    values = mine.values[::step].astype(np.float64)
-    best_shift, best_difference = 0, np.inf
-    for shift in sorted(range(-reach, reach + 1), key=abs):
-        t_ns = mine.t_ref_ns[::step] + start_ns + shift * period_ns
-        inside = (t_ns >= true.t_ref_ns[0] - period_ns) & (t_ns <= true.t_ref_ns[-1] + period_ns)
-        if inside.sum() < len(values) / 2:
-            continue
-        candidate = true.values[nearest_index(true.t_ref_ns, t_ns[inside])]
-        difference = float(np.abs(values[inside] - candidate).mean())
-        if difference < best_difference * (1 - 1e-9):
-            best_shift, best_difference = shift, difference
-    return _pair(mine, true, start_ns + best_shift * period_ns)
+    t_ns, values = mine.t_ref_ns[::step] + shift_ns, mine.values[::step].astype(np.float64)
+    inside = (t_ns >= true.t_ref_ns[0] - period_ns) & (t_ns <= true.t_ref_ns[-1] + period_ns)
+    if inside.sum() < len(t_ns) / 2:
+        return float("inf")
+    nearest = true.values[nearest_index(true.t_ref_ns, t_ns[inside])]
+    return float(np.abs(values[inside] - nearest).mean())
 
 
 def _pair(mine: StreamData, true: StreamData, shift_ns: int) -> Match:
