@@ -14,7 +14,7 @@ BASE_DELAY_NS = 2_000_000
 
 @dataclasses.dataclass(frozen=True)
 class Scene:
-    duration_s: float = 90.0
+    duration_s: float = 60.0
     rate_hz: float = 60.0
     skew_ppm: float = 50.0
     wander_ppm: float = 0.0
@@ -24,7 +24,7 @@ class Scene:
     grid_ms: float = 1.0
     drops: float = 0.002
     step_ms: float = 0.0
-    step_at_s: float = 45.0
+    step_at_s: float = 30.0
 
 
 SCENES = {
@@ -33,7 +33,7 @@ SCENES = {
     "serial timer 16 ms": Scene(grid_ms=16.0),
     "outliers 5 %, 50 ms": Scene(outliers=0.05, outlier_ms=50.0),
     "congestion 5 ms": Scene(jitter_ms=5.0),
-    "wander 5 ppm": Scene(duration_s=180.0, wander_ppm=5.0),
+    "wander 5 ppm": Scene(duration_s=150.0, wander_ppm=5.0),
     "step +200 ms": Scene(step_ms=200.0),
     "step -30 ms": Scene(step_ms=-30.0),
     "step -9 ms": Scene(step_ms=-9.0),
