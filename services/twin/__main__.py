@@ -1,0 +1,164 @@
+"""`dextouch twin record`: tasks and seeds in, truth episodes in a store and a summary out."""
+
+import argparse
+import json
+import multiprocessing
+import sys
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import DexTouchError, InvalidInputError
+from services.twin.cameras import CAMERAS
+from services.twin.episodes import TakeOptions, record, write_episode
+from services.twin.hands import DOMAINS, Domain
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.tasks import TASK_NAMES
+
+_MISS_DRAW = 5
+
+
+@dataclass(frozen=True)
+class TakeOrder:
+    """One episode to make, in whatever process."""
+
+    task: str
+    domain: Domain
+    seed: int
+    options: TakeOptions
+    store_url: str
+
+
+@dataclass(frozen=True)
+class TakeReport:
+    """What became of one order."""
+
+    episode_id: str
+    seed: int
+    success: bool
+    miss: bool
+
+
+@lru_cache(maxsize=2)
+def _stage(task: str, domain: Domain) -> Stage:
+    """Each process compiles each scene once."""
+    return Stage(task, domain, TwinSettings())
+
+
+def _take(order: TakeOrder) -> TakeReport:
+    episode = record(_stage(order.task, order.domain), order.seed, order.options)
+    episode_id = write_episode(EpisodeStore(order.store_url), episode)
+    return TakeReport(episode_id, order.seed, bool(episode.attributes.success), order.options.miss)
+
+
+def _seed_range(text: str) -> range:
+    first, separator, last = text.partition(":")
+    if not (first.isdecimal() and (last.isdecimal() or not separator)):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected A:B or A with 0 ≤ A < B")
+    seeds = range(int(first), int(last) if separator else int(first) + 1)
+    if not seeds:
+        raise argparse.ArgumentTypeError(f"got the empty range {text!r}, expected A < B")
+    return seeds
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="dextouch twin", description=__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    make = commands.add_parser("record", help="write truth episodes of a scripted demonstrator")
+    make.add_argument("--task", required=True, choices=TASK_NAMES)
+    make.add_argument("--seeds", required=True, type=_seed_range, help="A:B, B not included")
+    make.add_argument("--domain", default="robot", choices=DOMAINS)
+    make.add_argument("--noise", default=0.0, type=float, help="demonstrator's error, metres")
+    make.add_argument("--miss-fraction", default=0.0, type=float, help="takes without the objects")
+    make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS)
+    make.add_argument("--store", required=True, help="folder or file:///… of the episode store")
+    make.add_argument("--jobs", default=1, type=int, help="processes")
+    make.add_argument("--json", type=Path, help="write a summary here")
+    return parser
+
+
+def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
+    if not 0.0 <= arguments.miss_fraction <= 1.0 or arguments.jobs < 1:
+        raise InvalidInputError(
+            f"twin record: got --miss-fraction {arguments.miss_fraction} and --jobs "
+            f"{arguments.jobs}, expected a fraction 0 … 1 and at least one job"
+        )
+    orders = []
+    for seed in arguments.seeds:
+        draw = np.random.default_rng([seed, _MISS_DRAW]).random()
+        options = TakeOptions(
+            arguments.noise, bool(draw < arguments.miss_fraction), tuple(arguments.cameras)
+        )
+        orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
+    return orders
+
+
+def _work(orders: Sequence[TakeOrder], num_jobs: int) -> Iterator[TakeReport]:
+    if num_jobs == 1:
+        yield from map(_take, orders)
+        return
+    # Fresh processes: forking would copy whatever threads and locks the caller has.
+    with multiprocessing.get_context("spawn").Pool(num_jobs) as pool:
+        yield from pool.imap(_take, orders)
+
+
+def _shown(reports: Iterable[TakeReport], total: int, console: Console) -> list[TakeReport]:
+    return list(
+        track(
+            reports,
+            total=total,
+            description="twin record",
+            console=console,
+            disable=not console.is_terminal,
+        )
+    )
+
+
+def _summary(
+    arguments: argparse.Namespace, reports: Sequence[TakeReport], seconds: float
+) -> dict[str, object]:
+    aimed = [report for report in reports if not report.miss]
+    return {
+        "task": arguments.task,
+        "domain": arguments.domain,
+        "noise_m": arguments.noise,
+        "episodes": [report.episode_id for report in reports],
+        "num_misses": len(reports) - len(aimed),
+        "success_rate": sum(report.success for report in aimed) / len(aimed) if aimed else None,
+        "seconds": seconds,
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line; 0 is success, 2 is bad input (said on stderr)."""
+    arguments = _parser().parse_args(argv)
+    console = Console(stderr=True)
+    start_s = time.monotonic()
+    try:
+        orders = _orders(arguments)
+        reports = _shown(_work(orders, arguments.jobs), len(orders), console)
+    except DexTouchError as error:
+        print(f"dextouch twin: {error.message}", file=sys.stderr)
+        return 2
+    summary = _summary(arguments, reports, time.monotonic() - start_s)
+    if arguments.json is not None:
+        arguments.json.write_text(json.dumps(summary, indent=1) + "\n")
+    succeeded = sum(report.success for report in reports)
+    print(
+        f"{len(reports)} episodes of {arguments.task} ({arguments.domain}) in {arguments.store}: "
+        f"{succeeded} succeeded, {summary['num_misses']} were misses, "
+        f"{summary['seconds']:.1f} s"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

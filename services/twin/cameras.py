@@ -1,0 +1,121 @@
+"""Pictures of the twin by ray casting: a consistent state in, 64×64 images out, no GPU, no GL.
+
+Flat segment colours under one fixed light (Lambert) with a chequered table, so that motion shows
+and the same state always gives the same bytes.
+"""
+
+import math
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from dextouch.geometry.cameras import pinhole_matrix
+from dextouch.geometry.transforms import transform, transform_from_pose
+from services.twin.scene import Scene
+from services.twin.simulation import Simulation
+
+CAMERAS: Final = ("camera_head", "camera_wrist_left", "camera_wrist_right")
+FOVY_RAD: Final = {
+    "camera_head": math.radians(46.0),
+    "camera_wrist_left": math.radians(80.0),
+    "camera_wrist_right": math.radians(80.0),
+}
+_TO_LIGHT: Final = np.array([0.30, -0.40, 0.85]) / np.linalg.norm([0.30, -0.40, 0.85])
+_AMBIENT: Final = 0.35
+_BACKGROUND: Final = np.array([0.16, 0.17, 0.20])
+_CHECKER_M: Final = 0.08
+_CHECKER_DEPTH: Final = 0.14
+_FAR_M: Final = 4.0
+# Geoms of group 4 (the sensing skin) are invisible.
+_VISIBLE_GROUPS: Final = np.array([1, 1, 1, 1, 0, 0], dtype=np.uint8)
+
+
+def look_at(eye_m: np.ndarray, target_m: np.ndarray) -> Float64[np.ndarray, "4 4"]:
+    """T_world_camera of an optical frame at `eye_m` looking at `target_m`, world z upwards."""
+    forward = (target_m - eye_m) / np.linalg.norm(target_m - eye_m)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    return transform(np.stack([right, np.cross(forward, right), forward], axis=1), eye_m)
+
+
+HEAD_HOME: Final = look_at(np.array([0.0, -0.52, 0.55]), np.array([0.0, 0.03, 0.05]))
+
+
+def _wrist_mount(palm_sign: float) -> Float64[np.ndarray, "4 4"]:
+    """T_wrist_camera: behind the wrist on the palm side, looking along the fingers."""
+    tilt = 0.20
+    down = np.array([0.0, palm_sign * math.cos(tilt), math.sin(tilt)])
+    forward = np.array([0.0, palm_sign * math.sin(tilt), -math.cos(tilt)])
+    R = np.stack([np.cross(down, forward), down, forward], axis=1)
+    return transform(R, np.array([0.0, palm_sign * 0.045, 0.075]))
+
+
+class CameraRig:
+    """The three cameras of one scene; rays are computed once and turned with the camera."""
+
+    def __init__(self, scene: Scene, *, height_px: int, width_px: int) -> None:
+        self._model = scene.model
+        self.shape_px = (height_px, width_px)
+        self._colours = np.array(scene.model.geom_rgba[:, :3], dtype=np.float64)
+        self._table = scene.model.geom("table").id
+        self.mounts = [_wrist_mount(hand.palm_sign) for hand in scene.hands]
+        self.K = {
+            name: pinhole_matrix(width_px=width_px, height_px=height_px, fovy_rad=FOVY_RAD[name])
+            for name in CAMERAS
+        }
+        self._rays = {name: self._ray_table(self.K[name]) for name in CAMERAS}
+        num_rays = height_px * width_px
+        self._geom_ids = np.empty(num_rays, dtype=np.int32)
+        self._distances = np.empty(num_rays)
+        self._normals = np.empty(3 * num_rays)
+
+    def _ray_table(self, K: np.ndarray) -> Float64[np.ndarray, "rays 3"]:
+        """Unit rays of all pixel centres, row by row, in the optical frame."""
+        height, width = self.shape_px
+        u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        pixels = np.stack([u.ravel(), v.ravel(), np.ones(height * width)], axis=1)
+        rays = pixels @ np.linalg.inv(K).T
+        return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+    def pose(self, simulation: Simulation, camera: str) -> Float64[np.ndarray, "4 4"]:
+        """T_world_camera (optical frame) of one camera now."""
+        if camera == "camera_head":
+            return transform_from_pose(simulation.head_pose())
+        side_index = CAMERAS.index(camera) - 1
+        return transform_from_pose(simulation.wrist_poses()[side_index]) @ self.mounts[side_index]
+
+    def image(self, simulation: Simulation, camera: str) -> UInt8[np.ndarray, "h w 3"]:
+        """What one camera sees of a simulation whose derived quantities are current."""
+        T_world_camera = self.pose(simulation, camera)
+        rays_world = np.ascontiguousarray(self._rays[camera] @ T_world_camera[:3, :3].T)
+        eye_m = np.ascontiguousarray(T_world_camera[:3, 3])
+        mujoco.mj_multiRay(
+            self._model,
+            simulation.data,
+            eye_m,
+            rays_world.ravel(),
+            _VISIBLE_GROUPS,
+            1,
+            -1,
+            self._geom_ids,
+            self._distances,
+            self._normals,
+            len(rays_world),
+            _FAR_M,
+        )
+        return self._shaded(eye_m, rays_world).reshape(*self.shape_px, 3)
+
+    def _shaded(self, eye_m: np.ndarray, rays_world: np.ndarray) -> UInt8[np.ndarray, "rays 3"]:
+        hit = self._geom_ids >= 0
+        light = self._normals.reshape(-1, 3) @ _TO_LIGHT
+        brightness = _AMBIENT + (1 - _AMBIENT) * np.clip(light, 0.0, 1.0)
+        on_table = self._geom_ids == self._table
+        points = eye_m[:2] + rays_world[on_table, :2] * self._distances[on_table, None]
+        cells = np.floor(points / _CHECKER_M).sum(axis=1) % 2
+        brightness[on_table] *= 1 - _CHECKER_DEPTH * cells
+        rgb = np.where(
+            hit[:, None], self._colours[self._geom_ids] * brightness[:, None], _BACKGROUND
+        )
+        return (np.clip(rgb, 0.0, 1.0) * 255).round().astype(np.uint8)

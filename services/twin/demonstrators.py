@@ -1,0 +1,117 @@
+"""Scripted demonstrators: waypoints of both hands in, smooth commands on the model grid out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.interpolation import interpolate_linear, interpolate_poses
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import transform
+from dextouch.hands.actions import HandTrajectory
+from services.twin.cameras import HEAD_HOME
+from services.twin.simulation import MODEL_RATE_HZ
+
+# 1 + 5 × 16 grid steps: a take of 5 1/3 s.
+NUM_GRID_STEPS: Final = 81
+# A person who looks at what the hands do moves the head by centimetres and degrees.
+_SWAY_M: Final = np.array([0.022, 0.018, 0.014])
+_SWAY_RAD: Final = np.array([0.036, 0.036, 0.020])
+# Each part of a take lasts this share of its nominal time.
+_TEMPO: Final = (0.85, 1.15)
+# A person reading a waypoint a centimetre wrong also turns a little wrong.
+YAW_NOISE_RAD_PER_M: Final = 5.0
+
+
+@dataclass(frozen=True)
+class HandPose:
+    """Where one hand is and how it is bent."""
+
+    T_world_wrist: Float64[np.ndarray, "4 4"]
+    joints_rad: Float64[np.ndarray, "20"]
+
+
+@dataclass(frozen=True)
+class Waypoint:
+    """Both hands at one time of the take."""
+
+    time_s: float
+    left: HandPose
+    right: HandPose
+
+
+@dataclass(frozen=True)
+class WaypointNoise:
+    """How wrong a demonstrator reads one place: an offset on the table and a turn about z."""
+
+    offset_m: Float64[np.ndarray, "3"]
+    yaw_rad: float
+
+    @staticmethod
+    def draw(generator: np.random.Generator, noise_m: float) -> "WaypointNoise":
+        """One error; always draws as many numbers, so that ladders of noise share their seeds."""
+        errors = generator.normal(size=3) * noise_m
+        return WaypointNoise(
+            np.array([errors[0], errors[1], 0.0]), float(errors[2] * YAW_NOISE_RAD_PER_M)
+        )
+
+
+def moved(hand: HandPose, offset_m: Sequence[float] | np.ndarray) -> HandPose:
+    """The same hand shifted in the world."""
+    T = hand.T_world_wrist.copy()
+    T[:3, 3] += np.asarray(offset_m)
+    return HandPose(T, hand.joints_rad)
+
+
+def bent(hand: HandPose, joints_rad: np.ndarray) -> HandPose:
+    """The same wrist with another posture."""
+    return HandPose(hand.T_world_wrist, joints_rad)
+
+
+def head_sway(generator: np.random.Generator) -> Float64[np.ndarray, "81 4 4"]:
+    """T_world_camera_head at every grid step: a standing person's slow sway about home."""
+    times_s = np.arange(NUM_GRID_STEPS) / MODEL_RATE_HZ
+    rate_hz = generator.uniform(0.10, 0.40, size=6)
+    phase = generator.uniform(0.0, 2 * np.pi, size=6)
+    size = generator.uniform(0.2, 1.0, size=6)
+    waves = size * np.sin(2 * np.pi * rate_hz * times_s[:, None] + phase)
+    return HEAD_HOME @ transform(
+        rotation_from_vector(waves[:, 3:] * _SWAY_RAD), waves[:, :3] * _SWAY_M
+    )
+
+
+def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) -> list[Waypoint]:
+    """The same places, each reached a little earlier or later; start and end keep their time."""
+    times = np.array([waypoint.time_s for waypoint in waypoints])
+    parts = np.diff(times) * generator.uniform(*_TEMPO, size=len(times) - 1)
+    parts *= (times[-1] - times[0]) / parts.sum()
+    own = times[0] + np.concatenate([[0.0], np.cumsum(parts)])
+    return [
+        Waypoint(float(time_s), waypoint.left, waypoint.right)
+        for time_s, waypoint in zip(own, waypoints, strict=True)
+    ]
+
+
+def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
+    """Commands of a whole take: smoothstep between waypoints, still before and after them.
+
+    Raises:
+        InvalidInputError: times that do not increase.
+    """
+    times = np.array([waypoint.time_s for waypoint in waypoints])
+    if len(times) < 2 or (np.diff(times) <= 0).any():
+        raise InvalidInputError(
+            f"script: got waypoint times {times.tolist()} s, expected at least two, increasing"
+        )
+    at_s = np.clip(np.arange(NUM_GRID_STEPS) / MODEL_RATE_HZ, times[0], times[-1])
+    left = np.clip(np.searchsorted(times, at_s, side="right") - 1, 0, len(times) - 2)
+    ramp = (at_s - times[left]) / (times[left + 1] - times[left])
+    weight = ramp * ramp * (3 - 2 * ramp)
+    poses, joints = [], []
+    for hands in ([w.left for w in waypoints], [w.right for w in waypoints]):
+        poses.append(interpolate_poses(np.stack([h.T_world_wrist for h in hands]), left, weight))
+        joints.append(interpolate_linear(np.stack([h.joints_rad for h in hands]), left, weight))
+    return HandTrajectory(poses[0], poses[1], joints[0], joints[1], head)

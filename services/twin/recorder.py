@@ -1,0 +1,206 @@
+"""Truth streams of a running simulation: samples at each stream's own rate in, arrays out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, cast
+
+import numpy as np
+from jaxtyping import Int64, Shaped
+
+from dextouch.geometry.transforms import transform_from_pose
+from dextouch.hands.actions import ACTION_DIM, HandTrajectory
+from dextouch.hands.skeleton import NUM_KEYPOINTS
+from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+from services.twin.hands import HumanHand
+from services.twin.mjcf import PHYSICS_RATE_HZ
+from services.twin.simulation import MODEL_RATE_HZ
+from services.twin.stage import Stage
+
+TACTILE_RATE_HZ: Final = 60
+POSE_RATE_HZ: Final = 100
+KEYPOINT_RATE_HZ: Final = 120
+IMAGE_RATE_HZ: Final = 30
+_NS_PER_S: Final = 1_000_000_000
+
+
+@dataclass(frozen=True)
+class TruthStream:
+    """One stream of a truth episode."""
+
+    descriptor: StreamDescriptor
+    t_ref_ns: Int64[np.ndarray, " n"]
+    values: Shaped[np.ndarray, "n ..."]
+
+
+def _descriptor(
+    name: str, kind: StreamKind, unit: str, shape: tuple[int, ...], rate_hz: int
+) -> StreamDescriptor:
+    dtype = {"tactile": "float32", "image": "uint8"}.get(kind, "float64")
+    sides = [side for side in SIDES if f"_{side}" in name and name != "joints"]
+    frame = f"wrist_{sides[0]}" if kind == "keypoints" else "world" if kind == "pose" else None
+    return StreamDescriptor.model_validate(
+        {
+            "name": name,
+            "kind": kind,
+            "shape": shape,
+            "dtype": dtype,
+            "unit": unit,
+            "nominal_rate_hz": rate_hz,
+            "frame": frame,
+            "side": sides[0] if sides else None,
+        }
+    )
+
+
+def _flat(source: Callable[[], np.ndarray]) -> np.ndarray:
+    return source().ravel()
+
+
+class Recorder:
+    """Collects the truth of one take. `sample` is called at every physics step, from step 0."""
+
+    def __init__(self, stage: Stage, *, images: tuple[str, ...]) -> None:
+        self._stage = stage
+        self._sources: dict[str, tuple[StreamDescriptor, Callable[[], np.ndarray]]] = {}
+        self._samples: dict[str, list[np.ndarray]] = {}
+        self._due: dict[int, list[str]] = {}
+        self.pad_forces_n: list[np.ndarray] = []
+        self._add_touch_and_objects()
+        self._add_hands()
+        for camera in images:
+            self._add_camera(camera)
+
+    def _add(self, descriptor: StreamDescriptor, source: Callable[[], np.ndarray]) -> None:
+        self._sources[descriptor.name] = (descriptor, source)
+        self._samples[descriptor.name] = []
+        period = PHYSICS_RATE_HZ // round(descriptor.nominal_rate_hz)
+        self._due.setdefault(period, []).append(descriptor.name)
+
+    def _add_touch_and_objects(self) -> None:
+        simulation = self._stage.simulation
+        for index, side in enumerate(SIDES):
+            self._add(
+                _descriptor(f"tactile_{side}", "tactile", "kPa", (NUM_TAXELS,), TACTILE_RATE_HZ),
+                partial(self._tactile, index),
+            )
+        num_objects = len(self._stage.task.object_names)
+        self._add(
+            _descriptor("object_poses", "pose", "pose_m_wxyz", (num_objects, 7), POSE_RATE_HZ),
+            simulation.object_poses,
+        )
+
+    def _tactile(self, side_index: int) -> np.ndarray:
+        return self._stage.simulation.tactile_kpa[side_index]
+
+    def _wrist(self, side_index: int) -> np.ndarray:
+        return self._stage.simulation.wrist_poses()[side_index]
+
+    def _wrist_commanded(self, side_index: int) -> np.ndarray:
+        return self._stage.simulation.commanded_poses()[side_index]
+
+    def _add_pose(self, name: str, source: Callable[[], np.ndarray]) -> None:
+        self._add(_descriptor(name, "pose", "pose_m_wxyz", (7,), POSE_RATE_HZ), source)
+
+    def _add_hands(self) -> None:
+        simulation = self._stage.simulation
+        self._add_pose("head", simulation.head_pose)
+        for index, side in enumerate(SIDES):
+            self._add_pose(f"wrist_{side}", partial(self._wrist, index))
+            if self._stage.domain == "robot":
+                self._add_pose(
+                    f"wrist_{side}_commanded",
+                    partial(self._wrist_commanded, index),
+                )
+            else:
+                self._add_keypoints(side, index)
+        if self._stage.domain == "robot":
+            sources = (simulation.joints_rad, simulation.commanded_joints_rad)
+            for name, source in zip(("measured", "commanded"), sources, strict=True):
+                self._add(
+                    _descriptor(f"joints_{name}", "robot_state", "rad", (40,), POSE_RATE_HZ),
+                    partial(_flat, source),
+                )
+
+    def _add_keypoints(self, side: Side, index: int) -> None:
+        """Joint angles are kept while recording and become keypoints at the end."""
+        simulation = self._stage.simulation
+        self._add(
+            _descriptor(
+                f"keypoints_{side}", "keypoints", "m", (NUM_KEYPOINTS, 3), KEYPOINT_RATE_HZ
+            ),
+            lambda: simulation.joints_rad()[index],
+        )
+
+    def _add_camera(self, camera: str) -> None:
+        simulation, rig = self._stage.simulation, self._stage.rig
+        self._add(
+            _descriptor(camera, "image", "rgb8", (*rig.shape_px, 3), IMAGE_RATE_HZ),
+            lambda: rig.image(simulation, camera),
+        )
+
+    def sample(self, step_index: int) -> None:
+        """Take the samples that are due at this physics step."""
+        for period, names in self._due.items():
+            if step_index % period == 0:
+                for name in names:
+                    self._samples[name].append(np.array(self._sources[name][1]()))
+        if step_index % (PHYSICS_RATE_HZ // TACTILE_RATE_HZ) == 0:
+            self.pad_forces_n.append(self._stage.simulation.pad_forces_n.copy())
+
+    def streams(self) -> dict[str, TruthStream]:
+        """All streams recorded so far, by name."""
+        finished = {}
+        for name, (descriptor, _) in self._sources.items():
+            values = np.stack(self._samples[name])
+            if descriptor.kind == "keypoints":
+                values = self._keypoints(descriptor, values)
+            finished[name] = timed_stream(descriptor, values)
+        return finished
+
+    def _keypoints(self, descriptor: StreamDescriptor, joints_rad: np.ndarray) -> np.ndarray:
+        hands = {hand.side: hand.kinematics for hand in self._stage.simulation.scene.hands}
+        human = cast("HumanHand", hands[cast("Side", descriptor.side)])
+        return human.keypoints_m(joints_rad)
+
+
+def timed_stream(descriptor: StreamDescriptor, values: np.ndarray) -> TruthStream:
+    """Values of a stream that started at 0 and kept its nominal rate."""
+    rate_hz = round(descriptor.nominal_rate_hz)
+    t_ref_ns = (np.arange(len(values), dtype=np.int64) * _NS_PER_S + rate_hz // 2) // rate_hz
+    return TruthStream(descriptor, t_ref_ns, values)
+
+
+def action_stream(name: str, actions: np.ndarray) -> TruthStream:
+    """Actions [81, 67] on the model grid as a stream."""
+    descriptor = _descriptor(name, "robot_state", "action_m_rad", (ACTION_DIM,), MODEL_RATE_HZ)
+    return timed_stream(descriptor, actions)
+
+
+class GridLog:
+    """Measured poses and joints at grid steps, turned into a trajectory."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._simulation = stage.simulation
+        self._wrists: list[np.ndarray] = []
+        self._heads: list[np.ndarray] = []
+        self._joints: list[np.ndarray] = []
+
+    def sample(self) -> None:
+        """Note what is measured now."""
+        self._wrists.append(self._simulation.wrist_poses())
+        self._heads.append(self._simulation.head_pose())
+        self._joints.append(self._simulation.joints_rad())
+
+    def trajectory(self) -> HandTrajectory:
+        """All noted steps."""
+        Ts = transform_from_pose(np.stack(self._wrists))
+        joints = np.stack(self._joints)
+        return HandTrajectory(
+            Ts[:, 0],
+            Ts[:, 1],
+            joints[:, 0],
+            joints[:, 1],
+            transform_from_pose(np.stack(self._heads)),
+        )

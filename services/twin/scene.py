@@ -1,0 +1,103 @@
+"""A compiled scene: a task's objects and a domain's hands in, the model and its addresses out."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Int64
+
+from dextouch.tactile.layout import SIDES
+from services.twin.hands import Domain, TwinHand, twin_hand
+from services.twin.mjcf import scene_xml
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A model and where in its arrays things are; left comes before right everywhere."""
+
+    model: mujoco.MjModel
+    xml: str
+    domain: Domain
+    hands: tuple[TwinHand, TwinHand]
+    object_names: tuple[str, ...]
+
+    def _ids(self, kind: mujoco.mjtObj, names: list[str]) -> list[int]:
+        return [mujoco.mj_name2id(self.model, kind, name) for name in names]
+
+    @cached_property
+    def wrist_qpos(self) -> Int64[np.ndarray, "2 7"]:
+        """Places of each wrist's pose (x y z, qw qx qy qz) in qpos."""
+        joints = self._ids(mujoco.mjtObj.mjOBJ_JOINT, [f"{side}_free" for side in SIDES])
+        return np.array([self.model.jnt_qposadr[j] + np.arange(7) for j in joints], dtype=np.int64)
+
+    @cached_property
+    def joint_qpos(self) -> Int64[np.ndarray, "2 20"]:
+        """Places of each hand's joint angles in qpos."""
+        return np.array(
+            [
+                self.model.jnt_qposadr[
+                    self._ids(mujoco.mjtObj.mjOBJ_JOINT, list(hand.kinematics.joint_names))
+                ]
+                for hand in self.hands
+            ],
+            dtype=np.int64,
+        )
+
+    @cached_property
+    def joint_ctrl(self) -> Int64[np.ndarray, "2 20"]:
+        """Places of each hand's commanded joint angles in ctrl."""
+        return np.array(
+            [
+                self._ids(mujoco.mjtObj.mjOBJ_ACTUATOR, list(hand.kinematics.joint_names))
+                for hand in self.hands
+            ],
+            dtype=np.int64,
+        )
+
+    @cached_property
+    def mocap_rows(self) -> Int64[np.ndarray, "3"]:
+        """Mocap rows of the left and right wrist target and of the head camera."""
+        bodies = self._ids(mujoco.mjtObj.mjOBJ_BODY, ["left_target", "right_target", "head_target"])
+        return np.array(self.model.body_mocapid[bodies], dtype=np.int64)
+
+    @cached_property
+    def object_bodies(self) -> Int64[np.ndarray, " objects"]:
+        """Body of each of the task's objects."""
+        return np.array(
+            self._ids(mujoco.mjtObj.mjOBJ_BODY, list(self.object_names)), dtype=np.int64
+        )
+
+    @cached_property
+    def object_qpos(self) -> Int64[np.ndarray, "objects 7"]:
+        """Places of each object's pose in qpos."""
+        joints = self.model.body_jntadr[self.object_bodies]
+        starts = self.model.jnt_qposadr[joints]
+        return np.array([start + np.arange(7) for start in starts], dtype=np.int64)
+
+    @cached_property
+    def object_qvel(self) -> Int64[np.ndarray, "objects 6"]:
+        """Places of each object's velocity in qvel (linear in the world, then angular)."""
+        joints = self.model.body_jntadr[self.object_bodies]
+        starts = self.model.jnt_dofadr[joints]
+        return np.array([start + np.arange(6) for start in starts], dtype=np.int64)
+
+    @cached_property
+    def is_hand_geom(self) -> Bool[np.ndarray, " geoms"]:
+        """Which geoms belong to a hand."""
+        roots = self.model.body_rootid[self.model.geom_bodyid]
+        return np.isin(
+            roots, self._ids(mujoco.mjtObj.mjOBJ_BODY, [f"{side}_wrist" for side in SIDES])
+        )
+
+    @cached_property
+    def is_object_geom(self) -> Bool[np.ndarray, " geoms"]:
+        """Which geoms belong to one of the task's objects."""
+        return np.isin(self.model.geom_bodyid, self.object_bodies)
+
+
+def compile_scene(domain: Domain, *, objects: str, object_names: tuple[str, ...]) -> Scene:
+    """Compile the scene of a domain's two hands and the given objects (MJCF bodies)."""
+    hands = (twin_hand("left", domain), twin_hand("right", domain))
+    xml = scene_xml(hands, objects)
+    return Scene(mujoco.MjModel.from_xml_string(xml), xml, domain, hands, object_names)

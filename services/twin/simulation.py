@@ -1,0 +1,173 @@
+"""The running twin: commands on the model grid in, physics steps, contacts and poses out.
+
+Everything that plays in the twin, a scripted demonstrator or a policy through a rollout, goes
+through `Simulation.advance`, so both obey the same physics and the same interpolation.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.interpolation import interpolate_poses
+from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
+from services.twin.mjcf import PHYSICS_RATE_HZ
+from services.twin.scene import Scene
+from services.twin.tactile import TactileReader
+
+MODEL_RATE_HZ = 15
+STEPS_PER_GRID = PHYSICS_RATE_HZ // MODEL_RATE_HZ
+STEPS_PER_TACTILE = PHYSICS_RATE_HZ // 60
+# Commands are interpolated between grid steps and held for this many physics steps.
+STEPS_PER_COMMAND = 5
+STATE_KIND = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+_NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
+
+
+@dataclass(frozen=True)
+class Command:
+    """Where hands and head should be: poses of left wrist, right wrist, head camera; joints."""
+
+    Ts_world_x: Float64[np.ndarray, "3 4 4"]
+    joints_rad: Float64[np.ndarray, "2 20"]
+
+
+class Simulation:
+    """One scene in motion. `step_index` counts physics steps since the start of the take."""
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self.data = mujoco.MjData(scene.model)
+        self.step_index = 0
+        self.tactile_kpa: Float32[np.ndarray, "2 320"] = np.zeros((2, 320), dtype=np.float32)
+        self.pad_forces_n: Float64[np.ndarray, "2 6"] = np.zeros((2, 6))
+        self._skin = TactileReader(scene)
+        scene.model.opt.disableflags |= _NO_SENSORS
+
+    def place(
+        self, command: Command, object_poses: Float64[np.ndarray, "objects 7"], *, settle_s: float
+    ) -> None:
+        """Put hands at the command and objects at their poses, let things settle, start at 0.
+
+        The hands hang still where the command is, so measured equals commanded at the start.
+        """
+        mujoco.mj_resetData(self.scene.model, self.data)
+        self._apply(pose_from_transform(command.Ts_world_x), command.joints_rad)
+        self.data.qpos[self.scene.object_qpos] = object_poses
+        self._place_hands(command)
+        for _ in range(round(settle_s * PHYSICS_RATE_HZ)):
+            mujoco.mj_step(self.scene.model, self.data)
+        self._place_hands(command)
+        self.step_index = 0
+        self._sense()
+
+    def _place_hands(self, command: Command) -> None:
+        self.data.qpos[self.scene.wrist_qpos] = pose_from_transform(command.Ts_world_x[:2])
+        self.data.qpos[self.scene.joint_qpos] = command.joints_rad
+
+    def _apply(
+        self, poses: Float64[np.ndarray, "3 7"], joints_rad: Float64[np.ndarray, "2 20"]
+    ) -> None:
+        self.data.mocap_pos[self.scene.mocap_rows] = poses[:, :3]
+        self.data.mocap_quat[self.scene.mocap_rows] = poses[:, 3:]
+        self.data.ctrl[self.scene.joint_ctrl] = joints_rad
+
+    def advance(self, target: Command) -> Iterator[int]:
+        """Play one grid interval, moving the command linearly from where it is to `target`.
+
+        Yields the number of every physics step that was reached; poses are current at each of
+        them, everything else (skin, cameras, contacts) at those divisible by STEPS_PER_TACTILE.
+
+        Raises:
+            InvalidInputError: the physics diverged.
+        """
+        poses, joints_rad = self._interpolated(target)
+        for pose, joints in zip(poses, joints_rad, strict=True):
+            self._apply(pose, joints)
+            for _ in range(STEPS_PER_COMMAND):
+                mujoco.mj_step(self.scene.model, self.data)
+                self.step_index += 1
+                if self.step_index % STEPS_PER_TACTILE == 0:
+                    self._sense()
+                yield self.step_index
+        if not np.isfinite(self.data.qpos).all():
+            raise InvalidInputError(
+                f"twin: physics diverged before step {self.step_index}; expected finite poses; "
+                "send commands nearer to each other"
+            )
+
+    def _interpolated(
+        self, target: Command
+    ) -> tuple[Float64[np.ndarray, "parts 3 7"], Float64[np.ndarray, "parts 2 20"]]:
+        parts = STEPS_PER_GRID // STEPS_PER_COMMAND
+        weight = np.arange(1, parts + 1) / parts
+        before = transform_from_pose(self.commanded_poses())
+        left = np.zeros(parts, dtype=np.int64)
+        Ts = [
+            interpolate_poses(np.stack(pair), left, weight)
+            for pair in zip(before, target.Ts_world_x, strict=True)
+        ]
+        joints_before = self.commanded_joints_rad()
+        joints = joints_before + weight[:, None, None] * (target.joints_rad - joints_before)
+        return pose_from_transform(np.stack(Ts, axis=1)), joints
+
+    def _sense(self) -> None:
+        """Make every derived quantity belong to the present state, and read the skin."""
+        option = self.scene.model.opt
+        option.disableflags &= ~_NO_SENSORS
+        mujoco.mj_forward(self.scene.model, self.data)
+        option.disableflags |= _NO_SENSORS
+        self.tactile_kpa, self.pad_forces_n = self._skin.read(self.data)
+
+    def wrist_poses(self) -> Float64[np.ndarray, "2 7"]:
+        """Measured T_world_wrist of both hands: x y z (m), qw qx qy qz."""
+        return np.array(self.data.qpos[self.scene.wrist_qpos])
+
+    def joints_rad(self) -> Float64[np.ndarray, "2 20"]:
+        """Measured joint angles of both hands."""
+        return np.array(self.data.qpos[self.scene.joint_qpos])
+
+    def head_pose(self) -> Float64[np.ndarray, "7"]:
+        """T_world_camera_head (optical frame): x y z (m), qw qx qy qz."""
+        return np.array(self.commanded_poses()[2])
+
+    def commanded_poses(self) -> Float64[np.ndarray, "3 7"]:
+        """Commanded poses of left wrist, right wrist and head camera."""
+        rows = self.scene.mocap_rows
+        return np.concatenate([self.data.mocap_pos[rows], self.data.mocap_quat[rows]], axis=1)
+
+    def commanded_joints_rad(self) -> Float64[np.ndarray, "2 20"]:
+        """Commanded joint angles of both hands."""
+        return np.array(self.data.ctrl[self.scene.joint_ctrl])
+
+    def object_poses(self) -> Float64[np.ndarray, "objects 7"]:
+        """T_world_object of the task's objects: x y z (m), qw qx qy qz."""
+        return np.array(self.data.qpos[self.scene.object_qpos])
+
+    def object_speeds(self) -> Float64[np.ndarray, " objects"]:
+        """Largest of each object's linear (m/s) and angular (rad/s) speed components."""
+        return np.abs(self.data.qvel[self.scene.object_qvel]).max(axis=1)
+
+    def hand_touches_object(self) -> bool:
+        """Whether any part of a hand is in contact with any of the task's objects."""
+        geoms = self.data.contact.geom[: self.data.ncon]
+        hand = self.scene.is_hand_geom[geoms].any(axis=1)
+        return bool((hand & self.scene.is_object_geom[geoms].any(axis=1)).any())
+
+    def state(self) -> Float64[np.ndarray, " numbers"]:
+        """Everything the future depends on, commands included."""
+        size = mujoco.mj_stateSize(self.scene.model, STATE_KIND)
+        state = np.empty(size)
+        mujoco.mj_getState(self.scene.model, self.data, state, STATE_KIND)
+        return state
+
+    def set_state(self, state: np.ndarray, *, step_index: int) -> None:
+        """Continue from a state of `state`, `step_index` physics steps after the start."""
+        size = mujoco.mj_stateSize(self.scene.model, STATE_KIND)
+        if state.shape != (size,):
+            raise InvalidInputError(f"twin state: got shape {state.shape}, expected ({size},)")
+        mujoco.mj_setState(self.scene.model, self.data, state, STATE_KIND)
+        self.step_index = step_index

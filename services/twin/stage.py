@@ -1,0 +1,108 @@
+"""A task set up with a domain's hands: seed in, everything in its place and the script out."""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.transforms import transform_from_pose
+from dextouch.hands.actions import AnchorPoses, HandTrajectory
+from services.twin.cameras import CameraRig
+from services.twin.demonstrators import WaypointNoise, at_own_tempo, follow, head_sway
+from services.twin.hands import Domain
+from services.twin.scene import compile_scene
+from services.twin.settings import TwinSettings
+from services.twin.simulation import Command, Simulation
+from services.twin.tasks import get_task
+
+MAX_NOISE_M: Final = 0.2
+# Where the objects of a miss episode go: aside, or behind the viewer where nobody sees them.
+_ASIDE_M: Final = 0.13
+_SHELF_Y_M: Final = -3.0
+# Independent random numbers for each purpose, so that noise never changes the placement.
+_PLACEMENT, _NOISE, _SWAY, _MISS, _HABIT, _TEMPO = range(6)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What one take will do: where things really are, and the commands of every grid step."""
+
+    object_poses: Float64[np.ndarray, "objects 7"]
+    commands: HandTrajectory
+
+
+def command_row(commands: HandTrajectory, row: int) -> Command:
+    """One grid step of a trajectory as a command."""
+    return Command(
+        np.stack(commands.anchor(row).as_tuple()),
+        np.stack([commands.joints_left_rad[row], commands.joints_right_rad[row]]),
+    )
+
+
+class Stage:
+    """One task with one domain's hands: the compiled scene, its simulation and its cameras."""
+
+    def __init__(self, task: str, domain: Domain, settings: TwinSettings) -> None:
+        self.task = get_task(task)
+        self.domain: Domain = domain
+        self._settings = settings
+        scene = compile_scene(
+            domain, objects=self.task.objects_mjcf(), object_names=self.task.object_names
+        )
+        self.simulation = Simulation(scene)
+        self.rig = CameraRig(
+            scene, height_px=settings.image_height_px, width_px=settings.image_width_px
+        )
+
+    def plan(self, seed: int, *, noise_m: float = 0.0, miss: bool = False) -> Plan:
+        """The take of one seed.
+
+        Args:
+            seed: 0 or more; decides placement, habits and, if there is any, the noise.
+            noise_m: standard deviation of the demonstrator's error at each place, 0 … 0.2 m.
+            miss: the objects are elsewhere but the demonstrator moves as if they were not.
+        """
+        if seed < 0 or not 0.0 <= noise_m <= MAX_NOISE_M:
+            raise InvalidInputError(
+                f"twin: got seed {seed} and noise {noise_m} m, expected seed ≥ 0 and noise "
+                f"0 … {MAX_NOISE_M} m"
+            )
+        placed = self.task.place(np.random.default_rng([seed, _PLACEMENT]))
+        errors = np.random.default_rng([seed, _NOISE])
+        waypoints = self.task.script(
+            placed,
+            domain=self.domain,
+            generator=np.random.default_rng([seed, _HABIT]),
+            noise=(WaypointNoise.draw(errors, noise_m), WaypointNoise.draw(errors, noise_m)),
+        )
+        waypoints = at_own_tempo(waypoints, np.random.default_rng([seed, _TEMPO]))
+        commands = follow(waypoints, head_sway(np.random.default_rng([seed, _SWAY])))
+        if miss:
+            placed = _displaced(placed, np.random.default_rng([seed, _MISS]))
+        return Plan(placed, commands)
+
+    def start(self, plan: Plan) -> AnchorPoses:
+        """Set everything up for a take; the anchor is what is measured at step 0."""
+        self.simulation.place(
+            command_row(plan.commands, 0), plan.object_poses, settle_s=self._settings.settle_s
+        )
+        return self.anchor()
+
+    def anchor(self) -> AnchorPoses:
+        """Measured poses of wrists and head camera now."""
+        left, right = transform_from_pose(self.simulation.wrist_poses())
+        return AnchorPoses(left, right, transform_from_pose(self.simulation.head_pose()))
+
+
+def _displaced(
+    poses: Float64[np.ndarray, "objects 7"], generator: np.random.Generator
+) -> Float64[np.ndarray, "objects 7"]:
+    moved = poses.copy()
+    direction = generator.uniform(0.0, 2 * np.pi)
+    if generator.random() < 0.5:
+        moved[:, 1] += _SHELF_Y_M
+    else:
+        moved[:, :2] += _ASIDE_M * np.array([np.cos(direction), np.sin(direction)])
+    return moved

@@ -1,0 +1,22 @@
+"""Task names in, tasks out."""
+
+from typing import Final
+
+from dextouch.errors import UnknownNameError
+from services.twin.tasks.stack_bowls import StackBowls
+from services.twin.tasks.stand_bottle import StandBottle
+from services.twin.tasks.task import Task
+
+_TASKS: Final[dict[str, Task]] = {task.name: task for task in (StandBottle(), StackBowls())}
+TASK_NAMES: Final = tuple(_TASKS)
+
+
+def get_task(name: str) -> Task:
+    """One task.
+
+    Raises:
+        UnknownNameError: no such task.
+    """
+    if name not in _TASKS:
+        raise UnknownNameError("task", name, list(_TASKS))
+    return _TASKS[name]

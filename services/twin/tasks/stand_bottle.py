@@ -1,0 +1,148 @@
+"""Stand Bottle: a lying bottle's place in, a one-handed grasp, turn and set-down out."""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from dextouch.geometry.transforms import transform, transform_from_pose
+from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
+from services.twin.grasps import CylinderGrasp, opened, pressing
+from services.twin.hands import Domain, twin_hand
+from services.twin.mjcf import numbers
+from services.twin.simulation import Simulation
+from services.twin.tasks.postures import PALM_DOWN, relaxed
+from services.twin.tasks.task import REST_SPEED
+
+_RADIUS_M: Final = 0.025
+_HALF_LENGTH_M: Final = 0.115
+# A foot and a collar of this radius at its ends: it lies level, and fingers fit under it.
+_FOOT_RADIUS_M, _FOOT_HALF_M = 0.034, 0.008
+_CAP_RADIUS_M, _CAP_HALF_M = 0.014, 0.014
+# Where the bottle's middle is in the hand, along its own axis.
+_ALONG_M: Final = 0.010
+_GRASPS: Final[dict[Domain, CylinderGrasp]] = {
+    "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.050, _FOOT_RADIUS_M),
+    "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.050, _FOOT_RADIUS_M),
+}
+_SQUEEZE_N: Final = 10.0
+_OPEN_M: Final = 0.020
+# How far below the table the bottle is sent, so that the compliant wrist sets it down firmly.
+_PUSH_M: Final = 0.001
+# How the bottle lies in the closed hand: thumb and fingers turn it when they press. Its axis
+# (towards the cap) and its middle in the frame of the grasp, found by closing the hand once.
+_HELD_AXES: Final[dict[Domain, tuple[float, float, float]]] = {
+    "robot": (0.889, -0.130, -0.440),
+    "human": (0.967, -0.028, -0.250),
+}
+_HELD_MIDDLES_M: Final[dict[Domain, tuple[float, float, float]]] = {
+    "robot": (0.0088, -0.0017, 0.0015),
+    "human": (0.0127, -0.0010, -0.0010),
+}
+_RELEASE_S: Final = 0.4
+# Bottle's own z (its cap) points to world -x when it lies at yaw 0.
+_LYING: Final = rotation_from_vector(np.array([0.0, -0.5 * np.pi, 0.0]))
+_ROLL_UP: Final = rotation_from_vector(np.array([0.0, 0.5 * np.pi, 0.0]))
+
+
+def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
+    return rotation_from_vector(np.array([0.0, 0.0, yaw_rad]))
+
+
+def _turn_to_x(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
+    """The smallest rotation that takes an axis to x."""
+    unit = axis / np.linalg.norm(axis)
+    turn = np.cross(unit, [1.0, 0.0, 0.0])
+    sine = float(np.linalg.norm(turn))
+    return rotation_from_vector(turn / max(sine, 1e-12) * np.arctan2(sine, unit[0]))
+
+
+class StandBottle:
+    """Grasp the lying bottle with the right hand, turn it upright, set it down, let go."""
+
+    name = "stand_bottle"
+    instruction = "Pick up the bottle lying on the table and stand it upright."
+    object_names = ("bottle",)
+
+    def objects_mjcf(self) -> str:
+        """A cylinder with foot, collar and a narrower cap."""
+        foot, foot_z = (_FOOT_RADIUS_M, _FOOT_HALF_M), _HALF_LENGTH_M - _FOOT_HALF_M
+        cap_z = _HALF_LENGTH_M + _CAP_HALF_M
+        return (
+            '<body name="bottle"><freejoint/>'
+            f'<geom name="bottle_body" class="object" type="cylinder" mass="0.14" '
+            f'size="{numbers((_RADIUS_M, _HALF_LENGTH_M))}" rgba="0.20 0.62 0.32 1"/>'
+            f'<geom name="bottle_foot" class="object" type="cylinder" mass="0.04" '
+            f'size="{numbers(foot)}" pos="0 0 {-foot_z!r}" rgba="0.13 0.42 0.22 1"/>'
+            f'<geom name="bottle_collar" class="object" type="cylinder" mass="0.02" '
+            f'size="{numbers(foot)}" pos="0 0 {foot_z!r}" rgba="0.13 0.42 0.22 1"/>'
+            f'<geom name="bottle_cap" class="object" type="cylinder" mass="0.02" '
+            f'size="{numbers((_CAP_RADIUS_M, _CAP_HALF_M))}" pos="0 0 {cap_z!r}" '
+            'rgba="0.95 0.92 0.30 1"/></body>'
+        )
+
+    def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "1 7"]:
+        """Lying to the right of the middle, ±3 cm and ±0.25 rad."""
+        x, y = generator.uniform(-0.03, 0.03, size=2)
+        R = _yawed(float(generator.uniform(-0.25, 0.25))) @ _LYING
+        return np.array([[0.08 + x, 0.02 + y, _FOOT_RADIUS_M, *quaternion_from_rotation(R)]])
+
+    def script(
+        self,
+        object_poses: Float64[np.ndarray, "1 7"],
+        *,
+        domain: Domain,
+        generator: np.random.Generator,
+        noise: tuple[WaypointNoise, WaypointNoise],
+    ) -> list[Waypoint]:
+        """Over it, down, close, lift, roll, set down, open, away."""
+        grasp = _GRASPS[domain]
+        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
+        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
+        T_world_bottle = transform_from_pose(object_poses[0])
+        yaw = float(np.arctan2(-T_world_bottle[1, 2], -T_world_bottle[0, 2]))
+        R_axis = grasp.axis_rotation()
+        offset = grasp.axis_point_m(twin_hand("right", domain)) + _ALONG_M * R_axis[:, 0]
+        start_m, target_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+
+        held = grasp.axis_point_m(twin_hand("right", domain)) + R_axis @ _HELD_MIDDLES_M[domain]
+
+        def hand(R_world_wrist: np.ndarray, bottle_m: np.ndarray, joints: np.ndarray) -> HandPose:
+            return HandPose(transform(R_world_wrist, bottle_m - R_world_wrist @ offset), joints)
+
+        R_down = _yawed(yaw) @ PALM_DOWN @ R_axis.T
+        R_grasp = _yawed(yaw + noise[0].yaw_rad) @ PALM_DOWN @ R_axis.T
+        R_up = _yawed(yaw + noise[1].yaw_rad) @ _ROLL_UP @ PALM_DOWN
+        R_up = R_up @ _turn_to_x(np.array(_HELD_AXES[domain])) @ R_axis.T
+        there = T_world_bottle[:3, 3]
+        above = moved(hand(R_down, there, open_hand), start_m + np.array([0.0, -0.02, 0.14]))
+        reach = hand(R_grasp, there + noise[0].offset_m, open_hand)
+        target = np.array([0.08, 0.04, _HALF_LENGTH_M]) + target_m * [1.0, 1.0, 0.0]
+        stand = HandPose(transform(R_up, target + noise[1].offset_m - R_up @ held), press)
+        away = moved(bent(stand, open_hand), [0.13, -0.02, 0.02])
+        path = [
+            (0.0, above),
+            (0.8, reach),
+            (1.15, bent(reach, press)),
+            (1.3, bent(reach, press)),
+            (1.85, moved(bent(reach, press), [0.0, 0.0, 0.14])),
+            (2.6, moved(stand, [0.0, 0.0, 0.05])),
+            (3.1, moved(stand, [0.0, 0.0, _PUSH_M])),
+            (3.3, moved(stand, [0.0, 0.0, _PUSH_M])),
+            (3.3 + _RELEASE_S, moved(bent(stand, open_hand), [0.0, 0.0, _PUSH_M])),
+            (4.8, away),
+        ]
+        rest = relaxed("left", domain)
+        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+
+    def succeeded(self, simulation: Simulation) -> bool:
+        """Upright within 8°, on the table within 1 cm, at rest, untouched."""
+        pose = simulation.object_poses()[0]
+        up = transform_from_pose(pose)[2, 2]
+        return bool(
+            up > 0.99
+            and abs(pose[2] - _HALF_LENGTH_M) < 0.01
+            and simulation.object_speeds()[0] < REST_SPEED
+            and not simulation.hand_touches_object()
+        )

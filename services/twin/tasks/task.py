@@ -1,0 +1,63 @@
+"""What every task offers: objects and their places in, waypoints and a verdict out."""
+
+from typing import Final, Protocol
+
+import numpy as np
+from jaxtyping import Float64
+
+from services.twin.demonstrators import Waypoint, WaypointNoise
+from services.twin.hands import Domain
+from services.twin.simulation import Simulation
+
+# An object that moves slower than this (m/s and rad/s) is at rest.
+REST_SPEED: Final = 0.05
+
+
+class Task(Protocol):
+    """One thing to do on the table."""
+
+    @property
+    def name(self) -> str:
+        """Identifier, snake case."""
+        ...
+
+    @property
+    def instruction(self) -> str:
+        """What an operator or a policy is told."""
+        ...
+
+    @property
+    def object_names(self) -> tuple[str, ...]:
+        """Bodies of the task, in the order of poses."""
+        ...
+
+    def objects_mjcf(self) -> str:
+        """The bodies, each with a free joint and geoms of class `object`."""
+        ...
+
+    def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "objects 7"]:
+        """T_world_object at the start: x y z (m), qw qx qy qz."""
+        ...
+
+    def script(
+        self,
+        object_poses: Float64[np.ndarray, "objects 7"],
+        *,
+        domain: Domain,
+        generator: np.random.Generator,
+        noise: tuple[WaypointNoise, WaypointNoise],
+    ) -> list[Waypoint]:
+        """How the demonstrator does it.
+
+        Args:
+            object_poses: where the demonstrator believes the objects are.
+            domain: whose hands.
+            generator: of the habits that vary between takes but do not depend on `noise`.
+            noise: errors at the first (grasp) and second (place) location. The first waypoint is
+                free of them.
+        """
+        ...
+
+    def succeeded(self, simulation: Simulation) -> bool:
+        """Whether the task is done now: objects in pose, at rest, and no hand touching them."""
+        ...
