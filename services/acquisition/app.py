@@ -43,10 +43,11 @@ class _MockStation:
 
     def __init__(self, settings: AcquisitionSettings) -> None:
         from services.acquisition.mocks.faults import FaultScript
-        from services.acquisition.mocks.pattern import pattern_streams
+        from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
         from services.acquisition.mocks.station import MockStation
 
         streams, calibration = pattern_streams(), load_calibration(settings.calibration)
+        calibration = {**pattern_calibration(), **calibration}
         if settings.mock_store is not None and settings.mock_episode_id is not None:
             from dextouch.episodes import EpisodeStore
             from services.acquisition.mocks.episode import replay_calibration, replay_streams

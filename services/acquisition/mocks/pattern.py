@@ -5,12 +5,15 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
+from dextouch.geometry.cameras import pinhole_matrix
 from dextouch.hands.skeleton import CHAINS, NUM_KEYPOINTS, chain_indices
+from dextouch.schemas.episodes import Matrix, matrix_rows
 from dextouch.streams.descriptors import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, join_pads
 from services.acquisition.mocks.replay import ReplayStream
 
 IMAGE_PX = 64
+FOVY_RAD = 1.0
 PEAK_KPA = 30.0
 ROUND_S = 8.0
 
@@ -43,6 +46,12 @@ def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
     streams.append(_stream("head", "pose", (100.0, "pose_m_wxyz"), round_s, head))
     streams.append(_stream("camera_head", "image", (30.0, "rgb8"), round_s, _images))
     return streams
+
+
+def pattern_calibration() -> dict[str, Matrix]:
+    """The matrix of the made-up head camera, which alignment asks for."""
+    K_head = pinhole_matrix(width_px=IMAGE_PX, height_px=IMAGE_PX, fovy_rad=FOVY_RAD)
+    return {"K_head": matrix_rows(K_head)}
 
 
 def _stream(
