@@ -37,7 +37,6 @@ class ArrayEntry(BaseModel):
     dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
     shape: tuple[int, ...] = Field(min_length=1)
     chunk_rows: int = Field(ge=1)
-    codec: Literal["zstd", "plain"]
     dimension_names: tuple[str, ...]
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
@@ -109,11 +108,10 @@ def array_metadata(entry: ArrayEntry) -> bytes:
     little = {"name": "bytes", "configuration": {"endian": "little"}}
     compress = {"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": False}}
     checksum = {"name": "crc32c"}
-    inner = [{"name": "bytes"} if entry.dtype == "uint8" else little]
-    inner += [compress, checksum] if entry.codec == "zstd" else [checksum]
+    plain = {"name": "bytes"} if entry.dtype == "uint8" else little
     sharding = {
         "chunk_shape": [rows, *row_shape],
-        "codecs": inner,
+        "codecs": [plain, compress, checksum],
         "index_codecs": [little, checksum],
         "index_location": "end",
     }

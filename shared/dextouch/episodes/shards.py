@@ -45,7 +45,6 @@ class ShardWriter:
         dtype: of the rows, little endian.
         row_shape: of one row.
         chunk_rows: rows a storage chunk.
-        compress: zstd, or stored as it is (bytes that are compressed already).
     """
 
     def __init__(
@@ -55,11 +54,10 @@ class ShardWriter:
         dtype: np.dtype[np.generic],
         row_shape: tuple[int, ...],
         chunk_rows: int,
-        compress: bool,
     ) -> None:
         self.num_rows = 0
         self._dtype, self._row_shape, self._chunk_rows = dtype, row_shape, chunk_rows
-        self._zstd = Zstd(level=ZSTD_LEVEL) if compress else None
+        self._zstd = Zstd(level=ZSTD_LEVEL)
         self._pending: list[np.ndarray] = []
         self._num_pending = 0
         self._index: list[tuple[int, int]] = []
@@ -104,7 +102,7 @@ class ShardWriter:
 
     def _write_chunk(self) -> None:
         data = np.concatenate(self._pending).tobytes()
-        encoded = _with_crc(self._zstd.encode(data) if self._zstd else data)
+        encoded = _with_crc(self._zstd.encode(data))
         with disk_errors("write storage chunk"):
             write_all(self._file, encoded)
         self._index.append((self._offset, len(encoded)))
@@ -178,11 +176,10 @@ class ShardReader:
         body = _without_crc(data, what)
         shape = (self._entry.chunk_rows, *self._entry.shape[1:])
         expected = math.prod(shape) * self._dtype.itemsize
-        if self._entry.codec == "zstd":
-            try:
-                body = Zstd().decode(body)
-            except (RuntimeError, ValueError) as error:
-                raise CorruptDataError(f"{what}: no zstd data ({error})") from error
+        try:
+            body = Zstd().decode(body)
+        except (RuntimeError, ValueError) as error:
+            raise CorruptDataError(f"{what}: no zstd data ({error})") from error
         if len(body) != expected:
             raise CorruptDataError(f"{what}: got {len(body)} bytes, expected {expected}")
         return np.frombuffer(body, dtype=self._dtype).reshape(shape)

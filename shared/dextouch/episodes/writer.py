@@ -12,30 +12,21 @@ import numpy as np
 from dextouch.episodes.files import disk_errors, sync_folder, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
-    JPEG_CHUNK_BYTES,
-    JPEG_END_SUFFIX,
     METADATA_FILE,
     STAMPS,
-    ArrayEntry,
     CommitRecord,
     Kind,
-    array_metadata,
     array_names,
-    chunk_rows,
     encode_commit,
     group_metadata,
     sha256_hex,
-    shard_path,
 )
-from dextouch.episodes.shards import ShardWriter
+from dextouch.episodes.stream_writer import StreamWriter
 from dextouch.errors import (
     ConflictError,
     InvalidInputError,
-    NonFiniteError,
-    ShapeError,
     UnknownNameError,
 )
-from dextouch.images.jpeg import encode_jpeg, jpeg_size
 from dextouch.schemas.episodes import EpisodeAttributes, json_ready
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.checks import JPEG_UNIT
@@ -43,155 +34,6 @@ from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
 
 Attributes = EpisodeAttributes | RecordingAttributes
-
-
-class _ArrayWriter:
-    """One array: its shard and what the commit record will say about it."""
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        dtype: str,
-        row_shape: tuple[int, ...],
-        chunk_rows: int,
-        compress: bool,
-        time_dimension: str,
-    ) -> None:
-        self._path, self._dtype, self._row_shape = path, dtype, row_shape
-        self._chunk_rows, self._codec = chunk_rows, "zstd" if compress else "plain"
-        axes = (f"{path.name}_axis{axis}" for axis in range(1, 1 + len(row_shape)))
-        self._dimension_names = (time_dimension, *axes)
-        self._shard = ShardWriter(
-            path / shard_path(1 + len(row_shape)),
-            dtype=np.dtype(dtype).newbyteorder("<"),
-            row_shape=row_shape,
-            chunk_rows=chunk_rows,
-            compress=compress,
-        )
-
-    def append(self, rows: np.ndarray) -> None:
-        self._shard.append(rows)
-
-    def finish(self) -> ArrayEntry:
-        digest = self._shard.finish()
-        entry = ArrayEntry.model_validate(
-            {
-                "dtype": self._dtype,
-                "shape": (self._shard.num_rows, *self._row_shape),
-                "chunk_rows": self._chunk_rows,
-                "codec": self._codec,
-                "dimension_names": self._dimension_names,
-                "sha256": digest,
-            }
-        )
-        with disk_errors(f"write metadata of {self._path.name}"):
-            write_file(self._path / METADATA_FILE, array_metadata(entry))
-        return entry
-
-    def close(self) -> None:
-        self._shard.close()
-
-
-class _StreamWriter:
-    """One stream: its values, its stamps, and the checks that every block passes."""
-
-    def __init__(self, folder: Path, descriptor: StreamDescriptor, kind: Kind) -> None:
-        self.descriptor, self._kind = descriptor, kind
-        self._last_stamp_ns: int | None = None
-        self._num_bytes = 0
-        self._is_jpeg = descriptor.unit == JPEG_UNIT
-        name, rows, time = descriptor.name, chunk_rows(descriptor), f"{descriptor.name}_time"
-        if self._is_jpeg:
-            values = _ArrayWriter(
-                folder / name,
-                dtype="uint8",
-                row_shape=(),
-                chunk_rows=JPEG_CHUNK_BYTES,
-                compress=False,
-                time_dimension=f"{name}_byte",
-            )
-        else:
-            values = _ArrayWriter(
-                folder / name,
-                dtype=descriptor.dtype,
-                row_shape=descriptor.shape,
-                chunk_rows=rows,
-                compress=True,
-                time_dimension=time,
-            )
-        self.arrays = {name: values}
-        for other in array_names(descriptor, kind)[1:]:
-            self.arrays[other] = _ArrayWriter(
-                folder / other,
-                dtype="int64",
-                row_shape=(),
-                chunk_rows=rows,
-                compress=True,
-                time_dimension=time,
-            )
-
-    def append(self, values: np.ndarray, stamps: dict[str, np.ndarray]) -> None:
-        name = self.descriptor.name
-        for stamp, column in stamps.items():
-            if column.dtype != np.int64 or column.shape != (len(values),):
-                raise ShapeError(
-                    f"{name}: {stamp} is {column.dtype} {column.shape}, expected int64 "
-                    f"[{len(values)}] like the values"
-                )
-        if not len(values):
-            return
-        self._check_order(stamps[STAMPS[self._kind][0]])
-        if self._is_jpeg:
-            self._append_images(values)
-        else:
-            self.arrays[name].append(self._checked(values))
-        for stamp, column in stamps.items():
-            self.arrays[f"{name}_{stamp}"].append(column)
-
-    def _check_order(self, stamps_ns: np.ndarray) -> None:
-        # Arrival stamps may repeat: a device can hand over several samples at once.
-        least = 1 if self._kind == "episode" else 0
-        last = [] if self._last_stamp_ns is None else [self._last_stamp_ns]
-        steps = np.diff(np.concatenate([np.array(last, dtype=np.int64), stamps_ns]))
-        bad = np.flatnonzero(steps < least)
-        if len(bad):
-            raise InvalidInputError(
-                f"{self.descriptor.name}: stamp goes from sample to sample by "
-                f"{int(steps[bad[0]])} ns at place {int(bad[0])} of this block, expected at "
-                f"least {least} ns; sort the samples or drop the repeated ones"
-            )
-        self._last_stamp_ns = int(stamps_ns[-1])
-
-    def _checked(self, values: np.ndarray) -> np.ndarray:
-        descriptor = self.descriptor
-        if values.dtype != descriptor.numpy_dtype() or values.shape[1:] != descriptor.shape:
-            raise ShapeError(
-                f"{descriptor.name}: got values {values.dtype} {values.shape}, expected "
-                f"{descriptor.dtype} [n, {', '.join(map(str, descriptor.shape))}]"
-            )
-        # Recordings stay as the device spoke; in an episode nothing downstream expects NaN.
-        if self._kind == "episode" and values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise NonFiniteError(
-                f"{descriptor.name}: {int((~np.isfinite(values)).sum())} values are NaN or "
-                "infinite; leave invalid samples out of an episode"
-            )
-        return values
-
-    def _append_images(self, values: np.ndarray) -> None:
-        """Object array of JPEG bytes (kept as they are) or uint8 images (encoded here)."""
-        name, shape = self.descriptor.name, self.descriptor.shape
-        if values.dtype != object:
-            values = np.array([*map(encode_jpeg, values), b""], dtype=object)[:-1]
-        for index, data in enumerate(values):
-            size = jpeg_size(data, where=f"{name}: image {index} of this block")
-            if size != shape[:2]:
-                raise ShapeError(f"{name}: image {index} is {size} pixels, expected {shape[:2]}")
-        lengths = np.array([len(data) for data in values], dtype=np.int64)
-        ends = self._num_bytes + np.cumsum(lengths)
-        self._num_bytes = int(ends[-1])
-        self.arrays[name].append(np.frombuffer(b"".join(values), dtype=np.uint8))
-        self.arrays[name + JPEG_END_SUFFIX].append(ends)
 
 
 class EpisodeWriter:
@@ -210,7 +52,7 @@ class EpisodeWriter:
     def __init__(self, *, stage: Path, target: Path, kind: Kind, attributes: Attributes) -> None:
         self._stage, self._target, self._kind = stage, target, kind
         self._attributes = attributes
-        self._streams: dict[str, _StreamWriter] = {}
+        self._streams: dict[str, StreamWriter] = {}
         with disk_errors(f"create {stage}"):
             stage.mkdir(parents=True)
             # Held as long as the writer lives: tells a sweep that this stage is not abandoned.
@@ -237,7 +79,7 @@ class EpisodeWriter:
         for name in array_names(descriptor, self._kind):
             if name in taken:
                 raise ConflictError(f"stream {descriptor.name!r}: array {name!r} exists already")
-        self._streams[descriptor.name] = _StreamWriter(self._stage, descriptor, self._kind)
+        self._streams[descriptor.name] = StreamWriter(self._stage, descriptor, self._kind)
 
     def append(
         self,
@@ -315,8 +157,7 @@ class EpisodeWriter:
                 self._commit()
         finally:
             for stream in self._streams.values():
-                for array in stream.arrays.values():
-                    array.close()
+                stream.close()
             shutil.rmtree(self._stage, ignore_errors=True)
             os.close(self._lock)
 
@@ -328,9 +169,9 @@ class EpisodeWriter:
             json_ready(self._attributes.model_copy(update={"streams": descriptors}))
         )
         entries = {
-            name: array.finish()
+            name: entry
             for stream in self._streams.values()
-            for name, array in stream.arrays.items()
+            for name, entry in stream.finish().items()
         }
         record = CommitRecord(
             kind=self._kind,

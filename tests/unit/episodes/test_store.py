@@ -328,3 +328,17 @@ def test_a_killed_writer_leaves_nothing_to_see(store):
     assert store.list(kind="recording") == []
     assert store.sweep() == 1
     assert list((store.root / ".staging").iterdir()) == []
+
+
+def test_a_refused_block_leaves_no_trace(made, store):
+    with store.writer(attributes=made.attributes) as writer:
+        writer.add_stream(scalar_stream())
+        writer.append("force", values=np.ones((2, 2), "f4"), t_ref_ns=np.array([1, 2]))
+        with pytest.raises(NonFiniteError):
+            writer.append("force", values=np.full((1, 2), np.nan, "f4"), t_ref_ns=np.array([9]))
+        with pytest.raises(InvalidInputError):
+            writer.append("force", values=np.ones((1, 2), "f4"), t_ref_ns=np.array([2]))
+        writer.append("force", values=np.ones((1, 2), "f4"), t_ref_ns=np.array([3]))
+    data = store.open("stand-bottle-0003").read("force")
+    assert data.t_ref_ns.tolist() == [1, 2, 3]
+    assert (data.values == 1).all()
