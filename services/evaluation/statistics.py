@@ -68,7 +68,7 @@ def bootstrap_mean_interval(
     values: np.ndarray,
     generator: np.random.Generator,
     *,
-    num_draws: int = 2000,
+    num_draws: int = 1000,
     confidence: float = 0.95,
 ) -> Interval:
     """Percentile interval of the mean of independent values [n].
@@ -90,7 +90,7 @@ def bootstrap_agreement(
     imagined: np.ndarray,
     measure: str,
     generator: np.random.Generator,
-    num_draws: int = 2000,
+    num_draws: int = 1000,
 ) -> AgreementInterval:
     """95 % percentile interval of an agreement figure, drawing the matched starts anew.
 

@@ -1,5 +1,6 @@
 """Figures and pictures of a run in; one self-contained HTML page out."""
 
+from services.evaluation.reporting.from_episodes import action_picture, episode_picture
 from services.evaluation.reporting.page import write_report
 from services.evaluation.reporting.pictures import (
     ActionPicture,
@@ -13,5 +14,7 @@ __all__ = [
     "EpisodePicture",
     "PredictionPicture",
     "ReportPictures",
+    "action_picture",
+    "episode_picture",
     "write_report",
 ]

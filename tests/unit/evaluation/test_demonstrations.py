@@ -1,0 +1,131 @@
+"""Episodes of a store as arrays and pictures, and what is refused."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams.descriptors import StreamDescriptor
+from services.evaluation.__main__ import main
+from services.evaluation.demonstrations import instructions_of, read_demonstrations
+from services.evaluation.reporting import action_picture, episode_picture
+from services.evaluation.starts import refuse_training_starts, start_digest
+from services.evaluation.success_probe import SuccessProbe
+from tests.unit.evaluation import toy
+
+GRID_NS = np.round(np.arange(toy.STEPS) * 1e9 / 15).astype(np.int64)
+
+
+def write(store: EpisodeStore, item: toy.Demonstration, **changed: object) -> None:
+    """A toy demonstration as an episode of the store."""
+    attributes = {
+        "episode_id": item.episode_id, "task": item.task, "instruction": item.instruction,
+        "domain": "robot", "origin": "twin", "seed": item.seed, "success": item.success,
+        "anchor": StoredAnchor.from_poses(toy.ANCHOR), "K_head": matrix_rows(toy.K_HEAD),
+    }  # fmt: skip
+    pose = {"kind": "robot_state", "dtype": "float64", "unit": "action", "shape": (67,)}
+    touch = {"kind": "tactile", "dtype": "float32", "unit": "kPa", "shape": (320,)}
+    streams = {
+        "action": (item.measured, pose),
+        "action_commanded": (item.commanded, pose),
+        "camera_head": (
+            item.images,
+            {"kind": "image", "dtype": "uint8", "unit": "rgb8", "shape": item.images.shape[1:]},
+        ),
+        "tactile_left": (item.tactile_kpa[:, 0], touch),
+        "tactile_right": (item.tactile_kpa[:, 1], touch),
+    }
+    built = EpisodeAttributes.model_validate(attributes | changed)
+    with store.writer(kind="episode", attributes=built) as writer:
+        for name, (values, fields) in streams.items():
+            writer.add_stream(StreamDescriptor(name=name, nominal_rate_hz=15, **fields))
+            writer.append(name, values=values, t_ref_ns=GRID_NS)
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("episodes")
+    store = EpisodeStore(folder)
+    for item in toy.demonstrations(range(12), noise_m=0.06):
+        write(store, item)
+    write(store, toy.demonstration("reach", 77, name="a-person"), domain="human")
+    return str(folder)
+
+
+def test_arrays_come_back_as_they_were(url):
+    found = {d.episode_id: d for d in read_demonstrations(EpisodeStore(url))}
+    assert len(found) == 24
+    assert "a-person" not in found
+    item = toy.demonstration("reach far", 4, noise_m=0.06)
+    back = found[item.episode_id]
+    for name in ("images", "tactile_kpa", "measured", "commanded"):
+        np.testing.assert_allclose(getattr(back, name), getattr(item, name), atol=1e-12)
+    assert (back.success, back.seed, back.start_digest) == (
+        item.success,
+        item.seed,
+        item.start_digest,
+    )
+    assert instructions_of(found.values()) == toy.INSTRUCTIONS
+
+
+def test_tasks_can_be_chosen(url):
+    chosen = read_demonstrations(EpisodeStore(url), tasks=["reach"])
+    assert {d.task for d in chosen} == {"reach"}
+    with pytest.raises(NotFoundError, match="juggle"):
+        read_demonstrations(EpisodeStore(url), tasks=["juggle"])
+
+
+def test_an_unknown_outcome_is_refused(tmp_path):
+    store = EpisodeStore(tmp_path)
+    write(store, toy.demonstration("reach", 1, name="who-knows"), success=None)
+    with pytest.raises(InvalidInputError, match="who-knows"):
+        read_demonstrations(store)
+
+
+def test_pictures_of_an_episode(url):
+    reader = EpisodeStore(url).open("reach-3-0")
+    picture = episode_picture(reader, num_moments=5)
+    assert picture.times_s == pytest.approx([0, 20 / 15, 40 / 15, 60 / 15, 80 / 15])
+    assert picture.title == "reach, robot, twin: success"
+    np.testing.assert_array_equal(picture.images[-1], toy.demonstration("reach", 3).images[-1])
+    actions = action_picture(reader)
+    assert actions.measured.shape == actions.commanded.shape == (toy.STEPS, 67)
+
+
+def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
+    output, figures = tmp_path / "probe.safetensors", tmp_path / "figures.json"
+    flags = ["--episodes", url, "--output", str(output), "--json", str(figures)]
+    training = ["--training.num_training_steps", "3", "--training.held_out_share", "0.5"]
+    assert main(["train-probe", *flags, *training]) == 0
+    assert "held_out_accuracy" in capsys.readouterr().out
+    probe = SuccessProbe.load(output)
+    assert probe.metadata.settings["instructions"] == toy.INSTRUCTIONS
+    assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
+
+
+def test_the_command_line_refuses_clearly(capsys):
+    assert main(["juggle"]) == 2
+    assert "unknown command 'juggle'" in capsys.readouterr().err
+    with pytest.raises(InvalidInputError, match="FIRST:LAST"):
+        main(["run", "--seeds", "9:3"])
+    with pytest.raises(InvalidInputError, match="episodes"):
+        main(["train-policy"])
+
+
+def test_starts_are_told_apart_by_image_and_touch():
+    item = toy.demonstration("reach", 0)
+    image, taxels = item.images[0], item.tactile_kpa[0]
+    digest = start_digest(image, taxels)
+    assert digest == start_digest(image.copy(), taxels.copy())
+    brighter, touched = image.copy(), taxels.copy()
+    brighter[3, 4, 1] ^= 1
+    touched[1, 9] += 0.01
+    assert len({digest, start_digest(brighter, taxels), start_digest(image, touched)}) == 3
+    refuse_training_starts([digest], trained_on=["something else"], what="a probe")
+    with pytest.raises(ConflictError, match="1 starts were trained on by a probe"):
+        refuse_training_starts([digest], trained_on=[digest], what="a probe")
+    with pytest.raises(InvalidInputError, match="expected one image"):
+        start_digest(item.images[:2], taxels)
