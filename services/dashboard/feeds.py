@@ -24,7 +24,7 @@ from services.dashboard.views import (
 logger = structlog.get_logger(__name__)
 
 MAX_TAXEL_BYTES = 64 * 1024
-NUM_TAKES = 8
+NUM_TAKES = 6
 
 
 class Feeds:
@@ -32,6 +32,7 @@ class Feeds:
 
     def __init__(self, upstreams: Mapping[str, Upstream], settings: DashboardSettings) -> None:
         self._upstreams = upstreams
+        self._clocks: dict[str, str] = {}
         topics = [
             Topic("station", settings.station_period_s, self._station_messages),
             Topic("taxels", settings.taxel_period_s, self._taxel_messages),
@@ -81,15 +82,24 @@ class Feeds:
             return []
         store = self._upstreams["episode_store"]
         try:
-            recordings, episodes = await asyncio.gather(
-                store.json("GET", store_api.RECORDINGS_PATH),
-                store.json("GET", store_api.EPISODES_PATH),
-            )
-            return store_api.take_views(recordings, episodes, newest=NUM_TAKES)
+            recordings = await store_api.newest_recordings(store, NUM_TAKES)
+            episodes = await store_api.newest_episodes(store, NUM_TAKES)
+            known = self._clocks
+            # An episode never changes: each is asked about once.
+            self._clocks = {
+                item.episode_id: known[item.episode_id]
+                if item.episode_id in known
+                else await store_api.clock_words(store, item.episode_id)
+                for item in episodes
+            }
         except DexTouchError as error:
             # The services topic tells operators; the log keeps the reason.
             logger.warning("takes_not_listed", error=error.message)
             return []
+        return [
+            *(store_api.episode_view(item, self._clocks) for item in episodes),
+            *(store_api.recording_view(item) for item in recordings),
+        ]
 
     async def operate(self, action: str, body: Mapping[str, Any]) -> dict[str, object]:
         """One recorder action; the recorder's new state."""

@@ -1,44 +1,87 @@
-"""The episode store's lists in, the newest takes as the page shows them out."""
+"""The episode store's answers in, the newest takes as the page shows them out."""
 
-from pydantic import ValidationError
+from collections.abc import Mapping
+from typing import TypeVar
+
+from pydantic import BaseModel, ValidationError
 
 from dextouch.errors import UnavailableError
-from dextouch.schemas.episodes import EpisodeList
-from dextouch.schemas.recordings import RecordingList
+from dextouch.schemas.episodes import EpisodeDetail, EpisodeList, EpisodeSummary
+from dextouch.schemas.recordings import RecordingList, RecordingSummary
+from services.dashboard.upstream import Upstream
 from services.dashboard.views import TakeView
 
 RECORDINGS_PATH = "/v1/recordings"
 EPISODES_PATH = "/v1/episodes"
+OUTCOMES = {True: "success", False: "failure", None: "not judged"}
+
+ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-def take_views(recordings: object, episodes: object, *, newest: int) -> list[TakeView]:
-    """The last `newest` of both lists, which the store orders by id, latest first.
+async def newest_recordings(store: Upstream, count: int) -> list[RecordingSummary]:
+    """The last recordings by id, latest first."""
+    page = await _last_page(store, RECORDINGS_PATH, count, RecordingList)
+    return list(reversed(page.recordings))
 
-    Raises:
-        UnavailableError: lists in a form this version does not know.
-    """
+
+async def newest_episodes(store: Upstream, count: int) -> list[EpisodeSummary]:
+    """The last episodes by id, latest first."""
+    page = await _last_page(store, EPISODES_PATH, count, EpisodeList)
+    return list(reversed(page.episodes))
+
+
+async def clock_words(store: Upstream, episode_id: str) -> str:
+    """How well the clocks of an episode were fitted; empty where none were."""
+    answer = await store.json("GET", f"{EPISODES_PATH}/{episode_id}")
+    clocks = _read(EpisodeDetail, answer).attributes.clocks
+    residuals_ms = [clock.residual_rms_ms for clock in clocks if clock.residual_rms_ms is not None]
+    skews_ppm = [abs(clock.skew_ppm) for clock in clocks if clock.skew_ppm is not None]
+    if not residuals_ms or not skews_ppm:
+        return ""
+    lost = sum(clock.num_dropped for clock in clocks)
+    return (
+        f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
+        f"{lost} samples lost"
+    )
+
+
+def recording_view(item: RecordingSummary) -> TakeView:
+    """A recording as the page shows it."""
+    num_samples = sum(item.num_samples.values())
+    return TakeView(
+        kind="recording",
+        name=item.recording_id,
+        task=item.task,
+        domain=item.domain,
+        outcome=f"{num_samples} samples, {len(item.num_samples)} streams",
+    )
+
+
+def episode_view(item: EpisodeSummary, clocks: Mapping[str, str]) -> TakeView:
+    """An episode as the page shows it."""
+    return TakeView(
+        kind="episode",
+        name=item.episode_id,
+        task=item.task,
+        domain=item.domain,
+        outcome=f"{OUTCOMES[item.success]}, {item.num_steps} steps",
+        clocks=clocks.get(item.episode_id, ""),
+    )
+
+
+async def _last_page(store: Upstream, path: str, count: int, model: type[ModelT]) -> ModelT:
+    """The store lists by id, oldest first: ask how many there are, then for the last of them."""
+    first = await store.json("GET", f"{path}?limit={count}")
+    total = first.get("num_matching", 0) if isinstance(first, dict) else 0
+    if not isinstance(total, int) or total <= count:
+        return _read(model, first)
+    return _read(model, await store.json("GET", f"{path}?limit={count}&offset={total - count}"))
+
+
+def _read(model: type[ModelT], answer: object) -> ModelT:
     try:
-        raw = RecordingList.model_validate(recordings).recordings
-        done = EpisodeList.model_validate(episodes).episodes
+        return model.model_validate(answer)
     except ValidationError as error:
-        raise UnavailableError(f"episode_store: lists of an unknown form ({error})") from error
-    outcomes = {True: "success", False: "failure", None: "not judged"}
-    return [
-        TakeView(
-            kind="episode",
-            name=item.episode_id,
-            task=item.task,
-            domain=item.domain,
-            outcome=f"{outcomes[item.success]}, {item.num_steps} steps",
-        )
-        for item in reversed(done[-newest:])
-    ] + [
-        TakeView(
-            kind="recording",
-            name=item.recording_id,
-            task=item.task,
-            domain=item.domain,
-            outcome=f"{sum(item.num_samples.values())} samples in {len(item.num_samples)} streams",
-        )
-        for item in reversed(raw[-newest:])
-    ]
+        raise UnavailableError(
+            f"episode_store: an answer of an unknown form ({error.error_count()} fields do not fit)"
+        ) from error

@@ -79,6 +79,7 @@ class TakeView(BaseModel):
     task: str
     domain: str
     outcome: str
+    clocks: str = ""
 
 
 class CameraView(BaseModel):

@@ -12,7 +12,7 @@ export function showServices(list, services) {
 export function showTakes(body, takes) {
   const rows = takes.map((take) => element("tr", {},
     element("td", { class: "quiet" }, take.kind), element("td", { class: "name" }, take.name),
-    element("td", {}, take.task), element("td", {}, take.domain), element("td", {}, take.outcome)));
+    element("td", {}, take.task), element("td", {}, take.domain), element("td", {}, take.outcome, take.clocks ? element("span", { class: "why" }, take.clocks) : null)));
   const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, "Nothing stored yet."));
   body.replaceChildren(...(rows.length ? rows : [empty]));
 }

@@ -22,6 +22,28 @@ EPISODE = {
     "num_steps": 81,
     "content_sha256": "a" * 64,
 }
+EYE = np.eye(4).tolist()
+DETAIL = {
+    "attributes": {
+        "episode_id": "take-0001",
+        "task": "stack_bowls",
+        "instruction": "stack the bowls",
+        "domain": "human",
+        "origin": "recorded",
+        "anchor": {
+            "T_world_wrist_left": EYE,
+            "T_world_wrist_right": EYE,
+            "T_world_camera_head": EYE,
+        },
+        "K_head": np.eye(3).tolist(),
+        "clocks": [
+            {"stream": "head", "skew_ppm": -49.7, "residual_rms_ms": 0.06, "num_samples": 530},
+            {"stream": "tactile_left", "num_samples": 320, "num_dropped": 3},
+        ],
+    },
+    "num_steps": 81,
+    "content_sha256": "a" * 64,
+}
 
 
 class FakeServices:
@@ -42,12 +64,18 @@ class FakeServices:
         self.app.get(station_api.RECORDER_PATH)(lambda: self.recorder)
         self.app.get(station_api.TAXELS_PATH)(self._taxels)
         self.app.post(station_api.RECORDER_PATH + "/{action}")(self._act)
-        self.app.get("/v1/episodes")(lambda: {"episodes": [EPISODE], "num_matching": 1})
+        self.episodes = [EPISODE]
+        self.app.get("/v1/episodes")(self._list_episodes)
+        self.app.get("/v1/episodes/{episode_id}")(lambda: DETAIL)
         self.app.get("/v1/recordings")(lambda: {"recordings": [], "num_matching": 0})
 
     async def _note(self, request, call_next):
         self.asked.append(request.url.path)
         return await call_next(request)
+
+    def _list_episodes(self, limit: int, offset: int = 0):
+        page = self.episodes[offset : offset + limit]
+        return {"episodes": page, "num_matching": len(self.episodes)}
 
     def _taxels(self):
         arrays = {f"tactile_{side}": values for side, values in PRESSURES.items()}

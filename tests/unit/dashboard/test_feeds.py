@@ -82,6 +82,25 @@ async def test_services(upstreams):
 async def test_takes(feeds):
     (take,) = await feeds.takes()
     assert (take.kind, take.name, take.outcome) == ("episode", "take-0001", "not judged, 81 steps")
+    assert take.clocks == "skew to 50 ppm, residual to 0.06 ms, 3 samples lost"
+
+
+async def test_an_episode_is_asked_about_once(feeds, services):
+    await feeds.takes()
+    await feeds.takes()
+    assert services.asked.count("/v1/episodes/take-0001") == 1
+
+
+async def test_the_newest_of_many_are_shown(feeds, services):
+    (episode,) = services.episodes
+    services.episodes = [episode | {"episode_id": f"take-{n:04d}"} for n in range(20)]
+    takes = await feeds.takes()
+    assert [take.name for take in takes] == [f"take-{n:04d}" for n in range(19, 13, -1)]
+
+
+async def test_a_foreign_list_is_no_crash(feeds, services):
+    services.episodes = [{"name": "?"}]
+    assert await feeds.takes() == []
 
 
 async def test_operate(feeds, services):
