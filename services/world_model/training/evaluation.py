@@ -57,8 +57,8 @@ def evaluate_prediction(
         psnr, psnr_copy, psnr_codec, psnr_wrong_actions (dB, mean over images); tactile_mse and its
         _copy, _zero, _codec, _wrong_actions (kPa²); contact_f1, contact_f1_copy, contact_f1_codec;
         num_windows. Copy repeats the first step, zero feels nothing, codec encodes and decodes the
-        truth, wrong actions are those of another held-out episode of the same task (absent where
-        no task has two episodes).
+        truth, wrong actions are those of another held-out episode of the same task, from half a
+        take away (absent where no task has two episodes).
 
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.
@@ -156,7 +156,11 @@ def _other_actions(
     requests: Sequence[PredictionRequest],
     kind: ActionKind,
 ) -> list[tuple[int, PredictionRequest]]:
-    """Each request with the actions of the next other episode of its task, at the same start."""
+    """Each request with actions of the next other episode of its task, from half a take away.
+
+    At the same time of a scripted take the other episode moves nearly the same way, and there
+    would be nothing to notice.
+    """
     by_task: dict[str, list[EpisodeArrays]] = {}
     for episode, _ in places:
         if all(episode is not known for known in by_task.setdefault(episode.task, [])):
@@ -166,9 +170,10 @@ def _other_actions(
         siblings = by_task[episode.task]
         here = next(i for i, known in enumerate(siblings) if known is episode)
         other = siblings[(here + 1) % len(siblings)]
-        num_steps = len(request.actions)
-        if other is not episode and start + num_steps <= len(other):
-            taken = _cut(other, start, num_steps, kind).request
+        num_starts = len(other) - len(request.actions) + 1
+        if other is not episode:
+            begin = (start + num_starts // 2) % num_starts
+            taken = _cut(other, begin, len(request.actions), kind).request
             others.append(
                 (index, replace(request, actions=taken.actions, action_kind=taken.action_kind))
             )

@@ -1,0 +1,59 @@
+"""The model behind the rollout routes: started from an observation, stepped, refused clearly."""
+
+import numpy as np
+import pytest
+from httpx import ASGITransport, AsyncClient
+
+from dextouch.schemas.rollout_codec import decode_answer, encode_start
+from dextouch.schemas.rollouts import StartRequest
+from dextouch.worlds.serve import create_world_app
+from services.world_model.settings import WorldModelSettings
+from services.world_model.world import ModelWorld
+from tests.unit.world_model.test_world import make_start
+
+FLOAT64 = {"content-type": "application/octet-stream; dtype=float64"}
+
+
+@pytest.fixture
+async def client(checkpoint):
+    world = ModelWorld(checkpoint)
+    app = create_world_app({"tiny": world}, WorldModelSettings(), name="world_model")
+    transport = ASGITransport(app, raise_app_exceptions=False)
+    async with (
+        app.router.lifespan_context(app),
+        AsyncClient(transport=transport, base_url="http://model") as opened,
+    ):
+        yield opened
+
+
+async def test_a_rollout_runs_over_http(client, toy_episode):
+    episode = toy_episode(1)
+    start = make_start(episode)
+    request = StartRequest(world="tiny", task=start.task, seed=4, instruction=start.instruction)
+    response = await client.post(
+        "/v1/rollouts",
+        content=encode_start(request, start),
+        headers={"content-type": "application/msgpack"},
+    )
+    assert response.status_code == 201, response.text
+    rollout = decode_answer(response.content, max_bytes=10**7).rollout
+    chunk = episode.actions["commanded"][1:9]
+    answer = await client.post(
+        f"/v1/rollouts/{rollout.id}/chunks/0", content=chunk.tobytes(), headers=FLOAT64
+    )
+    assert answer.status_code == 200, answer.text
+    observation = decode_answer(answer.content, max_bytes=10**7).observation
+    assert observation.first_step == 1
+    assert observation.tactile_kpa.shape == (8, 2, 320)
+    broken = np.full((8, 67), np.nan)
+    refused = await client.post(
+        f"/v1/rollouts/{rollout.id}/chunks/1", content=broken.tobytes(), headers=FLOAT64
+    )
+    assert refused.status_code in {400, 422}
+    assert refused.headers["content-type"] == "application/problem+json"
+
+
+async def test_it_is_listed_with_its_digest(client, checkpoint):
+    worlds = (await client.get("/v1/worlds")).json()["worlds"]
+    assert worlds[0]["digest"] == checkpoint.digest
+    assert worlds[0]["kind"] == "model"
