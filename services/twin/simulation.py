@@ -157,17 +157,22 @@ class Simulation:
         hand = self.scene.is_hand_geom[geoms].any(axis=1)
         return bool((hand & self.scene.is_object_geom[geoms].any(axis=1)).any())
 
+    @property
+    def state_size(self) -> int:
+        """How many numbers a state has."""
+        return mujoco.mj_stateSize(self.scene.model, STATE_KIND)
+
     def state(self) -> Float64[np.ndarray, " numbers"]:
         """Everything the future depends on, commands included."""
-        size = mujoco.mj_stateSize(self.scene.model, STATE_KIND)
-        state = np.empty(size)
+        state = np.empty(self.state_size)
         mujoco.mj_getState(self.scene.model, self.data, state, STATE_KIND)
         return state
 
     def set_state(self, state: np.ndarray, *, step_index: int) -> None:
         """Continue from a state of `state`, `step_index` physics steps after the start."""
-        size = mujoco.mj_stateSize(self.scene.model, STATE_KIND)
-        if state.shape != (size,):
-            raise InvalidInputError(f"twin state: got shape {state.shape}, expected ({size},)")
+        if state.shape != (self.state_size,):
+            raise InvalidInputError(
+                f"twin state: got shape {state.shape}, expected ({self.state_size},)"
+            )
         mujoco.mj_setState(self.scene.model, self.data, state, STATE_KIND)
         self.step_index = step_index

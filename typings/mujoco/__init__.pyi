@@ -5,15 +5,15 @@ import numpy as np
 __version__: str
 
 class mjtObj(IntEnum):
-    mjOBJ_BODY: int
-    mjOBJ_JOINT: int
-    mjOBJ_ACTUATOR: int
+    mjOBJ_BODY = 1
+    mjOBJ_JOINT = 3
+    mjOBJ_ACTUATOR = 19
 
 class mjtState(IntEnum):
-    mjSTATE_INTEGRATION: int
+    mjSTATE_INTEGRATION = 32767
 
 class mjtDisableBit(IntEnum):
-    mjDSBL_SENSOR: int
+    mjDSBL_SENSOR = 8192
 
 class _Named:
     id: int

@@ -1,0 +1,207 @@
+"""The twin as a world: rollouts of commanded actions in, what cameras and skin report out."""
+
+import hashlib
+import json
+from dataclasses import dataclass
+from importlib.metadata import version
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import (
+    AnchorPoses,
+    actions_from_poses,
+    check_actions,
+    poses_from_actions,
+)
+from dextouch.streams.packing import pack, unpack
+from dextouch.worlds.world import (
+    Observation,
+    RolloutStart,
+    StartedRollout,
+    SteppedRollout,
+    WorldDescription,
+)
+from services.twin.cameras import CAMERAS
+from services.twin.recorder import GridLog
+from services.twin.settings import TwinSettings
+from services.twin.simulation import (
+    MODEL_RATE_HZ,
+    STEPS_PER_GRID,
+    STEPS_PER_TACTILE,
+)
+from services.twin.stage import Stage, command_row
+from services.twin.tasks import TASK_NAMES, get_task
+
+MAX_SNAPSHOT_BYTES: Final = 1 << 20
+
+
+@dataclass(frozen=True)
+class TwinState:
+    """Where one rollout is: its task, its grid step, and all of the physics."""
+
+    task: str
+    seed: int
+    step: int
+    physics: Float64[np.ndarray, " numbers"]
+    anchor: AnchorPoses
+
+
+class TwinWorld:
+    """The real world of this platform until there is a robot.
+
+    A rollout starts from task and seed, at the first observation of the demonstration of that
+    seed; replaying a demonstration's `action_commanded` reproduces it to the last bit. Measured
+    actions are taken as commands. Physics has no noise: the seed of a step changes nothing.
+    """
+
+    def __init__(self, settings: TwinSettings) -> None:
+        self._settings = settings
+        self._stages: dict[str, Stage] = {}
+        self._description = self._describe()
+
+    def _stage(self, task: str) -> Stage:
+        if task not in self._stages:
+            self._stages[get_task(task).name] = Stage(task, "robot", self._settings)
+        return self._stages[task]
+
+    def _describe(self) -> WorldDescription:
+        scenes = [self._stage(task).simulation.scene.xml for task in TASK_NAMES]
+        facts = [version("mujoco-core"), self._settings.model_dump(mode="json"), scenes]
+        return WorldDescription(
+            name="twin",
+            kind="twin",
+            digest=hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest(),
+            tasks=TASK_NAMES,
+            cameras=CAMERAS,
+            image_height_px=self._settings.image_height_px,
+            image_width_px=self._settings.image_width_px,
+            model_rate_hz=MODEL_RATE_HZ,
+            action_kinds=("measured", "commanded"),
+            starts_from=("task_seed",),
+            knows_success=True,
+        )
+
+    @property
+    def description(self) -> WorldDescription:
+        """See World."""
+        return self._description
+
+    def reset(self, start: RolloutStart) -> StartedRollout[TwinState]:
+        """See World; the task's hands and objects are placed by the seed."""
+        if start.observation is not None:
+            raise InvalidInputError(
+                "world twin: got a start with an observation; it begins from task and seed only"
+            )
+        stage = self._stage(start.task)
+        anchor = stage.start(stage.plan(start.seed))
+        log = _StepLog(stage)
+        log.step()
+        state = TwinState(start.task, start.seed, 0, stage.simulation.state(), anchor)
+        return StartedRollout(
+            state, log.observation(0, anchor), anchor, stage.rig.K["camera_head"].copy()
+        )
+
+    def step(
+        self, state: TwinState, actions: Float64[np.ndarray, "steps 67"], *, seed: int
+    ) -> SteppedRollout[TwinState]:
+        """See World; wrists, fingers and head are sent along the actions."""
+        del seed
+        checked = check_actions(actions, where="world twin: actions")
+        commands = poses_from_actions(checked, state.anchor)
+        stage = self._stage(state.task)
+        stage.simulation.set_state(state.physics, step_index=state.step * STEPS_PER_GRID)
+        log = _StepLog(stage)
+        for row in range(len(checked)):
+            for step_index in stage.simulation.advance(command_row(commands, row)):
+                if step_index % STEPS_PER_TACTILE == 0:
+                    log.touch()
+            log.step()
+        after = TwinState(
+            state.task,
+            state.seed,
+            state.step + len(checked),
+            stage.simulation.state(),
+            state.anchor,
+        )
+        return SteppedRollout(after, log.observation(state.step + 1, state.anchor))
+
+    def snapshot(self, state: TwinState) -> bytes:
+        """See World."""
+        fields = {
+            "world": self._description.digest,
+            "task": state.task,
+            "seed": state.seed,
+            "step": state.step,
+        }
+        return pack(fields, {"physics": state.physics, "anchor": np.stack(state.anchor.as_tuple())})
+
+    def restore(self, data: bytes) -> TwinState:
+        """See World."""
+        fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
+        if set(fields) != {"world", "task", "seed", "step"} or set(arrays) != {"physics", "anchor"}:
+            raise InvalidInputError(
+                f"world twin: got a snapshot with {sorted(fields)} and {sorted(arrays)}, "
+                "expected one that this world made"
+            )
+        if fields["world"] != self._description.digest:
+            raise InvalidInputError(
+                f"world twin: got a snapshot of world {fields['world']!r}, expected "
+                f"{self._description.digest!r}; restore it with the version that made it"
+            )
+        task, seed, step = fields["task"], fields["seed"], fields["step"]
+        if not (isinstance(task, str) and isinstance(seed, int) and isinstance(step, int)):
+            raise InvalidInputError("world twin: the snapshot's task, seed or step is damaged")
+        physics, anchor = arrays["physics"], arrays["anchor"]
+        size = self._stage(task).simulation.state_size
+        if physics.shape != (size,) or anchor.shape != (3, 4, 4) or step < 0:
+            raise InvalidInputError(
+                f"world twin: got a snapshot of shapes {physics.shape} and {anchor.shape} at step "
+                f"{step}, expected ({size},), (3, 4, 4) and a step ≥ 0"
+            )
+        return TwinState(
+            task,
+            seed,
+            step,
+            np.array(physics, dtype=np.float64),
+            AnchorPoses(*np.array(anchor, dtype=np.float64)),
+        )
+
+
+class _StepLog:
+    """What is seen, felt and measured at consecutive grid steps of one stage."""
+
+    def __init__(self, stage: Stage) -> None:
+        self._stage = stage
+        self._grid = GridLog(stage)
+        self._images: dict[str, list[np.ndarray]] = {camera: [] for camera in CAMERAS}
+        self._tactile: list[np.ndarray] = []
+        self._since_step: list[np.ndarray] = []
+
+    def touch(self) -> None:
+        """Note the skin's sample of now."""
+        self._since_step.append(self._stage.simulation.tactile_kpa)
+
+    def step(self) -> None:
+        """Close a grid step: its tactile reading is the mean since the last one."""
+        if not self._since_step:
+            self.touch()
+        mean = np.stack(self._since_step).mean(axis=0, dtype=np.float64)
+        self._tactile.append(mean.astype(np.float32))
+        self._since_step = []
+        self._grid.sample()
+        for camera, images in self._images.items():
+            images.append(self._stage.rig.image(self._stage.simulation, camera))
+
+    def observation(self, first_step: int, anchor: AnchorPoses) -> Observation:
+        """All closed steps; success is judged at the last one."""
+        return Observation(
+            first_step=first_step,
+            images={camera: np.stack(images) for camera, images in self._images.items()},
+            tactile_kpa=np.stack(self._tactile),
+            action_reached=actions_from_poses(self._grid.trajectory(), anchor),
+            reached_is_measured=True,
+            success=self._stage.task.succeeded(self._stage.simulation),
+        )
