@@ -1,4 +1,4 @@
-"""`dextouch twin record`: tasks and seeds in, truth episodes in a store and a summary out."""
+"""`dextouch twin record|serve`: seeds to truth episodes in a store, or the twin over HTTP."""
 
 import argparse
 import json
@@ -23,6 +23,7 @@ from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.tasks import TASK_NAMES
 
+EXIT_REFUSED = 3
 _MISS_DRAW = 5
 
 
@@ -82,6 +83,7 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--store", required=True, help="folder or file:///… of the episode store")
     make.add_argument("--jobs", default=1, type=int, help="processes")
     make.add_argument("--json", type=Path, help="write a summary here")
+    commands.add_parser("serve", help="serve the twin as a world; flags: serve --help")
     return parser
 
 
@@ -138,24 +140,36 @@ def _summary(
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line; 0 is success, 2 is bad input (said on stderr)."""
-    arguments = _parser().parse_args(argv)
-    console = Console(stderr=True)
-    start_s = time.monotonic()
+    """Run the command line.
+
+    Returns:
+        0, or 3 for a refusal with its reason on stderr.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
     try:
-        orders = _orders(arguments)
-        reports = _shown(_work(orders, arguments.jobs), len(orders), console)
+        if arguments[:1] == ["serve"]:
+            from services.twin.serving import serve
+
+            serve(arguments[1:])
+            return 0
+        return _record(_parser().parse_args(arguments))
     except DexTouchError as error:
         print(f"dextouch twin: {error.message}", file=sys.stderr)
-        return 2
+        return EXIT_REFUSED
+
+
+def _record(arguments: argparse.Namespace) -> int:
+    start_s = time.monotonic()
+    orders = _orders(arguments)
+    reports = _shown(_work(orders, arguments.jobs), len(orders), Console(stderr=True))
     summary = _summary(arguments, reports, time.monotonic() - start_s)
     if arguments.json is not None:
-        arguments.json.write_text(json.dumps(summary, indent=1) + "\n")
+        content = json.dumps(summary, indent=2) + "\n"
+        arguments.json.write_text(content, encoding="utf-8")
     succeeded = sum(report.success for report in reports)
     print(
         f"{len(reports)} episodes of {arguments.task} ({arguments.domain}) in {arguments.store}: "
-        f"{succeeded} succeeded, {summary['num_misses']} were misses, "
-        f"{summary['seconds']:.1f} s"
+        f"{succeeded} succeeded, {summary['num_misses']} were misses, {summary['seconds']:.1f} s"
     )
     return 0
 

@@ -1,15 +1,12 @@
-"""Settings of the twin: environment `DEXTOUCH_TWIN_*` or arguments in, checked values out."""
+"""What can be chosen about the twin; physics and geometry belong to the code's version."""
 
-from pydantic import Field
-from pydantic_settings import BaseSettings, SettingsConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 
-class TwinSettings(BaseSettings):
-    """What can be chosen about the twin; physics and geometry are part of the code's version."""
+class TwinSettings(BaseModel):
+    """Size of the images, and how long objects settle before a take begins."""
 
-    model_config = SettingsConfigDict(
-        env_prefix="DEXTOUCH_TWIN_", env_nested_delimiter="__", frozen=True, extra="forbid"
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
     image_height_px: int = Field(default=64, ge=16, le=512)
     image_width_px: int = Field(default=64, ge=16, le=512)
