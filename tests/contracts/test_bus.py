@@ -98,6 +98,7 @@ async def test_a_cancelled_reader_loses_nothing(bus, topic):
     await asyncio.sleep(0)
     waiting.cancel()
     await asyncio.gather(waiting, return_exceptions=True)
+    assert waiting.cancelled()
     await bus.publish(topic, {"i": 7})
     assert (await take(subscription, 1))[0].fields == {"i": 7}
 

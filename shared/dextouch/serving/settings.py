@@ -11,6 +11,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas.problems import first_problems
 
 MIN_KEY_CHARACTERS = 16
+# A policy may think this long between two chunks without losing its connection.
+KEEP_ALIVE_S = 75
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
@@ -101,5 +103,6 @@ def run(app: FastAPI, settings: ServiceSettings) -> None:
         log_config=None,
         access_log=False,
         server_header=False,
+        timeout_keep_alive=KEEP_ALIVE_S,
         timeout_graceful_shutdown=settings.shutdown_grace_s,
     )

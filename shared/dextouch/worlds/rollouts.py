@@ -14,6 +14,7 @@ from typing import Any
 from weakref import WeakValueDictionary
 
 import numpy as np
+import structlog
 from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -35,6 +36,8 @@ from dextouch.worlds.admission import check_answer, check_chunk, check_selector,
 from dextouch.worlds.batcher import StepJob, WorldWorker
 from dextouch.worlds.records import LastAnswer, RecordStore, RolloutRecord, StoredRecord
 from dextouch.worlds.world import StartedRollout, World
+
+logger = structlog.get_logger(__name__)
 
 
 class RolloutLimits(BaseModel):
@@ -130,6 +133,7 @@ class RolloutService:
         )
         version = await self._records.write(RolloutRecord(info, snapshot), over_version=0)
         self._live.put(info.id, version, started.state)
+        logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = Origin(started.anchor, started.K_head)
         return Answer(encode_answer(info, started.observation, selector=selector, origin=origin))
 
@@ -157,6 +161,7 @@ class RolloutService:
             request = _ChunkRequest(check_chunk(actions, description), selector)
             replayed = _replay(stored.record, chunk, request)
             if replayed is not None:
+                logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
                 return replayed
             self._check_length(stored.record.info)
             try:
@@ -181,12 +186,14 @@ class RolloutService:
         changed = {"id": secrets.token_hex(16)} | ({} if seed is None else {"seed": seed})
         info = parent.info.model_copy(update=changed)
         await self._records.write(RolloutRecord(info, parent.snapshot), over_version=0)
+        logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
         return info
 
     async def delete(self, rollout_id: str) -> None:
         """End a rollout."""
         self._live.drop(rollout_id)
         await self._records.delete(rollout_id)
+        logger.info("rollout_deleted", rollout_id=rollout_id)
 
     def close(self) -> None:
         """End the worlds' threads; rollouts stay in the store."""

@@ -58,6 +58,7 @@ class SumWorld:
 
     def __init__(self, name: str = "sum", digest: str = "d1") -> None:
         self.num_restores = 0
+        self.num_steps = 0
         self._description = WorldDescription(
             name=name,
             kind="model",
@@ -83,6 +84,7 @@ class SumWorld:
         return StartedRollout(state, first, anchor(), K_HEAD)
 
     def step(self, state: SumState, actions: np.ndarray, *, seed: int) -> SteppedRollout[SumState]:
+        self.num_steps += 1
         actions = check_actions(actions)
         if (actions == 1e6).any():
             raise InvalidInputError("sum: joint 1e6 cannot be reached")

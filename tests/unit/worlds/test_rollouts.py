@@ -157,6 +157,7 @@ async def test_a_retry_while_the_first_try_runs_waits_and_is_replayed():
     rollout_id = await begin(made)
     answers = await asyncio.gather(*(made.step(rollout_id, 0, actions(4), ALL) for _ in range(3)))
     assert [answer.replayed for answer in answers] == [False, True, True]
+    assert made._workers["sum"].world.num_steps == 1
     made.close()
 
 
