@@ -108,10 +108,10 @@ clock = OnlineClock()
 stamps = [(n * 16_666_667, n * 16_666_667 + (n * 7919) % 1000 * 3000) for n in range(20_000)]
 best = float("inf")
 for start in range(0, 20_000, 4000):
-    began = time.perf_counter()
+    began = time.process_time()
     for device, host in stamps[start : start + 4000]:
         clock.update(t_host_ns=host, t_device_ns=device)
-    best = min(best, (time.perf_counter() - began) / 4000)
+    best = min(best, (time.process_time() - began) / 4000)
 print(best * 1e6)
 """
 
