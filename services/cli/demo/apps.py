@@ -1,0 +1,41 @@
+"""A store folder and a world model in; the applications of the services that the demo uses, out."""
+
+from pathlib import Path
+from typing import Any
+
+from fastapi import FastAPI
+
+from dextouch.worlds.baseline import CopyFirstWorld
+from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds.world import World
+from services.alignment.app import create_app as create_alignment
+from services.alignment.settings import AlignmentSettings
+from services.episode_store.app import create_app as create_store
+from services.episode_store.settings import EpisodeStoreSettings
+from services.twin.settings import TwinSettings
+from services.twin.world import TwinWorld
+from services.world_model.checkpoints import Checkpoint
+from services.world_model.world import ModelWorld
+
+
+def build_apps(store_folder: Path, world_model: Checkpoint) -> dict[str, FastAPI]:
+    """Store, alignment, the twin as the real world, and the imagined worlds.
+
+    Args:
+        store_folder: where recordings and episodes lie.
+        world_model: served beside the copy-first baseline.
+    """
+    url = str(store_folder)
+    model = ModelWorld(world_model)
+    imagined: dict[str, World[Any]] = {
+        "world_model": model,
+        "copy-first": CopyFirstWorld.beside(model.description),
+    }
+    return {
+        "episode_store": create_store(EpisodeStoreSettings(store_url=url)),
+        "alignment": create_alignment(AlignmentSettings(store_url=url)),
+        "twin": create_world_app(
+            {"twin": TwinWorld(TwinSettings())}, WorldServiceSettings(), name="twin"
+        ),
+        "imagined": create_world_app(imagined, WorldServiceSettings(), name="imagined"),
+    }

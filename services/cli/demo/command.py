@@ -1,0 +1,168 @@
+"""The flags of `dextouch demo` in; a table, report.json and report.html out."""
+
+import json
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from dextouch import __version__
+from dextouch.clients.policy import Policy
+from dextouch.episodes import EpisodeStore
+from services.cli.demo.apps import build_apps
+from services.cli.demo.background import served
+from services.cli.demo.judging import judge, ladder
+from services.cli.demo.models import Models, committed_models, train_models
+from services.cli.demo.pictures import collect
+from services.cli.demo.prediction import PredictionResult, measure_prediction
+from services.cli.demo.recording import Take, align, measure, record_take, upload
+from services.cli.demo.settings import DemoPlan, parse
+from services.cli.demo.stages import Stages
+from services.cli.demo.table import show
+from services.cli.demo.truth import Truth, make_truth
+from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.reporting import write_report
+
+# Errors that both takes have; the report's figure is the worse one.
+COMMON_ERRORS = ("taxel_mae_kpa", "fingertip_error_mm", "wrist_error_mm", "wrist_error_deg")
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the whole way once.
+
+    Returns:
+        0 when every stage ran; what was measured is in the report, good or not.
+    """
+    plan = parse(argv)
+    plan.output.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
+        report = Demo(plan, Path(folder)).run()
+    text = json.dumps(report, indent=2, allow_nan=False)
+    for path in (plan.output / "report.json", plan.json):
+        if path is not None:
+            path.write_text(text, encoding="utf-8")
+    show(report)
+    print(f"\nreport: {plan.output / 'report.html'}")
+    return 0
+
+
+class Demo:
+    """One run: its plan, its scratch folder and the stages it went through."""
+
+    def __init__(self, plan: DemoPlan, folder: Path) -> None:
+        self.plan = plan
+        self.stages = Stages()
+        self._truth_folder = folder / "truth"
+        self._store_folder = folder / "store"
+        self._spool = folder / "spool"
+
+    def run(self) -> dict[str, Any]:
+        """All stages; the report as `report.json` holds it."""
+        truth = self._make_truth()
+        models = self._models()
+        apps = build_apps(self._store_folder, models.world_model)
+        with served(apps) as urls:
+            takes = self._record(truth, urls)
+            prediction = self._predict(truth, models)
+            scores = self._judge(truth, urls, models)
+        report = self._report(takes, prediction, scores, models)
+        with self.stages.stage("report", "drawing the report"):
+            write_report(
+                report, collect(takes, prediction.pictures), self.plan.output / "report.html"
+            )
+        return {**report, "stages": self.stages.rows()}
+
+    def _make_truth(self) -> Truth:
+        stage = self.stages.stage("truth", "recording the truth in the physics twin")
+        with stage, _bar("episodes") as progress:
+            return make_truth(self.plan, self._truth_folder, progress)
+
+    def _models(self) -> Models:
+        if not self.plan.train:
+            return committed_models()
+        with self.stages.stage("train", "training world model, policy and probe"):
+            return train_models(self.plan.output / "trained")
+
+    def _record(self, truth: Truth, urls: Mapping[str, str]) -> dict[str, Take]:
+        truths = EpisodeStore(self._truth_folder)
+        aligned = EpisodeStore(self._store_folder)
+        takes = {}
+        for seed, (domain, episode_id) in enumerate(truth.takes.items()):
+            true_episode = truths.open(episode_id)
+            with self.stages.stage(f"record_{domain}", f"recording a {domain} take"):
+                recorded, devices = record_take(true_episode, self._spool, seed=seed)
+                upload(self._spool, urls["episode_store"])
+            with self.stages.stage(f"align_{domain}", f"aligning the {domain} take"):
+                job = align(urls["alignment"], recorded.recording_id)
+                takes[domain] = measure(
+                    aligned, true_episode, recorded, job.alignment_id, devices=devices
+                )
+        return takes
+
+    def _predict(self, truth: Truth, models: Models) -> PredictionResult:
+        with self.stages.stage("predict", "predicting held-out scenes with the world model"):
+            ids = [name for level in truth.demonstrations.values() for name in level]
+            return measure_prediction(models.world_model, EpisodeStore(self._truth_folder), ids)
+
+    def _judge(self, truth: Truth, urls: Mapping[str, str], models: Models) -> dict[str, Any]:
+        with self.stages.stage("judge", "scoring policies in the twin and in the world model"):
+            store = EpisodeStore(self._truth_folder)
+            policies: dict[str, Policy] = {
+                **ladder(store, truth.demonstrations),
+                "behaviour cloning": models.policy,
+                "hold still": HoldPolicy(),
+            }
+            return judge(urls, policies, models, self.plan)
+
+    def _report(
+        self,
+        takes: Mapping[str, Take],
+        prediction: PredictionResult,
+        scores: Mapping[str, Any],
+        models: Models,
+    ) -> dict[str, Any]:
+        return {
+            "about": {
+                "version": __version__,
+                "world_model": models.world_model.digest,
+                "held_out_seeds": list(self.plan.seeds),
+                "success_probe": models.probe.metadata.metrics,
+            },
+            "stages": self.stages.rows(),
+            "errors": worst_errors(takes),
+            "takes": {
+                name: {**take.errors, "devices": take.devices} for name, take in takes.items()
+            },
+            "world_model": prediction.figures,
+            **scores,
+        }
+
+
+def worst_errors(takes: Mapping[str, Take]) -> dict[str, Any]:
+    """Of every error the worse of the takes; streams carry their take's name where both have it."""
+    errors: dict[str, Any] = {}
+    for name in ("clock_rms_ms", "latency_ms", "latency_error_ms", "num_dropped"):
+        errors[name] = {
+            f"{take_name}.{stream}": value
+            for take_name, take in takes.items()
+            for stream, value in take.errors[name].items()
+        }
+    for name in COMMON_ERRORS:
+        errors[name] = max(take.errors[name] for take in takes.values())
+    errors["taxel_iou"] = min(take.errors["taxel_iou"] for take in takes.values())
+    return errors
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
+    columns = (TextColumn("   {task.description}"), BarColumn(), MofNCompleteColumn())
+    with Progress(*columns, TimeElapsedColumn(), transient=True) as progress:
+        task = progress.add_task(what, total=None)
+
+        def advance(done: int, total: int) -> None:
+            progress.update(task, completed=done, total=total)
+
+        yield advance

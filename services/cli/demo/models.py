@@ -1,0 +1,52 @@
+"""Committed or freshly trained networks, as the demo uses them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from services.cli import train
+from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
+from services.evaluation.success_probe import SuccessProbe
+from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
+
+
+@dataclass(frozen=True)
+class Models:
+    """World model, closed-loop policy and success probe."""
+
+    world_model: Checkpoint
+    policy: BehaviourCloningPolicy
+    probe: SuccessProbe
+
+
+def committed_models() -> Models:
+    """The networks that come with the package.
+
+    Raises:
+        NotFoundError, CorruptDataError: a file is missing or damaged.
+    """
+    return _load(default_checkpoint(), DEFAULT_POLICY, DEFAULT_PROBE)
+
+
+def train_models(folder: Path) -> Models:
+    """Record training episodes and train all three, by the commands that made the committed ones.
+
+    Args:
+        folder: where episodes and checkpoints go; episodes that are there are used again.
+    """
+    episodes = str(folder / "episodes")
+    world_model = folder / "world_model.safetensors"
+    policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
+    train.main(["data", "--store", episodes])
+    train.main(["world-model", "--episodes", episodes, "--output", str(world_model)])
+    train.main(["policy", "--episodes", episodes, "--output", str(policy)])
+    train.main(["probe", "--episodes", episodes, "--output", str(probe)])
+    return _load(world_model, policy, probe)
+
+
+def _load(world_model: Path, policy: Path, probe: Path) -> Models:
+    return Models(
+        read_checkpoint(world_model),
+        BehaviourCloningPolicy.load(policy),
+        SuccessProbe.load(probe),
+    )

@@ -1,0 +1,140 @@
+"""Truth episodes in; what is left of them after devices, spool, upload and alignment, out.
+
+The whole way is the real one: mock devices speak packets, real drivers decode them, the recorder
+spools, the uploader sends over HTTP, the alignment service makes the episode.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.schemas.problems import Problem, error_from_problem
+from services.acquisition.clock import VirtualClock
+from services.acquisition.mocks.episode import replay_calibration, replay_streams
+from services.acquisition.mocks.faults import FaultScript
+from services.acquisition.mocks.ledger import Fate
+from services.acquisition.mocks.station import MockStation, MockTake
+from services.acquisition.schemas import SaveTake, TakePrompt
+from services.acquisition.uploader import Uploader
+from services.alignment.schemas import AlignmentJob
+from services.alignment.truth import NEAR_NS, compare_with_truth, match_samples
+
+ALIGNMENT_TIMEOUT_S = 300.0
+UPLOAD_PERIOD_S = 1.0
+
+
+@dataclass(frozen=True)
+class Take:
+    """One recorded, aligned take with the errors of the whole way."""
+
+    truth: EpisodeReader
+    episode: EpisodeReader
+    errors: dict[str, Any]
+    devices: list[dict[str, Any]]
+    clock_residuals_ms: dict[str, np.ndarray]
+
+
+def record_take(
+    truth: EpisodeReader, spool_root: Path, *, seed: int
+) -> tuple[MockTake, list[dict[str, Any]]]:
+    """Play the truth through every mock device once, disturbed as an ordinary station is.
+
+    Returns:
+        The take in the spool, and for every device what the ledger says beside what the health
+        counters found.
+    """
+    attributes = truth.attributes
+    with MockStation(
+        replay_streams(truth),
+        FaultScript.first_light(),
+        seed,
+        VirtualClock(),
+        spool_root=spool_root,
+        name="demo",
+        calibration=replay_calibration(truth),
+    ) as mock:
+        take = mock.run_take(
+            TakePrompt(
+                task=attributes.task, instruction=attributes.instruction, domain=attributes.domain
+            ),
+            recording_id=f"demo-{attributes.domain}",
+            how=SaveTake(success=attributes.success, accept_incomplete=True),
+        )
+        health = mock.station.health.report()
+    return take, [_device_row(take, device.model_dump()) for device in health.devices]
+
+
+def _device_row(take: MockTake, counters: dict[str, Any]) -> dict[str, Any]:
+    ledger = take.ledger.of(counters["device"])
+    return {
+        "device": counters["device"],
+        "sent": ledger.count(Fate.SENT),
+        "dropped": ledger.count(Fate.DROPPED),
+        "corrupted": ledger.count(Fate.CORRUPTED),
+        "ledger_lost": ledger.count_lost_between(),
+        "counted_packets": counters["packets"],
+        "counted_lost": counters["lost"],
+        "counted_crc_errors": counters["crc_errors"],
+    }
+
+
+def upload(spool_root: Path, store_url: str) -> None:
+    """Send every take of the spool to the store service.
+
+    Raises:
+        UnavailableError: a take could not be sent; it stays in the spool.
+    """
+    with EpisodeStoreClient(store_url) as client:
+        uploader = Uploader(spool_root, client, period_s=UPLOAD_PERIOD_S)
+        uploader.upload_all()
+        left = [status for status in uploader.status() if not status.uploaded]
+    if left:
+        raise UnavailableError(f"upload of {left[0].recording_id}: {left[0].error}")
+
+
+def align(alignment_url: str, recording_id: str) -> AlignmentJob:
+    """Let the alignment service make an episode of a recording, and wait for it.
+
+    Raises:
+        DexTouchError: what the service refused, with its reason.
+    """
+    answer = httpx.post(
+        f"{alignment_url}/v1/alignments",
+        params={"wait": "true"},
+        json={"recording_id": recording_id},
+        timeout=ALIGNMENT_TIMEOUT_S,
+        trust_env=False,
+    )
+    if answer.is_error:
+        raise error_from_problem(Problem.model_validate_json(answer.content))
+    return AlignmentJob.model_validate_json(answer.content)
+
+
+def measure(
+    store: EpisodeStore,
+    truth: EpisodeReader,
+    take: MockTake,
+    episode_id: str,
+    *,
+    devices: list[dict[str, Any]],
+) -> Take:
+    """Compare the aligned episode with the truth it was recorded from."""
+    episode = store.open(episode_id)
+    started_ns = store.recording(take.recording_id).attributes.started_t_host_ns
+    if started_ns is None:
+        raise InvalidInputError(f"recording {take.recording_id}: no start time; record it again")
+    origin_ns = started_ns + round(episode.attributes.quality["origin_after_start_ns"])
+    origin_in_truth_ns = origin_ns - take.ledger.start_host_ns
+    errors = compare_with_truth(episode, truth, origin_in_truth_ns=origin_in_truth_ns)
+    residuals = {}
+    for name in errors["clock_rms_ms"]:
+        match = match_samples(episode, truth, name, origin_in_truth_ns, NEAR_NS)
+        t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
+        residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
+    return Take(truth, episode, errors, devices, residuals)

@@ -1,0 +1,86 @@
+"""The report of a run in, the table that ends it on the terminal out."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+def show(report: Mapping[str, Any]) -> None:
+    """Print stages, errors, predictions and scores."""
+    console = Console()
+    console.print(_stages(report["stages"]))
+    console.print(_errors(report["errors"]))
+    console.print(_world_model(report["world_model"]))
+    console.print(_policies(report["policies"]))
+    console.print(_agreement(report["agreement"]))
+
+
+def _table(title: str, *columns: str) -> Table:
+    table = Table(title=title, title_justify="left", header_style="bold")
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    return table
+
+
+def _stages(stages: list[dict[str, Any]]) -> Table:
+    table = _table("Stages", "stage", "seconds")
+    for row in stages:
+        table.add_row(row["name"], f"{row['seconds']:.1f}")
+    return table
+
+
+def _errors(errors: Mapping[str, Any]) -> Table:
+    table = _table("Recording path against the twin's truth", "error", "value")
+    worst = max(errors["clock_rms_ms"], key=lambda name: errors["clock_rms_ms"][name])
+    table.add_row(f"clock RMS, worst stream ({worst})", f"{errors['clock_rms_ms'][worst]:.3f} ms")
+    rows = (
+        ("taxel_iou", "contact IoU of taxels", ""),
+        ("taxel_mae_kpa", "taxel error", "kPa"),
+        ("wrist_error_mm", "wrist position", "mm"),
+        ("wrist_error_deg", "wrist rotation", "°"),
+        ("fingertip_error_mm", "robot fingertips", "mm"),
+    )
+    for key, name, unit in rows:
+        table.add_row(name, f"{errors[key]:.4g} {unit}".strip())
+    return table
+
+
+def _world_model(figures: Mapping[str, Any]) -> Table:
+    table = _table("World model on held-out scenes", "", "model", "copy", "other")
+    number = "{:.3g}".format
+    table.add_row(
+        "images, PSNR (dB)",
+        number(figures["psnr"]),
+        number(figures["psnr_copy"]),
+        f"wrong actions {figures['psnr_wrong_actions']:.3g}, codec {figures['psnr_codec']:.3g}",
+    )
+    table.add_row(
+        "touch, MSE (kPa²)",
+        number(figures["tactile_mse"]),
+        number(figures["tactile_mse_copy"]),
+        f"all zero {figures['tactile_mse_zero']:.3g}",
+    )
+    table.add_row(
+        "contact F1", number(figures["contact_f1"]), number(figures["contact_f1_copy"]), ""
+    )
+    return table
+
+
+def _policies(rows: list[dict[str, Any]]) -> Table:
+    table = _table("Success of policies", "policy", "task", "real", "imagined")
+    for row in rows:
+        table.add_row(row["policy"], row["task"], f"{row['real']:.2f}", f"{row['imagined']:.2f}")
+    return table
+
+
+def _agreement(agreement: Mapping[str, Mapping[str, Any]]) -> Table:
+    table = _table("Agreement of real and imagined scores", "task", "Pearson", "MMRV")
+    for task, row in agreement.items():
+        table.add_row(task, _maybe(row["pearson"]), _maybe(row["mmrv"]))
+    return table
+
+
+def _maybe(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3f}"

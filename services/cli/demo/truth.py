@@ -1,0 +1,76 @@
+"""A plan in; the truth episodes that a run records, predicts and judges with, in a store, out."""
+
+import multiprocessing
+import os
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from dextouch.episodes import EpisodeStore
+from services.cli.demo.settings import TASKS, DemoPlan
+from services.twin.cameras import CAMERAS
+from services.twin.episodes import TakeOptions, record, write_episode
+from services.twin.hands import Domain
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+
+# The human stands a bottle, the robot stacks bowls: one hand and both, in one run.
+RECORDED = {"human": "stand_bottle", "robot": "stack_bowls"}
+MAX_PROCESSES = 4
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Ids of the truth episodes: the two takes, and the demonstrations by noise level."""
+
+    takes: dict[str, str] = field(default_factory=dict)
+    demonstrations: dict[float, list[str]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Order:
+    """Episodes of one stage, made by one process."""
+
+    task: str
+    domain: Domain
+    seeds: tuple[int, ...]
+    options: TakeOptions
+
+
+def make_truth(plan: DemoPlan, store_folder: Path, progress: Callable[[int, int], None]) -> Truth:
+    """Record the truth of a run in the twin, on all cores.
+
+    Args:
+        plan: seeds and noise levels.
+        store_folder: where the episodes go.
+        progress: told how many episodes are done, of how many.
+    """
+    takes = [
+        _Order(task, "human" if domain == "human" else "robot", (plan.take_seed,), TakeOptions())
+        for domain, task in RECORDED.items()
+    ]
+    ladder = [
+        _Order(task, "robot", tuple(plan.seeds), TakeOptions(noise_m, images=CAMERAS[:1]))
+        for noise_m in plan.noise_ladder_m
+        for task in TASKS
+    ]
+    orders = takes + ladder
+    made: list[list[str]] = []
+    total = sum(len(order.seeds) for order in orders)
+    processes = min(MAX_PROCESSES, os.cpu_count() or 1)
+    # Spawned, not forked: torch and service threads must not be copied half-way.
+    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
+        for ids in pool.map(_make, orders, [str(store_folder)] * len(orders)):
+            made.append(ids)
+            progress(sum(map(len, made)), total)
+    demonstrations: dict[float, list[str]] = {}
+    for order, ids in zip(ladder, made[len(takes) :], strict=True):
+        demonstrations.setdefault(order.options.noise_m, []).extend(ids)
+    return Truth(dict(zip(RECORDED, [ids[0] for ids in made], strict=False)), demonstrations)
+
+
+def _make(order: _Order, store_folder: str) -> list[str]:
+    store = EpisodeStore(store_folder)
+    stage = Stage(order.task, order.domain, TwinSettings())
+    return [write_episode(store, record(stage, seed, order.options)) for seed in order.seeds]

@@ -1,0 +1,78 @@
+"""This machine in; a table of what DexTouch can do on it, and what to install for the rest, out."""
+
+import argparse
+import importlib.util
+import json
+import os
+import platform
+import shutil
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that was looked at."""
+
+    what: str
+    found: str
+    ok: bool = True
+    do: str = ""
+
+
+_PACKAGES = {
+    "zarr": ("episodes", "store"),
+    "serial": ("gloves over serial", "station"),
+    "hid": ("trackers over HID", "station"),
+    "cv2": ("cameras and calibration", "station"),
+    "fastapi": ("HTTP services", "serve"),
+    "redis": ("the Redis bus", "serve"),
+    "scipy": ("alignment", "align"),
+    "mujoco": ("the physics twin", "twin"),
+    "torch": ("world model and policies", "model"),
+    "gymnasium": ("the Gymnasium bridge", "gym"),
+}
+
+
+def examine() -> list[Finding]:
+    """Look at Python, packages, disk, devices and optional programs; changes nothing."""
+    version = platform.python_version()
+    findings = [
+        Finding("Python", version, ok=version.startswith("3.11"), do="install Python 3.11"),
+        Finding("processor cores", str(os.cpu_count())),
+    ]
+    for package, (purpose, extra) in _PACKAGES.items():
+        there = importlib.util.find_spec(package) is not None
+        hint = "" if there else f"pip install 'dextouch-wm[{extra}]'"
+        findings.append(
+            Finding(f"{package} ({purpose})", "yes" if there else "no", ok=there, do=hint)
+        )
+    free_gb = shutil.disk_usage(Path.cwd()).free / 1e9
+    findings.append(
+        Finding("free disk", f"{free_gb:.1f} GB", ok=free_gb > 2, do="free at least 2 GB")
+    )
+    redis = shutil.which("redis-server")
+    findings.append(
+        Finding("redis-server (optional)", redis or "no: the memory bus is used instead")
+    )
+    for folder, pattern in (("/dev", "ttyACM*"), ("/dev", "hidraw*"), ("/dev", "video*")):
+        found = sorted(path.name for path in Path(folder).glob(pattern))
+        findings.append(Finding(f"devices {pattern}", ", ".join(found) or "none"))
+    return findings
+
+
+def main(argv: Sequence[str]) -> int:
+    """Print the findings; exit 1 when something needed is missing."""
+    parser = argparse.ArgumentParser(prog="dextouch doctor", description=__doc__)
+    parser.add_argument("--json", type=Path, help="write the findings here")
+    arguments = parser.parse_args(list(argv))
+    findings = examine()
+    width = max(len(finding.what) for finding in findings)
+    for finding in findings:
+        mark = "ok     " if finding.ok else "MISSING"
+        hint = f"  → {finding.do}" if not finding.ok and finding.do else ""
+        print(f"{mark}  {finding.what:<{width}}  {finding.found}{hint}")
+    if arguments.json:
+        arguments.json.write_text(json.dumps([asdict(f) for f in findings], indent=2))
+    return 0 if all(finding.ok for finding in findings) else 1

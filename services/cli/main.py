@@ -1,0 +1,95 @@
+"""`dextouch COMMAND …` in, the command's exit status out; errors we raise become one clear line."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from dextouch import __version__
+from dextouch.errors import DexTouchError
+
+
+class Command(NamedTuple):
+    """One word of the command line: the module whose `main(argv)` does it, and what it does.
+
+    `before` are words put before the arguments.
+    """
+
+    module: str
+    does: str
+    before: tuple[str, ...] = ()
+
+
+COMMANDS = {
+    "demo": Command("services.cli.demo", "record, align, imagine and score on this machine"),
+    "up": Command("services.cli.up", "run every service in one process, with a dashboard"),
+    "doctor": Command("services.cli.doctor", "say what this machine can do and what is missing"),
+    "twin": Command(
+        "services.twin.__main__", "record truth episodes in the physics twin, or serve it"
+    ),
+    "station": Command("services.acquisition.__main__", "record gloves, trackers and cameras"),
+    "store": Command(
+        "services.episode_store.__main__", "list, show, verify, delete, serve episodes"
+    ),
+    "align": Command("services.alignment.__main__", "turn recordings into synchronized episodes"),
+    "train": Command("services.cli.train", "train the world model, a policy or the success probe"),
+    "serve": Command(
+        "services.world_model.__main__", "serve the world model's rollouts", ("serve",)
+    ),
+    "evaluate": Command(
+        "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
+    ),
+}
+
+EXIT_USAGE = 2
+EXIT_REFUSED = 3
+
+
+def usage() -> str:
+    """The text of `dextouch --help`."""
+    rows = [f"  {name:<10}{command.does}" for name, command in COMMANDS.items()]
+    return "\n".join(
+        [
+            "usage: dextouch COMMAND [options]",
+            "",
+            "Collect human and robot touch, learn a world model from it, judge policies inside it.",
+            "",
+            *rows,
+            "",
+            "Every command explains itself with --help and writes its result with --json PATH.",
+            "Start with: dextouch demo",
+        ]
+    )
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Returns:
+        Its exit status; 2 for a word we do not know, 3 for a refusal with a reason on stderr.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in {"-h", "--help", "help"}:
+        print(usage())
+        return 0
+    if arguments[0] == "--version":
+        print(f"dextouch {__version__}")
+        return 0
+    name, *rest = arguments
+    if name not in COMMANDS:
+        print(f"dextouch: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
+        return EXIT_USAGE
+    try:
+        module = importlib.import_module(COMMANDS[name].module)
+        status = module.main([*COMMANDS[name].before, *rest])
+    except DexTouchError as error:
+        print(f"dextouch {name}: {error.message}", file=sys.stderr)
+        return EXIT_REFUSED
+    except KeyboardInterrupt:
+        print(f"dextouch {name}: interrupted", file=sys.stderr)
+        return 130
+    return int(status or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

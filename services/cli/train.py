@@ -1,0 +1,36 @@
+"""`dextouch train WHAT …` in; episodes to learn from, or a measured checkpoint, out."""
+
+import importlib
+import sys
+from collections.abc import Sequence
+
+# What is trained: the module that does it, and the words put before the arguments.
+TRAINERS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "data": ("services.cli.training_data", ()),
+    "world-model": ("services.world_model.__main__", ("train",)),
+    "policy": ("services.evaluation.__main__", ("train-policy",)),
+    "probe": ("services.evaluation.__main__", ("train-probe",)),
+}
+
+USAGE = """usage: dextouch train data|world-model|policy|probe [options]
+
+  data         record the mixed twin episodes that everything is trained on
+  world-model  the joint visuo-tactile flow-matching model
+  policy       a closed-loop policy that imitates the demonstrations
+  probe        the judge of imagined success
+
+Each explains itself with --help and writes its figures with --json PATH.
+The committed checkpoints were made in this order."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Train one thing; 2 for a word that is none."""
+    word, *rest = list(argv) or ["--help"]
+    if word in {"-h", "--help"}:
+        print(USAGE)
+        raise SystemExit(0)
+    if word not in TRAINERS:
+        print(f"dextouch train: unknown {word!r}\n\n{USAGE}", file=sys.stderr)
+        return 2
+    module, before = TRAINERS[word]
+    return int(importlib.import_module(module).main([*before, *rest]) or 0)

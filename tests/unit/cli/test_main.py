@@ -1,0 +1,58 @@
+"""The command line: known words, unknown words, refusals, and the folder that is no package."""
+
+import json
+import subprocess
+import sys
+
+import pytest
+
+from dextouch.errors import UnavailableError
+from services.cli import doctor, main
+
+
+def test_help_lists_every_command(capsys):
+    assert main.main(["--help"]) == 0
+    text = capsys.readouterr().out
+    assert all(name in text for name in main.COMMANDS)
+
+
+def test_unknown_command_names_the_valid_ones(capsys):
+    assert main.main(["dance"]) == main.EXIT_USAGE
+    assert "'dance'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", sorted(main.COMMANDS))
+def test_every_command_can_be_loaded_and_explains_itself(name, capsys):
+    try:
+        status = main.main([name, "--help"])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 0
+    assert "usage" in capsys.readouterr().out.lower()
+
+
+def test_a_refusal_is_one_line_without_a_traceback(monkeypatch, capsys):
+    def refuse(argv):
+        raise UnavailableError("no room for this")
+
+    monkeypatch.setattr(doctor, "main", refuse)
+    assert main.main(["doctor"]) == main.EXIT_REFUSED
+    assert capsys.readouterr().err == "dextouch doctor: no room for this\n"
+
+
+def test_doctor_writes_its_findings(tmp_path, capsys):
+    status = doctor.main(["--json", str(tmp_path / "doctor.json")])
+    findings = json.loads((tmp_path / "doctor.json").read_text())
+    assert status == (0 if all(f["ok"] for f in findings) else 1)
+    assert len(capsys.readouterr().out.splitlines()) == len(findings)
+
+
+def test_the_nouns_cannot_be_imported_twice():
+    answer = subprocess.run(
+        [sys.executable, "-c", "import shared.dextouch"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert answer.returncode == 1
+    assert "import `dextouch`" in answer.stderr
