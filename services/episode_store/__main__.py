@@ -35,6 +35,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments[0].startswith("--") and arguments[0] != "--help":
             return _serve(arguments)
         options = _parser().parse_args(arguments)
+        # What the catalog leaves out is told on stderr, beside the list.
+        configure_logging(service="episode_store", log_format="auto", level="warning")
         url = options.store or load_settings(EpisodeStoreSettings, []).store_url
         result, status = _WORDS[options.word](EpisodeStore(url), options)
     except DexTouchError as error:

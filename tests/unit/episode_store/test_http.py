@@ -24,6 +24,7 @@ from dextouch.hands.actions import IDENTITY_POSE_9D, pack_action
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.serving.settings import ApiKey
 from dextouch.streams.descriptors import StreamDescriptor
+from services.episode_store import __main__ as command_line
 from services.episode_store.__main__ import main
 from services.episode_store.app import create_app
 
@@ -242,6 +243,13 @@ def run(store, *words):
     return main([words[0], "--store", str(store.root), *words[1:]])
 
 
+@pytest.fixture
+def _plain_logs(monkeypatch):
+    """The command line sets up logging for its process, which here is that of all tests."""
+    monkeypatch.setattr(command_line, "configure_logging", lambda **_: None)
+
+
+@pytest.mark.usefixtures("_plain_logs")
 def test_command_line(store, capsys, tmp_path):
     write_episode(store, "e-1")
     write_episode(store, "e-2", task="stack_bowls")

@@ -1,5 +1,7 @@
 """Uploads: exactly once whatever is repeated, lost or killed between; gaps and changes refused."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import httpx
 import numpy as np
 import pytest
@@ -218,6 +220,25 @@ def spool_of(path, attributes, batch_of, count):
         k = np.arange(3)
         writer.append("wrist_left", SampleBatch(k, k, k, np.ones((3, 7))))
     return SpoolReader(path)
+
+
+def test_the_same_batches_from_many_threads_count_once(ingest, store, attributes, batch_of):
+    names = [f"take-{index}" for index in range(3)]
+    for name in names:
+        ingest.create(attributes.model_copy(update={"recording_id": name}))
+
+    def send_all(name):
+        replayed = 0
+        for number in range(6):
+            data = encode_batch(attributes.streams[0], batch_of(5 * number, 5), number=number)
+            replayed += ingest.put_batch(name, "glove_left", number, data).replayed
+        return replayed
+
+    with ThreadPoolExecutor(9) as pool:
+        replayed = list(pool.map(send_all, names * 3))
+    assert sum(replayed) == 2 * 6 * 3
+    finish(ingest, 6)
+    assert_complete(store, batch_of, 30)
 
 
 def upload(client, spool):
