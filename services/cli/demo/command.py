@@ -132,7 +132,7 @@ class Demo:
                 "success_probe": models.probe.metadata.metrics,
             },
             "stages": self.stages.rows(),
-            "errors": worst_errors(takes),
+            "errors": worst_errors({name: take.errors for name, take in takes.items()}),
             "takes": {
                 name: {**take.errors, "devices": take.devices} for name, take in takes.items()
             },
@@ -141,18 +141,18 @@ class Demo:
         }
 
 
-def worst_errors(takes: Mapping[str, Take]) -> dict[str, Any]:
+def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
     """Of every error the worse of the takes; streams carry their take's name where both have it."""
     errors: dict[str, Any] = {}
     for name in ("clock_rms_ms", "latency_ms", "latency_error_ms", "num_dropped"):
         errors[name] = {
             f"{take_name}.{stream}": value
-            for take_name, take in takes.items()
-            for stream, value in take.errors[name].items()
+            for take_name, errors_of_take in takes.items()
+            for stream, value in errors_of_take[name].items()
         }
     for name in COMMON_ERRORS:
-        errors[name] = max(take.errors[name] for take in takes.values())
-    errors["taxel_iou"] = min(take.errors["taxel_iou"] for take in takes.values())
+        errors[name] = max(found[name] for found in takes.values())
+    errors["taxel_iou"] = min(found["taxel_iou"] for found in takes.values())
     return errors
 
 

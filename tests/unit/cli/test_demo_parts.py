@@ -1,0 +1,124 @@
+"""Parts of the demo that need no twin and no network weights."""
+
+from pathlib import Path
+
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from dextouch.errors import UnavailableError
+from services.cli import training_data
+from services.cli.demo.background import served
+from services.cli.demo.command import worst_errors
+from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
+from services.cli.demo.stages import Stages
+from services.cli.demo.table import show
+
+
+def errors(scale):
+    return {
+        "clock_rms_ms": {"head": 0.1 * scale},
+        "latency_ms": {"head": 4.0},
+        "latency_error_ms": {"head": 0.01},
+        "num_dropped": {"head": scale},
+        "taxel_iou": 1.0 - 0.01 * scale,
+        "taxel_mae_kpa": 0.003 * scale,
+        "fingertip_error_mm": 1.0 * scale,
+        "wrist_error_mm": 0.5 * scale,
+        "wrist_error_deg": 0.05 * scale,
+    }
+
+
+def test_the_report_tells_the_worse_of_two_takes():
+    takes = {
+        name: Take(
+            truth=None, episode=None, errors=errors(scale), devices=[], clock_residuals_ms={}
+        )
+        for name, scale in (("human", 1), ("robot", 2))
+    }
+    worst = worst_errors(takes)
+    assert worst["taxel_iou"] == 0.98
+    assert worst["wrist_error_mm"] == 1.0
+    assert worst["clock_rms_ms"] == {"human.head": 0.1, "robot.head": 0.2}
+
+
+def test_stages_keep_order_and_time_also_of_those_that_fail(capsys):
+    stages = Stages()
+    with stages.stage("one", "doing one"):
+        pass
+    with pytest.raises(ValueError, match="broken"), stages.stage("two", "doing two"):
+        raise ValueError("broken")
+    assert [row["name"] for row in stages.rows()] == ["one", "two"]
+    assert "1. doing one" in capsys.readouterr().err
+
+
+def test_services_answer_inside_the_block_and_are_gone_after_it():
+    app = FastAPI()
+
+    @app.get("/hello")
+    async def hello() -> dict[str, str]:
+        return {"answer": "hello"}
+
+    with served({"hello": app}) as urls:
+        answer = httpx.get(f"{urls['hello']}/hello", trust_env=False)
+        assert answer.json() == {"answer": "hello"}
+    with pytest.raises(httpx.ConnectError):
+        httpx.get(f"{urls['hello']}/hello", trust_env=False)
+
+
+def test_a_service_that_cannot_start_is_an_error():
+    async def refuse(app):
+        raise UnavailableError("no")
+        yield
+
+    app = FastAPI(lifespan=refuse)
+    with pytest.raises(UnavailableError, match="did not start"), served({"broken": app}):
+        pass
+
+
+def test_held_out_seeds_are_never_training_seeds():
+    plan = parse(["--seeds", "3", "--output", "somewhere"])
+    assert plan.output == Path("somewhere")
+    assert min(plan.seeds) >= FIRST_HELD_OUT_SEED
+    assert plan.take_seed not in plan.seeds
+    with pytest.raises(SystemExit):
+        parse(["--seeds", "0"])
+
+
+def test_training_episodes_are_the_same_every_time_and_mixed():
+    drawn = [
+        training_data.options_of("stand_bottle", seed, miss_fraction=0.2) for seed in range(200)
+    ]
+    again = [
+        training_data.options_of("stand_bottle", seed, miss_fraction=0.2) for seed in range(200)
+    ]
+    assert drawn == again
+    assert 20 < sum(options.miss for options in drawn) < 60
+    assert 50 < sum(options.noise_m == 0 for options in drawn) < 90
+    assert max(options.noise_m for options in drawn) <= training_data.MAX_NOISE_M
+
+
+def test_the_table_shows_undefined_agreement(capsys):
+    show(
+        {
+            "stages": [{"name": "truth", "seconds": 1.0}],
+            "errors": errors(1),
+            "world_model": dict.fromkeys(
+                (
+                    "psnr",
+                    "psnr_copy",
+                    "psnr_wrong_actions",
+                    "psnr_codec",
+                    "tactile_mse",
+                    "tactile_mse_copy",
+                    "tactile_mse_zero",
+                    "contact_f1",
+                    "contact_f1_copy",
+                ),
+                1.0,
+            ),
+            "policies": [{"policy": "hold", "task": "t", "real": 0.0, "imagined": 0.5}],
+            "agreement": {"t": {"pearson": "undefined", "mmrv": 0.1}},
+        }
+    )
+    assert "undefined" in capsys.readouterr().out
