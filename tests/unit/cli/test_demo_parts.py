@@ -30,13 +30,7 @@ def errors(scale):
 
 
 def test_the_report_tells_the_worse_of_two_takes():
-    takes = {
-        name: Take(
-            truth=None, episode=None, errors=errors(scale), devices=[], clock_residuals_ms={}
-        )
-        for name, scale in (("human", 1), ("robot", 2))
-    }
-    worst = worst_errors(takes)
+    worst = worst_errors({"human": errors(1), "robot": errors(2)})
     assert worst["taxel_iou"] == 0.98
     assert worst["wrist_error_mm"] == 1.0
     assert worst["clock_rms_ms"] == {"human.head": 0.1, "robot.head": 0.2}
