@@ -67,13 +67,14 @@ class ComposeProcesses:
     path: Path
     folder: Path
     variables: dict
+    without: tuple = ()
     running: dict = field(default_factory=dict)
 
     def __post_init__(self):
         self.services = {
             name: service
             for name, service in yaml.safe_load(self.path.read_text())["services"].items()
-            if not service.get("profiles")
+            if not service.get("profiles") and name not in self.without
         }
         self.ports = {name: free_port() for name in self.services}
 

@@ -1,0 +1,184 @@
+"""`dextouch up`: flags in; every service in this one process, its address on the terminal, out."""
+
+import asyncio
+import json
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Literal
+
+from fastapi import FastAPI
+from pydantic import AliasChoices, Field
+from pydantic_settings import BaseSettings, SettingsConfigDict
+
+from dextouch.errors import UnknownNameError
+from dextouch.serving.logs import configure_logging
+from dextouch.serving.settings import load_settings
+from services.cli.servers import Place, bind, serve_all, stop_on_signals
+
+LOOPBACK = "127.0.0.1"
+# Settings and the addresses of all services in, one service out.
+Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
+
+
+class UpSettings(BaseSettings):
+    """Where data goes and which ports are taken; 0 takes any free one.
+
+    Everything that is recorded lies below `data`. Mock devices play episode `mock_episode_id` of
+    this store, or a made-up pattern when none is named.
+    """
+
+    model_config = SettingsConfigDict(
+        frozen=True,
+        extra="forbid",
+        env_prefix="DEXTOUCH_UP_",
+        cli_prog_name="dextouch up",
+        cli_kebab_case=False,
+    )
+
+    data: Path = Path("runs/up")
+    station: str = Field(default="mock station", min_length=1, max_length=64)
+    mock_episode_id: str | None = None
+    without: tuple[str, ...] = Field(default=(), description="services to leave out")
+    dashboard_port: int = Field(default=0, ge=0, le=65535)
+    acquisition_port: int = Field(default=0, ge=0, le=65535)
+    episode_store_port: int = Field(default=0, ge=0, le=65535)
+    alignment_port: int = Field(default=0, ge=0, le=65535)
+    twin_port: int = Field(default=0, ge=0, le=65535)
+    world_model_port: int = Field(default=0, ge=0, le=65535)
+    log_level: Literal["debug", "info", "warning", "error"] = "warning"
+    json_path: Path | None = Field(
+        default=None,
+        validation_alias=AliasChoices("json"),
+        description="write the addresses there once all services answer",
+    )
+
+    def port(self, name: str) -> int:
+        """The wanted port of a service."""
+        ports: dict[str, int] = self.model_dump()
+        return ports[f"{name}_port"]
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serve until SIGINT or SIGTERM."""
+    settings = load_settings(UpSettings, list(argv))
+    configure_logging(service="up", log_format="auto", level=settings.log_level)
+    return asyncio.run(run(settings))
+
+
+async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
+    """Compose and serve; `stop` ends it from inside (tests), signals from outside."""
+    if stop is None:
+        stop = asyncio.Event()
+        stop_on_signals(stop)
+    builders = _wanted(settings)
+    with ExitStack() as held:
+        places = {}
+        for name in builders:
+            places[name] = bind(name, host=LOOPBACK, port=settings.port(name))
+            held.callback(places[name].socket.close)
+        urls = {name: place.url for name, place in places.items()}
+        placed = [(places[name], build(settings, urls)) for name, build in builders.items()]
+        ready = asyncio.Event()
+        announcing = asyncio.create_task(_announce(settings, places, ready))
+        held.callback(announcing.cancel)
+        await serve_all(placed, stop=stop, ready=ready)
+    return 0
+
+
+def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
+    needed = ("episode_store", "acquisition", "dashboard")
+    optional = [name for name in BUILDERS if name not in needed]
+    for name in settings.without:
+        if name not in optional:
+            raise UnknownNameError("service to leave out", name, optional)
+    return {name: build for name, build in BUILDERS.items() if name not in settings.without}
+
+
+async def _announce(
+    settings: UpSettings, places: Mapping[str, Place], ready: asyncio.Event
+) -> None:
+    await ready.wait()
+    for name, place in places.items():
+        print(f"{name:<14}{place.url}")
+    print(f"data          {settings.data.resolve()}")
+    print(f"\nOpen {places['dashboard'].url} · stop with Ctrl-C", flush=True)
+    if settings.json_path is not None:
+        urls = {name: place.url for name, place in places.items()}
+        settings.json_path.write_text(json.dumps(urls, indent=2) + "\n", encoding="utf-8")
+
+
+# Services are imported when they are built: `dextouch --help` stays light.
+
+
+def _episode_store(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
+    from services.episode_store.app import create_app
+    from services.episode_store.settings import EpisodeStoreSettings
+
+    return create_app(EpisodeStoreSettings(store_url=_store_url(settings)))
+
+
+def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
+    from services.alignment.app import create_app
+    from services.alignment.settings import AlignmentSettings
+
+    return create_app(AlignmentSettings(store_url=_store_url(settings)))
+
+
+def _acquisition(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
+    from services.acquisition.app import create_app
+    from services.acquisition.settings import AcquisitionSettings
+
+    return create_app(
+        AcquisitionSettings(
+            station=settings.station,
+            spool=settings.data / "spool",
+            mock=True,
+            mock_store=_store_url(settings) if settings.mock_episode_id else None,
+            mock_episode_id=settings.mock_episode_id,
+            episode_store_url=urls["episode_store"],
+        )
+    )
+
+
+def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
+    from dextouch.worlds.serve import create_world_app
+    from services.twin.serving import TwinServiceSettings
+    from services.twin.world import TwinWorld
+
+    settings = TwinServiceSettings()
+    world = TwinWorld(settings.scene)
+    return create_world_app({world.description.name: world}, settings, name="twin")
+
+
+def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
+    from dextouch.worlds.serve import create_world_app
+    from services.world_model.settings import WorldModelSettings
+    from services.world_model.world import open_world
+
+    settings = WorldModelSettings()
+    world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
+    return create_world_app({world.description.name: world}, settings, name="world_model")
+
+
+def _dashboard(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
+    from services.dashboard.app import create_app
+    from services.dashboard.settings import DashboardSettings
+
+    upstreams = {f"{name}_url": url for name, url in urls.items() if name != "dashboard"}
+    return create_app(DashboardSettings.model_validate({"station": settings.station} | upstreams))
+
+
+def _store_url(settings: UpSettings) -> str:
+    return str(settings.data / "store")
+
+
+# In the order in which data flows; stopped in reverse.
+BUILDERS: Mapping[str, Builder] = {
+    "episode_store": _episode_store,
+    "alignment": _alignment,
+    "acquisition": _acquisition,
+    "twin": _twin,
+    "world_model": _world_model,
+    "dashboard": _dashboard,
+}

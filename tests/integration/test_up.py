@@ -1,0 +1,76 @@
+"""`dextouch up`: all services answer in one process, know each other, and stop together."""
+
+import asyncio
+import json
+from pathlib import Path
+
+import httpx
+import pytest
+
+from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from services.cli import up
+from services.cli.servers import bind
+
+START_LIMIT_S = 120
+PRETRAINED = Path(up.__file__).parents[1] / "world_model/pretrained"
+# A working tree in which the model has not been trained yet has nothing to serve there.
+WITHOUT = () if list(PRETRAINED.glob("*.safetensors")) else ("world_model",)
+
+
+async def written(path):
+    """The addresses, once they are there."""
+    while not path.is_file() or not path.read_text().endswith("\n"):  # noqa: ASYNC110 - a file
+        await asyncio.sleep(0.05)
+    return json.loads(path.read_text())
+
+
+async def test_all_services_in_one_process(tmp_path, capsys):
+    settings = up.UpSettings(data=tmp_path / "data", json=tmp_path / "urls.json", without=WITHOUT)
+    stop = asyncio.Event()
+    running = asyncio.create_task(up.run(settings, stop))
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
+    expected = set(up.BUILDERS) - set(WITHOUT)
+    assert set(urls) == expected
+    async with httpx.AsyncClient(trust_env=False) as client:
+        overview = (await client.get(urls["dashboard"] + "/v1/overview")).json()
+        worlds = (await client.get(urls["twin"] + "/v1/worlds")).json()["worlds"]
+    levels = {service["name"]: service["level"] for service in overview["services"]}
+    assert levels == dict.fromkeys(expected - {"dashboard"}, "OK")
+    assert overview["station"]["reachable"]
+    assert worlds[0]["kind"] == "twin"
+    stop.set()
+    assert await asyncio.wait_for(running, 30) == 0
+    assert urls["dashboard"] in capsys.readouterr().out
+
+
+async def test_a_taken_port_is_a_clear_refusal(tmp_path):
+    place = bind("other", host="127.0.0.1", port=0)
+    place.socket.listen()
+    port = place.socket.getsockname()[1]
+    settings = up.UpSettings(data=tmp_path, dashboard_port=port)
+    with pytest.raises(ConflictError, match="--dashboard_port"):
+        await up.run(settings, asyncio.Event())
+    place.socket.close()
+
+
+def test_wrong_flags_are_named():
+    with pytest.raises(InvalidInputError, match="twin_port"):
+        up.main(["--twin_port", "70000"])
+
+
+async def test_what_cannot_be_left_out_is_named(tmp_path):
+    settings = up.UpSettings(data=tmp_path, without=("dashboard",))
+    with pytest.raises(UnknownNameError, match="valid: alignment, twin, world_model"):
+        await up.run(settings, asyncio.Event())
+
+
+async def test_without_worlds(tmp_path):
+    settings = up.UpSettings(
+        data=tmp_path / "data", json=tmp_path / "urls.json", without=("twin", "world_model")
+    )
+    stop = asyncio.Event()
+    running = asyncio.create_task(up.run(settings, stop))
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
+    assert set(urls) == {"episode_store", "alignment", "acquisition", "dashboard"}
+    stop.set()
+    assert await asyncio.wait_for(running, 30) == 0

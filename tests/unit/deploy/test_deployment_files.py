@@ -1,0 +1,132 @@
+"""Deployment files against what they must be: valid, without privileges, and true to the code."""
+
+import importlib
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+import yaml
+
+from dextouch.serving.app import create_service_app
+from dextouch.serving.settings import ServiceSettings
+
+ROOT = Path(__file__).parents[3]
+COMPOSE = ROOT / "docker-compose.yml"
+SERVICES = yaml.safe_load(COMPOSE.read_text())["services"]
+OURS = {name: service for name, service in SERVICES.items() if name != "redis"}
+
+
+def validates(path):
+    command = [sys.executable, "-m", "check_jsonschema", "--builtin-schema", "vendor.compose-spec"]
+    done = subprocess.run([*command, str(path)], capture_output=True, check=False, cwd=ROOT)
+    return done.returncode == 0
+
+
+@pytest.mark.parametrize("path", ["docker-compose.yml", "deploy/compose.devices.yml"])
+def test_compose_files_are_valid(path):
+    assert validates(ROOT / path)
+
+
+def test_a_misspelt_condition_is_caught(tmp_path):
+    text = COMPOSE.read_text()
+    wrong = tmp_path / "docker-compose.yml"
+    wrong.write_text(text.replace("service_healthy", "service_wealthy", 1))
+    assert "service_wealthy" in wrong.read_text()
+    assert not validates(wrong)
+
+
+@pytest.mark.parametrize("name", SERVICES)
+def test_no_privileges(name):
+    service = SERVICES[name]
+    assert service["read_only"] is True
+    assert service["cap_drop"] == ["ALL"]
+    assert service["security_opt"] == ["no-new-privileges:true"]
+    assert not service.get("privileged")
+    for port in service.get("ports", []):
+        assert re.fullmatch(r"127\.0\.0\.1:\$\{DEXTOUCH_\w+_PORT:-\d+\}:8000", port)
+
+
+@pytest.mark.parametrize("name", [name for name in SERVICES if not SERVICES[name].get("profiles")])
+def test_lasting_services_have_health_and_a_place(name):
+    assert SERVICES[name]["healthcheck"]["test"][0] == "CMD"
+    for other, rule in SERVICES[name].get("depends_on", {}).items():
+        assert other in SERVICES
+        assert rule["condition"] == "service_healthy"
+
+
+def test_published_ports_differ():
+    ports = [port for service in SERVICES.values() for port in service.get("ports", [])]
+    defaults = [re.search(r":-(\d+)", port).group(1) for port in ports]
+    assert len(set(defaults)) == len(defaults)
+
+
+@pytest.mark.parametrize("name", OURS)
+def test_commands_and_variables_exist(name):
+    python, flag, module, *_ = OURS[name]["command"]
+    assert (python, flag) == ("python", "-m")
+    package = importlib.import_module(module)
+    folder = Path(package.__file__).parent
+    assert (folder / "__main__.py").is_file()
+    prefix = f"DEXTOUCH_{module.removeprefix('services.').upper()}_"
+    # Settings stand in settings.py; those of serving a world may stand beside the serving.
+    files = [name for name in ("settings", "serving") if (folder / f"{name}.py").is_file()]
+    known = {
+        (kind.model_config.get("env_prefix", "") + field).upper()
+        for name in files
+        for kind in vars(importlib.import_module(f"{module}.{name}")).values()
+        if isinstance(kind, type) and hasattr(kind, "model_fields")
+        for field in kind.model_fields
+    }
+    wanted = {key for key in OURS[name].get("environment", {}) if key.startswith(prefix)}
+    unknown = {key for key in wanted if key.split("__")[0] not in known}
+    assert not unknown
+
+
+def test_image_runs_without_root_and_with_health():
+    text = (ROOT / "deploy/Dockerfile").read_text()
+    stages = re.findall(r"^FROM (\S+) AS (\S+)$", text, re.MULTILINE)
+    assert {"light", "model"} <= {stage for _, stage in stages}
+    assert {stage: base for base, stage in stages}["light"] == "runtime"
+    runtime = text[text.index("AS runtime") : text.index("AS light")]
+    assert "USER 10001:10001" in runtime
+    assert "HEALTHCHECK" in runtime
+    for service in OURS.values():
+        assert service["build"]["target"] in {"light", "model"}
+        assert service["image"] == f"dextouch:{service['build']['target']}"
+
+
+def test_udev_rules_parse_and_name_devices_once():
+    lines = (ROOT / "deploy/udev/60-dextouch.rules").read_text().splitlines()
+    rules = [line for line in lines if line and not line.startswith("#")]
+    names = []
+    for rule in rules:
+        parts = [part.strip() for part in rule.split(",")]
+        for part in parts:
+            assert re.fullmatch(r'[A-Z]+(\{\w+\})?(==|\+=|=)"[^"]*"', part), part
+        names += re.findall(r'SYMLINK\+="(dextouch/\w+)"', rule)
+        assert 'GROUP="dextouch"' in parts
+    assert len(set(names)) == len(names) == len(rules)
+
+
+async def test_alerts_name_exported_metrics():
+    app = create_service_app(name="x", version="0", settings=ServiceSettings(), routers=[])
+    transport = httpx.ASGITransport(app=app)
+    async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
+        await client.get("/healthz")
+        exported = set(re.findall(r"^(dextouch_\w+)", (await client.get("/metrics")).text, re.M))
+    rules = yaml.safe_load((ROOT / "deploy/prometheus/rules.yml").read_text())
+    expressions = [rule["expr"] for group in rules["groups"] for rule in group["rules"]]
+    assert expressions
+    for expression in expressions:
+        assert set(re.findall(r"dextouch_\w+", expression)) <= exported
+
+
+def test_prometheus_scrapes_every_service():
+    config = yaml.safe_load((ROOT / "deploy/prometheus/prometheus.yml").read_text())
+    (job,) = config["scrape_configs"]
+    targets = {target for entry in job["static_configs"] for target in entry["targets"]}
+    lasting = {name for name, service in OURS.items() if not service.get("profiles")}
+    assert targets == {f"{name}:8000" for name in lasting}
