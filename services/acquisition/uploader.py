@@ -9,7 +9,7 @@ from typing import Protocol, runtime_checkable
 import structlog
 
 from dextouch.episodes.log import SpoolReader, SpoolWriter
-from dextouch.errors import ConflictError, DexTouchError
+from dextouch.errors import ConflictError, DexTouchError, StorageError
 from dextouch.schemas.recordings import (
     BatchReceipt,
     LedgerEntry,
@@ -95,16 +95,18 @@ class Uploader:
             self._thread.join()
 
     def status(self) -> list[UploadStatus]:
-        """Every saved take."""
-        return [
-            UploadStatus(
-                recording_id=path.name,
-                uploaded=(path / UPLOADED_FILE).exists(),
-                error=self._errors.get(path.name),
-            )
-            for path in _spools(self._spool_root)
-            if SpoolReader(path).closed
-        ]
+        """Every saved take, and every damaged one."""
+        found = []
+        for path in _spools(self._spool_root):
+            error = self._errors.get(path.name)
+            try:
+                if not SpoolReader(path).closed:
+                    continue
+            except StorageError as damage:
+                error = damage.message
+            uploaded = (path / UPLOADED_FILE).exists()
+            found.append(UploadStatus(recording_id=path.name, uploaded=uploaded, error=error))
+        return found
 
     def upload_all(self) -> list[str]:
         """Send every closed take that the store lacks; ids of those that it has now.
@@ -171,28 +173,35 @@ def recover_spool(spool_root: Path) -> list[str]:
     """Close what a killed process left open, so that it is uploaded; ids of what was recovered.
 
     Every acknowledged sample is kept and the recording's ledger says `interrupted`. A take that
-    holds no sample is removed; one that another process is writing is left alone.
+    holds no sample is removed; one that another process is writing, or that is damaged, is left
+    alone.
     """
     recovered = []
     for path in _spools(spool_root):
-        if SpoolReader(path).closed:
-            continue
         try:
-            spool = SpoolWriter.resume(path)
+            if not SpoolReader(path).closed and _recover(path):
+                recovered.append(path.name)
         except ConflictError:
             continue
-        names = [descriptor.name for descriptor in spool.attributes.streams]
-        if not any(spool.num_samples(name) for name in names):
-            spool.abandon()
-            shutil.rmtree(path)
-            continue
-        marks = tuple(LedgerEntry(stream=name, event="interrupted", count=1) for name in names)
-        ledger = (*spool.attributes.ledger, *marks)
-        spool.set_attributes(spool.attributes.model_copy(update={"ledger": ledger}))
-        spool.close()
-        logger.warning("recover_take", recording_id=path.name)
-        recovered.append(path.name)
+        except StorageError as error:
+            # One damaged take must not keep the station from starting; it stays for a person.
+            logger.error("fail_recovery", recording_id=path.name, error=error.message)  # noqa: TRY400
     return recovered
+
+
+def _recover(path: Path) -> bool:
+    spool = SpoolWriter.resume(path)
+    names = [descriptor.name for descriptor in spool.attributes.streams]
+    if not any(spool.num_samples(name) for name in names):
+        spool.abandon()
+        shutil.rmtree(path)
+        return False
+    marks = tuple(LedgerEntry(stream=name, event="interrupted", count=1) for name in names)
+    ledger = (*spool.attributes.ledger, *marks)
+    spool.set_attributes(spool.attributes.model_copy(update={"ledger": ledger}))
+    spool.close()
+    logger.warning("recover_take", recording_id=path.name)
+    return True
 
 
 def _spools(spool_root: Path) -> Iterator[Path]:

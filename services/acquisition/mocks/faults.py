@@ -15,10 +15,10 @@ MAX_BOOT_NS = 10**12
 class DeviceFaults(BaseModel):
     """What disturbs one device; the default is a perfect one.
 
-    Times in seconds count from the start of the take. `jitter_ms` is the mean of an exponential
-    delay on top of the constant `path_delay_ms`; packets never overtake each other. Noise is per
-    axis. `bit_error_rate` acts on serial lines only: USB and sockets have checksums of their own.
-    `dead_taxels` are raw cells that always read zero.
+    Times in seconds count from the start of the device's first take. `jitter_ms` is the mean of an
+    exponential delay on top of the constant `path_delay_ms`; packets never overtake each other.
+    Noise is per axis. `bit_error_rate` acts on serial lines only: USB and sockets have checksums
+    of their own. `dead_taxels` are raw cells that always read zero.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

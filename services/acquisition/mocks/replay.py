@@ -104,8 +104,8 @@ class MockDevice:
         Args:
             clock: a virtual one makes the device wait for the host after each packet.
             waiter: of the calling thread.
-            start_host_ns: when the take starts; the device's clock counts from there.
-            offset_ns: shift of this play, for one that goes round and round.
+            start_host_ns: when the device's first take started; its clock counts from there.
+            offset_ns: from there to the start of this play.
 
         Returns:
             False when the waiter was cancelled.

@@ -80,6 +80,7 @@ class MockStation:
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []
         self._failures: list[str] = []
+        self._epoch_ns: int | None = None
 
     def __enter__(self) -> "MockStation":
         self.start()
@@ -113,7 +114,7 @@ class MockStation:
     def run_take(
         self, prompt: TakePrompt, *, recording_id: str | None = None, how: SaveTake | None = None
     ) -> MockTake:
-        """Record the whole episode once and save it.
+        """Record the whole episode once and save it; may be repeated.
 
         Args:
             prompt: task and instruction.
@@ -132,7 +133,9 @@ class MockStation:
         for thread, _ in self._players:
             thread.join()
         self._drain()
-        check = recorder.stop().check
+        if recorder.status().state == "recording":
+            recorder.stop()
+        check = recorder.status().check
         recorder.save(how or SaveTake(accept_incomplete=True))
         if self._failures or check is None or status.recording_id is None:
             raise DeviceError(f"mock station: {'; '.join(self._failures) or 'no take'}")
@@ -153,13 +156,17 @@ class MockStation:
         self._play(self._clock.now_ns() + LIVE_LEAD_NS, laps=None)
 
     def _play(self, start_ns: int, *, laps: int | None) -> None:
+        # The devices' clocks and counters go on from one take to the next.
+        if self._epoch_ns is None:
+            self._epoch_ns = start_ns
+        offset_ns = start_ns - self._epoch_ns
         # All waiters exist before the first thread runs: a virtual clock waits for all of them.
         waiters = [self._clock.waiter(drives_time=True) for _ in self.pairs]
         self._players = [
             (
                 threading.Thread(
                     target=self._run,
-                    args=(pair, waiter, start_ns, laps),
+                    args=(pair, waiter, (self._epoch_ns, offset_ns), laps),
                     name=f"mock-{pair.device.name}",
                     daemon=True,
                 ),
@@ -170,14 +177,17 @@ class MockStation:
         for thread, _ in self._players:
             thread.start()
 
-    def _run(self, pair: MockPair, waiter: Waiter, start_ns: int, laps: int | None) -> None:
+    def _run(
+        self, pair: MockPair, waiter: Waiter, start: tuple[int, int], laps: int | None
+    ) -> None:
+        epoch_ns, first_offset_ns = start
         with closing(waiter):
             lap = 0
             try:
                 while laps is None or lap < laps:
-                    offset_ns = lap * self._lap_ns
+                    offset_ns = first_offset_ns + lap * self._lap_ns
                     if not pair.device.play(
-                        self._clock, waiter, start_host_ns=start_ns, offset_ns=offset_ns
+                        self._clock, waiter, start_host_ns=epoch_ns, offset_ns=offset_ns
                     ):
                         return
                     lap += 1

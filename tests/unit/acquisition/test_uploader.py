@@ -165,3 +165,16 @@ def test_batches_of_large_images_are_small():
     image = STREAMS[0].model_copy(update={"shape": (480, 640, 3), "dtype": "uint8"})
     assert batch_samples(image) == 4
     assert batch_samples(STREAMS[0]) == 60
+
+
+def test_a_damaged_take_does_not_keep_the_others(tmp_path):
+    damaged = spool(tmp_path, "damaged", close=False)
+    (damaged / "recording.json").write_text("{")
+    spool(tmp_path, "left", close=False)
+    assert recover_spool(tmp_path) == ["left"]
+    store = FakeStore()
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    assert uploader.upload_all() == ["left"]
+    damaged_status, left_status = uploader.status()
+    assert "damaged" in damaged_status.error
+    assert left_status.error is None

@@ -1,0 +1,75 @@
+import pytest
+
+from dextouch.errors import InvalidInputError
+from dextouch.serving.settings import ServiceSettings, load_settings
+from services.acquisition.clock import RealClock
+from services.acquisition.devices import build_drivers, load_calibration
+from services.acquisition.settings import AcquisitionSettings
+
+OPTIONS = {
+    "station",
+    "spool",
+    "mock",
+    "mock_store",
+    "mock_episode_id",
+    "mock_faults",
+    "seed",
+    "devices",
+    "calibration",
+    "episode_store_url",
+    "episode_store_key",
+    "upload_period_s",
+    "keep_uploaded",
+}
+DEVICES = (
+    {"kind": "tactile_glove", "side": "left", "serial_number": "G1"},
+    {"kind": "tactile_glove", "side": "right", "port": "/dev/ttyACM0"},
+    {"kind": "finger_tracker", "side": "left", "vendor_id": 1, "product_id": 2},
+    {"kind": "pose_tracker", "stream": "head", "vendor_id": 1, "product_id": 3},
+    {"kind": "camera", "stream": "camera_head", "port": 5000},
+    {"kind": "robot_state", "port": 5001},
+)
+
+
+def test_options_are_these():
+    assert set(AcquisitionSettings.model_fields) - set(ServiceSettings.model_fields) == OPTIONS
+
+
+def test_environment_and_flags(monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_ACQUISITION_STATION", "desk_3")
+    settings = load_settings(AcquisitionSettings, ["--mock", "true", "--seed", "4"])
+    assert (settings.station, settings.mock, settings.seed) == ("desk_3", True, 4)
+
+
+def test_real_devices_become_drivers():
+    drivers = build_drivers(AcquisitionSettings(devices=DEVICES).devices, RealClock())
+    assert [driver.name for driver in drivers] == [
+        "glove_left",
+        "glove_right",
+        "finger_tracker_left",
+        "pose_tracker_head",
+        "camera_head",
+        "robot_state",
+    ]
+    assert len({d.name for driver in drivers for d in driver.descriptors}) == 11
+
+
+@pytest.mark.parametrize(
+    "devices", [(), DEVICES[:1] * 2, ({"kind": "tactile_glove", "side": "left"},)]
+)
+def test_impossible_stations_are_refused(devices):
+    settings = AcquisitionSettings(devices=devices)
+    with pytest.raises(InvalidInputError, match=r"station|serial_number"):
+        build_drivers(settings.devices, RealClock())
+
+
+def test_calibration_file(tmp_path):
+    path = tmp_path / "calibration.json"
+    path.write_text('{"K_head": [[1, 0], [0, 1]]}')
+    assert load_calibration(path) == {"K_head": ((1, 0), (0, 1))}
+    assert load_calibration(None) == {}
+    path.write_text("{")
+    with pytest.raises(InvalidInputError, match="no JSON"):
+        load_calibration(path)
+    with pytest.raises(InvalidInputError, match="no JSON"):
+        load_calibration(tmp_path / "nowhere.json")
