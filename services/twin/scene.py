@@ -72,15 +72,13 @@ class Scene:
     def object_qpos(self) -> Int64[np.ndarray, "objects 7"]:
         """Places of each object's pose in qpos."""
         joints = self.model.body_jntadr[self.object_bodies]
-        starts = self.model.jnt_qposadr[joints]
-        return np.array([start + np.arange(7) for start in starts], dtype=np.int64)
+        return self.model.jnt_qposadr[joints][:, None] + np.arange(7)
 
     @cached_property
     def object_qvel(self) -> Int64[np.ndarray, "objects 6"]:
         """Places of each object's velocity in qvel (linear in the world, then angular)."""
         joints = self.model.body_jntadr[self.object_bodies]
-        starts = self.model.jnt_dofadr[joints]
-        return np.array([start + np.arange(6) for start in starts], dtype=np.int64)
+        return self.model.jnt_dofadr[joints][:, None] + np.arange(6)
 
     @cached_property
     def is_hand_geom(self) -> Bool[np.ndarray, " geoms"]:

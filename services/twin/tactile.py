@@ -1,9 +1,9 @@
 """What the skin feels: contacts of a MuJoCo state in, pressures [2, 320] and pad forces out.
 
 The native tactile sensor tells how deep each taxel lies in what it touches: the *shape*. The
-contact solver tells how hard each pad is pressed: the *amount*. Each pad's depths are scaled so
-that its pressures sum to its force; where a pad is pressed but no taxel lies in anything, the
-force goes to the taxel nearest to each contact.
+contact solver tells how hard each pad is pressed: the *amount*. Each pad's depths become the
+pressures of an elastic layer that sum to its force; where a pad is pressed but no taxel lies in
+anything, the force goes to the taxel nearest to each contact.
 """
 
 from dataclasses import dataclass
@@ -17,6 +17,11 @@ from services.twin.scene import Scene
 
 # A contact farther than this from every taxel is on the back of the hand and not felt.
 FELT_WITHIN_M = 0.008
+# The elastic layer, fitted to an analytic one of 20 kPa/mm (tests/accuracy/test_twin_tactile.py).
+SKIN_STIFFNESS_PA_M = 1.4e7
+# Native depths carry the skin's offset and the softness of the rigid contact. At most this much
+# of them is taken back: a flat face needs some to bridge the sensor's errors at its edges.
+MAX_RELIEF_M = 0.002
 _MIN_FORCE_N = 1e-6
 _MIN_DEPTH_M = 1e-9
 _PASCAL_PER_KPA = 1000.0
@@ -115,9 +120,36 @@ class TactileReader:
             if row[taxel] <= FELT_WITHIN_M:
                 mujoco.mj_contactForce(self._model, data, contact_index, wrench)
                 on_nearest_n[taxel] += wrench[0]
-        force_n = on_nearest_n.sum()
+        force_n = float(on_nearest_n.sum())
         if force_n < _MIN_FORCE_N:
             return np.zeros_like(on_nearest_n)
         depths = np.maximum(data.sensordata[pad.depths], 0.0)
-        total = depths.sum()
-        return on_nearest_n if total < _MIN_DEPTH_M else depths * (force_n / total)
+        if depths.max() < _MIN_DEPTH_M:
+            return on_nearest_n
+        return elastic_layer(
+            depths, force_n, SKIN_STIFFNESS_PA_M * self._areas_m2[pad.taxels.start]
+        )
+
+
+def elastic_layer(
+    depths_m: Float64[np.ndarray, " taxels"],
+    force_n: float,
+    stiffness_n_m: float,
+) -> Float64[np.ndarray, " taxels"]:
+    """Force on each taxel of springs at depths that are known up to a common relief c.
+
+    Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M, and scales
+    the result so that it sums to F.
+
+    Args:
+        depths_m: 0 or more, at least one of them positive.
+        force_n: what the forces sum to.
+        stiffness_n_m: of one taxel.
+    """
+    touched = depths_m > 0.0
+    deepest_first = np.sort(depths_m[touched])[::-1]
+    num_pressed = np.arange(1, deepest_first.size + 1)
+    reliefs_m = (np.cumsum(deepest_first) - force_n / stiffness_n_m) / num_pressed
+    relief_m = min(reliefs_m[np.flatnonzero(reliefs_m < deepest_first)[-1]], MAX_RELIEF_M)
+    springs = np.where(touched, np.maximum(depths_m - relief_m, 0.0), 0.0)
+    return springs * (force_n / springs.sum())

@@ -1,6 +1,6 @@
 """What every task offers: objects and their places in, waypoints and a verdict out."""
 
-from typing import Final, Protocol
+from typing import Final, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64
@@ -13,6 +13,7 @@ from services.twin.simulation import Simulation
 REST_SPEED: Final = 0.05
 
 
+@runtime_checkable
 class Task(Protocol):
     """One thing to do on the table."""
 
