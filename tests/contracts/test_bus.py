@@ -97,7 +97,8 @@ async def test_a_cancelled_reader_loses_nothing(bus, topic):
     waiting = asyncio.create_task(take(subscription, 1))
     await asyncio.sleep(0)
     waiting.cancel()
-    await asyncio.gather(waiting, return_exceptions=True)
+    done, _ = await asyncio.wait([waiting], timeout=10)
+    assert done
     assert waiting.cancelled()
     await bus.publish(topic, {"i": 7})
     assert (await take(subscription, 1))[0].fields == {"i": 7}
