@@ -1,6 +1,5 @@
 """Flags and environment in, the frozen settings of training and serving out."""
 
-import sys
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,7 +16,7 @@ class OptimizerSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    batch: int = Field(default=16, ge=1)
+    batch: int = Field(default=8, ge=1)
     learning_rate: float = Field(default=2e-3, gt=0)
     warmup_steps: int = Field(default=100, ge=1)
     weight_decay: float = Field(default=0.02, ge=0)
@@ -87,6 +86,22 @@ class WorldModelSettings(WorldServiceSettings):
     num_threads: int = Field(default=1, ge=1)
 
 
-def command_line() -> str:
-    """The command that runs now, without its path: kept in checkpoints."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+def command_line(settings: TrainSettings) -> str:
+    """The command that repeats a run: every setting that is not the default.
+
+    Stores go by their last name: checkpoints travel, folders do not.
+    """
+    given = settings.model_dump(
+        mode="json", exclude_defaults=True, exclude={"output", "json_path", "episodes", "heldout"}
+    )
+    flags = [f"--episodes={_last_name(settings.episodes)}"]
+    if settings.heldout is not None:
+        flags.append(f"--heldout={_last_name(settings.heldout)}")
+    for name, value in given.items():
+        fields = value.items() if isinstance(value, dict) else [("", value)]
+        flags += [f"--{name}{'.' if field else ''}{field}={number}" for field, number in fields]
+    return " ".join(["python -m services.world_model train", *flags])
+
+
+def _last_name(url: str) -> str:
+    return url.rstrip("/").rsplit("/", 1)[-1]

@@ -95,7 +95,7 @@ def train_on(
         name=settings.name,
         network=settings.network,
         tasks=tuple(sorted({episode.task for episode in trained})),
-        command=command_line(),
+        command=command_line(settings),
         seed=settings.seed,
         training_steps=run.step,
         training_cpu_s=round(run.cpu_s, 1),
@@ -171,6 +171,7 @@ class TrainingRun:
             lr=settings.optimizer.learning_rate,
             weight_decay=settings.optimizer.weight_decay,
             betas=(0.9, 0.95),
+            fused=True,
         )
 
     @torch.no_grad()
