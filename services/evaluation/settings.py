@@ -1,7 +1,7 @@
 """Flags in; frozen settings of training and of an evaluation run out."""
 
 import re
-import sys
+import shlex
 from pathlib import Path
 from typing import TypeVar
 
@@ -102,6 +102,6 @@ def parse(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
         raise InvalidInputError(f"{cls.__name__}: {first_problems(error)}") from error
 
 
-def command_line() -> str:
-    """The command that runs now, without its path: kept in checkpoints."""
-    return " ".join([Path(sys.argv[0]).name, *sys.argv[1:]])
+def command_line(word: str, arguments: list[str]) -> str:
+    """A command of this service as it would be typed; kept in checkpoints."""
+    return shlex.join(["python", "-m", "services.evaluation", word, *arguments])

@@ -40,7 +40,7 @@ class ProbeSettings(BaseModel):
 
     seed: int = 0
     num_training_steps: int = Field(default=1200, ge=1)
-    max_seconds: float = Field(default=200.0, gt=0)
+    max_cpu_s: float = Field(default=200.0, gt=0)
     batch_size: int = Field(default=64, ge=2)
     learning_rate: float = Field(default=1e-3, gt=0)
     weight_decay: float = Field(default=1e-2, ge=0)
@@ -127,7 +127,7 @@ def train_success_probe(
     learned = labelled_endings(training, shape, with_early=True)
     tested = labelled_endings(held_out, shape, with_early=False)
     network = ProbeNetwork(shape)
-    seconds = _optimize(network, learned, settings)
+    cpu_s = _optimize(network, learned, settings)
     metadata = CheckpointMetadata(
         kind=KIND,
         command=command,
@@ -142,7 +142,7 @@ def train_success_probe(
             "instructions": instructions_of(demonstrations),
         },
         metrics={
-            "training_seconds": round(seconds, 1),
+            "training_cpu_s": round(cpu_s, 1),
             "num_training_episodes": len(training),
             "num_held_out_episodes": len(held_out),
             **_accuracies(network, tested, shape),
@@ -153,17 +153,17 @@ def train_success_probe(
 
 
 def _optimize(network: ProbeNetwork, learned: Labelled, settings: ProbeSettings) -> float:
-    """Minimize the balanced cross entropy; gives the seconds it took."""
+    """Minimize the balanced cross entropy; gives the CPU seconds it took."""
     generator = torch.Generator().manual_seed(settings.seed)
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
     network.train()
-    started = time.perf_counter()
+    started = time.process_time()
     with Progress("probe", settings.num_training_steps) as progress:
         for step in range(settings.num_training_steps):
-            elapsed = time.perf_counter() - started
-            done = max(step / settings.num_training_steps, elapsed / settings.max_seconds)
+            elapsed = time.process_time() - started
+            done = max(step / settings.num_training_steps, elapsed / settings.max_cpu_s)
             if done >= 1:
                 break
             for group in optimizer.param_groups:
@@ -181,7 +181,7 @@ def _optimize(network: ProbeNetwork, learned: Labelled, settings: ProbeSettings)
             optimizer.step()
             progress.advance(loss=float(loss.detach()))
     network.eval()
-    return time.perf_counter() - started
+    return time.process_time() - started
 
 
 def _disturb(

@@ -15,7 +15,7 @@ CHUNK_SIZE = CHUNK_STEPS * ACTION_DIM
 NUM_PHASE_FEATURES = 8
 STATE_DIM = NUM_PAD_FEATURES + ACTION_DIM + NUM_PHASE_FEATURES + 1
 _REACHED = slice(NUM_PAD_FEATURES, NUM_PAD_FEATURES + ACTION_DIM)
-_CHANNELS = 24
+_CHANNELS = (16, 16, 24)
 _TASK_FEATURES = 8
 
 
@@ -109,16 +109,17 @@ class CloningNetwork(nn.Module):
         self.register_buffer("reached_scale", torch.ones(ACTION_DIM))
         self.register_buffer("coefficient_scale", torch.ones(num_components))
         self.task = nn.Embedding(num_tasks, _TASK_FEATURES)
+        first, second, third = _CHANNELS
         self.eye = nn.Sequential(
-            nn.Conv2d(6, _CHANNELS, 5, stride=2, padding=2),
+            nn.Conv2d(6, first, 5, stride=2, padding=2),
             nn.ReLU(),
-            nn.Conv2d(_CHANNELS, _CHANNELS, 3, padding=1),
+            nn.Conv2d(first, second, 3, padding=1),
             nn.ReLU(),
-            nn.Conv2d(_CHANNELS, _CHANNELS, 3, padding=1),
+            nn.Conv2d(second, third, 3, padding=1),
             SpatialSoftmax(),
         )
         self.head = nn.Sequential(
-            nn.Linear(2 * _CHANNELS + STATE_DIM + _TASK_FEATURES, hidden),
+            nn.Linear(2 * third + STATE_DIM + _TASK_FEATURES, hidden),
             nn.ReLU(),
             nn.Linear(hidden, hidden),
             nn.ReLU(),
