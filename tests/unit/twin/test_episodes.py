@@ -1,0 +1,150 @@
+"""Truth episodes: the streams that were agreed on, the same bytes for the same seed."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.hands.actions import IDENTITY_POSE_9D
+from services.twin import __main__ as command_line
+from services.twin.episodes import TakeOptions, episode_id, record, write_episode
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+
+HEAD_ONLY = TakeOptions(images=("camera_head",))
+BLIND = TakeOptions(images=())
+COMMON = {
+    "tactile_left": (321, 320),
+    "tactile_right": (321, 320),
+    "wrist_left": (534, 7),
+    "wrist_right": (534, 7),
+    "head": (534, 7),
+    "camera_head": (161, 64, 64, 3),
+    "action": (81, 67),
+}
+ROBOT = COMMON | {
+    "object_poses": (534, 1, 7),
+    "joints_measured": (534, 40),
+    "joints_commanded": (534, 40),
+    "wrist_left_commanded": (534, 7),
+    "wrist_right_commanded": (534, 7),
+    "action_commanded": (81, 67),
+}
+HUMAN = COMMON | {
+    "object_poses": (534, 2, 7),
+    "keypoints_left": (641, 25, 3),
+    "keypoints_right": (641, 25, 3),
+}
+
+
+def digest(episode) -> str:
+    sha = hashlib.sha256()
+    for name, stream in sorted(episode.streams.items()):
+        sha.update(name.encode() + stream.t_ref_ns.tobytes() + stream.values.tobytes())
+    return sha.hexdigest()
+
+
+@pytest.fixture(scope="module")
+def robot_take(bottle_stage):
+    return record(bottle_stage, 3, HEAD_ONLY)
+
+
+@pytest.fixture(scope="module")
+def human_take(bowls_stage):
+    return record(bowls_stage, 3, HEAD_ONLY)
+
+
+@pytest.mark.parametrize("domain", ["robot", "human"])
+def test_an_episode_has_the_agreed_streams(robot_take, human_take, domain):
+    episode, expected = (robot_take, ROBOT) if domain == "robot" else (human_take, HUMAN)
+    assert {name: stream.values.shape for name, stream in episode.streams.items()} == expected
+    for stream in episode.streams.values():
+        assert stream.t_ref_ns[0] == 0
+        assert stream.values.dtype == stream.descriptor.numpy_dtype()
+        period_ns = 1e9 / stream.descriptor.nominal_rate_hz
+        assert np.abs(np.diff(stream.t_ref_ns) - period_ns).max() <= 1
+    assert episode.attributes.success is True
+    assert episode.attributes.domain == domain
+
+
+def test_actions_are_relative_to_what_is_measured_at_step_0(robot_take):
+    for name in ("action", "action_commanded"):
+        first = robot_take.streams[name].values[0]
+        for start in (0, 9, 58):
+            np.testing.assert_allclose(first[start : start + 9], IDENTITY_POSE_9D, atol=1e-12)
+    gap = robot_take.streams["action_commanded"].values - robot_take.streams["action"].values
+    assert 1e-3 < np.abs(gap[:, 9:12]).max() < 0.05
+
+
+def test_the_same_seed_gives_the_same_bytes_on_a_fresh_stage(robot_take):
+    again = record(Stage("stand_bottle", "robot", TwinSettings()), 3, HEAD_ONLY)
+    assert digest(again) == digest(robot_take)
+    assert again.attributes == robot_take.attributes
+
+
+def test_another_seed_gives_another_take(bottle_stage, robot_take):
+    assert digest(record(bottle_stage, 4, HEAD_ONLY)) != digest(robot_take)
+
+
+def test_cameras_that_are_not_asked_for_change_nothing_else(bottle_stage, robot_take):
+    blind = record(bottle_stage, 3, BLIND)
+    assert "camera_head" not in blind.streams
+    for name, stream in blind.streams.items():
+        assert stream.values.tobytes() == robot_take.streams[name].values.tobytes()
+
+
+def test_a_miss_keeps_the_motion_and_loses_the_touch(bottle_stage, robot_take):
+    miss = record(bottle_stage, 3, TakeOptions(miss=True, images=()))
+    commanded = miss.streams["action_commanded"].values
+    assert commanded.tobytes() == robot_take.streams["action_commanded"].values.tobytes()
+    assert miss.attributes.success is False
+    assert miss.pad_forces_n.sum() < 0.2 * robot_take.pad_forces_n.sum()
+
+
+def test_pads_press_while_the_bottle_is_held(robot_take):
+    held = robot_take.pad_forces_n[round(2.0 * 60), 1]
+    assert held[0] > 1.0
+    assert held[1:5].sum() > 1.0
+    assert not robot_take.pad_forces_n[:, 0].any()
+    assert not robot_take.pad_forces_n[0].any()
+
+
+def test_an_episode_goes_through_the_store(robot_take, tmp_path):
+    store = EpisodeStore(tmp_path)
+    stored = store.open(write_episode(store, robot_take))
+    window = stored.window(start=0, num_steps=17)
+    np.testing.assert_array_equal(
+        window.images["camera_head"], robot_take.streams["camera_head"].values[:33:2]
+    )
+    np.testing.assert_allclose(window.actions, robot_take.streams["action"].values[:17], atol=1e-9)
+
+
+def test_ids_differ_for_every_way_to_make_an_episode():
+    options = [TakeOptions(), TakeOptions(noise_m=0.01), TakeOptions(miss=True)]
+    assert len({episode_id("stand_bottle", "robot", 1, option) for option in options}) == 3
+
+
+def test_bad_requests_are_refused(bottle_stage):
+    with pytest.raises(InvalidInputError, match="noise"):
+        bottle_stage.plan(0, noise_m=1.0)
+    with pytest.raises(InvalidInputError, match="seed"):
+        bottle_stage.plan(-1)
+    with pytest.raises(UnknownNameError, match="camera_head"):
+        TakeOptions(images=("camera_foot",))
+    with pytest.raises(UnknownNameError, match="stand_bottle"):
+        Stage("juggle", "robot", TwinSettings())
+
+
+def test_the_command_line_records_and_says_so(tmp_path, capsys):
+    summary = tmp_path / "summary.json"
+    arguments = ["record", "--task", "stack_bowls", "--seeds", "7:8", "--cameras", "camera_head"]
+    status = command_line.main(
+        [*arguments, "--store", str(tmp_path / "store"), "--json", str(summary)]
+    )
+    assert status == 0
+    assert "twin-stack_bowls-robot-000007" in summary.read_text()
+    assert EpisodeStore(tmp_path / "store").open("twin-stack_bowls-robot-000007")
+    assert command_line.main([*arguments, "--store", str(tmp_path / "store")]) == 3
+    assert "exists already" in capsys.readouterr().err

@@ -1,0 +1,63 @@
+"""The twin as a world: a rollout replays its demonstration to the last bit."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from dextouch.worlds.world import RolloutStart
+from services.twin.episodes import TakeOptions, record
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.world import TwinWorld
+
+SMALL = TwinSettings(image_height_px=16, image_width_px=16)
+CHUNK = 16
+
+
+@pytest.fixture(scope="module")
+def world():
+    return TwinWorld(SMALL)
+
+
+@pytest.mark.parametrize("task", ["stand_bottle", "stack_bowls"])
+def test_replaying_the_commanded_actions_reproduces_the_demonstration(world, task):
+    episode = record(Stage(task, "robot", SMALL), 11, TakeOptions(images=("camera_head",)))
+    commanded = episode.streams["action_commanded"].values
+    started = world.reset(RolloutStart(task, 11, ""))
+    state, seen = started.state, [started.observation]
+    for first in range(1, 81, CHUNK):
+        stepped = world.step(state, commanded[first : first + CHUNK], seed=first)
+        state = world.restore(world.snapshot(stepped.state))
+        seen.append(stepped.observation)
+    reached = np.concatenate([observation.action_reached for observation in seen])
+    np.testing.assert_array_equal(reached, episode.streams["action"].values)
+    images = np.concatenate([observation.images["camera_head"] for observation in seen])
+    np.testing.assert_array_equal(images, episode.streams["camera_head"].values[::2])
+    tactile = np.concatenate([observation.tactile_kpa for observation in seen])
+    native = np.stack([episode.streams[f"tactile_{s}"].values for s in ("left", "right")], axis=1)
+    expected = native[1:].reshape(80, 4, 2, 320).mean(axis=1, dtype=np.float64)
+    np.testing.assert_allclose(tactile[1:], expected, atol=1e-5)
+    np.testing.assert_array_equal(tactile[0], native[0])
+    assert seen[-1].success is True
+    assert episode.attributes.success is True
+
+
+def test_standing_still_does_not_succeed(world):
+    started = world.reset(RolloutStart("stack_bowls", 2, ""))
+    still = np.repeat(started.observation.action_reached, CHUNK, axis=0)
+    stepped = world.step(started.state, still, seed=0)
+    assert stepped.observation.success is False
+    np.testing.assert_allclose(stepped.observation.action_reached[:, :58], still[:, :58], atol=1e-6)
+
+
+def test_a_start_with_an_observation_is_refused(world):
+    started = world.reset(RolloutStart("stand_bottle", 0, ""))
+    with pytest.raises(InvalidInputError, match="task and seed"):
+        world.reset(RolloutStart("stand_bottle", 0, "", observation=started.observation))
+
+
+def test_a_snapshot_of_another_twin_is_refused(world):
+    other = TwinWorld(TwinSettings(image_height_px=32, image_width_px=32))
+    state = other.reset(RolloutStart("stand_bottle", 0, "")).state
+    with pytest.raises(InvalidInputError, match="version"):
+        world.restore(other.snapshot(state))
