@@ -18,8 +18,8 @@ from services.twin.simulation import MODEL_RATE_HZ
 # 1 + 5 × 16 grid steps: a take of 5 1/3 s.
 NUM_GRID_STEPS: Final = 81
 # A person who looks at what the hands do moves the head by centimetres and degrees.
-_SWAY_M: Final = np.array([0.022, 0.018, 0.014])
-_SWAY_RAD: Final = np.array([0.036, 0.036, 0.020])
+_SWAY_M: Final = np.array([0.030, 0.025, 0.020])
+_SWAY_RAD: Final = np.array([0.050, 0.050, 0.028])
 # Each part of a take lasts this share of its nominal time.
 _TEMPO: Final = (0.85, 1.15)
 # A person reading a waypoint a centimetre wrong also turns a little wrong.

@@ -12,6 +12,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from dextouch import __version__
 from dextouch.clients.policy import Policy
 from dextouch.episodes import EpisodeStore
+from dextouch.serving.logs import configure_logging
 from services.cli.demo.apps import build_apps
 from services.cli.demo.background import served
 from services.cli.demo.judging import judge, ladder
@@ -37,6 +38,7 @@ def main(argv: Sequence[str]) -> int:
         0 when every stage ran; what was measured is in the report, good or not.
     """
     plan = parse(argv)
+    configure_logging(service="demo", log_format="auto", level="warning")
     plan.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
         report = Demo(plan, Path(folder)).run()
