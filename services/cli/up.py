@@ -143,12 +143,10 @@ def _acquisition(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
 
 def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
     from dextouch.worlds.serve import create_world_app
-    from services.twin.serving import TwinServiceSettings
-    from services.twin.world import TwinWorld
+    from services.twin.serving import TwinServiceSettings, twin_worlds
 
     settings = TwinServiceSettings()
-    world = TwinWorld(settings.scene)
-    return create_world_app({world.description.name: world}, settings, name="twin")
+    return create_world_app(twin_worlds(settings.scene), settings, name="twin")
 
 
 def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:

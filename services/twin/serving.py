@@ -1,7 +1,11 @@
-"""`dextouch twin serve`: flags and environment (DEXTOUCH_TWIN_…) in, the twin over HTTP out."""
+"""Flags and environment (DEXTOUCH_TWIN_…) in; the twin and its baseline over HTTP out."""
+
+from typing import Any
 
 from dextouch.serving.settings import load_settings, service_config
+from dextouch.worlds.baseline import CopyFirstWorld
 from dextouch.worlds.serve import WorldServiceSettings, serve_worlds
+from dextouch.worlds.world import World
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 
@@ -14,6 +18,13 @@ class TwinServiceSettings(WorldServiceSettings):
     scene: TwinSettings = TwinSettings()
 
 
+def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
+    """The twin and, beside it, the baseline that every imagined world must beat."""
+    twin = TwinWorld(scene)
+    baseline = CopyFirstWorld.beside(twin.description)
+    return {"twin": twin, baseline.description.name: baseline}
+
+
 def serve(arguments: list[str]) -> None:
     """Serve until SIGINT or SIGTERM.
 
@@ -21,5 +32,4 @@ def serve(arguments: list[str]) -> None:
         InvalidInputError: settings that do not fit.
     """
     settings = load_settings(TwinServiceSettings, arguments)
-    world = TwinWorld(settings.scene)
-    serve_worlds({world.description.name: world}, settings, name="twin")
+    serve_worlds(twin_worlds(settings.scene), settings, name="twin")

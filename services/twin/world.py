@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import (
     AnchorPoses,
     actions_from_poses,
@@ -55,9 +55,18 @@ class TwinWorld:
     A rollout starts from task and seed, at the first observation of the demonstration of that
     seed; replaying a demonstration's `action_commanded` reproduces it to the last bit. Measured
     actions are taken as commands. Physics has no noise: the seed of a step changes nothing.
+
+    Args:
+        settings: cameras to show and how.
+
+    Raises:
+        UnknownNameError: a camera that the twin does not have.
     """
 
     def __init__(self, settings: TwinSettings) -> None:
+        for camera in settings.cameras:
+            if camera not in CAMERAS:
+                raise UnknownNameError("camera", camera, list(CAMERAS))
         self._settings = settings
         self._stages: dict[str, Stage] = {}
         self._description = self._describe()
@@ -75,7 +84,7 @@ class TwinWorld:
             kind="twin",
             digest=hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest(),
             tasks=TASK_NAMES,
-            cameras=CAMERAS,
+            cameras=self._settings.cameras,
             image_height_px=self._settings.image_height_px,
             image_width_px=self._settings.image_width_px,
             model_rate_hz=MODEL_RATE_HZ,
@@ -97,7 +106,7 @@ class TwinWorld:
             )
         stage = self._stage(start.task)
         anchor = stage.start(stage.plan(start.seed))
-        log = _StepLog(stage)
+        log = _StepLog(stage, self._settings.cameras)
         log.step()
         state = TwinState(start.task, start.seed, 0, stage.simulation.state(), anchor)
         return StartedRollout(
@@ -113,7 +122,7 @@ class TwinWorld:
         commands = poses_from_actions(checked, state.anchor)
         stage = self._stage(state.task)
         stage.simulation.set_state(state.physics, step_index=state.step * STEPS_PER_GRID)
-        log = _StepLog(stage)
+        log = _StepLog(stage, self._settings.cameras)
         for row in range(len(checked)):
             for step_index in stage.simulation.advance(command_row(commands, row)):
                 if step_index % STEPS_PER_TACTILE == 0:
@@ -173,10 +182,10 @@ class TwinWorld:
 class _StepLog:
     """What is seen, felt and measured at consecutive grid steps of one stage."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: Stage, cameras: tuple[str, ...]) -> None:
         self._stage = stage
         self._grid = GridLog(stage)
-        self._images: dict[str, list[np.ndarray]] = {camera: [] for camera in CAMERAS}
+        self._images: dict[str, list[np.ndarray]] = {camera: [] for camera in cameras}
         self._tactile: list[np.ndarray] = []
         self._since_step: list[np.ndarray] = []
 

@@ -49,7 +49,7 @@ class TrainSettings(BaseModel):
     output: Path = Path("runs/world_model/tiny.safetensors")
     name: str = "tiny"
     seed: int = Field(default=0, ge=0)
-    cpu_budget_s: float = Field(default=480.0, gt=0)
+    cpu_budget_s: float = Field(default=1000.0, gt=0)
     max_steps: int | None = Field(default=None, ge=1)
     num_threads: int = Field(default=1, ge=1)
     heldout_percent: int = Field(default=10, ge=1, le=50)

@@ -35,7 +35,9 @@ def build_apps(store_folder: Path, world_model: Checkpoint) -> dict[str, FastAPI
         "episode_store": create_store(EpisodeStoreSettings(store_url=url)),
         "alignment": create_alignment(AlignmentSettings(store_url=url)),
         "twin": create_world_app(
-            {"twin": TwinWorld(TwinSettings())}, WorldServiceSettings(), name="twin"
+            {"twin": TwinWorld(TwinSettings(cameras=("camera_head",)))},
+            WorldServiceSettings(),
+            name="twin",
         ),
         "imagined": create_world_app(imagined, WorldServiceSettings(), name="imagined"),
     }

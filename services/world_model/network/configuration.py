@@ -12,7 +12,7 @@ class NetworkConfig(BaseModel):
     patch_px: int = Field(default=8, description="side of a visual patch")
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
     codec_channels: int = Field(default=48, ge=1, le=768, description="latents of a visual patch")
-    palm_channels: int = Field(default=32, ge=1, le=240, description="latents of a palm pad")
+    palm_channels: int = Field(default=48, ge=1, le=240, description="latents of a palm pad")
     video_width: int = Field(default=96, ge=8)
     tactile_width: int = Field(default=96, ge=8)
     num_layers: int = Field(default=3, ge=1)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.worlds.world import RolloutStart
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
@@ -54,6 +54,24 @@ def test_a_start_with_an_observation_is_refused(world):
     started = world.reset(RolloutStart("stand_bottle", 0, ""))
     with pytest.raises(InvalidInputError, match="task and seed"):
         world.reset(RolloutStart("stand_bottle", 0, "", observation=started.observation))
+
+
+def test_leaving_cameras_out_changes_nothing_else(world):
+    one_eyed = TwinWorld(SMALL.model_copy(update={"cameras": ("camera_head",)}))
+    start = RolloutStart("stack_bowls", 4, "")
+    plain, fast = world.reset(start), one_eyed.reset(start)
+    still = np.repeat(plain.observation.action_reached, CHUNK, axis=0)
+    expected = world.step(plain.state, still, seed=0).observation
+    got = one_eyed.step(fast.state, still, seed=0).observation
+    assert set(got.images) == {"camera_head"}
+    np.testing.assert_array_equal(got.images["camera_head"], expected.images["camera_head"])
+    np.testing.assert_array_equal(got.tactile_kpa, expected.tactile_kpa)
+    np.testing.assert_array_equal(got.action_reached, expected.action_reached)
+
+
+def test_an_unknown_camera_is_refused():
+    with pytest.raises(UnknownNameError, match="camera_head"):
+        TwinWorld(SMALL.model_copy(update={"cameras": ("camera_knee",)}))
 
 
 def test_a_snapshot_of_another_twin_is_refused(world):
