@@ -16,7 +16,7 @@ from dextouch.serving.logs import configure_logging
 from services.cli.demo.apps import build_apps
 from services.cli.demo.background import served
 from services.cli.demo.judging import judge, ladder
-from services.cli.demo.models import Models, committed_models, train_models
+from services.cli.demo.models import Models, committed_models, train_models, use_one_thread
 from services.cli.demo.pictures import collect
 from services.cli.demo.prediction import PredictionResult, measure_prediction
 from services.cli.demo.recording import Take, align, measure, record_take, upload
@@ -39,6 +39,7 @@ def main(argv: Sequence[str]) -> int:
     """
     plan = parse(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
+    use_one_thread()
     plan.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
         report = Demo(plan, Path(folder)).run()

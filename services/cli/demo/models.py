@@ -3,6 +3,8 @@
 from dataclasses import dataclass
 from pathlib import Path
 
+import torch
+
 from services.cli import train
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
@@ -42,6 +44,11 @@ def train_models(folder: Path) -> Models:
     train.main(["policy", "--episodes", episodes, "--output", str(policy)])
     train.main(["probe", "--episodes", episodes, "--output", str(probe)])
     return _load(world_model, policy, probe)
+
+
+def use_one_thread() -> None:
+    """One torch thread: beside busy services a second one makes small networks slower."""
+    torch.set_num_threads(1)
 
 
 def _load(world_model: Path, policy: Path, probe: Path) -> Models:

@@ -22,7 +22,7 @@ class DemoPlan:
     json: Path | None
     train: bool
     num_seeds: int
-    noise_ladder_m: tuple[float, ...] = (0.0, 0.012, 0.03)
+    noise_ladder_m: tuple[float, ...] = (0.0, 0.01, 0.03)
     take_seed: int = FIRST_HELD_OUT_SEED + 900
 
     @property
