@@ -59,7 +59,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def run_train_policy(arguments: list[str]) -> int:
     """Train the cloned policy and keep it."""
     settings = parse(TrainPolicySettings, arguments)
-    demonstrations = read_demonstrations(EpisodeStore(settings.episodes), tasks=settings.tasks)
+    stores = [EpisodeStore(url) for url in settings.episodes]
+    demonstrations = read_demonstrations(*stores, tasks=settings.tasks)
     command = command_line("train-policy", arguments)
     checkpoint = train_cloned_policy(demonstrations, settings.training, command=command)
     return _keep(checkpoint, settings.output, settings.json_path)
@@ -68,7 +69,8 @@ def run_train_policy(arguments: list[str]) -> int:
 def run_train_probe(arguments: list[str]) -> int:
     """Train the success probe and keep it."""
     settings = parse(TrainProbeSettings, arguments)
-    demonstrations = read_demonstrations(EpisodeStore(settings.episodes), tasks=settings.tasks)
+    stores = [EpisodeStore(url) for url in settings.episodes]
+    demonstrations = read_demonstrations(*stores, tasks=settings.tasks)
     command = command_line("train-probe", arguments)
     checkpoint = train_success_probe(demonstrations, settings.training, command=command)
     return _keep(checkpoint, settings.output, settings.json_path)

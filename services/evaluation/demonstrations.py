@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from services.evaluation.starts import start_digest
 
 CAMERA = "camera_head"
@@ -68,28 +68,33 @@ def read_demonstration(reader: EpisodeReader) -> Demonstration:
     )
 
 
-def read_demonstrations(store: EpisodeStore, *, tasks: Sequence[str] = ()) -> list[Demonstration]:
-    """All robot episodes of a store, in the order of their ids.
+def read_demonstrations(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[Demonstration]:
+    """All robot episodes of some stores, store by store in the order of their ids.
 
     Args:
-        store: where to read.
+        stores: where to read.
         tasks: only these; empty for all.
 
     Raises:
         NotFoundError: not one such episode.
+        ConflictError: two stores hold an episode of the same id.
     """
-    demonstrations = []
-    for episode_id in sorted(store.list(kind="episode")):
-        reader = store.open(episode_id)
-        attributes = reader.attributes
-        if attributes.domain == "robot" and (not tasks or attributes.task in tasks):
-            demonstrations.append(read_demonstration(reader))
-    if not demonstrations:
+    found: dict[str, Demonstration] = {}
+    for store in stores:
+        for episode_id in sorted(store.list(kind="episode")):
+            reader = store.open(episode_id)
+            attributes = reader.attributes
+            if attributes.domain != "robot" or (tasks and attributes.task not in tasks):
+                continue
+            if episode_id in found:
+                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
+            found[episode_id] = read_demonstration(reader)
+    if not found:
         raise NotFoundError(
             f"no robot episode of {', '.join(tasks) or 'any task'} in the store; "
             "record some with the twin first"
         )
-    return demonstrations
+    return list(found.values())
 
 
 def data_hash(demonstrations: Iterable[Demonstration]) -> str:

@@ -22,11 +22,11 @@ SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
 class TrainPolicySettings(BaseSettings):
-    """Imitate the robot episodes of a store."""
+    """Imitate the robot episodes of some stores."""
 
     model_config = service_config("evaluation_train_policy")
 
-    episodes: str = Field(description="episode store: folder or file:// URL")
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     output: Path = Path("runs/evaluation/behaviour_cloning.safetensors")
     tasks: tuple[str, ...] = ()
     training: CloningSettings = CloningSettings()
@@ -34,11 +34,11 @@ class TrainPolicySettings(BaseSettings):
 
 
 class TrainProbeSettings(BaseSettings):
-    """Learn to tell success on the robot episodes of a store."""
+    """Learn to tell success on the robot episodes of some stores."""
 
     model_config = service_config("evaluation_train_probe")
 
-    episodes: str = Field(description="episode store: folder or file:// URL")
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     output: Path = Path("runs/evaluation/success_probe.safetensors")
     tasks: tuple[str, ...] = ()
     training: ProbeSettings = ProbeSettings()

@@ -23,6 +23,7 @@ from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_we
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.features import pad_features
 from services.evaluation.policies.cloning_network import (
+    SLOT_STEPS,
     CloningBatch,
     CloningNetwork,
     phase_features,
@@ -45,8 +46,16 @@ class CloningShape(BaseModel):
     def network(self) -> CloningNetwork:
         """A network of this shape, not trained yet."""
         return CloningNetwork(
-            num_tasks=len(self.tasks), num_components=self.num_components, hidden=self.hidden
+            num_tasks=len(self.tasks),
+            num_slots=self.num_slots,
+            num_components=self.num_components,
+            hidden=self.hidden,
         )
+
+    @property
+    def num_slots(self) -> int:
+        """Stretches of time that have a mean chunk of their own."""
+        return self.horizon_steps // SLOT_STEPS + 1
 
 
 @dataclass(frozen=True)
@@ -92,6 +101,7 @@ def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> Clonin
         torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255 - 0.5,
         torch.tensor(state, dtype=torch.float32),
         torch.tensor([shape.tasks.index(i.task) for i in inputs]),
+        torch.tensor([min(i.step // SLOT_STEPS, shape.num_slots - 1) for i in inputs]),
     )
 
 
@@ -171,6 +181,6 @@ class BehaviourCloningPolicy:
             self._task,
         )
         with torch.no_grad():
-            coefficients = self._network(cloning_batch([moment], self.shape))
-            chunk = self._network.codec.decode(coefficients)[0].double().numpy()
+            batch = cloning_batch([moment], self.shape)
+            chunk = self._network.codec.decode(self._network(batch), batch)[0].double().numpy()
         return chunk_from_start(chunk, moment.reached)

