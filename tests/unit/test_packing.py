@@ -33,3 +33,8 @@ def test_lying_shape_is_refused():
     data = pack({}, {"a": np.zeros(4, np.float32)})
     with pytest.raises(InvalidInputError, match="got 16 bytes, expected 20"):
         unpack(data.replace(b"\x91\x04", b"\x91\x05"), max_bytes=1000)
+
+
+def test_numbers_that_do_not_travel_are_refused():
+    with pytest.raises(InvalidInputError, match="whole number"):
+        pack({"seed": 2**70}, {})

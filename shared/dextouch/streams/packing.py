@@ -18,7 +18,7 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
     """Bytes of JSON-like fields and arrays (little endian, C order).
 
     Raises:
-        InvalidInputError: an array of a kind that does not travel.
+        InvalidInputError: an array of a kind, or a whole number of a size, that does not travel.
     """
     packed = {}
     for name, array in arrays.items():
@@ -27,7 +27,10 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
             raise InvalidInputError(f"array {name!r}: dtype {dtype}, expected one of {DTYPES}")
         ordered = np.ascontiguousarray(array, dtype=np.dtype(dtype).newbyteorder("<"))
         packed[name] = {"dtype": dtype, "shape": list(ordered.shape), "data": ordered.tobytes()}
-    return msgpack.packb({"fields": dict(fields), "arrays": packed})
+    try:
+        return msgpack.packb({"fields": dict(fields), "arrays": packed})
+    except OverflowError as error:
+        raise InvalidInputError("body: a whole number outside -2^63 … 2^64-1") from error
 
 
 def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:

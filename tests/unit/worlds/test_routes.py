@@ -265,7 +265,9 @@ def damaged_start(data: st.DataObject) -> bytes:
     if where == "field":
         fields = message["fields"][data.draw(st.sampled_from(["start", "observation"]))]
         fields[data.draw(st.sampled_from(sorted(fields)))] = data.draw(
-            st.none() | st.lists(st.integers(), max_size=2) | st.floats(allow_nan=True)
+            st.none()
+            | st.lists(st.integers(-(2**63), 2**64 - 1), max_size=2)
+            | st.floats(allow_nan=True)
         )
     elif where == "array":
         del arrays[data.draw(st.sampled_from(sorted(arrays)))]

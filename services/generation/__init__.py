@@ -1,0 +1,1 @@
+"""Imagined episodes: recorded actions played in an imagined world, back into the store."""

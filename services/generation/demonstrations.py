@@ -1,0 +1,134 @@
+"""A robot episode and a served imagined world in; the same actions as that world sees them, out."""
+
+import hashlib
+from typing import Final, Literal
+
+import numpy as np
+
+from dextouch.clients.rollouts import RolloutClient
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError
+from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
+from dextouch.schemas.rollouts import Observation
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.tactile.layout import SIDES
+
+CAMERA: Final = "camera_head"
+CHUNK_STEPS: Final = 16
+NS_PER_S: Final = 1_000_000_000
+Kind = Literal["tactile", "image", "robot_state"]
+
+
+def imagine_episode(
+    source: EpisodeReader, client: RolloutClient, world: str, store: EpisodeStore
+) -> str:
+    """Play an episode's commanded actions in an imagined world and keep what it showed.
+
+    The imagined episode starts from the source's first observation. Its `success` is the
+    *source's*: what these actions really led to, which is what a judge of imagined endings has to
+    learn. Its lineage names the source and the world's digest.
+
+    Args:
+        source: a robot episode with head camera, touch and commanded actions.
+        client: of the service that has the world.
+        world: its name there.
+        store: where the imagined episode goes.
+
+    Returns:
+        Its id; the same source and world give the same id, and one that is there is kept.
+
+    Raises:
+        InvalidInputError: a source without commanded actions.
+        UnknownNameError: no such world.
+    """
+    digests = {description.name: description.digest for description in client.worlds()}
+    attributes = source.attributes
+    name = imagined_id(attributes.episode_id, digests.get(world, world))
+    if store.exists(name):
+        return name
+    if "action_commanded" not in source.streams:
+        raise InvalidInputError(
+            f"episode {attributes.episode_id!r}: has no commanded actions to play in {world!r}"
+        )
+    window = source.window(0, source.num_steps, cameras=(CAMERA,))
+    commanded = source.read("action_commanded").values
+    first = Observation(
+        first_step=0,
+        images={CAMERA: window.images[CAMERA][:1]},
+        tactile_kpa=window.tactile_kpa[:1],
+        action_reached=window.actions[:1],
+        reached_is_measured=True,
+    )
+    seen = [first]
+    with client.start(
+        world=world,
+        task=attributes.task,
+        seed=attributes.seed or 0,
+        instruction=attributes.instruction,
+        init=(first, window.anchor, window.K_head),
+    ) as rollout:
+        seen.extend(
+            rollout.step(commanded[begin : begin + CHUNK_STEPS])
+            for begin in range(1, len(commanded), CHUNK_STEPS)
+        )
+    lineage = (
+        *attributes.lineage,
+        LineageEntry(kind="episode", id=attributes.episode_id, sha256=source.content_sha256),
+        LineageEntry(kind="checkpoint", id=world, sha256=_sha256(digests.get(world, ""))),
+    )
+    imagined = attributes.model_copy(
+        update={
+            "episode_id": name,
+            "origin": "imagined",
+            "lineage": lineage,
+            "object_names": (),
+            "generator_command": None,
+            "streams": (),
+        }
+    )
+    _write(store, imagined, seen, commanded)
+    return name
+
+
+def imagined_id(episode_id: str, world_digest: str) -> str:
+    """The id of an imagined episode: its source and, in short, the world that imagined it."""
+    return f"imagined-{world_digest[:8]}-{episode_id}"
+
+
+def _sha256(digest: str) -> str | None:
+    return digest if len(digest) == hashlib.sha256().digest_size * 2 else None
+
+
+def _write(
+    store: EpisodeStore,
+    attributes: EpisodeAttributes,
+    seen: list[Observation],
+    commanded: np.ndarray,
+) -> None:
+    rate_hz = attributes.model_rate_hz
+    tactile = np.concatenate([observation.tactile_kpa for observation in seen])
+    images = np.concatenate([observation.images[CAMERA] for observation in seen])
+    reached = np.concatenate([observation.action_reached for observation in seen])
+    t_ref_ns = np.round(np.arange(len(tactile)) * NS_PER_S / rate_hz).astype(np.int64)
+    streams: list[tuple[str, Kind, str, np.ndarray]] = [
+        (CAMERA, "image", "rgb8", images),
+        ("action", "robot_state", "action_m_rad", reached),
+        ("action_commanded", "robot_state", "action_m_rad", np.asarray(commanded)),
+    ]
+    for index, side in enumerate(SIDES):
+        streams.append((f"tactile_{side}", "tactile", "kPa", tactile[:, index]))
+    with store.writer(kind="episode", attributes=attributes) as writer:
+        for name, kind, unit, values in streams:
+            writer.add_stream(
+                StreamDescriptor.model_validate(
+                    {
+                        "name": name,
+                        "kind": kind,
+                        "shape": values.shape[1:],
+                        "dtype": values.dtype.name,
+                        "unit": unit,
+                        "nominal_rate_hz": rate_hz,
+                    }
+                )
+            )
+            writer.append(name, values=values, t_ref_ns=t_ref_ns)
