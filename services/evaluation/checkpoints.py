@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, NotFoundError
 
@@ -65,7 +65,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     unfinished = path.with_suffix(".unfinished")
     text = checkpoint.metadata.model_dump_json()
     tensors = {name: tensor.contiguous() for name, tensor in checkpoint.tensors.items()}
-    save_file(tensors, unfinished, metadata={_METADATA_KEY: text})
+    unfinished.write_bytes(save(tensors, metadata={_METADATA_KEY: text}))
     unfinished.replace(path)
 
 
