@@ -29,10 +29,12 @@ MAX_NOISE_M = 0.025
 CAMERAS = ("camera_head",)
 
 
-def options_of(task: str, seed: int, *, miss_fraction: float) -> TakeOptions:
+def options_of(
+    task: str, seed: int, *, miss_fraction: float, exact_fraction: float = EXACT_FRACTION
+) -> TakeOptions:
     """How the episode of a task and seed is made; the same every time."""
     draw = np.random.default_rng([seed, len(task)])
-    exact = draw.random() < EXACT_FRACTION
+    exact = draw.random() < exact_fraction
     noise_m = 0.0 if exact else float(np.round(draw.uniform(0, MAX_NOISE_M), 3))
     return TakeOptions(noise_m, bool(draw.random() < miss_fraction), CAMERAS)
 
@@ -42,9 +44,9 @@ def _stage(task: str) -> Stage:
     return Stage(task, "robot", TwinSettings())
 
 
-def _make(order: tuple[str, int, float, str]) -> bool | None:
-    task, seed, miss_fraction, url = order
-    store, options = EpisodeStore(url), options_of(task, seed, miss_fraction=miss_fraction)
+def _make(order: tuple[str, int, TakeOptions, str]) -> bool | None:
+    task, seed, options, url = order
+    store = EpisodeStore(url)
     if store.exists(episode_id(task, "robot", seed, options)):
         return None
     episode = record(_stage(task), seed, options)
@@ -53,7 +55,12 @@ def _make(order: tuple[str, int, float, str]) -> bool | None:
 
 
 def make_training_data(
-    store: str, seeds: range, *, miss_fraction: float, num_jobs: int | None = None
+    store: str,
+    seeds: range,
+    *,
+    miss_fraction: float,
+    exact_fraction: float = EXACT_FRACTION,
+    num_jobs: int | None = None,
 ) -> dict[str, int]:
     """Record one episode a task and seed; what the store has already is kept.
 
@@ -68,7 +75,10 @@ def make_training_data(
             f"training data: got seeds {seeds} and miss fraction {miss_fraction}, expected at "
             "least one seed and 0 … 1"
         )
-    orders = [(task, seed, miss_fraction, store) for seed in seeds for task in TASK_NAMES]
+    mix = {"miss_fraction": miss_fraction, "exact_fraction": exact_fraction}
+    orders = [
+        (task, seed, options_of(task, seed, **mix), store) for seed in seeds for task in TASK_NAMES
+    ]
     processes = num_jobs or os.cpu_count() or 1
     # Spawned, not forked: threads and locks of the caller must not be copied half-way.
     with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
@@ -86,12 +96,17 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")
     parser.add_argument("--count", type=int, default=130, help="seeds a task (%(default)s)")
     parser.add_argument("--miss-fraction", type=float, default=0.2, help="(%(default)s)")
+    parser.add_argument("--exact", action="store_true", help="no noise at all")
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
     parser.add_argument("--json", type=Path, help="write the counts here")
     arguments = parser.parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     counts = make_training_data(
-        arguments.store, seeds, miss_fraction=arguments.miss_fraction, num_jobs=arguments.jobs
+        arguments.store,
+        seeds,
+        miss_fraction=arguments.miss_fraction,
+        exact_fraction=1.0 if arguments.exact else EXACT_FRACTION,
+        num_jobs=arguments.jobs,
     )
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
     if arguments.json:

@@ -11,6 +11,9 @@ from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 
+# Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
+EXACT_DATA = ("--first", "1000", "--count", "120", "--miss-fraction", "0", "--exact")
+
 
 @dataclass(frozen=True)
 class Models:
@@ -31,18 +34,22 @@ def committed_models() -> Models:
 
 
 def train_models(folder: Path) -> Models:
-    """Record training episodes and train all three, by the commands that made the committed ones.
+    """Record training episodes and train all three, as the committed ones were trained.
 
     Args:
         folder: where episodes and checkpoints go; episodes that are there are used again.
     """
-    episodes = str(folder / "episodes")
+    episodes, exact, imagined = (str(folder / name) for name in ("episodes", "exact", "imagined"))
     world_model = folder / "world_model.safetensors"
     policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
     train.main(["data", "--store", episodes])
+    train.main(["data", "--store", exact, *EXACT_DATA])
     train.main(["world-model", "--episodes", episodes, "--output", str(world_model)])
-    train.main(["policy", "--episodes", episodes, "--output", str(policy)])
-    train.main(["probe", "--episodes", episodes, "--output", str(probe)])
+    train.main(["policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)])
+    train.main(
+        ["imagined", "--episodes", episodes, "--store", imagined, "--checkpoint", str(world_model)]
+    )
+    train.main(["probe", "--episodes", episodes, "--episodes", imagined, "--output", str(probe)])
     return _load(world_model, policy, probe)
 
 

@@ -90,11 +90,14 @@ def test_training_episodes_are_the_same_every_time_and_mixed():
     assert 20 < sum(options.miss for options in drawn) < 60
     assert 50 < sum(options.noise_m == 0 for options in drawn) < 90
     assert max(options.noise_m for options in drawn) <= training_data.MAX_NOISE_M
+    exact = training_data.options_of("stand_bottle", 5, miss_fraction=0.0, exact_fraction=1.0)
+    assert (exact.noise_m, exact.miss) == (0.0, False)
 
 
 def test_the_table_shows_undefined_agreement(capsys):
     show(
         {
+            "about": {"success_probe": {"held_out_accuracy": 0.8}},
             "stages": [{"name": "truth", "seconds": 1.0}],
             "errors": errors(1),
             "world_model": dict.fromkeys(
