@@ -130,10 +130,10 @@ class Demo:
         return {
             "about": {
                 "version": __version__,
-                "world_model": models.world_model.digest,
-                "held_out_seeds": list(self.plan.seeds),
-                "success_probe": models.probe.metadata.metrics,
+                "world model": models.world_model.digest[:12],
+                "held-out seeds": f"{self.plan.seeds[0]} … {self.plan.seeds[-1]}",
             },
+            "success_probe": models.probe.metadata.metrics,
             "stages": self.stages.rows(),
             "errors": worst_errors({name: take.errors for name, take in takes.items()}),
             "takes": {

@@ -14,7 +14,7 @@ def show(report: Mapping[str, Any]) -> None:
     console.print(_errors(report["errors"]))
     console.print(_world_model(report["world_model"]))
     console.print(_policies(report["policies"]))
-    accuracy = report["about"]["success_probe"]["held_out_accuracy"]
+    accuracy = report["success_probe"]["held_out_accuracy"]
     console.print(f"Imagined success is told by a learned probe, right on {accuracy:.0%} of the")
     console.print("held-out true and imagined endings.\n")
     console.print(_agreement(report["agreement"]))

@@ -97,7 +97,7 @@ def test_training_episodes_are_the_same_every_time_and_mixed():
 def test_the_table_shows_undefined_agreement(capsys):
     show(
         {
-            "about": {"success_probe": {"held_out_accuracy": 0.8}},
+            "success_probe": {"held_out_accuracy": 0.8},
             "stages": [{"name": "truth", "seconds": 1.0}],
             "errors": errors(1),
             "world_model": dict.fromkeys(
