@@ -2,8 +2,13 @@
 
 import os
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
+from hypothesis import settings
 from jaxtyping import install_import_hook
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 install_import_hook(["dextouch", "services"], "beartype.beartype")
+
+# The same examples in every run: a change is red because of the change, not because of the day.
+# No deadline: machines that are busy with other things are slow, not wrong.
+settings.register_profile("steady", derandomize=True, deadline=None)
+settings.load_profile("steady")
