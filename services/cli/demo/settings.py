@@ -47,7 +47,7 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         "--train",
         action="store_true",
         help="train world model, policy and probe anew instead of using the committed ones "
-        "(about half an hour on two cores)",
+        "(takes far longer than the demo itself)",
     )
     parser.add_argument(
         "--seeds",
