@@ -125,13 +125,17 @@ def _episode_attributes(
         instruction=source.instruction,
         domain=source.domain,
         origin="recorded",
+        station=source.station,
+        operator=source.operator,
         anchor=StoredAnchor.from_poses(actions.anchor),
         K_head=source.calibration["K_head"],
         success=source.success,
+        recovered=source.recovered,
         lineage=(*source.lineage, origin),
         calibration=source.calibration,
         clocks=tuple(stream.timing.report for stream in streams.values()),
-        quality=quality,
+        # What the station measured, too; of two figures with one name the aligned one counts.
+        quality=source.quality | quality,
         created_at=source.started_at,
     )
 

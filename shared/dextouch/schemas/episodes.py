@@ -93,7 +93,8 @@ class EpisodeAttributes(BaseModel):
     """Everything about an episode that is not a sample.
 
     `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
-    `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures.
+    `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures;
+    `recovered` says that the writer died and this is what its journals vouch for.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -104,11 +105,14 @@ class EpisodeAttributes(BaseModel):
     instruction: str = Field(max_length=2000)
     domain: Domain
     origin: Origin
+    station: str | None = Field(default=None, min_length=1, max_length=128)
+    operator: str | None = None
     seed: int | None = None
     model_rate_hz: FiniteFloat = Field(default=15.0, gt=0)
     anchor: StoredAnchor
     K_head: Matrix
     success: bool | None = None
+    recovered: bool = False
     generator_command: str | None = None
     lineage: tuple[LineageEntry, ...] = ()
     object_names: tuple[str, ...] = ()

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat
 
 from dextouch.schemas.episodes import (
     FORMAT_VERSION,
@@ -29,7 +29,8 @@ class RecordingAttributes(BaseModel):
     """Everything about a raw take that is not a sample.
 
     `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
-    matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` what went wrong, counted.
+    matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` what went wrong, counted;
+    `quality` named figures; `recovered` says that the station died during the take.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -45,9 +46,11 @@ class RecordingAttributes(BaseModel):
     started_at: AwareDatetime | None = None
     started_t_host_ns: int | None = None
     success: bool | None = None
+    recovered: bool = False
     calibration: dict[str, Matrix] = {}
     lineage: tuple[LineageEntry, ...] = ()
     ledger: tuple[LedgerEntry, ...] = ()
+    quality: dict[str, FiniteFloat] = {}
     streams: tuple[StreamDescriptor, ...] = ()
 
 
