@@ -1,0 +1,199 @@
+"""An MCAP file that `export_mcap` wrote in, an equal episode or recording in a store out."""
+
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
+from pydantic import ValidationError
+
+from dextouch.bridges.blocks import is_encoded, objects
+from dextouch.bridges.mcap.messages import MessageCodec, Sent
+from dextouch.bridges.mcap.records import records
+from dextouch.bridges.mcap.writing import ABOUT, ATTRIBUTES_FILE, BRIDGE_VERSION, COUNTS
+from dextouch.episodes import EpisodeStore, EpisodeWriter
+from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
+from dextouch.schemas.episodes import EpisodeAttributes
+from dextouch.schemas.recordings import RecordingAttributes
+
+MAX_ATTRIBUTES_BYTES: Final = 1 << 24
+_BLOCK_BYTES: Final = 1 << 24
+
+
+@dataclass
+class _About:
+    """What a file says before its samples matter."""
+
+    kind: str = ""
+    attributes: EpisodeAttributes | RecordingAttributes | None = None
+    counts: dict[str, int] = field(default_factory=dict)
+
+
+def import_mcap(path: Path, store: EpisodeStore) -> str:
+    """Read an MCAP file that came from `export_mcap` into a store.
+
+    Args:
+        path: of the file; it may come from anywhere.
+        store: where the episode or recording appears under the id that it had.
+
+    Returns:
+        The id.
+
+    Raises:
+        NotFoundError: no such file.
+        InvalidInputError: no MCAP file, or not one of ours.
+        CorruptDataError: truncated or damaged; the store stays as it was.
+        LimitExceededError: a record is larger than any that we write.
+        ConflictError: the id is in the store already.
+    """
+    about = _about(path)
+    attributes = about.attributes
+    if isinstance(attributes, EpisodeAttributes):
+        with store.writer(attributes=attributes) as writer:
+            _Import(path, about, writer).run()
+        return attributes.episode_id
+    if not isinstance(attributes, RecordingAttributes):
+        raise InvalidInputError(
+            f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
+            "`dextouch export --format mcap` wrote can be imported"
+        )
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        _Import(path, about, writer).run()
+    return attributes.recording_id
+
+
+def _about(path: Path) -> _About:
+    about, text = _About(), None
+    for record in records(path):
+        if isinstance(record, Metadata) and record.name == ABOUT:
+            version = record.metadata.get("bridge_version")
+            if version != BRIDGE_VERSION:
+                raise StorageError(
+                    f"{path}: got bridge version {version!r}, expected {BRIDGE_VERSION!r}; "
+                    "read it with the release that wrote it"
+                )
+            about.kind = record.metadata.get("kind", "")
+        elif isinstance(record, Metadata) and record.name == COUNTS:
+            about.counts = {name: _count(path, n) for name, n in record.metadata.items()}
+        elif isinstance(record, Attachment) and record.name == ATTRIBUTES_FILE:
+            text = record.data
+    if text is not None and about.kind in {"episode", "recording"}:
+        about.attributes = _attributes(path, about.kind, text)
+    return about
+
+
+def _count(path: Path, text: str) -> int:
+    if not text.isdecimal() or len(text) > 18:
+        raise CorruptDataError(f"{path}: metadata {COUNTS!r} says {text!r}, expected a number")
+    return int(text)
+
+
+def _attributes(path: Path, kind: str, text: bytes) -> EpisodeAttributes | RecordingAttributes:
+    if len(text) > MAX_ATTRIBUTES_BYTES:
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")
+    try:
+        plain = json.dumps(json.loads(text))
+        if kind == "episode":
+            return EpisodeAttributes.model_validate_json(plain)
+        return RecordingAttributes.model_validate_json(plain)
+    except (ValueError, RecursionError, ValidationError) as error:
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} does not fit ({error})") from error
+
+
+class _Pending:
+    """Samples of one stream that wait to be written together."""
+
+    def __init__(self, codec: MessageCodec, writer: EpisodeWriter, *, is_episode: bool) -> None:
+        self.codec, self._writer, self._is_episode = codec, writer, is_episode
+        self.num_samples = 0
+        self._sent: list[Sent] = []
+        self._num_bytes = 0
+
+    def add(self, data: bytes) -> None:
+        """One message."""
+        self._sent.append(self.codec.decode(data))
+        self.num_samples += 1
+        self._num_bytes += len(data)
+        if self._num_bytes >= _BLOCK_BYTES:
+            self.flush()
+
+    def flush(self) -> None:
+        """Write what waits."""
+        sent, descriptor = self._sent, self.codec.descriptor
+        self._sent, self._num_bytes = [], 0
+        if not sent:
+            return
+        if is_encoded(descriptor):
+            values = objects([s.value for s in sent if isinstance(s.value, bytes)])
+        else:
+            values = np.stack([np.asarray(s.value) for s in sent])
+        t_ns = np.array([s.t_ns for s in sent], dtype=np.int64)
+        if self._is_episode:
+            self._writer.append(descriptor.name, values=values, t_ref_ns=t_ns)
+            return
+        self._writer.append(
+            descriptor.name,
+            values=values,
+            t_host_ns=t_ns,
+            t_device_ns=np.array([s.t_device_ns for s in sent], dtype=np.int64),
+            sequence=np.array([s.sequence for s in sent], dtype=np.int64),
+        )
+
+
+class _Import:
+    """One file on its way into a writer."""
+
+    def __init__(self, path: Path, about: _About, writer: EpisodeWriter) -> None:
+        self._path, self._counts = path, about.counts
+        streams = about.attributes.streams if about.attributes else ()
+        self._pending = {
+            f"/{stream.name}": _Pending(
+                MessageCodec(stream), writer, is_episode=about.kind == "episode"
+            )
+            for stream in streams
+        }
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, _Pending | None] = {}
+
+    def run(self) -> None:
+        """All messages, then the count of each stream."""
+        for record in records(self._path):
+            self._take(record)
+        for topic, pending in self._pending.items():
+            pending.flush()
+            expected = self._counts.get(pending.codec.descriptor.name)
+            if pending.num_samples != expected:
+                raise CorruptDataError(
+                    f"{self._path}: {topic} holds {pending.num_samples} messages, expected "
+                    f"{expected}; the file was cut or filtered after the export"
+                )
+
+    def _take(self, record: McapRecord) -> None:
+        if isinstance(record, Schema):
+            self._schemas[record.id] = record
+        elif isinstance(record, Channel):
+            self._channels[record.id] = self._known(record)
+        elif isinstance(record, Message):
+            if record.channel_id not in self._channels:
+                raise CorruptDataError(
+                    f"{self._path}: a message of channel {record.channel_id}, which is not there"
+                )
+            pending = self._channels[record.channel_id]
+            if pending is not None:
+                pending.add(record.data)
+
+    def _known(self, channel: Channel) -> _Pending | None:
+        """The stream of a channel; channels that others added carry none of our samples."""
+        pending = self._pending.get(channel.topic)
+        if pending is None:
+            return None
+        schema = self._schemas.get(channel.schema_id)
+        name = schema.name if schema else None
+        if (channel.message_encoding, name) != ("protobuf", pending.codec.message):
+            raise CorruptDataError(
+                f"{self._path}: {channel.topic} has messages {channel.message_encoding!r} "
+                f"{name!r}, expected 'protobuf' {pending.codec.message!r}"
+            )
+        return pending

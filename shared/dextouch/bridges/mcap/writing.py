@@ -1,0 +1,201 @@
+"""An episode or recording of a store in, an MCAP file that Foxglove shows and we read back, out."""
+
+import heapq
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from dextouch import __version__
+from dextouch.bridges.blocks import Reader, blocks, is_encoded, stamp_at
+from dextouch.bridges.mcap.messages import MessageCodec, Sent, calibration_message
+from dextouch.bridges.mcap.protobuf import descriptor_set
+from dextouch.bridges.mcap.schemas import CALIBRATION, TABLE, raw_encoding
+from dextouch.bridges.new_file import new_file
+from dextouch.episodes import EpisodeReader
+from dextouch.errors import InvalidInputError
+from dextouch.images.jpeg import encode_jpeg
+from dextouch.schemas.episodes import json_ready
+from dextouch.streams.descriptors import StreamDescriptor
+
+PROFILE: Final = "dextouch"
+BRIDGE_VERSION: Final = "1"
+ABOUT: Final = "dextouch"
+COUNTS: Final = "dextouch.num_samples"
+ATTRIBUTES_FILE: Final = "attributes.json"
+CALIBRATION_FILE: Final = "calibration.json"
+CHUNK_BYTES: Final = 1 << 20
+HEAD_CAMERA: Final = "camera_head"
+_SEQUENCE_BITS = 0xFFFF_FFFF
+
+
+class _Message(NamedTuple):
+    """What is merged by time; the order of channels decides between equal times."""
+
+    log_time: int
+    order: int
+    publish_time: int
+    sequence: int
+    data: bytes
+
+
+def export_mcap(
+    reader: Reader, path: Path, *, overwrite: bool = False, jpeg_quality: int | None = None
+) -> int:
+    """Write one episode or recording as MCAP.
+
+    `log_time` is t_ref_ns (episode) or t_host_ns (recording), `publish_time` the device's stamp
+    where there is one. Images that are stored encoded are copied as they are.
+
+    Args:
+        reader: of the episode or recording.
+        path: of the new file.
+        overwrite: whether an existing file is replaced.
+        jpeg_quality: 1 … 100 turns `rgb8` images into JPEG, which loses detail; None keeps
+            every pixel.
+
+    Returns:
+        How many messages were written.
+
+    Raises:
+        ConflictError: the file exists.
+        InvalidInputError: a quality outside 1 … 100.
+        StorageError: the disk does not take it.
+    """
+    if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
+        raise InvalidInputError(f"JPEG quality: got {jpeg_quality}, expected 1 … 100")
+    with new_file(path, overwrite=overwrite) as partial, partial.open("wb") as file:
+        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=CompressionType.ZSTD)
+        return _Export(reader, writer, jpeg_quality).run()
+
+
+class _Export:
+    """One file that is being written."""
+
+    def __init__(self, reader: Reader, writer: Writer, jpeg_quality: int | None) -> None:
+        self._reader, self._writer, self._quality = reader, writer, jpeg_quality
+        self._is_episode = isinstance(reader, EpisodeReader)
+        self._sources = list(reader.attributes.streams)
+        self._streams = [self._as_sent(stream) for stream in self._sources]
+        counts = {stream.name: reader.num_samples(stream.name) for stream in self._streams}
+        self._counts = counts
+        firsts = [stamp_at(reader, name, 0) for name, count in counts.items() if count]
+        # MCAP's times cannot be negative; the messages' own stamps stay as they are.
+        self._zero_ns = min([0, *firsts])
+        self._schema_ids: dict[str, int] = {}
+        self._channel_ids: list[int] = []
+
+    def _as_sent(self, stream: StreamDescriptor) -> StreamDescriptor:
+        if self._quality is None or stream.kind != "image" or raw_encoding(stream) != "rgb8":
+            return stream
+        return stream if is_encoded(stream) else stream.model_copy(update={"unit": "jpeg"})
+
+    def run(self) -> int:
+        """Everything in the order that a reader wants it."""
+        self._writer.start(profile=PROFILE, library=f"dextouch {__version__}")
+        self._write_about()
+        sources = [self._messages(order) for order in range(len(self._streams))]
+        num_messages = self._write_calibration()
+        for message in heapq.merge(*sources):
+            self._writer.add_message(
+                channel_id=self._channel_ids[message.order],
+                log_time=message.log_time,
+                publish_time=message.publish_time,
+                sequence=message.sequence,
+                data=message.data,
+            )
+            num_messages += 1
+        finish: Callable[[], None] = self._writer.finish
+        finish()
+        return num_messages
+
+    def _write_about(self) -> None:
+        reader, attributes = self._reader, self._reader.attributes
+        kept = attributes.model_copy(update={"streams": tuple(self._streams)})
+        for name, value in (
+            (ATTRIBUTES_FILE, json_ready(kept)),
+            (CALIBRATION_FILE, self._calibration()),
+        ):
+            self._writer.add_attachment(
+                create_time=0,
+                log_time=0,
+                name=name,
+                media_type="application/json",
+                data=json.dumps(value, sort_keys=True, indent=1).encode(),
+            )
+        about = {
+            "bridge_version": BRIDGE_VERSION,
+            "kind": "episode" if self._is_episode else "recording",
+            "content_sha256": reader.content_sha256,
+            "log_time_zero_ns": str(self._zero_ns),
+            "task": attributes.task,
+            "instruction": attributes.instruction,
+        }
+        self._writer.add_metadata(ABOUT, about)
+        self._writer.add_metadata(COUNTS, {n: str(count) for n, count in self._counts.items()})
+        for stream in self._streams:
+            message = MessageCodec(stream).message
+            metadata = {"stream": stream.name, "unit": stream.unit, "kind": stream.kind}
+            self._channel_ids.append(self._channel(f"/{stream.name}", message, metadata))
+
+    def _calibration(self) -> dict[str, object]:
+        matrices: dict[str, object] = dict(self._reader.attributes.calibration)
+        if isinstance(self._reader, EpisodeReader):
+            matrices["K_head"] = self._reader.attributes.K_head
+        return matrices
+
+    def _channel(self, topic: str, message: str, metadata: dict[str, str]) -> int:
+        if message not in self._schema_ids:
+            self._schema_ids[message] = self._writer.register_schema(
+                name=message, encoding="protobuf", data=descriptor_set(TABLE, message)
+            )
+        return self._writer.register_channel(
+            topic=topic,
+            message_encoding="protobuf",
+            schema_id=self._schema_ids[message],
+            metadata=metadata,
+        )
+
+    def _write_calibration(self) -> int:
+        K = self._calibration().get("K_head")
+        camera = self._reader.streams.get(HEAD_CAMERA)
+        if K is None or camera is None or not self._counts[HEAD_CAMERA]:
+            return 0
+        first_ns = stamp_at(self._reader, HEAD_CAMERA, 0)
+        height_px, width_px = camera.shape[:2]
+        data = calibration_message(
+            np.array(K),
+            t_ns=first_ns,
+            frame=camera.frame or HEAD_CAMERA,
+            shape_px=(height_px, width_px),
+        )
+        log_time = first_ns - self._zero_ns
+        self._writer.add_message(
+            channel_id=self._channel(f"/{HEAD_CAMERA}/calibration", CALIBRATION, {}),
+            log_time=log_time,
+            publish_time=log_time,
+            data=data,
+        )
+        return 1
+
+    def _messages(self, order: int) -> Iterator[_Message]:
+        stream = self._streams[order]
+        codec = MessageCodec(stream)
+        to_jpeg = is_encoded(stream) and not is_encoded(self._sources[order])
+        for block in blocks(self._reader, stream.name):
+            columns = (block.t_ns.tolist(), block.t_device_ns.tolist(), block.sequence.tolist())
+            for t_ns, t_device_ns, number, value in zip(*columns, block.values, strict=True):
+                if to_jpeg:
+                    value = encode_jpeg(value, quality=self._quality or 1)  # noqa: PLW2901
+                sent = Sent(t_ns, t_device_ns, number, value)
+                log_time = t_ns - self._zero_ns
+                yield _Message(
+                    log_time,
+                    order,
+                    t_device_ns if t_device_ns >= 0 else log_time,
+                    number & _SEQUENCE_BITS if number >= 0 else 0,
+                    codec.encode(sent, with_device=not self._is_episode),
+                )
