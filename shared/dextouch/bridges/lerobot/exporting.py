@@ -1,0 +1,191 @@
+"""Episodes in, a LeRobotDataset v3.0 folder out that is there whole or not at all."""
+
+import re
+import shutil
+import uuid
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from dextouch.bridges.lerobot.dataset import DatasetWriter
+from dextouch.bridges.lerobot.frames import frames_of, images_at
+from dextouch.bridges.lerobot.h264 import (
+    decode_entry_points,
+    encode_images,
+    is_entry_point,
+)
+from dextouch.bridges.lerobot.layout import IMAGES
+from dextouch.bridges.lerobot.sidecar import Sidecar
+from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
+from dextouch.episodes import EpisodeReader
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import ConflictError, InvalidInputError
+
+REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
+
+
+@dataclass(frozen=True)
+class ExportOptions:
+    """How episodes become a dataset.
+
+    `fps`: frames a second, a whole number; without it the model rate of the first episode.
+    `cameras`: whose images go along, the first of them setting the frames' times when `fps` is its
+    own rate; without it all image streams of the first episode, the head's first. `crf`, `group`:
+    quality (0 … 51) and distance of IDR pictures of video that has to be encoded.
+    """
+
+    fps: int | None = None
+    cameras: tuple[str, ...] | None = None
+    crf: int = 23
+    group: int = 2
+    robot_type: str = "dextouch"
+
+
+DEFAULTS = ExportOptions()
+
+
+def export_lerobot(
+    readers: Iterable[EpisodeReader],
+    folder: Path,
+    *,
+    repo_id: str,
+    options: ExportOptions = DEFAULTS,
+) -> int:
+    """Write episodes as one LeRobotDataset v3.0; the number of frames comes back.
+
+    Args:
+        readers: of the episodes, in the order that they shall have; opened one by one.
+        folder: of the dataset; must not exist.
+        repo_id: name of the dataset, `user/name`.
+        options: rate, cameras, quality.
+
+    Raises:
+        ConflictError: the folder exists.
+        InvalidInputError: no episodes, a rate that is no whole number, or episodes that do not fit
+            into one dataset.
+        UnknownNameError: a camera that an episode does not have.
+        CorruptDataError: a damaged episode.
+        StorageError: the disk does not take it.
+    """
+    if not REPO_ID.fullmatch(repo_id):
+        raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
+    if folder.exists():
+        raise ConflictError(f"{folder}: exists already; choose another folder")
+    partial = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.partial")
+    try:
+        num_frames = _write(readers, partial, repo_id, options)
+        with disk_errors(f"complete {folder}"):
+            partial.rename(folder)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return num_frames
+
+
+def _write(
+    readers: Iterable[EpisodeReader], folder: Path, repo_id: str, options: ExportOptions
+) -> int:
+    dataset: DatasetWriter | None = None
+    cameras: tuple[str, ...] = ()
+    try:
+        for reader in readers:
+            if dataset is None:
+                cameras = options.cameras or _cameras_of(reader)
+                dataset = _new_dataset(reader, folder, cameras, options)
+            _add_episode(dataset, reader, cameras, options)
+    finally:
+        if dataset is not None:
+            dataset.close_files()
+    if dataset is None:
+        raise InvalidInputError("export to LeRobot: got no episode, expected at least one")
+    dataset.finish(repo_id)
+    return dataset.num_frames
+
+
+def _cameras_of(reader: EpisodeReader) -> tuple[str, ...]:
+    names = [name for name, stream in reader.streams.items() if stream.kind == "image"]
+    return tuple(sorted(names, key=lambda name: (name != "camera_head", name)))
+
+
+def _new_dataset(
+    reader: EpisodeReader, folder: Path, cameras: Sequence[str], options: ExportOptions
+) -> DatasetWriter:
+    rate_hz = reader.attributes.model_rate_hz
+    if options.fps is None and rate_hz != round(rate_hz):
+        raise InvalidInputError(
+            f"episode {reader.attributes.episode_id!r}: got a model rate of {rate_hz} Hz, LeRobot "
+            "counts whole frames a second; give fps="
+        )
+    _check_cameras(reader, cameras)
+    return DatasetWriter(
+        folder,
+        cameras={name: reader.streams[name].shape for name in cameras},
+        fps=round(rate_hz) if options.fps is None else options.fps,
+        has_measured="action_commanded" in reader.streams,
+        robot_type=options.robot_type,
+    )
+
+
+def _check_cameras(reader: EpisodeReader, cameras: Sequence[str]) -> None:
+    images = [name for name, stream in reader.streams.items() if stream.kind == "image"]
+    missing = [name for name in cameras if name not in images]
+    if missing:
+        raise InvalidInputError(
+            f"episode {reader.attributes.episode_id!r}: has no camera {missing}, only {images}; "
+            "choose cameras that all episodes have"
+        )
+
+
+def _add_episode(
+    dataset: DatasetWriter, reader: EpisodeReader, cameras: Sequence[str], options: ExportOptions
+) -> None:
+    _check_cameras(reader, cameras)
+    frames = frames_of(reader, cameras, dataset.fps)
+    videos: dict[str, list[bytes]] = {}
+    statistics: dict[str, Statistics] = {}
+    how: dict[str, Literal["remuxed", "encoded"]] = {}
+    where = f"episode {reader.attributes.episode_id!r}"
+    for camera in cameras:
+        stored = stored_units(reader, camera, frames.image_indices[camera])
+        how[camera] = "encoded" if stored is None else "remuxed"
+        videos[camera] = (
+            stored
+            if stored is not None
+            else list(
+                encode_images(
+                    images_at(reader, camera, frames.image_indices[camera]),
+                    fps=dataset.fps,
+                    crf=options.crf,
+                    group=options.group,
+                )
+            )
+        )
+        entries = [data for data in videos[camera] if is_entry_point(data)]
+        sampled = [entries[place] for place in sample_places(len(entries))]
+        statistics[IMAGES + camera] = image_statistics(
+            decode_entry_points(sampled, where=f"{where}: {camera!r}")
+        )
+    sidecar = Sidecar(
+        episode_index=dataset.num_episodes,
+        content_sha256=reader.content_sha256,
+        grid=frames.grid,
+        action_kind=frames.action_kind,
+        cameras=how,
+        attributes=reader.attributes,
+    )
+    dataset.append(frames, videos, statistics, sidecar)
+
+
+def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> list[bytes] | None:
+    """The stored access units of a camera, if exactly these images in a row make up a video.
+
+    None where the stream is no H.264, images are left out or repeated, or the first one cannot be
+    decoded without those before it.
+    """
+    consecutive = bool((np.diff(indices) == 1).all())
+    if reader.streams[camera].unit != "h264" or not consecutive:
+        return None
+    units = reader.encoded_images(camera, int(indices[0]), int(indices[-1]) + 1)
+    return units if is_entry_point(units[0]) else None

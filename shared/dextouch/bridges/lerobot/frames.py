@@ -1,0 +1,197 @@
+"""An episode and a frame rate in, the rows of its LeRobot frames out."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64, UInt8
+
+from dextouch.episodes import EpisodeReader
+from dextouch.episodes.window import mean_over_ranges, nearest_indices, step_ranges
+from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.geometry.interpolation import bracket, interpolate_linear, interpolate_poses
+from dextouch.hands.actions import (
+    ACTION_DIM,
+    AnchorPoses,
+    HandTrajectory,
+    actions_from_poses,
+    poses_from_actions,
+)
+from dextouch.images.jpeg import decode_jpeg
+from dextouch.schemas.rollouts import ActionKind
+from dextouch.tactile.layout import NUM_TAXELS, SIDES
+
+Grid = Literal["model", "camera", "uniform"]
+BLOCK_IMAGES = 32
+WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
+
+
+@dataclass(frozen=True)
+class EpisodeFrames:
+    """One row a frame; `image_indices` say which stored image of each camera a frame shows.
+
+    `state` holds absolute measured poses and joints; `action` and `measured` are relative to the
+    measured poses of the episode's step 0. `image_dt_ns` is the image's stamp minus the frame's.
+    """
+
+    grid: Grid
+    action_kind: ActionKind
+    t_ref_ns: Int64[np.ndarray, " n"]
+    state: Float32[np.ndarray, "n 67"]
+    action: Float32[np.ndarray, "n 67"]
+    measured: Float32[np.ndarray, "n 67"]
+    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_valid: Bool[np.ndarray, "n 2"]
+    image_indices: dict[str, Int64[np.ndarray, " n"]]
+    image_dt_ns: Int64[np.ndarray, "n cameras"]
+
+    def __len__(self) -> int:
+        return len(self.t_ref_ns)
+
+
+def stream_stamps(reader: EpisodeReader, name: str) -> Int64[np.ndarray, " n"]:
+    """Stamps of a stream's samples; its values are not read.
+
+    Raises:
+        UnknownNameError: no such stream.
+    """
+    if name not in reader.streams:
+        raise UnknownNameError("stream", name, list(reader.streams))
+    # The reader offers no public way to stamps without values, and values may be video.
+    return reader._column(f"{name}_t_ref_ns")  # noqa: SLF001
+
+
+def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> EpisodeFrames:
+    """The frames of an episode.
+
+    On the model grid when `fps` is the model rate; at the first camera's own stamps when `fps` is
+    its rate; otherwise evenly spaced from step 0. Images are the nearest ones, tactile values the
+    mean since the frame before; off the model grid poses and joints are interpolated between its
+    steps.
+
+    Raises:
+        InvalidInputError: an episode without steps or with fewer than one frame.
+        NotFoundError: a camera without images.
+    """
+    steps = reader.read("action") if reader.num_steps else None
+    if steps is None or steps.values.shape[1:] != (ACTION_DIM,):
+        raise InvalidInputError(
+            f"episode {reader.attributes.episode_id!r}: has no 'action' of {ACTION_DIM} numbers; "
+            "export only episodes that are aligned"
+        )
+    grid, t_ns = _frame_times(reader, cameras, fps, steps.t_ref_ns)
+    kind: ActionKind = "commanded" if "action_commanded" in reader.streams else "measured"
+    measured = _at(reader, steps.values, steps.t_ref_ns, t_ns)
+    action = measured
+    if kind == "commanded":
+        sent = reader.read("action_commanded")
+        action = _at(reader, sent.values, sent.t_ref_ns, t_ns)
+    anchor = reader.attributes.anchor.to_poses()
+    state = actions_from_poses(poses_from_actions(measured, anchor), WORLD)
+    kpa, valid = _tactile(reader, t_ns)
+    indices, offsets = {}, np.zeros((len(t_ns), len(cameras)), dtype=np.int64)
+    for column, camera in enumerate(cameras):
+        stamps = _image_stamps(reader, camera)
+        indices[camera] = nearest_indices(stamps, t_ns)
+        offsets[:, column] = stamps[indices[camera]] - t_ns
+    return EpisodeFrames(
+        grid=grid,
+        action_kind=kind,
+        t_ref_ns=t_ns,
+        state=state.astype(np.float32),
+        action=action.astype(np.float32),
+        measured=measured.astype(np.float32),
+        tactile_kpa=kpa,
+        tactile_valid=valid,
+        image_indices=indices,
+        image_dt_ns=offsets,
+    )
+
+
+def _image_stamps(reader: EpisodeReader, camera: str) -> Int64[np.ndarray, " n"]:
+    stamps = stream_stamps(reader, camera)
+    if not len(stamps):
+        raise NotFoundError(
+            f"episode {reader.attributes.episode_id!r}: {camera!r} holds no image; "
+            "leave that camera out"
+        )
+    return stamps
+
+
+def _frame_times(
+    reader: EpisodeReader, cameras: Sequence[str], fps: int, steps_ns: np.ndarray
+) -> tuple[Grid, Int64[np.ndarray, " n"]]:
+    if fps == reader.attributes.model_rate_hz:
+        return "model", steps_ns.copy()
+    half_ns = round(0.5e9 / fps)
+    if cameras and fps == round(reader.streams[cameras[0]].nominal_rate_hz):
+        stamps = _image_stamps(reader, cameras[0])
+        inside = (stamps >= steps_ns[0] - half_ns) & (stamps <= steps_ns[-1] + half_ns)
+        if not inside.any():
+            raise InvalidInputError(
+                f"episode {reader.attributes.episode_id!r}: no image of {cameras[0]!r} lies "
+                "within its steps"
+            )
+        return "camera", stamps[inside]
+    count = int((int(steps_ns[-1] - steps_ns[0]) * fps) // 10**9) + 1
+    return "uniform", steps_ns[0] + np.rint(np.arange(count) * (1e9 / fps)).astype(np.int64)
+
+
+def _at(
+    reader: EpisodeReader, actions: np.ndarray, steps_ns: np.ndarray, t_ns: np.ndarray
+) -> np.ndarray:
+    """Actions at other times; at the steps themselves they are given back as they are."""
+    if np.array_equal(steps_ns, t_ns) or len(steps_ns) < 2:
+        return np.repeat(actions, len(t_ns), axis=0) if len(actions) != len(t_ns) else actions
+    anchor = reader.attributes.anchor.to_poses()
+    poses = poses_from_actions(actions, anchor)
+    inside_ns = t_ns.clip(steps_ns[0], steps_ns[-1])
+    widest_ns = int(np.diff(steps_ns).max())
+    left, weight, _ = bracket(steps_ns, inside_ns, max_gap_ns=widest_ns)
+    between = HandTrajectory(
+        interpolate_poses(poses.Ts_world_wrist_left, left, weight),
+        interpolate_poses(poses.Ts_world_wrist_right, left, weight),
+        interpolate_linear(poses.joints_left_rad, left, weight),
+        interpolate_linear(poses.joints_right_rad, left, weight),
+        interpolate_poses(poses.Ts_world_camera_head, left, weight),
+    )
+    return actions_from_poses(between, anchor)
+
+
+def _tactile(
+    reader: EpisodeReader, t_ns: np.ndarray
+) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+    kpa = np.zeros((len(t_ns), 2, NUM_TAXELS), dtype=np.float32)
+    valid = np.zeros((len(t_ns), 2), dtype=bool)
+    for hand, side in enumerate(SIDES):
+        name = f"tactile_{side}"
+        if name in reader.streams:
+            data = reader.read(name)
+            ranges = step_ranges(data.t_ref_ns, t_ns, 0, len(t_ns))
+            kpa[:, hand], valid[:, hand] = mean_over_ranges(data.values, ranges)
+    return kpa, valid
+
+
+def images_at(
+    reader: EpisodeReader, camera: str, indices: np.ndarray
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Stored images at ascending indices, decoded a block at a time.
+
+    Raises:
+        CorruptDataError: damaged bytes.
+    """
+    is_jpeg = reader.streams[camera].unit == "jpeg"
+    stamps = stream_stamps(reader, camera)
+    for start in range(0, len(indices), BLOCK_IMAGES):
+        wanted = [int(index) for index in indices[start : start + BLOCK_IMAGES]]
+        first, last = wanted[0], wanted[-1]
+        if is_jpeg:
+            encoded = reader.encoded_images(camera, first, last + 1)
+            where = f"episode {reader.attributes.episode_id!r}: {camera!r} image"
+            for index in wanted:
+                yield decode_jpeg(encoded[index - first], where=f"{where} {index}")
+        else:
+            block = reader.read(camera, int(stamps[first]), int(stamps[last]) + 1).values
+            for index in wanted:
+                yield block[index - first]

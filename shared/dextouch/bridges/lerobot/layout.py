@@ -1,0 +1,142 @@
+"""Nothing or a template in, the names, shapes and paths of a LeRobotDataset v3.0 out."""
+
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.tactile.layout import NUM_TAXELS
+
+CODEBASE_VERSION: Final = "v3.0"
+INFO_FILE: Final = "meta/info.json"
+STATS_FILE: Final = "meta/stats.json"
+TASKS_FILE: Final = "meta/tasks.parquet"
+CARD_FILE: Final = "README.md"
+EPISODES_PATH: Final = "meta/episodes/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+DATA_PATH: Final = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+VIDEO_PATH: Final = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+SIDECAR_PATH: Final = "meta/dextouch/episode-{episode_index:06d}.json"
+CHUNK_FILES: Final = 1000
+DATA_FILE_MB: Final = 100
+VIDEO_FILE_MB: Final = 200
+
+ACTION: Final = "action"
+STATE: Final = "observation.state"
+TACTILE: Final = "observation.tactile"
+IMAGES: Final = "observation.images."
+# Outside "observation" and "action": LeRobot's policies take nothing from here by themselves.
+MEASURED: Final = "dextouch.action_measured"
+VALID: Final = "dextouch.tactile_valid"
+STAMP: Final = "dextouch.t_ref_ns"
+IMAGE_DT: Final = "dextouch.image_dt_ns"
+
+Feature = dict[str, Any]
+Features = dict[str, Feature]
+
+_FIELD = re.compile(r"\{([a-z_]+)(?::0(\d{1,2})d)?\}")
+
+
+def pose_names(name: str) -> list[str]:
+    """Names of a 9-D pose: translation in metres, then two columns of the rotation matrix."""
+    rotation = [f"r{row}{column}" for column in (0, 1) for row in range(3)]
+    return [f"{name}.{part}" for part in ("x_m", "y_m", "z_m", *rotation)]
+
+
+def action_names() -> list[str]:
+    """Names of the 67 numbers of an action or a state, in their order."""
+    joints = [f"{name}_rad" for side in ("left", "right") for name in RobotHand(side).joint_names]
+    wrists = [*pose_names("wrist_left"), *pose_names("wrist_right")]
+    return [*wrists, *joints, *pose_names("camera_head")]
+
+
+def _feature(dtype: str, shape: Sequence[int], names: list[str] | None) -> Feature:
+    return {"dtype": dtype, "shape": list(shape), "names": names}
+
+
+def video_feature(shape: Sequence[int], fps: int) -> Feature:
+    """The feature of a camera whose images are `shape` [height, width, 3]."""
+    info = {
+        "video.height": shape[0],
+        "video.width": shape[1],
+        "video.codec": "h264",
+        "video.pix_fmt": "yuv420p",
+        "video.fps": fps,
+        "video.channels": 3,
+        "has_audio": False,
+        "is_depth_map": False,
+    }
+    return {**_feature("video", shape, ["height", "width", "channels"]), "info": info}
+
+
+def dataset_features(
+    cameras: Mapping[str, Sequence[int]], fps: int, *, has_measured: bool
+) -> Features:
+    """Every feature of an export, by name.
+
+    Args:
+        cameras: shape of each camera's images.
+        fps: frames a second of the dataset.
+        has_measured: actions are commanded ones, so measured ones stand beside them.
+    """
+    names = action_names()
+    features = {IMAGES + name: video_feature(shape, fps) for name, shape in cameras.items()}
+    features[STATE] = _feature("float32", [len(names)], names)
+    features[TACTILE] = _feature("float32", [2, NUM_TAXELS], ["hand", "taxel_kpa"])
+    features[ACTION] = _feature("float32", [len(names)], names)
+    if has_measured:
+        features[MEASURED] = _feature("float32", [len(names)], names)
+    features[VALID] = _feature("bool", [2], ["left", "right"])
+    features[STAMP] = _feature("int64", [1], None)
+    if cameras:
+        features[IMAGE_DT] = _feature("int64", [len(cameras)], list(cameras))
+    features["timestamp"] = _feature("float32", [1], None)
+    for name in ("frame_index", "episode_index", "index", "task_index"):
+        features[name] = _feature("int64", [1], None)
+    return features
+
+
+def file_place(number: int) -> tuple[int, int]:
+    """Chunk and file index of the n-th file of a kind."""
+    return divmod(number, CHUNK_FILES)
+
+
+def fill_path(template: str, **values: int | str) -> str:
+    """A path template with its fields filled in; nothing but plain fields is understood.
+
+    Raises:
+        InvalidInputError: a field that is not among `values`, or any other brace.
+    """
+
+    def field(match: re.Match[str]) -> str:
+        name, width = match[1], match[2]
+        if name not in values:
+            raise InvalidInputError(
+                f"path template {template!r}: got field {name!r}, expected {sorted(values)}"
+            )
+        return str(values[name]).zfill(int(width or 0))
+
+    filled = _FIELD.sub(field, template)
+    if "{" in filled or "}" in filled:
+        raise InvalidInputError(
+            f"path template {template!r}: expected fields like {{chunk_index:03d}} only"
+        )
+    return filled
+
+
+def confined(folder: Path, relative: str) -> Path:
+    """A path below `folder`, links followed.
+
+    Raises:
+        CorruptDataError: it leads out of the folder.
+    """
+    root = folder.resolve()
+    if "\0" in relative:
+        raise CorruptDataError(f"{folder}: got a path with a zero byte")
+    path = (root / relative).resolve()
+    if not path.is_relative_to(root):
+        raise CorruptDataError(
+            f"{folder}: path {relative!r} leads out of the dataset; such a dataset is not read"
+        )
+    return path

@@ -1,0 +1,72 @@
+"""What LeRobot has no place for in, one JSON file an episode out; and back, checked."""
+
+import json
+from pathlib import Path
+from typing import Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from dextouch.bridges.lerobot.frames import Grid
+from dextouch.bridges.lerobot.layout import SIDECAR_PATH, confined, fill_path
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import CorruptDataError
+from dextouch.schemas.episodes import EpisodeAttributes
+from dextouch.schemas.rollouts import ActionKind
+
+MAX_SIDECAR_BYTES: Final = 1 << 22
+
+
+class Sidecar(BaseModel):
+    """An episode's attributes, its content hash, and how its frames were made.
+
+    `cameras` says whether a camera's video was `remuxed` (bytes as they were) or `encoded` anew.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    sidecar_version: Literal[1] = 1
+    episode_index: int = Field(ge=0)
+    content_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
+    grid: Grid
+    action_kind: ActionKind
+    cameras: dict[str, Literal["remuxed", "encoded"]]
+    attributes: EpisodeAttributes
+
+
+def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
+    """Put an episode's file into a dataset.
+
+    Raises:
+        StorageError: the disk does not take it.
+    """
+    path = folder / fill_path(SIDECAR_PATH, episode_index=sidecar.episode_index)
+    with disk_errors(f"write {path}"):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(json.dumps(sidecar.model_dump(mode="json"), indent=2) + "\n")
+
+
+def read_sidecar(folder: Path, episode_index: int) -> Sidecar | None:
+    """An episode's file; None where the dataset has none, being of other origin.
+
+    Raises:
+        CorruptDataError: one that is no such file.
+    """
+    path = confined(folder, fill_path(SIDECAR_PATH, episode_index=episode_index))
+    if not path.is_file():
+        return None
+    with disk_errors(f"read {path}"):
+        if path.stat().st_size > MAX_SIDECAR_BYTES:
+            raise CorruptDataError(f"{path}: is larger than {MAX_SIDECAR_BYTES} bytes")
+        data = path.read_bytes()
+    try:
+        sidecar = Sidecar.model_validate_json(data)
+    except ValidationError as error:
+        raise CorruptDataError(
+            f"{path}: is no description of an episode ({error}); remove it to import the frames "
+            "as a dataset of other origin"
+        ) from error
+    if sidecar.episode_index != episode_index:
+        raise CorruptDataError(
+            f"{path}: got episode {sidecar.episode_index}, expected {episode_index}"
+        )
+    return sidecar

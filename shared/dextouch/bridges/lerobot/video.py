@@ -1,0 +1,126 @@
+"""H.264 access units of many episodes in, mp4 files with a place for each episode out."""
+
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import av
+from av.container import OutputContainer
+from av.video.stream import VideoStream
+
+from dextouch.bridges.lerobot.h264 import holds_idr, is_entry_point, parameter_sets
+from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, file_place, fill_path
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import CorruptDataError, ShapeError
+
+
+@dataclass(frozen=True)
+class VideoPlace:
+    """Where one episode's images lie: the n-th file of the camera, and seconds within it."""
+
+    file_number: int
+    from_timestamp_s: float
+    to_timestamp_s: float
+
+
+class CameraVideo:
+    """The mp4 files of one camera, one episode after the other.
+
+    Access units are muxed as they are. A new file starts when the next episode would make the file
+    too large, or was encoded with other parameter sets than the file's header holds.
+
+    Args:
+        folder: root of the dataset.
+        key: feature of the camera.
+        fps: images a second of the dataset.
+        shape: [height, width, 3] of the images.
+        file_bytes: size that a file should not exceed; one episode is never split.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        key: str,
+        *,
+        fps: int,
+        shape: Sequence[int],
+        file_bytes: int = VIDEO_FILE_MB << 20,
+    ) -> None:
+        self._folder, self._key, self._fps, self._shape = folder, key, fps, tuple(shape)
+        self._file_bytes = file_bytes
+        self._file_number = -1
+        self._num_images = self._num_bytes = 0
+        self._parameters: tuple[bytes, ...] = ()
+        self._output: OutputContainer | None = None
+        self._stream: VideoStream | None = None
+
+    def append(self, access_units: Sequence[bytes], *, where: str) -> VideoPlace:
+        """Mux one episode.
+
+        Args:
+            access_units: one an image, the first an entry point; without B-frames.
+            where: names the episode and camera in errors.
+
+        Raises:
+            CorruptDataError: the first image is no entry point.
+            ShapeError: images of another size.
+            StorageError: the disk does not take it.
+        """
+        if not access_units or not is_entry_point(access_units[0]):
+            raise CorruptDataError(f"{where}: does not begin with an IDR image and its headers")
+        size = sum(map(len, access_units))
+        parameters = parameter_sets(access_units[0])
+        full = self._num_bytes + size > self._file_bytes
+        if self._output is None or full or parameters != self._parameters:
+            self._start_file(access_units[0], where=where)
+            self._parameters = parameters
+        first = self._num_images
+        with disk_errors(f"write {where}"):
+            for data in access_units:
+                self._mux(data)
+        self._num_bytes += size
+        stop = self._num_images
+        return VideoPlace(self._file_number, first / self._fps, stop / self._fps)
+
+    def close(self) -> None:
+        """Complete the file that is open."""
+        if self._output is not None:
+            with disk_errors(f"complete a video of {self._key}"):
+                self._output.close()
+        self._output = self._stream = None
+
+    def _start_file(self, access_unit: bytes, *, where: str) -> None:
+        self.close()
+        self._file_number += 1
+        self._num_images = self._num_bytes = 0
+        chunk, file = file_place(self._file_number)
+        path = self._folder / fill_path(
+            VIDEO_PATH, video_key=self._key, chunk_index=chunk, file_index=file
+        )
+        try:
+            with av.open(io.BytesIO(access_unit), format="h264") as source:
+                template = source.streams.video[0]
+                size = (template.height, template.width)
+                if size != self._shape[:2]:
+                    raise ShapeError(f"{where}: got images {size}, expected {self._shape[:2]}")
+                with disk_errors(f"create {path}"):
+                    path.parent.mkdir(parents=True, exist_ok=True)
+                    self._output = av.open(path, "w", format="mp4")
+                self._stream = self._output.add_stream_from_template(template)
+        except (av.error.InvalidDataError, IndexError) as error:
+            raise CorruptDataError(f"{where}: is no H.264 stream ({error})") from error
+        self._stream.time_base = Fraction(1, self._fps)
+
+    def _mux(self, data: bytes) -> None:
+        assert self._output is not None  # noqa: S101 (opened by append)
+        assert self._stream is not None  # noqa: S101 (likewise)
+        packet = av.Packet(data)
+        packet.stream = self._stream
+        packet.pts = packet.dts = self._num_images
+        packet.duration = 1
+        packet.time_base = Fraction(1, self._fps)
+        packet.is_keyframe = holds_idr(data)
+        self._output.mux(packet)
+        self._num_images += 1
