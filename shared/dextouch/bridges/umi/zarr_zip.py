@@ -1,0 +1,334 @@
+"""Rows of named arrays ↔ a Zarr v2 group inside one zip file, as `zarr.open` reads it.
+
+Written without zarr (https://zarr-specs.readthedocs.io/en/latest/v2/v2.0.html): storage chunks are
+zstd, zip entries are stored as they are. Reading trusts nothing: names, sizes and shapes are
+checked before anything is allocated, and a missing storage chunk is an error, never zeros.
+"""
+
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+
+import numpy as np
+import zstandard
+from jaxtyping import Shaped
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+)
+
+ZSTD_LEVEL: Final = 1
+MAX_CHUNK_BYTES: Final = 1 << 27
+MAX_METADATA_BYTES: Final = 1 << 26
+MAX_ROWS: Final = 1 << 40
+# The earliest date a zip can name: equal content gives equal bytes.
+_DATE = (1980, 1, 1, 0, 0, 0)
+
+Size = Annotated[int, Field(ge=1, le=1 << 20)]
+
+
+class _Codec(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="allow")
+
+    id: str
+
+
+class ArrayMetadata(BaseModel):
+    """`.zarray` of one array; only what is written here can be read."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    zarr_format: Literal[2] = 2
+    shape: tuple[Annotated[int, Field(ge=0, le=MAX_ROWS)], ...] = Field(min_length=1, max_length=6)
+    chunks: tuple[Size, ...] = Field(min_length=1, max_length=6)
+    dtype: Literal["|b1", "|u1", "<u2", "<i8", "<f4", "<f8"]
+    compressor: _Codec | None
+    fill_value: float | bool | None = 0
+    order: Literal["C"] = "C"
+    filters: None = None
+    dimension_separator: Literal["."] = "."
+
+    def chunk_bytes(self) -> int:
+        """Bytes of one storage chunk, decoded."""
+        return math.prod(self.chunks) * np.dtype(self.dtype).itemsize
+
+
+class _NewArray:
+    def __init__(self, dtype: str, row_shape: tuple[int, ...], chunk_rows: int) -> None:
+        self.dtype, self.row_shape, self.chunk_rows = dtype, row_shape, chunk_rows
+        self.num_rows = 0
+        self.attributes: dict[str, Any] = {}
+        self.pending: list[np.ndarray] = []
+        self.num_pending = 0
+
+    def metadata(self) -> ArrayMetadata:
+        return ArrayMetadata.model_validate(
+            {
+                "shape": (self.num_rows, *self.row_shape),
+                "chunks": (self.chunk_rows, *self.row_shape),
+                "dtype": self.dtype,
+                "compressor": {"id": "zstd", "level": ZSTD_LEVEL},
+                "fill_value": False if self.dtype == "|b1" else 0,
+            }
+        )
+
+
+class ZarrZipWriter:
+    """Appends rows to the arrays of a new group; memory holds one storage chunk an array.
+
+    Args:
+        path: of the new zip file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._zip = zipfile.ZipFile(path, "x", zipfile.ZIP_STORED)
+        self._arrays: dict[str, _NewArray] = {}
+        self._zstd = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+
+    def add_array(
+        self,
+        name: str,
+        *,
+        dtype: str,
+        row_shape: tuple[int, ...],
+        chunk_rows: int,
+        attributes: Mapping[str, Any] | None = None,
+    ) -> None:
+        """Announce an array `GROUP/NAME` of one of the types of `ArrayMetadata`."""
+        array = _NewArray(np.dtype(dtype).str, row_shape, chunk_rows)
+        array.attributes = dict(attributes or {})
+        self._arrays[name] = array
+
+    def append(self, name: str, rows: np.ndarray) -> None:
+        """Append rows [n, *row_shape]; they are cast to the array's type."""
+        array = self._arrays[name]
+        rows = np.array(rows, dtype=array.dtype)
+        if rows.shape[1:] != array.row_shape:
+            raise InvalidInputError(
+                f"{name}: got rows of {rows.shape[1:]}, expected {array.row_shape}"
+            )
+        while len(rows):
+            taken = rows[: array.chunk_rows - array.num_pending]
+            array.pending.append(taken)
+            array.num_pending += len(taken)
+            array.num_rows += len(taken)
+            rows = rows[len(taken) :]
+            if array.num_pending == array.chunk_rows:
+                self._write_chunk(name, array)
+
+    def _write_chunk(self, name: str, array: _NewArray) -> None:
+        missing = array.chunk_rows - array.num_pending
+        padding = np.zeros((missing, *array.row_shape), dtype=array.dtype)
+        data = np.concatenate([*array.pending, padding]).tobytes()
+        index = (array.num_rows - 1) // array.chunk_rows
+        key = ".".join([str(index), *("0" for _ in array.row_shape)])
+        self._write(f"{name}/{key}", self._zstd.compress(data))
+        array.pending, array.num_pending = [], 0
+
+    def _write(self, name: str, data: bytes) -> None:
+        self._zip.writestr(zipfile.ZipInfo(name, _DATE), data)
+
+    def finish(self, attributes: Mapping[str, Mapping[str, Any]]) -> None:
+        """Write what is left, the metadata and the attributes of groups (by name, "" the root)."""
+        groups = {"", *attributes, *(name.rpartition("/")[0] for name in self._arrays)}
+        for group in sorted(groups):
+            prefix = f"{group}/" if group else ""
+            self._write(f"{prefix}.zgroup", _json({"zarr_format": 2}))
+            if attributes.get(group):
+                self._write(f"{prefix}.zattrs", _json(attributes[group]))
+        for name, array in self._arrays.items():
+            if array.num_pending:
+                self._write_chunk(name, array)
+            self._write(f"{name}/.zarray", _json(array.metadata().model_dump()))
+            if array.attributes:
+                self._write(f"{name}/.zattrs", _json(array.attributes))
+        self._zip.close()
+
+    def close(self) -> None:
+        """Give the file back; without `finish` it is no zip file that anyone can use."""
+        self._zip.close()
+
+
+def _json(value: object) -> bytes:
+    return json.dumps(value, sort_keys=True, indent=1, allow_nan=False).encode()
+
+
+@contextmanager
+def zip_errors(path: Path) -> Iterator[None]:
+    """Turn the errors of a bad zip file into ours."""
+    try:
+        with disk_errors(f"read {path}"):
+            yield
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
+        raise CorruptDataError(
+            f"{path}: is no whole zip file ({error}); copy or export it again"
+        ) from error
+    except NotImplementedError as error:
+        raise StorageError(f"{path}: uses a zip feature that is not supported ({error})") from error
+
+
+class ZarrZipReader:
+    """Reads rows of arrays of a Zarr v2 group in a zip file from anywhere.
+
+    Args:
+        path: of the zip file.
+
+    Raises:
+        NotFoundError: no such file.
+        CorruptDataError: no zip file, or names that are no part of a Zarr group.
+    """
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_file():
+            raise NotFoundError(f"{path}: no such file; expected a zip file")
+        self._path = path
+        self._arrays: dict[str, ArrayMetadata] = {}
+        with zip_errors(path):
+            self._zip = zipfile.ZipFile(path)
+        self._entries: dict[str, zipfile.ZipInfo] = {}
+        for entry in self._zip.infolist():
+            self._check_name(entry.filename)
+            self._entries[entry.filename] = entry
+
+    def _check_name(self, name: str) -> None:
+        parts = name.rstrip("/").split("/")
+        if name.startswith("/") or "\\" in name or ".." in parts or "" in parts or ":" in name:
+            self.close()
+            raise CorruptDataError(f"{self._path}: holds an entry named {name!r}; refused")
+        if name in self._entries:
+            self.close()
+            raise CorruptDataError(f"{self._path}: holds two entries named {name!r}; refused")
+
+    def close(self) -> None:
+        """Give the file back."""
+        self._zip.close()
+
+    def __enter__(self) -> "ZarrZipReader":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def arrays(self, group: str) -> list[str]:
+        """Names of the arrays of a group."""
+        ends = "/.zarray"
+        names = [n[: -len(ends)] for n in self._entries if n.endswith(ends)]
+        return sorted(n for n in names if n.rpartition("/")[0] == group)
+
+    def attributes(self, name: str) -> dict[str, Any]:
+        """`.zattrs` of a group or an array; empty where there are none."""
+        key = f"{name}/.zattrs" if name else ".zattrs"
+        if key not in self._entries:
+            return {}
+        value = self._json(key)
+        if not isinstance(value, dict):
+            raise CorruptDataError(f"{self._path}: {key} is no JSON object")
+        return value
+
+    def metadata(self, name: str) -> ArrayMetadata:
+        """What an array holds.
+
+        Raises:
+            NotFoundError: no such array.
+            StorageError: an array of a kind that is not supported.
+            CorruptDataError: metadata that does not fit.
+        """
+        if name not in self._arrays:
+            key = f"{name}/.zarray"
+            if key not in self._entries:
+                raise NotFoundError(f"{self._path}: holds no array {name!r}")
+            try:
+                metadata = ArrayMetadata.model_validate_json(json.dumps(self._json(key)))
+            except ValidationError as error:
+                raise CorruptDataError(f"{self._path}: {key} does not fit ({error})") from error
+            self._check(name, metadata)
+            self._arrays[name] = metadata
+        return self._arrays[name]
+
+    def _check(self, name: str, metadata: ArrayMetadata) -> None:
+        compressor = metadata.compressor
+        if compressor is not None and compressor.id != "zstd":
+            raise StorageError(
+                f"{self._path}: {name} is compressed as {compressor.id!r}, expected 'zstd' or "
+                "none; write it again with that compressor"
+            )
+        if metadata.chunks[1:] != metadata.shape[1:]:
+            raise CorruptDataError(
+                f"{self._path}: {name} has storage chunks {metadata.chunks} for shape "
+                f"{metadata.shape}, expected whole rows"
+            )
+        num_bytes = metadata.chunk_bytes()
+        if num_bytes > MAX_CHUNK_BYTES:
+            raise LimitExceededError(
+                f"{self._path}: {name} has storage chunks of {num_bytes} bytes, expected at "
+                f"most {MAX_CHUNK_BYTES}"
+            )
+
+    def read(self, name: str, start: int, stop: int) -> Shaped[np.ndarray, "n ..."]:
+        """Rows start … stop-1 of an array.
+
+        Raises:
+            InvalidInputError: rows outside the array.
+            CorruptDataError: damaged or missing bytes.
+        """
+        metadata = self.metadata(name)
+        if not 0 <= start <= stop <= metadata.shape[0]:
+            raise InvalidInputError(
+                f"{self._path}: got rows {start} … {stop} of {name}, expected within 0 … "
+                f"{metadata.shape[0]}"
+            )
+        each, parts = metadata.chunks[0], []
+        for index in range(start // each, -(-stop // each)):
+            chunk = self._chunk(name, metadata, index)
+            parts.append(chunk[max(0, start - index * each) : stop - index * each])
+        if not parts:
+            return np.empty((0, *metadata.shape[1:]), dtype=metadata.dtype)
+        return np.concatenate(parts)
+
+    def _chunk(self, name: str, metadata: ArrayMetadata, index: int) -> np.ndarray:
+        key = f"{name}/" + ".".join([str(index), *("0" for _ in metadata.shape[1:])])
+        if key not in self._entries:
+            raise CorruptDataError(f"{self._path}: {key} is missing; export it again")
+        num_bytes = metadata.chunk_bytes()
+        data = self._bytes(key, MAX_CHUNK_BYTES)
+        if metadata.compressor is not None:
+            try:
+                with zstandard.ZstdDecompressor().stream_reader(data) as stream:
+                    # One byte more than expected, never the whole of what may unfold.
+                    data = stream.read(num_bytes + 1)
+            except zstandard.ZstdError as error:
+                raise CorruptDataError(f"{self._path}: {key} is damaged ({error})") from error
+        if len(data) != num_bytes:
+            raise CorruptDataError(
+                f"{self._path}: {key} holds {len(data)} bytes or more, expected {num_bytes}"
+            )
+        return np.frombuffer(data, dtype=metadata.dtype).reshape(metadata.chunks)
+
+    def _bytes(self, key: str, limit: int) -> bytes:
+        entry = self._entries[key]
+        if entry.flag_bits & 1:
+            raise StorageError(f"{self._path}: {key} is encrypted; expected plain entries")
+        with zip_errors(self._path), self._zip.open(entry) as file:
+            data = file.read(limit + 1)
+        if len(data) > limit:
+            raise LimitExceededError(
+                f"{self._path}: {key} holds more than {limit} bytes, the most that is read"
+            )
+        return data
+
+    def _json(self, key: str) -> object:
+        try:
+            return json.loads(self._bytes(key, MAX_METADATA_BYTES))
+        except (ValueError, RecursionError) as error:
+            raise CorruptDataError(f"{self._path}: {key} is no JSON ({error})") from error
