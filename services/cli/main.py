@@ -39,6 +39,7 @@ COMMANDS = {
     "evaluate": Command(
         "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
     ),
+    "bench": Command("services.cli.bench", "time a stage against its error, beside its rivals"),
 }
 
 EXIT_USAGE = 2

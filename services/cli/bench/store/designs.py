@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, UInt8, UInt16
@@ -43,6 +43,14 @@ class OpenStore(ABC):
             return [self.window(camera, start) for camera in cameras]
         with ThreadPoolExecutor(len(cameras)) as threads:
             return list(threads.map(lambda camera: self.window(camera, start), cameras))
+
+
+@runtime_checkable
+class ReadsTouch(Protocol):
+    """An open store that can give the touch of a window without its images."""
+
+    def touch(self, start: int) -> tuple[np.ndarray, np.ndarray]:
+        """34 samples of the left and of the right hand, those of the window at image `start`."""
 
 
 class Design(Protocol):

@@ -22,14 +22,14 @@ _SHAPES = {"keypoints": (25, 3), "wrist": (7,), "head": (7,), "action": (67,)}
 
 
 def make_take(
-    seconds: float, seed: int, *, on_camera: Callable[[], None] = lambda: None
+    seconds: float, seed: int, *, on_camera: Callable[[str], None] = lambda _: None
 ) -> Workload:
     """The streams of one take; the same for the same seed and length.
 
     Args:
         seconds: length, of whole images.
         seed: of everything random.
-        on_camera: called when a camera is rendered.
+        on_camera: called with a camera's name before it is rendered, from its thread.
     """
     rng = np.random.default_rng(seed)
     camera_rngs = rng.spawn(len(CAMERAS))
@@ -37,9 +37,8 @@ def make_take(
 
     def one_camera(index: int) -> np.ndarray:
         camera_rng = camera_rngs[index]
-        images = render(make_scene(CAMERAS[index], camera_rng), num_images, camera_rng)
-        on_camera()
-        return images
+        on_camera(CAMERAS[index])
+        return render(make_scene(CAMERAS[index], camera_rng), num_images, camera_rng)
 
     with ThreadPoolExecutor(len(CAMERAS)) as threads:
         pictures = list(threads.map(one_camera, range(len(CAMERAS))))

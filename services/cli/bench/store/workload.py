@@ -6,8 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from dextouch.errors import UnknownNameError
-
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
 IMAGE_SHAPE = (480, 640, 3)
 IMAGE_RATE_HZ = 30
@@ -64,16 +62,12 @@ class Workload:
         """Windows start at 0 … num_starts - 1."""
         return self.num_images - WINDOW_IMAGES + 1
 
-    def stream(self, name: str) -> TimedStream:
-        """A stream by its name, image or not.
-
-        Raises:
-            UnknownNameError: no such stream.
-        """
-        for streams in (self.images, self.numbers):
-            if name in streams:
-                return streams[name]
-        raise UnknownNameError("stream", name, [*self.images, *self.numbers])
+    def arrived_with(self, name: str, image_index: int) -> slice:
+        """The samples of a numeric stream that arrive between an image and the one before it."""
+        count = len(self.numbers[name].t_ref_ns)
+        return slice(
+            image_index * count // self.num_images, (image_index + 1) * count // self.num_images
+        )
 
     def first(self, seconds: float) -> "Workload":
         """The first seconds of the take: what designs warm up with."""

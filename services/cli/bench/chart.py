@@ -1,0 +1,126 @@
+"""Designs as points of time and error in; one SVG picture that stands by itself out."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+
+_WIDTH, _HEIGHT = 460, 340
+_LEFT, _RIGHT, _TOP, _BOTTOM = 64, 18, 34, 48
+_OURS, _RIVAL, _LINE, _TEXT = "#c2410c", "#475569", "#cbd5e1", "#1e293b"
+
+
+@dataclass(frozen=True)
+class Point:
+    """One design: its median time with the spread of the rounds, and its error."""
+
+    label: str
+    time: float
+    time_low: float
+    time_high: float
+    error: float
+    is_ours: bool
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One picture: time from left to right (logarithmic), error upwards; low and left is good."""
+
+    title: str
+    time_label: str
+    error_label: str
+    points: Sequence[Point]
+
+
+def draw(panels: Sequence[Panel], *, title: str) -> str:
+    """The SVG text of panels side by side; panels without a point are left out."""
+    panels = [panel for panel in panels if panel.points]
+    width = _WIDTH * max(1, len(panels))
+    body = [
+        f'<g transform="translate({index * _WIDTH} 0)">{"".join(_panel(panel))}</g>'
+        for index, panel in enumerate(panels)
+    ]
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {_HEIGHT}" '
+        f'width="{width}" height="{_HEIGHT}" role="img" aria-label="{escape(title)}" '
+        f'font-family="sans-serif" font-size="11" fill="{_TEXT}">'
+        f'<rect width="{width}" height="{_HEIGHT}" fill="white"/>{"".join(body)}</svg>\n'
+    )
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """Round numbers 1, 2, 5 × 10ⁿ within low … high, both above zero."""
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    numbers = [factor * 10.0**n for n in range(first, last + 1) for factor in (1, 2, 5)]
+    return [number for number in numbers if low <= number <= high]
+
+
+def linear_ticks(low: float, high: float) -> list[float]:
+    """About five round numbers within low … high."""
+    step = 10.0 ** math.floor(math.log10((high - low) / 5))
+    step *= next((f for f in (1, 2, 5) if (high - low) / (step * f) <= 6), 10)
+    return [step * k for k in range(math.ceil(low / step), math.floor(high / step) + 1)]
+
+
+class _Axes:
+    """Where a time and an error lie in a panel."""
+
+    def __init__(self, points: Sequence[Point]) -> None:
+        self.low = min(point.time_low for point in points) / 1.5
+        self.high = max(point.time_high for point in points) * 1.5
+        self.error_high = max(max(point.error for point in points) * 1.15, 1e-6)
+
+    def x_px(self, time: float) -> float:
+        share = math.log(time / self.low) / math.log(self.high / self.low)
+        return _LEFT + share * (_WIDTH - _LEFT - _RIGHT)
+
+    def y_px(self, error: float) -> float:
+        return _HEIGHT - _BOTTOM - error / self.error_high * (_HEIGHT - _BOTTOM - _TOP)
+
+
+def _panel(panel: Panel) -> list[str]:
+    axes = _Axes(panel.points)
+    right, bottom = _WIDTH - _RIGHT, _HEIGHT - _BOTTOM
+    parts = [f'<text x="{_LEFT}" y="20" font-weight="bold">{escape(panel.title)}</text>']
+    for number in linear_ticks(0.0, axes.error_high):
+        y = axes.y_px(number)
+        parts.append(
+            f'<path d="M{_LEFT} {y:.1f}H{right}" stroke="{_LINE}"/>'
+            f'<text x="{_LEFT - 6}" y="{y + 4:.1f}" text-anchor="end">{number:g}</text>'
+        )
+    for number in log_ticks(axes.low, axes.high):
+        x = axes.x_px(number)
+        parts.append(
+            f'<path d="M{x:.1f} {_TOP}V{bottom}" stroke="{_LINE}"/>'
+            f'<text x="{x:.1f}" y="{bottom + 15}" text-anchor="middle">{number:g}</text>'
+        )
+    middle_x, middle_y = (_LEFT + right) / 2, (_TOP + bottom) / 2
+    parts.append(
+        f'<text x="{middle_x}" y="{_HEIGHT - 12}" text-anchor="middle">'
+        f"{escape(panel.time_label)}</text>"
+        f'<text transform="translate(16 {middle_y}) rotate(-90)" text-anchor="middle">'
+        f"{escape(panel.error_label)}</text>"
+    )
+    return parts + _points(panel.points, axes)
+
+
+def _points(points: Sequence[Point], axes: _Axes) -> list[str]:
+    """Dots with whiskers; labels move down where one would lie on another."""
+    parts, taken = [], list[tuple[float, float]]()
+    for point in sorted(points, key=lambda p: (p.error, p.time), reverse=True):
+        x, y = axes.x_px(point.time), axes.y_px(point.error)
+        colour = _OURS if point.is_ours else _RIVAL
+        label_y = y - 8
+        while any(abs(label_y - ty) < 12 and abs(x - tx) < 110 for tx, ty in taken):
+            label_y += 13
+        taken.append((x, label_y))
+        anchor = "end" if x > _WIDTH * 0.62 else "start"
+        parts.append(
+            f'<path d="M{axes.x_px(point.time_low):.1f} {y:.1f}H{axes.x_px(point.time_high):.1f}" '
+            f'stroke="{colour}" stroke-width="2"/>'
+            f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}">'
+            f"<title>{escape(point.label)}: {point.time:.3g}, {point.error:.3g}</title></circle>"
+            f'<text x="{x:.1f}" y="{label_y:.1f}" text-anchor="{anchor}" fill="{colour}">'
+            f"{escape(point.label)}</text>"
+        )
+    return parts

@@ -1,0 +1,93 @@
+"""Repeated measurements in; their median and spread, and whether a bound is met, out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError
+
+Sense = Literal["at least", "at most"]
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One quantity measured several times: all values, in the order of the rounds."""
+
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        if not self.values or not np.isfinite(self.values).all():
+            raise InvalidInputError(
+                f"figure: got {self.values}, expected at least one value, all of them finite"
+            )
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Figure":
+        """The figure of a list of measurements."""
+        return cls(tuple(float(value) for value in values))
+
+    @property
+    def median(self) -> float:
+        """The middle of the rounds."""
+        return float(np.median(self.values))
+
+    @property
+    def low(self) -> float:
+        """The smallest round."""
+        return min(self.values)
+
+    @property
+    def high(self) -> float:
+        """The largest round."""
+        return max(self.values)
+
+    def over(self, other: "Figure") -> "Figure":
+        """Ratio to another figure, round by round: what both saw of the machine cancels.
+
+        Raises:
+            InvalidInputError: another number of rounds.
+        """
+        if len(self.values) != len(other.values):
+            raise InvalidInputError(
+                f"figure: got {len(self.values)} and {len(other.values)} rounds, expected the "
+                "same number; measure both in one run"
+            )
+        return Figure.of([a / b for a, b in zip(self.values, other.values, strict=True)])
+
+    def scaled(self, factor: float) -> "Figure":
+        """The figure in another unit."""
+        return Figure.of([value * factor for value in self.values])
+
+    def inverse(self, of: float = 1.0) -> "Figure":
+        """How often something fits into `of`: a rate from a time."""
+        return Figure.of([of / value for value in self.values])
+
+    def text(self) -> str:
+        """Median, with the spread where there were several rounds."""
+        if len(self.values) == 1:
+            return f"{self.median:.3g}"
+        return f"{self.median:.3g} ({self.low:.3g} … {self.high:.3g})"
+
+
+@dataclass(frozen=True)
+class Requirement:
+    """What was promised, and what was measured; None: not measured in this run."""
+
+    what: str
+    figure: float | None
+    sense: Sense
+    bound: float
+    unit: str = ""
+
+    @property
+    def is_met(self) -> bool | None:
+        """Whether the bound holds; None where nothing was measured."""
+        if self.figure is None:
+            return None
+        return self.figure >= self.bound if self.sense == "at least" else self.figure <= self.bound
+
+    def verdict(self) -> str:
+        """One word for the table."""
+        return {None: "not measured", True: "pass", False: "FAIL"}[self.is_met]

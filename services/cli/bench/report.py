@@ -1,0 +1,95 @@
+"""What a stage found: tables, points and requirements in; a terminal's tables and JSON out."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from services.cli.bench.chart import Panel
+from services.cli.bench.figures import Requirement
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """Rows of text under a title; the first column names them."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """Everything one run of a stage says.
+
+    `data` is what JSON keeps of the measurements: every round of every figure.
+    """
+
+    stage: str
+    machine: dict[str, str]
+    options: dict[str, Any]
+    tables: Sequence[ResultTable]
+    panels: Sequence[Panel]
+    requirements: Sequence[Requirement]
+    data: dict[str, Any]
+    notes: Sequence[str] = field(default=())
+
+    @property
+    def is_met(self) -> bool:
+        """Whether every requirement was measured and holds."""
+        return all(requirement.is_met for requirement in self.requirements)
+
+    def to_json(self) -> str:
+        """The report as JSON text."""
+        requirements = [
+            {**asdict(requirement), "verdict": requirement.verdict()}
+            for requirement in self.requirements
+        ]
+        content = {
+            "stage": self.stage,
+            "machine": self.machine,
+            "options": self.options,
+            "requirements": requirements,
+            "notes": list(self.notes),
+            **self.data,
+        }
+        return json.dumps(content, indent=2, allow_nan=False)
+
+
+def show(report: StageReport, console: Console) -> None:
+    """Print the machine, the tables and the requirements."""
+    console.print(_table("Machine", ("", ""), list(report.machine.items())))
+    for table in report.tables:
+        console.print(_table(table.title, table.columns, table.rows))
+    for note in report.notes:
+        console.print(f"Note: {note}", markup=False, highlight=False)
+    rows = [
+        (
+            requirement.what,
+            "" if requirement.figure is None else f"{requirement.figure:.3g}",
+            f"{requirement.sense} {requirement.bound:g} {requirement.unit}".strip(),
+            requirement.verdict(),
+        )
+        for requirement in report.requirements
+    ]
+    console.print(_table("Acceptance", ("requirement", "measured", "bound", "verdict"), rows))
+
+
+def write_json(report: StageReport, path: Path) -> None:
+    """Write the report where `--json` says; its folder is made."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(report.to_json() + "\n", encoding="utf-8")
+
+
+def _table(title: str, columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Table:
+    table = Table(title=title, title_justify="left", header_style="bold")
+    table.show_header = any(columns)
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table

@@ -1,0 +1,41 @@
+"""Things to time in; their measurements, taken in turns, out."""
+
+from collections.abc import Callable, Mapping
+from typing import TypeVar
+
+from dextouch.errors import InvalidInputError
+
+T = TypeVar("T")
+
+
+def interleaved(
+    subjects: Mapping[str, Callable[[int], T]],
+    num_rounds: int,
+    *,
+    on_step: Callable[[str], None] = lambda _: None,
+) -> dict[str, list[T]]:
+    """Measure all subjects once a round, each round beginning with another of them.
+
+    What the machine does besides (a busy neighbour, a warm cache) then falls on all alike.
+
+    Args:
+        subjects: name → what measures it once, given the round's index.
+        num_rounds: at least 1.
+        on_step: called with a subject's name before it is measured.
+
+    Returns:
+        The results of each subject, round by round.
+
+    Raises:
+        InvalidInputError: no round.
+    """
+    if num_rounds < 1:
+        raise InvalidInputError(f"rounds: got {num_rounds}, expected at least 1")
+    names = list(subjects)
+    results: dict[str, list[T]] = {name: [] for name in names}
+    for round_index in range(num_rounds):
+        turn = round_index % max(1, len(names))
+        for name in names[turn:] + names[:turn]:
+            on_step(name)
+            results[name].append(subjects[name](round_index))
+    return results

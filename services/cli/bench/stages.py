@@ -1,0 +1,67 @@
+"""The name of a stage in; what adds its options and measures it out."""
+
+import argparse
+import importlib
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from pathlib import Path
+from typing import NamedTuple, Protocol, cast
+
+from dextouch.errors import UnknownNameError
+from services.cli.bench.report import StageReport
+
+# Opens a progress bar: (what, number of steps) → a function that is called with each step's name.
+Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
+
+
+class Stage(Protocol):
+    """One stage of the platform that can be timed against its error.
+
+    A module with these two functions is a stage.
+    """
+
+    def add_options(self, parser: argparse.ArgumentParser) -> None:
+        """Add the stage's own options; every stage has --quick, --json, --out and --check."""
+
+    def measure(self, options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+        """Measure everything once.
+
+        Args:
+            options: what the command line said.
+            folder: for what the measurement writes; the caller removes it.
+            bar: shows how far long work is.
+        """
+
+
+class StageEntry(NamedTuple):
+    """Where a stage lives, what it times, and what its --help teaches."""
+
+    module: str
+    does: str
+    teaches: str
+
+
+STAGES = {
+    "store": StageEntry(
+        "services.cli.bench.store.stage",
+        "write and read a take: ours, zarr-python, MCAP",
+        "Writes one take of a whole station (three cameras 640 by 480 at 30 Hz, two gloves, "
+        "finger and pose trackers, actions) with every design in turn, then reads windows of it "
+        "at random: 17 images of one camera with the touch of both hands and the actions of "
+        "their time. Reports time, processor time, bytes and image error of each design, the "
+        "latency of small appends to the spool, and a paced run that counts late rows; ends "
+        "with what the store promises and whether it holds. Close other programs first: timings "
+        "on a busy machine say little.",
+    ),
+}
+
+
+def load_stage(name: str) -> Stage:
+    """The module that measures a stage.
+
+    Raises:
+        UnknownNameError: no such stage.
+    """
+    if name not in STAGES:
+        raise UnknownNameError("stage", name, list(STAGES))
+    return cast("Stage", importlib.import_module(STAGES[name].module))
