@@ -1,28 +1,31 @@
-"""Episode format v1: names of files, Zarr v3 metadata, and the commit record that makes it true."""
+"""Episode format v2: names of files, Zarr v3 metadata, and the commit record that makes it true."""
 
 import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
-from dextouch.schemas.episodes import FORMAT_VERSION, ID_PATTERN
-from dextouch.streams.checks import JPEG_UNIT
+from dextouch.schemas.episodes import ID_PATTERN
+from dextouch.streams.checks import H264_UNIT, JPEG_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 
 Kind = Literal["episode", "recording"]
 KINDS: tuple[Kind, ...] = ("episode", "recording")
+Codec = Literal["zstd", "jpeg", "h264"]
+FORMAT_VERSION: Final = 2
 COMMIT_FILE = "commit.json"
 METADATA_FILE = "zarr.json"
 ATTRIBUTES_KEY = "dextouch"
 CHUNK_SECONDS = 0.5
 ZSTD_LEVEL = 1
-# JPEG bytes lie end to end in one array; its storage chunks are only the unit of checksums.
-JPEG_CHUNK_BYTES = 1 << 16
-JPEG_END_SUFFIX = "_end"
+# Images a closed group of pictures, which is a storage chunk.
+GOP_IMAGES = 8
+# Names under which zarr-python finds the image codecs (dextouch.episodes.zarr_codecs).
+ZARR_CODECS: Mapping[Codec, str] = {"jpeg": "dextouch.jpeg", "h264": "dextouch.h264"}
 STAMPS: Mapping[Kind, tuple[str, ...]] = {
     "episode": ("t_ref_ns",),
     "recording": ("t_host_ns", "t_device_ns", "sequence"),
@@ -30,13 +33,19 @@ STAMPS: Mapping[Kind, tuple[str, ...]] = {
 
 
 class ArrayEntry(BaseModel):
-    """What the commit record says about one array; `sha256` is that of its decoded bytes."""
+    """What the commit record says about one array.
+
+    `sha256` is that of its decoded bytes; of image codecs that of all encoded storage chunks one
+    after the other. `encoder` says what wrote the images, with its settings.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
     shape: tuple[int, ...] = Field(min_length=1)
     chunk_rows: int = Field(ge=1)
+    codec: Codec = "zstd"
+    encoder: str | None = None
     dimension_names: tuple[str, ...]
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
@@ -46,7 +55,7 @@ class CommitRecord(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    format_version: Literal[1] = FORMAT_VERSION
+    format_version: Literal[2] = FORMAT_VERSION
     kind: Kind
     id: str
     attributes_sha256: str
@@ -67,17 +76,37 @@ def check_id(text: str, *, kind: str = "id") -> str:
     return text
 
 
-def chunk_rows(descriptor: StreamDescriptor) -> int:
-    """Samples a storage chunk: half a second."""
-    return max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
+def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:
+    """The same array with another length."""
+    return entry.model_copy(update={"shape": (num_rows, *entry.shape[1:])})
 
 
-def array_names(descriptor: StreamDescriptor, kind: Kind) -> tuple[str, ...]:
-    """Every array a stream occupies in a group."""
-    suffixes = [f"_{stamp}" for stamp in STAMPS[kind]]
-    if descriptor.unit == JPEG_UNIT:
-        suffixes.append(JPEG_END_SUFFIX)
-    return (descriptor.name, *(descriptor.name + suffix for suffix in suffixes))
+def codec_of(descriptor: StreamDescriptor) -> Codec:
+    """How a stream's values are kept."""
+    units: Mapping[str, Codec] = {JPEG_UNIT: "jpeg", H264_UNIT: "h264"}
+    return units.get(descriptor.unit, "zstd")
+
+
+def stream_arrays(descriptor: StreamDescriptor, kind: Kind) -> dict[str, ArrayEntry]:
+    """Every array that a stream occupies in a group, without rows yet; its values come first."""
+    name, codec = descriptor.name, codec_of(descriptor)
+    rows = max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
+    # The stamps of images go to disk as often as the images, so that a kill parts neither.
+    stamp_rows = rows if codec == "zstd" else GOP_IMAGES
+    time, no_hash = f"{name}_time", "0" * 64
+    axes = (f"{name}_axis{axis}" for axis in range(1, 1 + len(descriptor.shape)))
+    values = ArrayEntry(
+        dtype=descriptor.dtype,
+        shape=(0, *descriptor.shape),
+        chunk_rows={"zstd": rows, "jpeg": 1, "h264": GOP_IMAGES}[codec],
+        codec=codec,
+        dimension_names=(time, *axes),
+        sha256=no_hash,
+    )
+    stamps = ArrayEntry(
+        dtype="int64", shape=(0,), chunk_rows=stamp_rows, dimension_names=(time,), sha256=no_hash
+    )
+    return {name: values} | {f"{name}_{stamp}": stamps for stamp in STAMPS[kind]}
 
 
 def canonical_json(value: object) -> bytes:
@@ -109,9 +138,10 @@ def array_metadata(entry: ArrayEntry) -> bytes:
     compress = {"name": "zstd", "configuration": {"level": ZSTD_LEVEL, "checksum": False}}
     checksum = {"name": "crc32c"}
     plain = {"name": "bytes"} if entry.dtype == "uint8" else little
+    pack = [plain, compress] if entry.codec == "zstd" else [{"name": ZARR_CODECS[entry.codec]}]
     sharding = {
         "chunk_shape": [rows, *row_shape],
-        "codecs": [plain, compress, checksum],
+        "codecs": [*pack, checksum],
         "index_codecs": [little, checksum],
         "index_location": "end",
     }
@@ -128,7 +158,7 @@ def array_metadata(entry: ArrayEntry) -> bytes:
             "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
             "fill_value": 0,
             "codecs": [{"name": "sharding_indexed", "configuration": sharding}],
-            "attributes": {},
+            "attributes": {} if entry.encoder is None else {"encoder": entry.encoder},
             "dimension_names": list(entry.dimension_names),
         }
     )
@@ -163,9 +193,15 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
     if not whole:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} does not match its own sha256")
     if version != FORMAT_VERSION:
+        older = isinstance(version, int) and 1 <= version < FORMAT_VERSION
+        advice = (
+            "bring it over with `dextouch store migrate`"
+            if older
+            else "read it with the release that wrote it"
+        )
         raise StorageError(
-            f"{what}: got format version {version!r}, expected {FORMAT_VERSION}; "
-            "read it with the release that wrote it"
+            f"{what}: got format version {version!r}, expected {FORMAT_VERSION}; {advice}",
+            format_version=version,
         )
     try:
         return CommitRecord.model_validate(plain), digest

@@ -1,200 +1,202 @@
-"""A committed group on disk → attributes and slices of streams, every byte of them checked."""
+"""The contents of a group → slices of its streams, decoding only what is asked."""
 
-import hashlib
-import json
-from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
-from pydantic import ValidationError
 
-from dextouch.episodes.files import disk_errors
-from dextouch.episodes.format import (
-    ATTRIBUTES_KEY,
-    COMMIT_FILE,
-    JPEG_END_SUFFIX,
-    METADATA_FILE,
-    STAMPS,
-    Kind,
-    array_metadata,
-    array_names,
-    decode_commit,
-    sha256_hex,
-    shard_path,
-)
-from dextouch.episodes.shards import ShardReader
-from dextouch.errors import CorruptDataError, StorageError, UnknownNameError
-from dextouch.images.jpeg import decode_jpeg
+from dextouch.episodes.format import STAMPS, codec_of
+from dextouch.episodes.group_contents import CommittedGroup, GroupContents
+from dextouch.episodes.image_codecs import ImageChunks, transform_pixels
+from dextouch.episodes.video import FULL_FORM, ImageForm
+from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.schemas.episodes import EpisodeAttributes, Verification
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import JPEG_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
-VERIFY_BYTES = 1 << 24
 
 
 class GroupReader(Generic[A]):
     """What episodes and recordings share: attributes, arrays and their verification.
 
-    Nothing is read before it is asked for, and no file stays open.
+    Nothing is read before it is asked for. A reader may be used by several threads, be pickled and
+    be taken along into the worker processes of a data loader.
 
     Args:
-        folder: of a committed group.
-        kind: what it must be.
-        model: of its attributes.
-
-    Raises:
-        CorruptDataError: the commit record or the attributes are damaged.
-        StorageError: written by a newer version of the format.
+        contents: of a committed group, or of one that is being written.
     """
 
-    def __init__(self, folder: Path, kind: Kind, model: type[A]) -> None:
-        self._folder, self._kind = folder, kind
-        self._what = f"{kind} {folder.name}"
-        with disk_errors(f"open {self._what}"):
-            if not (folder / COMMIT_FILE).is_file():
-                raise CorruptDataError(f"{self._what}: {COMMIT_FILE} is missing")
-            commit = (folder / COMMIT_FILE).read_bytes()
-            if not (folder / METADATA_FILE).is_file():
-                raise CorruptDataError(f"{self._what}: {METADATA_FILE} is missing")
-            group = (folder / METADATA_FILE).read_bytes()
-        self._record, self.content_sha256 = decode_commit(commit, what=self._what)
-        if (self._record.kind, self._record.id) != (kind, folder.name):
-            raise CorruptDataError(
-                f"{self._what}: commit record says {self._record.kind} {self._record.id}"
-            )
-        if sha256_hex(group) != self._record.attributes_sha256:
-            raise CorruptDataError(f"{self._what}: attributes do not match their sha256")
-        try:
-            self.attributes: A = model.model_validate_json(
-                json.dumps(json.loads(group)["attributes"][ATTRIBUTES_KEY])
-            )
-        except (ValidationError, ValueError, KeyError) as error:
-            raise StorageError(f"{self._what}: attributes of an unknown kind ({error})") from error
+    def __init__(self, contents: GroupContents[A]) -> None:
+        self._contents: GroupContents[A] = contents
+        self._kind, self._what = contents.kind, contents.what
+        self.attributes: A = contents.attributes
+        self.content_sha256 = contents.content_sha256
         self.streams: dict[str, StreamDescriptor] = {s.name: s for s in self.attributes.streams}
-        missing = [
-            name
-            for descriptor in self.attributes.streams
-            for name in array_names(descriptor, kind)
-            if name not in self._record.arrays
-        ]
-        if missing:
-            raise CorruptDataError(f"{self._what}: arrays {missing} are not in the commit record")
-        self._shards: dict[str, ShardReader] = {}
         self._whole: dict[str, np.ndarray] = {}
 
     def num_samples(self, name: str) -> int:
         """How many samples a stream holds; nothing is read."""
         stamp = STAMPS[self._kind][0]
-        return self._record.arrays[f"{self._stream(name).name}_{stamp}"].shape[0]
+        return self._contents.entries[f"{self._stream(name).name}_{stamp}"].shape[0]
 
     def count(self, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> int:
         """How many samples `read` would give; only stamps are read."""
         low, high = self._range(name, start_ns, stop_ns)
         return high - low
 
+    def stamps_ns(self, name: str) -> np.ndarray:
+        """The stamps of a stream that put its samples in order, int64 [n], read-only."""
+        return self._column(f"{self._stream(name).name}_{STAMPS[self._kind][0]}")
+
+    def images(
+        self,
+        name: str,
+        start: int = 0,
+        stop: int | None = None,
+        *,
+        form: ImageForm = FULL_FORM,
+        out: np.ndarray | None = None,
+    ) -> np.ndarray:
+        """Images start … stop−1 of a camera, uint8 [n, h, w, channels].
+
+        Args:
+            name: of an image stream.
+            start: first image.
+            stop: one past the last; None for all.
+            form: half size or gray instead of the stored size and colours.
+            out: where the images go; made anew when not given.
+
+        Raises:
+            UnknownNameError: no such stream.
+            InvalidInputError: images outside the stream, or a stream without images.
+            ShapeError: an `out` that does not fit.
+            CorruptDataError: damaged bytes.
+        """
+        if self._stream(name).kind != "image":
+            raise InvalidInputError(f"{self._what}: {name!r} holds no images")
+        stop = self.num_samples(name) if stop is None else stop
+        if not 0 <= start <= stop <= self.num_samples(name):
+            raise InvalidInputError(
+                f"{self._what}: got images {start} … {stop} of {name!r}, expected within "
+                f"0 … {self.num_samples(name)}"
+            )
+        return self._pick_images(self._stream(name), np.arange(start, stop), form, out)
+
+    def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
+        """Images start … stop−1 of a `jpeg` or `h264` stream as they are stored, bytes each.
+
+        Raises:
+            InvalidInputError: a stream of another unit, or images outside the stream.
+            CorruptDataError: damaged bytes.
+        """
+        descriptor = self._stream(name)
+        if codec_of(descriptor) == "zstd":
+            raise InvalidInputError(
+                f"{self._what}: {name!r} has the unit {descriptor.unit!r}, not 'jpeg' or 'h264'"
+            )
+        if not 0 <= start <= stop <= self.num_samples(name):
+            raise InvalidInputError(f"{self._what}: {name!r} has no images {start} … {stop}")
+        chunks, shard = self._image_chunks(descriptor), self._contents.shard(name)
+        first = start // chunks.rows
+        images = [
+            image
+            for number in range(first, -(-stop // chunks.rows) if stop > start else first)
+            for image in chunks.unpack(shard.payload(number), number)
+        ]
+        return images[start - first * chunks.rows : stop - first * chunks.rows]
+
     def verify(self) -> Verification:
         """Read everything and compare it with the commit record.
 
         Raises:
             CorruptDataError: the first array that does not hold, by name.
+            InvalidInputError: a group that is still being written.
         """
-        num_bytes = 0
-        for name, entry in self._record.arrays.items():
-            path = self._folder / name / METADATA_FILE
-            if not path.is_file() or path.read_bytes() != array_metadata(entry):
-                raise CorruptDataError(f"{self._what}: {METADATA_FILE} of {name!r} is damaged")
-            shard, digest = self._shard(name), hashlib.sha256()
-            row_bytes = np.dtype(entry.dtype).itemsize * int(np.prod(entry.shape[1:]))
-            step = max(1, VERIFY_BYTES // max(1, row_bytes * entry.chunk_rows)) * entry.chunk_rows
-            for start in range(0, entry.shape[0], step):
-                data = shard.read(start, min(start + step, entry.shape[0])).tobytes()
-                digest.update(data)
-                num_bytes += len(data)
-            if digest.hexdigest() != entry.sha256:
-                raise CorruptDataError(f"{self._what}: sha256 of array {name!r} does not hold")
-        return Verification(
-            num_arrays=len(self._record.arrays),
-            num_bytes=num_bytes,
-            content_sha256=self.content_sha256,
-        )
+        if not isinstance(self._contents, CommittedGroup):
+            raise InvalidInputError(f"{self._what}: is still being written")
+        return self._contents.verify()
 
     def array_sha256(self, name: str) -> str:
         """The content hash of one array."""
-        if name not in self._record.arrays:
-            raise UnknownNameError("array", name, list(self._record.arrays))
-        return self._record.arrays[name].sha256
+        if name not in self._contents.entries:
+            raise UnknownNameError("array", name, list(self._contents.entries))
+        return self._contents.entries[name].sha256
 
     def _stream(self, name: str) -> StreamDescriptor:
         if name not in self.streams:
             raise UnknownNameError(f"stream of {self._what}", name, list(self.streams))
         return self.streams[name]
 
-    def _shard(self, name: str) -> ShardReader:
-        if name not in self._shards:
-            entry = self._record.arrays[name]
-            self._shards[name] = ShardReader(
-                self._folder / name / shard_path(len(entry.shape)),
-                entry,
-                what=f"{self._what}: array {name!r}",
-            )
-        return self._shards[name]
-
     def _column(self, name: str) -> np.ndarray:
         """A whole small array (stamps, actions), read once and kept."""
         if name not in self._whole:
-            column = self._shard(name).read()
+            column = self._contents.shard(name).read()
             column.flags.writeable = False
             self._whole[name] = column
         return self._whole[name]
 
     def _range(self, name: str, start_ns: int | None, stop_ns: int | None) -> tuple[int, int]:
-        stamps = self._column(f"{self._stream(name).name}_{STAMPS[self._kind][0]}")
+        stamps = self.stamps_ns(name)
         low = 0 if start_ns is None else int(np.searchsorted(stamps, start_ns))
         high = len(stamps) if stop_ns is None else int(np.searchsorted(stamps, stop_ns))
         return low, max(low, high)
 
     def _values(self, name: str, start: int, stop: int) -> np.ndarray:
         descriptor = self._stream(name)
-        if descriptor.unit != JPEG_UNIT:
-            return self._shard(name).read(start, stop)
-        return self._images(descriptor, np.arange(start, stop))
+        if codec_of(descriptor) == "zstd":
+            return self._contents.shard(name).read(start, stop)
+        return self._pick_images(descriptor, np.arange(start, stop), FULL_FORM, None)
 
-    def _pick(self, name: str, indices: np.ndarray) -> np.ndarray:
-        """Samples at ascending indices; of JPEG streams only these are decoded."""
-        descriptor = self._stream(name)
-        if descriptor.unit == JPEG_UNIT:
-            return self._images(descriptor, indices)
-        first = int(indices[0])
-        return self._shard(name).read(first, int(indices[-1]) + 1)[indices - first]
+    def _image_chunks(self, descriptor: StreamDescriptor) -> ImageChunks:
+        entry = self._contents.entries[descriptor.name]
+        what = f"{self._what}: array {descriptor.name!r}"
+        return ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
 
-    def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
-        """JPEG bytes of images start … stop-1 of a `jpeg` stream, as they are stored."""
-        ends = self._column(self._stream(name).name + JPEG_END_SUFFIX)
-        bounds = np.concatenate([[0], ends])
-        if not (np.diff(bounds) > 0).all() or int(bounds[-1]) != self._record.arrays[name].shape[0]:
-            raise CorruptDataError(f"{self._what}: image ends of {name!r} do not fit its bytes")
-        if start == stop:
-            return []
-        first = int(bounds[start])
-        data = self._shard(name).read(first, int(bounds[stop])).tobytes()
-        return [
-            data[int(bounds[i]) - first : int(bounds[i + 1]) - first] for i in range(start, stop)
-        ]
-
-    def _images(self, descriptor: StreamDescriptor, indices: np.ndarray) -> np.ndarray:
-        images = np.empty((len(indices), *descriptor.shape), dtype=np.uint8)
-        if not len(indices):
-            return images
-        first = int(indices[0])
-        encoded = self.encoded_images(descriptor.name, first, int(indices[-1]) + 1)
-        decoded: dict[int, np.ndarray] = {}
-        for row, index in enumerate(int(i) for i in indices):
-            if index not in decoded:
-                where = f"{self._what}: {descriptor.name!r} image {index}"
-                decoded[index] = decode_jpeg(encoded[index - first], where=where)
-                if decoded[index].shape != descriptor.shape:
-                    raise CorruptDataError(f"{where}: got {decoded[index].shape}")
-            images[row] = decoded[index]
+    def _pick_images(
+        self,
+        descriptor: StreamDescriptor,
+        indices: np.ndarray,
+        form: ImageForm,
+        out: np.ndarray | None,
+    ) -> np.ndarray:
+        """Images at ascending indices, of which some may repeat."""
+        shape = (len(indices), *form.shape(descriptor.shape))
+        if out is not None and (out.shape != shape or out.dtype != np.uint8):
+            raise ShapeError(
+                f"{descriptor.name}: out is {out.dtype} {out.shape}, not uint8 {shape}"
+            )
+        if codec_of(descriptor) == "zstd":
+            images = self._pick_plain(descriptor, indices, form)
+            if out is None:
+                return images
+            out[...] = images
+            return out
+        images = np.empty(shape, dtype=np.uint8) if out is None else out
+        unique, places = np.unique(indices, return_inverse=True)
+        if len(unique) == len(indices):
+            self._decode_images(descriptor, unique, form, images)
+        else:
+            once = np.empty((len(unique), *form.shape(descriptor.shape)), dtype=np.uint8)
+            self._decode_images(descriptor, unique, form, once)
+            images[...] = once[places]
         return images
+
+    def _pick_plain(
+        self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm
+    ) -> np.ndarray:
+        first, stop = (int(indices[0]), int(indices[-1]) + 1) if len(indices) else (0, 0)
+        images = self._contents.shard(descriptor.name).read(first, stop)
+        if not np.array_equal(indices, np.arange(first, stop)):
+            images = images[indices - first]
+        return images if form == FULL_FORM else transform_pixels(images, form)
+
+    def _decode_images(
+        self, descriptor: StreamDescriptor, indices: np.ndarray, form: ImageForm, out: np.ndarray
+    ) -> None:
+        chunks, shard = self._image_chunks(descriptor), self._contents.shard(descriptor.name)
+        numbers, starts = np.unique(indices // chunks.rows, return_index=True)
+        bounds: list[int] = np.append(starts, len(indices)).tolist()
+        for place, number in enumerate(numbers.tolist()):
+            low, high = bounds[place], bounds[place + 1]
+            places = (indices[low:high] - number * chunks.rows).tolist()
+            chunks.decode(shard.payload(number), number, places, form, out[low:high])

@@ -1,7 +1,7 @@
 """Batches of samples ↔ a spool: an append-only folder that a kill at any moment leaves readable.
 
 The spool is where a station records before anything else, and where the store keeps an upload
-until it is finished. `jpeg` streams travel as object arrays of JPEG bytes.
+until it is finished. Images of `jpeg` and `h264` streams travel as object arrays of bytes.
 """
 
 import os
@@ -12,7 +12,7 @@ from types import TracebackType
 import numpy as np
 
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
-from dextouch.episodes.journal import JournalWriter
+from dextouch.episodes.journal import SAMPLE_JOURNAL, JournalWriter
 from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
 from dextouch.episodes.spool_reader import (
     CLOSED_FILE,
@@ -22,7 +22,7 @@ from dextouch.episodes.spool_reader import (
 )
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import JPEG_UNIT, check_batch
+from dextouch.streams.checks import ENCODED_UNITS, check_batch
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 
@@ -65,10 +65,14 @@ class SpoolWriter:
             _create(path, attributes)
         self._lock = lock_spool(path)
         self._descriptors = {d.name: d for d in attributes.streams}
-        self._journals = {
-            name: JournalWriter(path, name, num_rows=num_rows.get(name))
-            for name in self._descriptors
-        }
+        self._journals: dict[str, JournalWriter] = {}
+        # The last stamp of each stream, which the next may not go below.
+        self._last_t_host_ns: dict[str, int | None] = {}
+        for name in self._descriptors:
+            self._journals[name] = JournalWriter(
+                path, name, SAMPLE_JOURNAL, num_rows=num_rows.get(name)
+            )
+            self.truncate(name, num_rows.get(name, 0))
         self._dirty: set[str] = set()
         with disk_errors(f"open spool {path.name}"):
             sync_folder(path)
@@ -90,7 +94,8 @@ class SpoolWriter:
         Args:
             stream_name: one of the recording's streams.
             batch: of the stream's dtype and shape; `t_host_ns` never decreases. Values of `jpeg`
-                streams are an object array of JPEG bytes (`dextouch.images.jpeg.jpeg_values`).
+                and `h264` streams are an object array of bytes, one an image
+                (`dextouch.images.jpeg.jpeg_values`).
 
         Raises:
             UnknownNameError: no such stream.
@@ -99,11 +104,12 @@ class SpoolWriter:
         """
         journal = self._journal(stream_name)
         descriptor = self._descriptors[stream_name]
-        check_batch(descriptor, batch, last_t_host_ns=journal.last_t_host_ns)
+        check_batch(descriptor, batch, last_t_host_ns=self._last_t_host_ns[stream_name])
         if not len(batch):
             return
-        stamps = np.stack([batch.t_host_ns, batch.t_device_ns, batch.sequence], axis=1)
-        journal.append(_payloads(descriptor, batch.values), stamps)
+        columns = (batch.t_host_ns.tolist(), batch.t_device_ns.tolist(), batch.sequence.tolist())
+        journal.append(_payloads(descriptor, batch.values), list(zip(*columns, strict=True)))
+        self._last_t_host_ns[stream_name] = columns[0][-1]
         self._dirty.add(stream_name)
 
     def num_samples(self, stream_name: str) -> int:
@@ -119,7 +125,8 @@ class SpoolWriter:
 
     def truncate(self, stream_name: str, num_samples: int) -> None:
         """Keep the first samples of a stream: undoes appends that were not acknowledged."""
-        self._journal(stream_name).truncate(num_samples)
+        rows = self._journal(stream_name).truncate(num_samples)
+        self._last_t_host_ns[stream_name] = int(rows["t_host_ns"][-1]) if num_samples else None
 
     def set_attributes(self, attributes: RecordingAttributes) -> None:
         """Replace what is known of the recording (ledger, success); id and streams stay.
@@ -193,7 +200,7 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
 
 
 def _payloads(descriptor: StreamDescriptor, values: np.ndarray) -> list[bytes]:
-    if descriptor.unit == JPEG_UNIT:
+    if descriptor.unit in ENCODED_UNITS:
         return list(values)
     data = np.ascontiguousarray(values, dtype=descriptor.numpy_dtype()).tobytes()
     size = len(data) // len(values)

@@ -1,12 +1,13 @@
 """An episode or recording on disk → its streams by time, and windows on the model grid."""
 
-from pathlib import Path
 from typing import Literal, overload
 
 import numpy as np
 
+from dextouch.episodes.camera_threads import each_camera
 from dextouch.episodes.format import STAMPS
 from dextouch.episodes.groups import GroupReader
+from dextouch.episodes.video import FULL_FORM, ImageForm
 from dextouch.episodes.window import (
     NativeWindow,
     StreamData,
@@ -28,15 +29,12 @@ ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "act
 
 
 class RecordingReader(GroupReader[RecordingAttributes]):
-    """A finished recording: raw streams, each with its own clock."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, "recording", RecordingAttributes)
+    """A recording: raw streams, each with its own clock."""
 
     def read(
         self, name: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> SampleBatch:
-        """Samples with start_ns ≤ t_host_ns < stop_ns; `jpeg` streams come as decoded images.
+        """Samples with start_ns ≤ t_host_ns < stop_ns; images come decoded.
 
         Raises:
             UnknownNameError: no such stream.
@@ -44,16 +42,13 @@ class RecordingReader(GroupReader[RecordingAttributes]):
         """
         low, high = self._range(name, start_ns, stop_ns)
         t_host_ns, t_device_ns, sequence = (
-            self._shard(f"{name}_{stamp}").read(low, high) for stamp in STAMPS["recording"]
+            self._column(f"{name}_{stamp}")[low:high].copy() for stamp in STAMPS["recording"]
         )
         return SampleBatch(t_host_ns, t_device_ns, sequence, self._values(name, low, high))
 
 
 class EpisodeReader(GroupReader[EpisodeAttributes]):
     """An episode: streams on one reference clock, actions on the model grid."""
-
-    def __init__(self, folder: Path) -> None:
-        super().__init__(folder, "episode", EpisodeAttributes)
 
     @property
     def num_steps(self) -> int:
@@ -63,7 +58,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def read(
         self, name: str, start_ns: int | None = None, stop_ns: int | None = None
     ) -> StreamData:
-        """Samples with start_ns ≤ t_ref_ns < stop_ns; `jpeg` streams come as decoded images.
+        """Samples with start_ns ≤ t_ref_ns < stop_ns; images come decoded.
 
         Raises:
             UnknownNameError: no such stream.
@@ -82,6 +77,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         cameras: tuple[str, ...] = ...,
         action_kind: ActionKind = ...,
         grid: Literal[True] = ...,
+        form: ImageForm = ...,
     ) -> Window: ...
     @overload
     def window(
@@ -92,6 +88,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         cameras: tuple[str, ...] = ...,
         action_kind: ActionKind = ...,
         grid: Literal[False],
+        form: ImageForm = ...,
     ) -> NativeWindow: ...
     def window(
         self,
@@ -101,6 +98,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         cameras: tuple[str, ...] = ("camera_head",),
         action_kind: ActionKind = "measured",
         grid: bool = True,
+        form: ImageForm = FULL_FORM,
     ) -> Window | NativeWindow:
         """Steps start … start + num_steps − 1, decoding only what they need.
 
@@ -110,37 +108,32 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             cameras: whose images are wanted; the others are not touched.
             action_kind: measured (reached) or commanded (sent) actions.
             grid: on the model grid; False gives all streams at their own rates, the camera
-                streams among them only for `cameras`.
+                streams among them only for `cameras` (see `native_window`).
+            form: half size or gray images.
 
         Raises:
             InvalidInputError: steps outside the episode.
             UnknownNameError: a camera or action kind that the episode does not have.
             CorruptDataError: damaged bytes.
         """
-        if num_steps < 1 or start < 0 or start + num_steps > self.num_steps:
-            raise InvalidInputError(
-                f"{self._what}: got window of steps {start} … {start + num_steps - 1}, "
-                f"expected within its {self.num_steps} steps"
-            )
+        self._check_steps(start, num_steps)
         self._check_cameras(cameras)
         if action_kind not in ACTION_STREAMS:
             raise UnknownNameError("action kind", action_kind, list(ACTION_STREAMS))
         stop = start + num_steps
         grid_ns = self._column("action_t_ref_ns")
         if not grid:
-            return self._native_window(int(grid_ns[start]), int(grid_ns[stop - 1]), cameras, start)
-        images, image_dt_ns = {}, {}
-        for camera in cameras:
-            stamps = self._column(f"{camera}_t_ref_ns")
-            if not len(stamps):
-                raise NotFoundError(f"{self._what}: {camera!r} holds no image")
-            nearest = nearest_indices(stamps, grid_ns[start:stop])
-            images[camera] = self._pick(camera, nearest)
-            image_dt_ns[camera] = stamps[nearest] - grid_ns[start:stop]
+            return self.native_window(start, num_steps, cameras=cameras, form=form)
+        nearest = {name: self._nearest(name, grid_ns[start:stop]) for name in cameras}
+        pictures = each_camera(
+            lambda name: self._pick_images(self.streams[name], nearest[name], form, None), cameras
+        )
         left, right = (self._tactile(side, start, stop) for side in SIDES)
         return Window(
-            images=images,
-            image_dt_ns=image_dt_ns,
+            images=pictures,
+            image_dt_ns={
+                name: self.stamps_ns(name)[nearest[name]] - grid_ns[start:stop] for name in cameras
+            },
             tactile_kpa=np.stack([left[0], right[0]], axis=1),
             tactile_valid=np.stack([left[1], right[1]], axis=1),
             actions=self._actions(start, stop, action_kind),
@@ -151,18 +144,63 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             K_head=self.attributes.K_head_matrix(),
         )
 
-    def _native_window(
-        self, first_ns: int, last_ns: int, cameras: tuple[str, ...], start: int
+    def native_window(
+        self,
+        start: int,
+        num_steps: int = 17,
+        *,
+        cameras: tuple[str, ...] = ("camera_head",),
+        streams: tuple[str, ...] | None = None,
+        form: ImageForm = FULL_FORM,
     ) -> NativeWindow:
-        names = [n for n, d in self.streams.items() if d.kind != "image" or n in cameras]
+        """The time of steps start … start + num_steps − 1 with every stream at its own rate.
+
+        Args:
+            start: first step.
+            num_steps: at least 1.
+            cameras: whose images are wanted.
+            streams: other streams that are wanted; None for all.
+            form: half size or gray images.
+
+        Raises:
+            InvalidInputError, UnknownNameError, CorruptDataError: as `window`.
+        """
+        self._check_steps(start, num_steps)
+        self._check_cameras(cameras)
+        others = tuple(n for n, d in self.streams.items() if d.kind != "image")
+        grid_ns = self._column("action_t_ref_ns")
+        first_ns, stop_ns = int(grid_ns[start]), int(grid_ns[start + num_steps - 1]) + 1
+        ranges = {name: self._range(name, first_ns, stop_ns) for name in cameras}
+        pictures = each_camera(lambda name: self.images(name, *ranges[name], form=form), cameras)
+        data = {
+            name: StreamData(self.stamps_ns(name)[slice(*ranges[name])].copy(), images)
+            for name, images in pictures.items()
+        }
+        data |= {
+            name: self.read(name, first_ns, stop_ns)
+            for name in (others if streams is None else streams)
+        }
         return NativeWindow(
-            streams={name: self.read(name, first_ns, last_ns + 1) for name in names},
+            streams=data,
             start_ns=first_ns,
-            stop_ns=last_ns + 1,
+            stop_ns=stop_ns,
             instruction=self.attributes.instruction,
             anchor=self._anchor(start),
             K_head=self.attributes.K_head_matrix(),
         )
+
+    def _nearest(self, camera: str, t_ns: np.ndarray) -> np.ndarray:
+        stamps = self.stamps_ns(camera)
+        if not len(stamps):
+            raise NotFoundError(f"{self._what}: {camera!r} holds no image")
+        return nearest_indices(stamps, t_ns)
+
+    def _check_steps(self, start: int, num_steps: int) -> None:
+        if num_steps < 1 or start < 0 or start + num_steps > self.num_steps:
+            raise InvalidInputError(
+                f"{self._what}: got window of steps {start} … {start + num_steps - 1}, "
+                f"expected within its {self.num_steps} steps"
+            )
 
     def _check_cameras(self, cameras: tuple[str, ...]) -> None:
         valid = [name for name, stream in self.streams.items() if stream.kind == "image"]

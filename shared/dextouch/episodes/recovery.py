@@ -7,6 +7,7 @@ from pathlib import Path
 
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.journal import (
+    SAMPLE_JOURNAL,
     JournalWriter,
     journal_path,
     part_path,
@@ -54,14 +55,14 @@ def _recover_stream(path: Path, name: str) -> RecoveryReport:
         journal.touch()
         before = part.stat().st_size, journal.stat().st_size
     num_rows = _num_trusted_rows(path, name)
-    JournalWriter(path, name, num_rows=num_rows).close()
+    JournalWriter(path, name, SAMPLE_JOURNAL, num_rows=num_rows).close()
     after = part.stat().st_size, journal.stat().st_size
     return RecoveryReport(name, num_rows, max(0, before[1] - after[1]), before[0] - after[0])
 
 
 def _num_trusted_rows(path: Path, name: str) -> int:
     """Rows left when those at the end are dropped whose payload never reached the disk."""
-    rows = read_rows(path, name)
+    rows = read_rows(path, name, SAMPLE_JOURNAL)
     num_rows = len(rows)
     while num_rows:
         try:

@@ -7,11 +7,11 @@ import numpy as np
 from pydantic import ValidationError
 
 from dextouch.episodes.files import disk_errors
-from dextouch.episodes.journal import journal_path, read_payloads, read_rows
+from dextouch.episodes.journal import SAMPLE_JOURNAL, journal_path, read_payloads, read_rows
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import JPEG_UNIT
+from dextouch.streams.checks import ENCODED_UNITS
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 
@@ -90,7 +90,7 @@ class SpoolReader:
         if name not in self._rows:
             if not journal_path(self.path, name).exists():
                 raise CorruptDataError(f"spool {self.path.name!r}: journal of {name!r} is missing")
-            self._rows[name] = read_rows(self.path, name)
+            self._rows[name] = read_rows(self.path, name, SAMPLE_JOURNAL)
         return self._rows[name]
 
 
@@ -112,7 +112,7 @@ def read_attributes(path: Path) -> RecordingAttributes:
 
 
 def _values(descriptor: StreamDescriptor, payloads: list[bytes]) -> np.ndarray:
-    if descriptor.unit == JPEG_UNIT:
+    if descriptor.unit in ENCODED_UNITS:
         return jpeg_values(payloads)
     values = np.frombuffer(b"".join(payloads), dtype=descriptor.numpy_dtype())
     return values.reshape(len(payloads), *descriptor.shape)

@@ -1,113 +1,56 @@
 """Blocks of one stream → its arrays in a group that is being written, after every check."""
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes.files import disk_errors, write_file
 from dextouch.episodes.format import (
-    JPEG_CHUNK_BYTES,
-    JPEG_END_SUFFIX,
-    METADATA_FILE,
+    GOP_IMAGES,
     STAMPS,
     ArrayEntry,
     Kind,
-    array_metadata,
-    array_names,
-    chunk_rows,
-    shard_path,
+    codec_of,
+    stream_arrays,
 )
-from dextouch.episodes.shards import ShardWriter
+from dextouch.episodes.image_codecs import pack_chunk
+from dextouch.episodes.image_queue import ImageQueue
+from dextouch.episodes.shard_writer import ShardWriter
+from dextouch.episodes.video import GopEncoder, VideoSettings, check_video_size, is_keyframe
+from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, StorageError
-from dextouch.images.jpeg import encode_jpeg, jpeg_size
-from dextouch.streams.checks import JPEG_UNIT
+from dextouch.images.jpeg import DEFAULT_QUALITY, encode_jpeg
+from dextouch.streams.checks import check_encoded_image
 from dextouch.streams.descriptors import StreamDescriptor
 
-
-class ArrayWriter:
-    """One array: its shard and what the commit record will say about it."""
-
-    def __init__(
-        self,
-        path: Path,
-        *,
-        dtype: str,
-        row_shape: tuple[int, ...],
-        chunk_rows: int,
-        time_dimension: str,
-    ) -> None:
-        self._path, self._dtype, self._row_shape = path, dtype, row_shape
-        self._chunk_rows = chunk_rows
-        axes = (f"{path.name}_axis{axis}" for axis in range(1, 1 + len(row_shape)))
-        self._dimension_names = (time_dimension, *axes)
-        self._shard = ShardWriter(
-            path / shard_path(1 + len(row_shape)),
-            dtype=np.dtype(dtype).newbyteorder("<"),
-            row_shape=row_shape,
-            chunk_rows=chunk_rows,
-        )
-
-    def append(self, rows: np.ndarray) -> None:
-        """Append rows of the array's dtype and shape."""
-        self._shard.append(rows)
-
-    def finish(self) -> ArrayEntry:
-        """Write what is left and the metadata."""
-        digest = self._shard.finish()
-        entry = ArrayEntry.model_validate(
-            {
-                "dtype": self._dtype,
-                "shape": (self._shard.num_rows, *self._row_shape),
-                "chunk_rows": self._chunk_rows,
-                "dimension_names": self._dimension_names,
-                "sha256": digest,
-            }
-        )
-        with disk_errors(f"write metadata of {self._path.name}"):
-            write_file(self._path / METADATA_FILE, array_metadata(entry))
-        return entry
-
-    def close(self) -> None:
-        """Give the file back."""
-        self._shard.close()
+Stamps = Mapping[str, np.ndarray]
 
 
 class StreamWriter:
-    """One stream: its values, its stamps, and the checks that every block passes."""
+    """One stream: its values, its stamps, and the checks that every block passes.
 
-    def __init__(self, folder: Path, descriptor: StreamDescriptor, kind: Kind) -> None:
-        self.descriptor, self._kind = descriptor, kind
+    Plain images of a `jpeg` or `h264` stream are encoded by a thread of the stream's own.
+    """
+
+    def __init__(
+        self, stage: Path, descriptor: StreamDescriptor, kind: Kind, options: WriteOptions
+    ) -> None:
+        self.descriptor, self._kind, self._options = descriptor, kind, options
         self._last_stamp_ns: int | None = None
-        self._num_bytes = 0
-        self._is_jpeg = descriptor.unit == JPEG_UNIT
-        name, rows, time = descriptor.name, chunk_rows(descriptor), f"{descriptor.name}_time"
-        if self._is_jpeg:
-            values = ArrayWriter(
-                folder / name,
-                dtype="uint8",
-                row_shape=(),
-                chunk_rows=JPEG_CHUNK_BYTES,
-                time_dimension=f"{name}_byte",
-            )
-        else:
-            values = ArrayWriter(
-                folder / name,
-                dtype=descriptor.dtype,
-                row_shape=descriptor.shape,
-                chunk_rows=rows,
-                time_dimension=time,
-            )
-        self.arrays = {name: values}
-        for other in array_names(descriptor, kind)[1:]:
-            self.arrays[other] = ArrayWriter(
-                folder / other,
-                dtype="int64",
-                row_shape=(),
-                chunk_rows=rows,
-                time_dimension=time,
-            )
+        self._images = _EncodedImages(descriptor, options.video)
+        self._queue: ImageQueue | None = None
+        entries = stream_arrays(descriptor, kind)
+        self.arrays = {
+            name: ShardWriter(stage, name, entry, sync=options.sync)
+            for name, entry in entries.items()
+        }
 
-    def append(self, values: np.ndarray, stamps: dict[str, np.ndarray]) -> None:
+    @property
+    def num_dropped(self) -> int:
+        """Images that found the queue full and were left out."""
+        return 0 if self._queue is None else self._queue.num_dropped
+
+    def append(self, values: np.ndarray, stamps: Stamps) -> None:
         """Append a block with all stamps of the kind; raises as `EpisodeWriter.append`."""
         name = self.descriptor.name
         for stamp, column in stamps.items():
@@ -119,17 +62,26 @@ class StreamWriter:
         if not len(values):
             return
         # All checks come before the first byte, so that a refused block leaves no trace.
-        first = stamps[STAMPS[self._kind][0]]
-        if self._is_jpeg:
-            images = self._encoded(values)
-            self._check_order(first)
-            self._append_images(images)
+        if codec_of(self.descriptor) == "zstd" or values.dtype != object:
+            self._check_values(values)
         else:
-            checked = self._checked(values)
-            self._check_order(first)
-            self.arrays[name].append(checked)
-        for stamp, column in stamps.items():
-            self.arrays[f"{name}_{stamp}"].append(column)
+            self._images.check(values)
+        self._check_order(stamps[STAMPS[self._kind][0]])
+        if codec_of(self.descriptor) == "zstd":
+            self.arrays[name].append(values)
+            self._append_stamps(stamps)
+        elif self._queue is None and (values.dtype == object or not self._options.threads):
+            self._append_images(values, stamps)
+        else:
+            self._enqueue(values, stamps)
+
+    def _enqueue(self, values: np.ndarray, stamps: Stamps) -> None:
+        # Once there is a queue, everything goes through it: the order must stay.
+        if self._queue is None:
+            name, when_full = self.descriptor.name, self._options.when_full
+            self._queue = ImageQueue(self._append_images, name=name, when_full=when_full)
+        kept = values if values.dtype == object else values.copy()
+        self._queue.put(kept, {stamp: column.copy() for stamp, column in stamps.items()})
 
     def _check_order(self, stamps_ns: np.ndarray) -> None:
         # Arrival stamps may repeat: a device can hand over several samples at once.
@@ -145,7 +97,7 @@ class StreamWriter:
             )
         self._last_stamp_ns = int(stamps_ns[-1])
 
-    def _checked(self, values: np.ndarray) -> np.ndarray:
+    def _check_values(self, values: np.ndarray) -> None:
         descriptor = self.descriptor
         if values.dtype != descriptor.numpy_dtype() or values.shape[1:] != descriptor.shape:
             raise ShapeError(
@@ -158,24 +110,15 @@ class StreamWriter:
                 f"{descriptor.name}: {int((~np.isfinite(values)).sum())} values are NaN or "
                 "infinite; leave invalid samples out of an episode"
             )
-        return values
 
-    def _encoded(self, values: np.ndarray) -> list[bytes]:
-        """JPEG bytes are kept as they are; uint8 images are encoded here."""
-        name, shape = self.descriptor.name, self.descriptor.shape
-        images = list(values) if values.dtype == object else [encode_jpeg(v) for v in values]
-        for index, data in enumerate(images):
-            size = jpeg_size(data, where=f"{name}: image {index} of this block")
-            if size != shape[:2]:
-                raise ShapeError(f"{name}: image {index} is {size} pixels, expected {shape[:2]}")
-        return images
+    def _append_images(self, values: np.ndarray, stamps: Stamps) -> None:
+        for payload, num_images in self._images.chunks(values):
+            self.arrays[self.descriptor.name].append_encoded(payload, num_images)
+        self._append_stamps(stamps)
 
-    def _append_images(self, images: list[bytes]) -> None:
-        name = self.descriptor.name
-        ends = self._num_bytes + np.cumsum([len(data) for data in images], dtype=np.int64)
-        self._num_bytes = int(ends[-1])
-        self.arrays[name].append(np.frombuffer(b"".join(images), dtype=np.uint8))
-        self.arrays[name + JPEG_END_SUFFIX].append(ends)
+    def _append_stamps(self, stamps: Stamps) -> None:
+        for stamp, column in stamps.items():
+            self.arrays[f"{self.descriptor.name}_{stamp}"].append(column)
 
     def finish(self) -> dict[str, ArrayEntry]:
         """Complete all arrays; what the commit record says about each.
@@ -183,14 +126,89 @@ class StreamWriter:
         Raises:
             StorageError: a block was written in part, since the disk failed in the middle.
         """
-        entries = {name: array.finish() for name, array in self.arrays.items()}
+        if self._queue is not None:
+            self._queue.drain()
         name = self.descriptor.name
-        counts = {n: e.shape[0] for n, e in entries.items() if n != name or not self._is_jpeg}
+        for payload, num_images in self._images.rest():
+            self.arrays[name].append_encoded(payload, num_images)
+        for array in self.arrays.values():
+            array.flush()
+        entries = {name: array.finish() for name, array in self.arrays.items()}
+        entries[name] = entries[name].model_copy(update={"encoder": self._images.encoder})
+        counts = {array: entry.shape[0] for array, entry in entries.items()}
         if len(set(counts.values())) != 1:
             raise StorageError(f"{name}: a block was written in part ({counts}); write it anew")
         return entries
 
     def close(self) -> None:
-        """Give the files back."""
+        """Give thread and files back."""
+        if self._queue is not None:
+            self._queue.stop()
         for array in self.arrays.values():
             array.close()
+
+
+class _EncodedImages:
+    """Images of a `jpeg` or `h264` stream → its storage chunks."""
+
+    def __init__(self, descriptor: StreamDescriptor, settings: VideoSettings) -> None:
+        self._descriptor, self._settings = descriptor, settings
+        self._codec = codec_of(descriptor)
+        self._num_given = 0
+        self._video: GopEncoder | None = None
+        self._group: list[bytes] = []
+        self.encoder: str | None = None
+        if self._codec == "h264":
+            check_video_size(*descriptor.shape[:2])
+
+    def check(self, values: np.ndarray) -> None:
+        """Refuse encoded images that are none of this stream."""
+        name = self._descriptor.name
+        if self.encoder is not None:
+            raise InvalidInputError(
+                f"{name}: got encoded images after plain ones, expected one kind in a stream"
+            )
+        for index, data in enumerate(values):
+            number = self._num_given + index
+            where = f"{name}: image {number}"
+            check_encoded_image(self._descriptor, data, where=where)
+            begins = number % GOP_IMAGES == 0
+            if self._codec == "h264" and is_keyframe(data) != begins:
+                raise InvalidInputError(
+                    f"{where}: is {'no' if begins else 'a'} key frame; expected closed groups of "
+                    f"{GOP_IMAGES} images, each beginning with one; decode and encode it anew"
+                )
+        self._num_given += len(values)
+
+    def chunks(self, values: np.ndarray) -> list[tuple[bytes, int]]:
+        """Storage chunks that these images complete, each with its number of images."""
+        images = list(values) if values.dtype == object else [self._encode(v) for v in values]
+        if self._codec == "jpeg":
+            return [(pack_chunk("jpeg", [data]), 1) for data in images]
+        complete = []
+        for data in images:
+            self._group.append(data)
+            if len(self._group) == GOP_IMAGES:
+                complete += self.rest()
+        return complete
+
+    def rest(self) -> list[tuple[bytes, int]]:
+        """The storage chunk of what is left."""
+        group, self._group = self._group, []
+        return [(pack_chunk("h264", group), len(group))] if group else []
+
+    def _encode(self, image: np.ndarray) -> bytes:
+        if self._codec == "jpeg":
+            self.encoder = f"simplejpeg quality {DEFAULT_QUALITY}"
+            return encode_jpeg(image)
+        if self._video is None:
+            if self._num_given:
+                raise InvalidInputError(
+                    f"{self._descriptor.name}: got plain images after encoded ones, expected one "
+                    "kind in a stream"
+                )
+            height, width, _ = self._descriptor.shape
+            rate_hz = self._descriptor.nominal_rate_hz
+            self._video = GopEncoder(height, width, rate_hz=rate_hz, settings=self._settings)
+            self.encoder = self._video.description
+        return self._video.encode(image)

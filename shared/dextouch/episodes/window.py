@@ -27,13 +27,14 @@ class StreamData:
 class Window:
     """n consecutive steps of the model grid.
 
-    `images` are the nearest ones, `image_dt_ns` the image's stamp minus the step's. `tactile_kpa`
-    [step, left/right, taxel] is the mean of the samples in (t−1, t]; where `tactile_valid` is false
-    there was none, and the row is zero. `actions` are relative to the *measured* poses of the first
-    step, whose absolute poses are `anchor`; `K_head` is in pixels.
+    `images` are the nearest ones (one channel if asked for in gray), `image_dt_ns` the image's
+    stamp minus the step's. `tactile_kpa` [step, left/right, taxel] is the mean of the samples in
+    (t−1, t]; where `tactile_valid` is false there was none, and the row is zero. `actions` are
+    relative to the *measured* poses of the first step, whose absolute poses are `anchor`; `K_head`
+    is in pixels.
     """
 
-    images: dict[str, UInt8[np.ndarray, "n h w 3"]]
+    images: dict[str, UInt8[np.ndarray, "n h w c"]]
     image_dt_ns: dict[str, Int64[np.ndarray, " n"]]
     tactile_kpa: Float32[np.ndarray, "n 2 320"]
     tactile_valid: Bool[np.ndarray, "n 2"]

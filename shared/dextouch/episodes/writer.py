@@ -1,6 +1,5 @@
 """Blocks of samples → a new episode or recording that appears whole or not at all."""
 
-import errno
 import fcntl
 import os
 import shutil
@@ -9,31 +8,25 @@ from types import TracebackType
 
 import numpy as np
 
-from dextouch.episodes.files import disk_errors, sync_folder, write_file
-from dextouch.episodes.format import (
-    COMMIT_FILE,
-    METADATA_FILE,
-    STAMPS,
-    CommitRecord,
-    Kind,
-    array_names,
-    encode_commit,
-    group_metadata,
-    sha256_hex,
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import STAMPS, stream_arrays
+from dextouch.episodes.stage import (
+    Attributes,
+    attributes_id,
+    commit_stage,
+    kind_of,
+    write_stage,
 )
 from dextouch.episodes.stream_writer import StreamWriter
-from dextouch.errors import (
-    ConflictError,
-    InvalidInputError,
-    UnknownNameError,
-)
-from dextouch.schemas.episodes import EpisodeAttributes, json_ready
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import JPEG_UNIT
+from dextouch.episodes.write_options import WriteOptions
+from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.schemas.episodes import EpisodeAttributes
+from dextouch.schemas.recordings import LedgerEntry
+from dextouch.streams.checks import ENCODED_UNITS
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
 
-Attributes = EpisodeAttributes | RecordingAttributes
+DROPPED_IMAGES = "dropped_before_encoder"
 
 
 class EpisodeWriter:
@@ -45,14 +38,19 @@ class EpisodeWriter:
     Args:
         stage: new folder on the store's file system.
         target: where the group appears at commit.
-        kind: "episode" or "recording".
-        attributes: of that kind.
+        attributes: of an episode or a recording.
+        options: durability and speed.
     """
 
-    def __init__(self, *, stage: Path, target: Path, kind: Kind, attributes: Attributes) -> None:
-        self._stage, self._target, self._kind = stage, target, kind
-        self._attributes = attributes
+    def __init__(
+        self, *, stage: Path, target: Path, attributes: Attributes, options: WriteOptions
+    ) -> None:
+        self._stage, self._target, self._options = stage, target, options
+        self._attributes, self._kind = attributes, kind_of(attributes)
         self._streams: dict[str, StreamWriter] = {}
+        keep = self._kind == "recording" if options.recoverable is None else options.recoverable
+        # Whether `stage.json` must be written before the next sample.
+        self._unannounced, self._recoverable = keep, keep
         with disk_errors(f"create {stage}"):
             stage.mkdir(parents=True)
             # Held as long as the writer lives: tells a sweep that this stage is not abandoned.
@@ -66,20 +64,24 @@ class EpisodeWriter:
 
         Raises:
             ConflictError: one of its arrays has the name of an array that exists.
-            InvalidInputError: a `jpeg` stream that does not hold uint8 [h, w, 3].
+            InvalidInputError: a `jpeg` or `h264` stream that does not hold uint8 [h, w, 3], or
+                an `h264` stream of odd height or width.
         """
-        if descriptor.unit == JPEG_UNIT and (
+        if descriptor.unit in ENCODED_UNITS and (
             descriptor.dtype != "uint8" or len(descriptor.shape) != 3 or descriptor.shape[2] != 3
         ):
             raise InvalidInputError(
                 f"{descriptor.name}: got {descriptor.dtype} {descriptor.shape}, "
-                "expected uint8 [h, w, 3] for unit 'jpeg'"
+                f"expected uint8 [h, w, 3] for unit {descriptor.unit!r}"
             )
         taken = {name for stream in self._streams.values() for name in stream.arrays}
-        for name in array_names(descriptor, self._kind):
+        for name in stream_arrays(descriptor, self._kind):
             if name in taken:
                 raise ConflictError(f"stream {descriptor.name!r}: array {name!r} exists already")
-        self._streams[descriptor.name] = StreamWriter(self._stage, descriptor, self._kind)
+        self._streams[descriptor.name] = StreamWriter(
+            self._stage, descriptor, self._kind, self._options
+        )
+        self._unannounced = self._recoverable
 
     def append(
         self,
@@ -95,8 +97,9 @@ class EpisodeWriter:
 
         Args:
             name: of an announced stream.
-            values: [n, *shape] of the stream's dtype; finite in episodes. For unit `jpeg` uint8
-                images [n, h, w, 3], or an object array of JPEG bytes that is kept as it is.
+            values: [n, *shape] of the stream's dtype; finite in episodes. For the units
+                `jpeg` and `h264` uint8 images [n, h, w, 3], or an object array of bytes, one an
+                image, that is kept as it is.
             t_ref_ns: [n], strictly increasing; episodes need exactly this stamp.
             t_host_ns: [n], never decreasing; recordings need it.
             t_device_ns: [n]; recordings only, NO_DEVICE_TIME where absent.
@@ -126,6 +129,9 @@ class EpisodeWriter:
                 f"{name}: got stamps {sorted(stamps)}, expected {list(STAMPS[self._kind])} "
                 f"in a block of {self._kind}"
             )
+        if self._unannounced:
+            write_stage(self._stage, self._with_streams())
+            self._unannounced = False
         self._streams[name].append(values, stamps)
 
     def set_attributes(self, attributes: Attributes) -> None:
@@ -142,6 +148,7 @@ class EpisodeWriter:
                 f"as {attributes_id(self._attributes)!r}"
             )
         self._attributes = attributes
+        self._unannounced = self._recoverable
 
     def __enter__(self) -> "EpisodeWriter":
         return self
@@ -164,43 +171,25 @@ class EpisodeWriter:
     def _commit(self) -> None:
         if not self._streams:
             raise InvalidInputError(f"{attributes_id(self._attributes)}: has no stream")
-        descriptors = tuple(stream.descriptor for stream in self._streams.values())
-        group = group_metadata(
-            json_ready(self._attributes.model_copy(update={"streams": descriptors}))
-        )
         entries = {
             name: entry
             for stream in self._streams.values()
             for name, entry in stream.finish().items()
         }
-        record = CommitRecord(
-            kind=self._kind,
-            id=attributes_id(self._attributes),
-            attributes_sha256=sha256_hex(group),
-            arrays=entries,
+        commit_stage(self._stage, self._target, self._with_losses(), entries)
+
+    def _with_streams(self) -> Attributes:
+        descriptors = tuple(stream.descriptor for stream in self._streams.values())
+        return self._attributes.model_copy(update={"streams": descriptors})
+
+    def _with_losses(self) -> Attributes:
+        """The attributes with the images that were dropped here counted in them."""
+        attributes = self._with_streams()
+        dropped = {name: s.num_dropped for name, s in self._streams.items() if s.num_dropped}
+        if isinstance(attributes, EpisodeAttributes):
+            figures = {f"{name}_{DROPPED_IMAGES}": float(n) for name, n in dropped.items()}
+            return attributes.model_copy(update={"quality": attributes.quality | figures})
+        entries = tuple(
+            LedgerEntry(stream=name, event=DROPPED_IMAGES, count=n) for name, n in dropped.items()
         )
-        with disk_errors(f"commit {record.id}"):
-            write_file(self._stage / METADATA_FILE, group)
-            write_file(self._stage / COMMIT_FILE, encode_commit(record)[0])
-            sync_folder(self._stage)
-            self._target.parent.mkdir(parents=True, exist_ok=True)
-            self._move_into_place()
-            sync_folder(self._target.parent)
-
-    def _move_into_place(self) -> None:
-        # Renaming a folder onto one that is not empty fails, so a race cannot overwrite.
-        try:
-            self._stage.rename(self._target)
-        except OSError as error:
-            if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
-                raise
-            raise ConflictError(
-                f"{self._kind} {self._target.name!r} exists already; choose another id"
-            ) from error
-
-
-def attributes_id(attributes: Attributes) -> str:
-    """The id that attributes carry, whatever their kind."""
-    if isinstance(attributes, EpisodeAttributes):
-        return attributes.episode_id
-    return attributes.recording_id
+        return attributes.model_copy(update={"ledger": attributes.ledger + entries})

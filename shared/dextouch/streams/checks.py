@@ -8,6 +8,11 @@ from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 
 JPEG_UNIT = "jpeg"
+H264_UNIT = "h264"
+# Values of these units are bytes, one an image.
+ENCODED_UNITS = (JPEG_UNIT, H264_UNIT)
+# Every access unit of H.264 as a byte stream begins so (ITU-T H.264, Annex B), with a zero before.
+_START_CODES = (b"\x00\x00\x00\x01", b"\x00\x00\x01")
 
 
 def check_batch(
@@ -17,20 +22,20 @@ def check_batch(
 
     Args:
         descriptor: of the stream.
-        batch: values of the descriptor's dtype and shape; for unit `jpeg` an object array of
-            bytes; `t_host_ns` never decreases.
+        batch: values of the descriptor's dtype and shape; for the units `jpeg` and `h264` an
+            object array of bytes; `t_host_ns` never decreases.
         last_t_host_ns: stamp of the sample before the batch.
 
     Raises:
         ShapeError: another dtype or shape.
-        InvalidInputError: stamps that go back, or bytes that are no JPEG image.
+        InvalidInputError: stamps that go back, or bytes that are no image of the unit.
     """
     values, name = batch.values, descriptor.name
     for stamp in ("t_host_ns", "t_device_ns", "sequence"):
         column = getattr(batch, stamp)
         if column.dtype != np.int64 or column.shape != (len(batch),):
             raise ShapeError(f"{name}: {stamp} is {column.dtype} {column.shape}, expected int64")
-    if descriptor.unit == JPEG_UNIT:
+    if descriptor.unit in ENCODED_UNITS:
         _check_images(descriptor, values)
     elif values.dtype != descriptor.numpy_dtype() or values.shape[1:] != descriptor.shape:
         raise ShapeError(
@@ -44,6 +49,8 @@ def check_batch(
             f"{name}: t_host_ns goes back to {int(batch.t_host_ns[0])} from {last_t_host_ns}; "
             "append samples in the order of their arrival"
         )
+    if len(batch) == 1:
+        return
     back = np.flatnonzero(np.diff(batch.t_host_ns) < 0)
     if len(back):
         raise InvalidInputError(
@@ -57,15 +64,33 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
     if values.dtype != object or values.ndim != 1:
         raise ShapeError(
             f"{name}: got values {values.dtype} {values.shape}, expected an object array of "
-            "JPEG bytes (see dextouch.images.jpeg.jpeg_values)"
+            "bytes, one an image (see dextouch.images.jpeg.jpeg_values)"
         )
     for index, data in enumerate(values):
-        where = f"{name}: image {index} of the batch"
-        if not isinstance(data, bytes):
-            raise ShapeError(f"{where} is {type(data).__name__}, expected JPEG bytes")
-        try:
-            size = jpeg_size(data, where=where)
-        except CorruptDataError as error:
-            raise InvalidInputError(error.message) from error
-        if size != descriptor.shape[:2]:
-            raise ShapeError(f"{where} is {size} pixels, expected {descriptor.shape[:2]}")
+        check_encoded_image(descriptor, data, where=f"{name}: image {index} of the batch")
+
+
+def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
+    """Refuse bytes that are no image of a stream with the unit `jpeg` or `h264`.
+
+    Of H.264 only the start code is looked at; the size is seen when it is decoded.
+
+    Raises:
+        ShapeError: no bytes, or an image of another size.
+        InvalidInputError: bytes of another kind.
+    """
+    if not isinstance(data, bytes):
+        raise ShapeError(f"{where} is {type(data).__name__}, expected bytes")
+    if descriptor.unit == H264_UNIT:
+        if not data.startswith(_START_CODES):
+            raise InvalidInputError(
+                f"{where}: begins with {data[:4]!r}, expected an H.264 access unit with a start "
+                "code (Annex B)"
+            )
+        return
+    try:
+        size = jpeg_size(data, where=where)
+    except CorruptDataError as error:
+        raise InvalidInputError(error.message) from error
+    if size != descriptor.shape[:2]:
+        raise ShapeError(f"{where} is {size} pixels, expected {descriptor.shape[:2]}")

@@ -12,7 +12,7 @@ import numpy as np
 
 from dextouch.errors import InvalidInputError, LimitExceededError, PacketError
 from dextouch.images.jpeg import jpeg_values
-from dextouch.streams.checks import JPEG_UNIT, check_batch
+from dextouch.streams.checks import ENCODED_UNITS, check_batch
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.packing import pack, unpack
 from dextouch.streams.samples import SampleBatch
@@ -31,7 +31,7 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
 
     Args:
         descriptor: of the stream.
-        batch: 1 … MAX_BATCH_SAMPLES samples; values of `jpeg` streams are JPEG bytes.
+        batch: 1 … MAX_BATCH_SAMPLES samples; values of `jpeg` and `h264` streams are bytes.
         number: of the batch within its stream, from 0.
 
     Raises:
@@ -43,7 +43,7 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
     if number < 0:
         raise InvalidInputError(f"{descriptor.name}: got batch number {number}, expected ≥ 0")
     arrays = {stamp: getattr(batch, stamp) for stamp in _STAMPS}
-    if descriptor.unit == JPEG_UNIT:
+    if descriptor.unit in ENCODED_UNITS:
         arrays["image_bytes"] = np.frombuffer(b"".join(batch.values), dtype=np.uint8)
         arrays["image_end"] = np.cumsum([len(data) for data in batch.values], dtype=np.int64)
     else:
@@ -79,13 +79,13 @@ def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> S
             f"{where}: bytes are batch {fields['number']!r} of stream {fields['stream']!r}, "
             f"expected batch {number} of {descriptor.name!r}"
         )
-    is_jpeg = descriptor.unit == JPEG_UNIT
-    payload = {"image_bytes", "image_end"} if is_jpeg else {"values"}
+    is_encoded = descriptor.unit in ENCODED_UNITS
+    payload = {"image_bytes", "image_end"} if is_encoded else {"values"}
     if set(arrays) != payload | set(_STAMPS):
         raise InvalidInputError(
             f"{where}: got arrays {sorted(arrays)}, expected {sorted(payload | set(_STAMPS))}"
         )
-    values = _images(arrays, where) if is_jpeg else arrays["values"]
+    values = _images(arrays, where) if is_encoded else arrays["values"]
     _check_columns(arrays, values, where)
     batch = SampleBatch(arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], values)
     _check_count(descriptor, len(batch))

@@ -1,12 +1,14 @@
-"""Format v1 as it lies on disk: what version 1 once wrote must always be read, and be the same."""
+"""The format on disk: version 2 is read and written as ever, version 1 is brought over."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
+from dextouch.errors import CorruptDataError, StorageError
 from dextouch.hands.actions import IDENTITY_POSE_9D
 from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.episodes import EpisodeAttributes
@@ -38,6 +40,20 @@ ACTIONS = np.concatenate(
     [np.tile(IDENTITY_POSE_9D, (3, 2)), np.zeros((3, 40)), np.tile(IDENTITY_POSE_9D, (3, 1))],
     axis=1,
 )
+VIDEO = StreamDescriptor(
+    name="camera_head",
+    kind="image",
+    shape=(16, 32, 3),
+    dtype="uint8",
+    unit="h264",
+    nominal_rate_hz=30,
+)
+VIDEO_VALUES = (
+    np.arange(11)[:, None, None, None] * 9
+    + np.arange(16)[:, None, None] * 4
+    + np.arange(32)[:, None] * 2
+    + np.array([0, 20, 40])
+).astype("u1")
 IDENTITY_ROWS = tuple(tuple(float(i == j) for j in range(4)) for i in range(4))
 
 
@@ -66,6 +82,25 @@ def write_episode(store):
         writer.append("action", values=ACTIONS, t_ref_ns=np.arange(3) * 500_000_000)
 
 
+def write_video(store):
+    attributes = EpisodeAttributes.model_validate(
+        {
+            "episode_id": "video",
+            "task": "stand_bottle",
+            "instruction": "",
+            "domain": "robot",
+            "origin": "twin",
+            "anchor": dict.fromkeys(
+                ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head"), IDENTITY_ROWS
+            ),
+            "K_head": ((4, 0, 2), (0, 4, 2), (0, 0, 1)),
+            "streams": (VIDEO,),
+        }
+    )
+    with store.writer(attributes=attributes) as writer:
+        writer.append("camera_head", values=VIDEO_VALUES, t_ref_ns=np.arange(11) * 33_333_333)
+
+
 def write_recording(store):
     attributes = RecordingAttributes(
         recording_id="golden",
@@ -83,30 +118,100 @@ def write_recording(store):
 
 @pytest.fixture
 def golden():
-    return EpisodeStore(GOLDEN / "store_v1")
+    return EpisodeStore(GOLDEN / "store_v2")
 
 
-def test_version_1_is_read(golden):
-    reader = golden.open("golden")
+@pytest.fixture
+def old(tmp_path):
+    """A copy of what version 1 once wrote."""
+    shutil.copytree(GOLDEN / "store_v1", tmp_path / "old")
+    return EpisodeStore(tmp_path / "old")
+
+
+def check_content(store):
+    reader = store.open("golden")
     reader.verify()
     np.testing.assert_array_equal(reader.read("force").values, FORCE_VALUES)
     window = reader.window(0, 3)
     assert window.images["camera_head"].shape == (3, 4, 4, 3)
     assert window.image_dt_ns["camera_head"].tolist() == [0, -500_000_000, 0]
-    recording = golden.recording("golden")
+    image = (GOLDEN / "image.jpg").read_bytes()
+    assert reader.encoded_images("camera_head", 0, 2) == [image] * 2
+    recording = store.recording("golden")
     recording.verify()
     assert recording.read("force").sequence.tolist() == [9, 10, 11, 12, 13]
     assert recording.read("force").t_device_ns.tolist() == [-1] * 5
 
 
-def test_version_1_is_still_written(golden, store):
+def test_version_2_is_read(golden):
+    check_content(golden)
+
+
+def test_version_2_is_still_written(golden, store):
     """Byte for byte except the shards, whose compressed bytes are zstd's own affair."""
     write_episode(store)
     write_recording(store)
+    write_video(store)
     files = sorted(path.relative_to(golden.root) for path in golden.root.rglob("*.json"))
-    assert len(files) == 15
+    assert len(files) == 18
     for path in files:
         assert (store.root / path).read_bytes() == (golden.root / path).read_bytes(), path
+
+
+def test_video_of_version_2_is_read(golden):
+    """The access units of one encoder, decoded as they were when they were written."""
+    reader = golden.open("video")
+    reader.verify()
+    images = reader.images("camera_head")
+    assert images.shape == (11, 16, 32, 3)
+    assert abs(images.astype(int) - VIDEO_VALUES).mean() < 2.5
+    again = reader.images("camera_head", 9, 11)
+    np.testing.assert_array_equal(again, images[9:])
+
+
+def test_version_1_is_brought_over(old):
+    with pytest.raises(StorageError, match="store migrate"):
+        old.open("golden")
+    before = (old.root / "episodes" / "golden" / "commit.json").read_bytes()
+    assert old.migrate("golden")
+    assert old.migrate("golden", kind="recording")
+    check_content(old)
+    (lineage,) = old.open("golden").attributes.lineage
+    assert (lineage.kind, lineage.id) == ("episode", "golden")
+    assert lineage.sha256 == json.loads(before)["sha256"]
+    assert not old.migrate("golden")
+    assert list((old.root / ".staging").iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["camera_head", "camera_head_end", "force", "force_t_ref_ns"])
+def test_damage_of_version_1_is_not_brought_over(old, name):
+    shard = next(p for p in (old.root / "episodes/golden" / name / "c").rglob("*") if p.is_file())
+    data = bytearray(shard.read_bytes())
+    data[3] ^= 1
+    shard.write_bytes(data)
+    with pytest.raises(CorruptDataError, match=name):
+        old.migrate("golden")
+    with pytest.raises(StorageError, match="version 1"):
+        old.open("golden")
+
+
+def test_a_kill_in_the_middle_of_a_migration_is_mended(old, monkeypatch):
+    real = Path.rename
+
+    def die(path, target):
+        if "migrated-" in path.name:
+            raise KeyboardInterrupt
+        return real(path, target)
+
+    monkeypatch.setattr(Path, "rename", die)
+    with pytest.raises(KeyboardInterrupt):
+        old.migrate("golden")
+    monkeypatch.undo()
+    assert old.list() == []
+    assert old.sweep() == 1
+    (group,) = old.recover()
+    assert (group.kind, group.item_id) == ("episode", "golden")
+    old.open("golden").verify()
 
 
 def test_attributes_are_found_by_other_readers(golden):

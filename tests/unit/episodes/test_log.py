@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import log
-from dextouch.episodes.journal import MAGIC, ROW
+from dextouch.episodes.journal import SAMPLE_JOURNAL
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -124,13 +124,13 @@ def test_resume_goes_on_where_it_stopped(path):
 def test_torn_ends_are_cut_and_counted(path):
     fill(path)
     with (path / "glove_left.journal").open("ab") as journal:
-        journal.write(b"\x01" * (ROW.itemsize + 7))
+        journal.write(b"\x01" * (SAMPLE_JOURNAL.dtype.itemsize + 7))
     with (path / "glove_left.part").open("ab") as part:
         part.write(b"half a sample")
     assert log.SpoolReader(path).num_samples("glove_left") == 10
     glove, camera = log.recover(path)
     assert (glove.num_samples, glove.dropped_part_bytes) == (10, 13)
-    assert glove.dropped_journal_bytes == ROW.itemsize + 7
+    assert glove.dropped_journal_bytes == SAMPLE_JOURNAL.dtype.itemsize + 7
     assert (camera.num_samples, camera.dropped_part_bytes) == (3, 0)
     assert log.recover(path)[0].dropped_part_bytes == 0
 
@@ -158,7 +158,7 @@ def test_damage_in_the_middle_is_refused_and_changes_nothing(path):
     fill(path)
     journal = path / "glove_left.journal"
     whole = bytearray(journal.read_bytes())
-    whole[len(MAGIC) + 3 * ROW.itemsize + 8] ^= 1
+    whole[len(SAMPLE_JOURNAL.magic) + 3 * SAMPLE_JOURNAL.dtype.itemsize + 8] ^= 1
     journal.write_bytes(whole)
     with pytest.raises(CorruptDataError, match="row 3 of 10"):
         log.recover(path)
@@ -218,7 +218,7 @@ def test_what_does_not_fit_is_refused(path, tmp_path):
             "glove_left",
             SampleBatch(good.t_host_ns[::-1], good.t_device_ns, good.sequence, good.values),
         )
-    with pytest.raises(ShapeError, match="JPEG"):
+    with pytest.raises(ShapeError, match="bytes, one an image"):
         writer.append("camera_head", glove_batch(0))
     with pytest.raises(ConflictError, match="exists"):
         log.SpoolWriter(path, ATTRIBUTES)

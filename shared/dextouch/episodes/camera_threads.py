@@ -1,0 +1,23 @@
+"""The same work for several cameras at once, one thread a camera."""
+
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
+
+R = TypeVar("R")
+
+MAX_THREADS = 8
+_pools: list[ThreadPoolExecutor] = []
+# A forked worker has none of its parent's threads, so it must not wait for them.
+os.register_at_fork(after_in_child=_pools.clear)
+
+
+def each_camera(work: Callable[[str], R], cameras: Iterable[str]) -> dict[str, R]:
+    """`work` of every camera; one camera alone is worked on in the caller's thread."""
+    names = list(cameras)
+    if len(names) < 2:
+        return {name: work(name) for name in names}
+    if not _pools:
+        _pools.append(ThreadPoolExecutor(MAX_THREADS, thread_name_prefix="camera"))
+    return dict(zip(names, _pools[0].map(work, names), strict=True))

@@ -1,0 +1,170 @@
+"""A committed group, or one that is still being written → its attributes and its arrays."""
+
+import hashlib
+import json
+import math
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Generic, TypeVar
+
+import numpy as np
+from pydantic import ValidationError
+
+from dextouch.episodes.format import (
+    ATTRIBUTES_KEY,
+    COMMIT_FILE,
+    METADATA_FILE,
+    ArrayEntry,
+    Kind,
+    array_metadata,
+    decode_commit,
+    sha256_hex,
+    shard_path,
+    stream_arrays,
+    with_rows,
+)
+from dextouch.episodes.journal import CHUNK_JOURNAL, journal_path, part_path, read_rows
+from dextouch.episodes.shard_reader import ShardReader
+from dextouch.episodes.sources import GroupFiles, LocalFile
+from dextouch.episodes.stage import read_stage
+from dextouch.errors import CorruptDataError, NotFoundError, StorageError
+from dextouch.schemas.episodes import EpisodeAttributes, Verification
+from dextouch.schemas.recordings import RecordingAttributes
+
+A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
+VERIFY_BYTES = 1 << 24
+
+
+@dataclass
+class CommittedGroup(Generic[A]):
+    """A group with a commit record; `read_group` makes it."""
+
+    files: GroupFiles
+    kind: Kind
+    attributes: A
+    entries: dict[str, ArrayEntry]
+    content_sha256: str
+    what: str
+    _shards: dict[str, ShardReader] = field(default_factory=dict)
+
+    def shard(self, name: str) -> ShardReader:
+        """One array; its index is kept."""
+        if name not in self._shards:
+            entry = self.entries[name]
+            source = self.files.source(f"{name}/{shard_path(len(entry.shape))}")
+            self._shards[name] = ShardReader(source, entry, what=f"{self.what}: array {name!r}")
+        return self._shards[name]
+
+    def verify(self) -> Verification:
+        """Read everything and compare it with the commit record.
+
+        Raises:
+            CorruptDataError: the first array that does not hold, by name.
+        """
+        num_bytes = sum(self._verify_array(name, entry) for name, entry in self.entries.items())
+        return Verification(
+            num_arrays=len(self.entries), num_bytes=num_bytes, content_sha256=self.content_sha256
+        )
+
+    def _verify_array(self, name: str, entry: ArrayEntry) -> int:
+        if self.files.get(f"{name}/{METADATA_FILE}") != array_metadata(entry):
+            raise CorruptDataError(f"{self.what}: {METADATA_FILE} of {name!r} is damaged")
+        shard, digest, num_bytes = self.shard(name), hashlib.sha256(), 0
+        shard.check_whole()
+        rows = entry.chunk_rows
+        row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
+        # Image codecs are hashed as they are stored, a storage chunk at a time.
+        plain = entry.codec == "zstd"
+        step = max(1, VERIFY_BYTES // max(1, row_bytes * rows)) * rows if plain else rows
+        for start in range(0, entry.shape[0], step):
+            stop = min(start + step, entry.shape[0])
+            data = shard.read(start, stop).tobytes() if plain else shard.payload(start // rows)
+            digest.update(data)
+            num_bytes += len(data)
+        if digest.hexdigest() != entry.sha256:
+            raise CorruptDataError(f"{self.what}: sha256 of array {name!r} does not hold")
+        return num_bytes
+
+
+@dataclass
+class LiveGroup(Generic[A]):
+    """A group that is being written, as far as its journals vouched for it when this was made."""
+
+    stage: Path
+    kind: Kind
+    attributes: A
+    entries: dict[str, ArrayEntry]
+    indexes: dict[str, np.ndarray]
+    what: str
+    content_sha256: str = ""
+
+    def shard(self, name: str) -> ShardReader:
+        """One array."""
+        return ShardReader(
+            LocalFile(part_path(self.stage, name)),
+            self.entries[name],
+            what=f"{self.what}: array {name!r}",
+            index=self.indexes[name],
+        )
+
+
+# What a reader reads from.
+GroupContents = CommittedGroup[A] | LiveGroup[A]
+
+
+def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[A]:
+    """The contents of a committed group; no array is read yet.
+
+    Raises:
+        CorruptDataError: the commit record or the attributes are damaged.
+        StorageError: written by another version of the format.
+    """
+    what = f"{kind} {files.item_id}"
+    commit, group = files.get(COMMIT_FILE), files.get(METADATA_FILE)
+    if commit is None:
+        raise CorruptDataError(f"{what}: {COMMIT_FILE} is missing")
+    record, content_sha256 = decode_commit(commit, what=what)
+    if group is None:
+        raise CorruptDataError(f"{what}: {METADATA_FILE} is missing")
+    if (record.kind, record.id) != (kind, files.item_id):
+        raise CorruptDataError(f"{what}: commit record says {record.kind} {record.id}")
+    if sha256_hex(group) != record.attributes_sha256:
+        raise CorruptDataError(f"{what}: attributes do not match their sha256")
+    try:
+        text = json.dumps(json.loads(group)["attributes"][ATTRIBUTES_KEY])
+        attributes = model.model_validate_json(text)
+    except (ValidationError, ValueError, KeyError) as error:
+        raise StorageError(f"{what}: attributes of an unknown kind ({error})") from error
+    wanted = [name for stream in attributes.streams for name in stream_arrays(stream, kind)]
+    missing = [name for name in wanted if name not in record.arrays]
+    if missing:
+        raise CorruptDataError(f"{what}: arrays {missing} are not in the commit record")
+    return CommittedGroup(files, kind, attributes, record.arrays, content_sha256, what)
+
+
+def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
+    """What a stage holds at this moment: whole storage chunks that all arrays of a stream have.
+
+    Raises:
+        NotFoundError: nothing that can be followed is being written there.
+        CorruptDataError: damage in a journal.
+    """
+    attributes = read_stage(stage)
+    if not isinstance(attributes, model):
+        raise NotFoundError(f"{stage.name}: is being written in a way that cannot be followed")
+    entries: dict[str, ArrayEntry] = {}
+    indexes: dict[str, np.ndarray] = {}
+    for stream in attributes.streams:
+        arrays = stream_arrays(stream, kind)
+        rows = {
+            name: read_rows(stage, name, CHUNK_JOURNAL)
+            for name in arrays
+            if journal_path(stage, name).is_file() and part_path(stage, name).is_file()
+        }
+        whole = len(rows) == len(arrays)
+        count = min(int(r["num_rows"].sum()) for r in rows.values()) if whole else 0
+        for name, entry in arrays.items():
+            entries[name] = with_rows(entry, count)
+            columns = (rows[name]["offset"], rows[name]["length"]) if count else ((), ())
+            indexes[name] = np.stack([np.asarray(c, dtype=np.uint64) for c in columns], axis=1)
+    return LiveGroup(stage, kind, attributes, entries, indexes, f"{kind} {stage.name}")

@@ -1,0 +1,56 @@
+"""Blocks of images in, the same blocks handed on in order by a thread; a bounded number waits."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+
+import numpy as np
+
+from dextouch.episodes.write_options import WhenFull
+
+MAX_WAITING_IMAGES = 32
+Work = Callable[[np.ndarray, Mapping[str, np.ndarray]], None]
+
+
+class ImageQueue:
+    """Hands blocks to `work` one after the other in a thread of its own.
+
+    Args:
+        work: takes the images and stamps of a block.
+        name: of the stream, for the thread.
+        when_full: "wait" or "drop".
+    """
+
+    def __init__(self, work: Work, *, name: str, when_full: WhenFull) -> None:
+        self.num_dropped = 0
+        self._work, self._when_full = work, when_full
+        self._waiting: deque[tuple[Future[None], int]] = deque()
+        self._num_images = 0
+        self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"encode-{name}")
+
+    def put(self, values: np.ndarray, stamps: Mapping[str, np.ndarray]) -> None:
+        """Queue a block, which must not change any more; raises what an earlier block raised."""
+        while self._waiting and self._waiting[0][0].done():
+            self._take_oldest()
+        # A block larger than the queue goes in when nothing waits.
+        while self._waiting and self._num_images + len(values) > MAX_WAITING_IMAGES:
+            if self._when_full == "drop":
+                self.num_dropped += len(values)
+                return
+            self._take_oldest()
+        self._waiting.append((self._thread.submit(self._work, values, stamps), len(values)))
+        self._num_images += len(values)
+
+    def drain(self) -> None:
+        """Wait until everything queued is written; raises as `put`."""
+        while self._waiting:
+            self._take_oldest()
+
+    def stop(self) -> None:
+        """End the thread; what still waits is left out."""
+        self._thread.shutdown(cancel_futures=True)
+
+    def _take_oldest(self) -> None:
+        done, num_images = self._waiting.popleft()
+        self._num_images -= num_images
+        done.result()

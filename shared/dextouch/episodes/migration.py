@@ -1,0 +1,130 @@
+"""A group of an older format version → the same group in the current one.
+
+Version 1 had no `h264` and kept JPEG images end to end in one array of bytes, with an array of the
+byte after each. Attributes, stamps and numbers are the same in both.
+"""
+
+import json
+from collections.abc import Iterator
+from itertools import pairwise
+
+import numpy as np
+from pydantic import ValidationError
+
+from dextouch.episodes.format import (
+    ATTRIBUTES_KEY,
+    COMMIT_FILE,
+    METADATA_FILE,
+    STAMPS,
+    ArrayEntry,
+    Kind,
+    canonical_json,
+    decode_commit,
+    sha256_hex,
+    shard_path,
+)
+from dextouch.episodes.shard_reader import ShardReader
+from dextouch.episodes.sources import GroupFiles
+from dextouch.errors import CorruptDataError, StorageError
+from dextouch.images.jpeg import jpeg_values
+from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.checks import JPEG_UNIT
+from dextouch.streams.descriptors import StreamDescriptor
+
+OLD_VERSION = 1
+BLOCK_SAMPLES = 256
+_JPEG_END_SUFFIX = "_end"
+
+Block = tuple[np.ndarray, dict[str, np.ndarray]]
+
+
+class OldGroup:
+    """A group of format version 1, checked as its own release checked it.
+
+    Args:
+        files: of the group.
+        kind: of the group.
+
+    Raises:
+        CorruptDataError: the commit record, the attributes or an array is damaged.
+        StorageError: another version.
+    """
+
+    def __init__(self, files: GroupFiles, kind: Kind) -> None:
+        self._files, self._kind, self._what = files, kind, f"{kind} {files.item_id}"
+        commit, group = files.get(COMMIT_FILE), files.get(METADATA_FILE)
+        try:
+            outer = json.loads(commit or b"")
+            record, digest = outer["record"], outer["sha256"]
+            version = record["format_version"]
+            if sha256_hex(canonical_json(record)) != digest:
+                raise CorruptDataError(f"{self._what}: {COMMIT_FILE} does not match its sha256")
+            if version != OLD_VERSION:
+                raise StorageError(
+                    f"{self._what}: got format version {version!r}, expected {OLD_VERSION}"
+                )
+            if sha256_hex(group or b"") != record["attributes_sha256"]:
+                raise CorruptDataError(f"{self._what}: attributes do not match their sha256")
+            self._entries = {
+                name: ArrayEntry.model_validate(entry) for name, entry in record["arrays"].items()
+            }
+            model = EpisodeAttributes if kind == "episode" else RecordingAttributes
+            text = json.dumps(json.loads(group or b"")["attributes"][ATTRIBUTES_KEY])
+            self._attributes = model.model_validate_json(text)
+        except (ValueError, KeyError, TypeError, AttributeError, ValidationError) as error:
+            raise CorruptDataError(f"{self._what}: is no group of version 1 ({error})") from error
+        self._content_sha256 = str(digest)
+
+    @property
+    def attributes(self) -> EpisodeAttributes | RecordingAttributes:
+        """The old attributes; lineage says which content they were brought over from."""
+        before = LineageEntry(kind=self._kind, id=self._files.item_id, sha256=self._content_sha256)
+        return self._attributes.model_copy(update={"lineage": (*self._attributes.lineage, before)})
+
+    def blocks(self, stream: StreamDescriptor) -> Iterator[Block]:
+        """Values and stamps of a stream, some samples at a time, every byte of them checked."""
+        stamps = {
+            stamp: self._shard(f"{stream.name}_{stamp}").read() for stamp in STAMPS[self._kind]
+        }
+        count = len(next(iter(stamps.values())))
+        for start in range(0, count, BLOCK_SAMPLES):
+            stop = min(start + BLOCK_SAMPLES, count)
+            values = self._values(stream, start, stop)
+            yield values, {name: column[start:stop] for name, column in stamps.items()}
+
+    def _values(self, stream: StreamDescriptor, start: int, stop: int) -> np.ndarray:
+        if stream.unit != JPEG_UNIT:
+            return self._shard(stream.name).read(start, stop)
+        bounds = np.concatenate([[0], self._shard(stream.name + _JPEG_END_SUFFIX).read()])
+        if not (np.diff(bounds) > 0).all():
+            raise CorruptDataError(f"{self._what}: image ends of {stream.name!r} do not rise")
+        first, last = int(bounds[start]), int(bounds[stop])
+        data = self._shard(stream.name).read(first, last).tobytes()
+        ends = [int(end) - first for end in bounds[start : stop + 1]]
+        return jpeg_values([data[low:high] for low, high in pairwise(ends)])
+
+    def _shard(self, name: str) -> ShardReader:
+        if name not in self._entries:
+            raise CorruptDataError(f"{self._what}: array {name!r} is not in the commit record")
+        entry = self._entries[name]
+        source = self._files.source(f"{name}/{shard_path(len(entry.shape))}")
+        return ShardReader(source, entry, what=f"{self._what}: array {name!r}")
+
+
+def is_current(files: GroupFiles, *, what: str) -> bool:
+    """Whether a group is of the current version.
+
+    Raises:
+        CorruptDataError: the commit record is damaged.
+        StorageError: a newer version.
+    """
+    try:
+        decode_commit(files.get(COMMIT_FILE) or b"", what=what)
+    except CorruptDataError:
+        raise
+    except StorageError as error:
+        if error.details.get("format_version") == OLD_VERSION:
+            return False
+        raise
+    return True

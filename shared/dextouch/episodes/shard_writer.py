@@ -1,0 +1,113 @@
+"""Rows of one array → storage chunks in a log, which closing turns into a Zarr v3 shard file."""
+
+import hashlib
+from pathlib import Path
+
+import google_crc32c
+import numpy as np
+from numcodecs.zstd import Zstd
+
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
+from dextouch.episodes.journal import CHUNK_JOURNAL, JournalWriter, journal_path, part_path
+from dextouch.episodes.shard_reader import with_crc
+
+_ZSTD = Zstd(level=ZSTD_LEVEL)
+
+
+class ShardWriter:
+    """Appends rows; memory holds one storage chunk at most, the rest survives a kill.
+
+    Args:
+        stage: folder that is being written.
+        name: of the array.
+        entry: of the array, with 0 rows and no hash yet.
+        sync: whether every storage chunk survives a power loss before `append` returns.
+    """
+
+    def __init__(self, stage: Path, name: str, entry: ArrayEntry, *, sync: bool) -> None:
+        self.num_rows = 0
+        self._stage, self._name, self._entry, self._sync = stage, name, entry, sync
+        self._dtype = np.dtype(entry.dtype).newbyteorder("<")
+        self._chunk = (
+            np.zeros((entry.chunk_rows, *entry.shape[1:]), dtype=self._dtype)
+            if entry.codec == "zstd"
+            else np.zeros(0, dtype=self._dtype)
+        )
+        self._num_pending = 0
+        self._index: list[tuple[int, int]] = []
+        self._offset = 0
+        self._sha256 = hashlib.sha256()
+        self._log = JournalWriter(stage, name, CHUNK_JOURNAL)
+
+    def append(self, rows: np.ndarray) -> None:
+        """Append rows [n, *row_shape] of the array's dtype (checked by the caller)."""
+        self.num_rows += len(rows)
+        while len(rows):
+            taken = rows[: len(self._chunk) - self._num_pending]
+            self._chunk[self._num_pending : self._num_pending + len(taken)] = taken
+            self._num_pending += len(taken)
+            rows = rows[len(taken) :]
+            if self._num_pending == len(self._chunk):
+                self._write_rows()
+
+    def append_encoded(self, payload: bytes, num_rows: int) -> None:
+        """Append one storage chunk of an image codec as it is."""
+        self.num_rows += num_rows
+        self._sha256.update(payload)
+        self._log_chunk(payload, num_rows)
+
+    def flush(self) -> None:
+        """Write the rows that do not fill a storage chunk; nothing is appended after this."""
+        if self._num_pending:
+            self._chunk[self._num_pending :] = 0
+            self._write_rows()
+
+    def finish(self) -> ArrayEntry:
+        """Turn the log into the shard; what the commit record says about the array comes back."""
+        self.flush()
+        finish_shard(self._stage, self._name, self._entry, self._log, self._index)
+        entry = with_rows(self._entry, self.num_rows)
+        return entry.model_copy(update={"sha256": self._sha256.hexdigest()})
+
+    def close(self) -> None:
+        """Give the files back; without `finish` they are a log and no shard."""
+        self._log.close()
+
+    def _write_rows(self) -> None:
+        data = self._chunk.tobytes()
+        num_rows = self._num_pending
+        self._sha256.update(memoryview(data)[: num_rows * (len(data) // len(self._chunk))])
+        self._num_pending = 0
+        self._log_chunk(_ZSTD.encode(data), num_rows)
+
+    def _log_chunk(self, payload: bytes, num_rows: int) -> None:
+        encoded = with_crc(payload)
+        self._log.append([encoded], [(num_rows,)])
+        if self._sync:
+            self._log.sync()
+        self._index.append((self._offset, len(encoded)))
+        self._offset += len(encoded)
+
+
+def finish_shard(
+    stage: Path, name: str, entry: ArrayEntry, log: JournalWriter, index: list[tuple[int, int]]
+) -> None:
+    """Append the shard's index to a log's part file, sync it, and put it in the shard's place.
+
+    The journal stays until the whole group is committed: a crash before that is mended from it.
+    """
+    data = np.array(index, dtype="<u8").reshape(-1, 2).tobytes()
+    log.write_tail(data + google_crc32c.value(data).to_bytes(4, "little"))
+    log.sync()
+    log.close()
+    target = stage / name / shard_path(len(entry.shape))
+    with disk_errors(f"close array {name}"):
+        target.parent.mkdir(parents=True, exist_ok=True)
+        part_path(stage, name).rename(target)
+
+
+def forget_journal(stage: Path, name: str) -> None:
+    """Remove the journal of an array whose group is about to be committed."""
+    with disk_errors(f"commit array {name}"):
+        journal_path(stage, name).unlink(missing_ok=True)

@@ -1,0 +1,134 @@
+"""Names of a group's files → their bytes; the one place that knows where a group lies."""
+
+import mmap
+import os
+import threading
+from collections import OrderedDict
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from dextouch.episodes.files import disk_errors
+
+# Each mapping holds a file descriptor, of which a process has about a thousand.
+MAX_MAPPED_FILES = 192
+
+
+@runtime_checkable
+class ByteSource(Protocol):
+    """One file's bytes, wherever it is."""
+
+    def size(self) -> int | None:
+        """Its length in bytes; None where there is no such file."""
+        ...
+
+    def read(self, offset: int, length: int) -> memoryview | bytes:
+        """Bytes offset … offset + length − 1, which the caller knows to exist."""
+        ...
+
+
+@runtime_checkable
+class GroupFiles(Protocol):
+    """The files of one committed group; names are relative, with `/` between."""
+
+    @property
+    def item_id(self) -> str:
+        """The id under which the group is stored."""
+        ...
+
+    def get(self, name: str) -> bytes | None:
+        """All bytes of a small file; None where there is no such file."""
+        ...
+
+    def source(self, name: str) -> ByteSource:
+        """A file that is read in parts."""
+        ...
+
+
+class _MappedFiles:
+    """The most recently read files of this process, mapped into memory."""
+
+    def __init__(self, capacity: int) -> None:
+        self._capacity = capacity
+        self._guard = threading.Lock()
+        self._maps: OrderedDict[tuple[str, int, int, int], mmap.mmap] = OrderedDict()
+
+    def get(self, path: str) -> memoryview | None:
+        """The file's bytes; None where it is missing or empty."""
+        try:
+            status = Path(path).stat()
+        except (FileNotFoundError, NotADirectoryError):
+            return None
+        # A file of the same name that was written anew is another file.
+        key = (path, status.st_ino, status.st_size, status.st_mtime_ns)
+        with self._guard:
+            known = self._maps.get(key)
+            if known is None:
+                if status.st_size == 0:
+                    return memoryview(b"")
+                known = self._map(path)
+                self._maps[key] = known
+                # Dropped, not closed: readers may still look at it, the last one frees it.
+                while len(self._maps) > self._capacity:
+                    self._maps.popitem(last=False)
+            else:
+                self._maps.move_to_end(key)
+        return memoryview(known)
+
+    def forget(self) -> None:
+        """Begin anew, as a forked process must."""
+        self._guard = threading.Lock()
+        self._maps.clear()
+
+    @staticmethod
+    def _map(path: str) -> mmap.mmap:
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
+        finally:
+            os.close(descriptor)
+
+
+_MAPPED = _MappedFiles(MAX_MAPPED_FILES)
+# A lock that another thread held at the fork would stay held in the child for ever.
+os.register_at_fork(after_in_child=_MAPPED.forget)
+
+
+class LocalFile:
+    """A file on this machine, mapped into memory when it is first read."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = str(path)
+
+    def size(self) -> int | None:
+        """Its length in bytes; None where there is no such file."""
+        with disk_errors(f"read {self._path}"):
+            data = _MAPPED.get(self._path)
+        return None if data is None else len(data)
+
+    def read(self, offset: int, length: int) -> memoryview:
+        """Bytes offset … offset + length − 1."""
+        with disk_errors(f"read {self._path}"):
+            data = _MAPPED.get(self._path)
+        return memoryview(b"") if data is None else data[offset : offset + length]
+
+
+class LocalGroup:
+    """The files of a group in a folder of this machine."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    @property
+    def item_id(self) -> str:
+        """The folder's name."""
+        return self.folder.name
+
+    def get(self, name: str) -> bytes | None:
+        """All bytes of a small file; None where there is no such file."""
+        path = self.folder / name
+        with disk_errors(f"read {path}"):
+            return path.read_bytes() if path.is_file() else None
+
+    def source(self, name: str) -> LocalFile:
+        """A file that is read in parts."""
+        return LocalFile(self.folder / name)

@@ -1,0 +1,122 @@
+"""A folder that is being written → a committed group; and what a kill left of one → the same.
+
+A stage holds a log an array (`dextouch.episodes.journal`), and `stage.json` with the attributes if
+its remains are worth keeping.
+"""
+
+import errno
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
+from dextouch.episodes.format import (
+    COMMIT_FILE,
+    METADATA_FILE,
+    ArrayEntry,
+    CommitRecord,
+    Kind,
+    array_metadata,
+    encode_commit,
+    group_metadata,
+    sha256_hex,
+)
+from dextouch.episodes.shard_writer import forget_journal
+from dextouch.errors import ConflictError, CorruptDataError
+from dextouch.schemas.episodes import EpisodeAttributes, json_ready
+from dextouch.schemas.recordings import RecordingAttributes
+
+STAGE_FILE = "stage.json"
+Attributes = EpisodeAttributes | RecordingAttributes
+
+
+def attributes_id(attributes: Attributes) -> str:
+    """The id that attributes carry, whatever their kind."""
+    if isinstance(attributes, EpisodeAttributes):
+        return attributes.episode_id
+    return attributes.recording_id
+
+
+def kind_of(attributes: Attributes) -> Kind:
+    """The kind of group that attributes belong to."""
+    return "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
+
+
+def write_stage(stage: Path, attributes: Attributes) -> None:
+    """Say what is being written here, so that `recover` can complete it."""
+    known = {"kind": kind_of(attributes), "attributes": json_ready(attributes)}
+    with disk_errors(f"write {STAGE_FILE} of {attributes_id(attributes)}"):
+        replace_file(stage / STAGE_FILE, json.dumps(known).encode())
+
+
+def read_stage(stage: Path) -> Attributes | None:
+    """What is being written in a stage; None where it is not worth keeping.
+
+    Raises:
+        CorruptDataError: `stage.json` is damaged.
+    """
+    path = stage / STAGE_FILE
+    with disk_errors(f"read {path}"):
+        if not path.is_file():
+            return None
+        data = path.read_bytes()
+    try:
+        known = json.loads(data)
+        model = EpisodeAttributes if known["kind"] == "episode" else RecordingAttributes
+        return model.model_validate_json(json.dumps(known["attributes"]))
+    except (ValueError, KeyError, TypeError, ValidationError) as error:
+        raise CorruptDataError(f"{stage.name}: {STAGE_FILE} is damaged ({error})") from error
+
+
+def commit_stage(
+    stage: Path, target: Path, attributes: Attributes, entries: Mapping[str, ArrayEntry]
+) -> None:
+    """Write metadata and commit record of finished arrays and move the folder into place.
+
+    Raises:
+        ConflictError: something is in that place.
+    """
+    group = group_metadata(json_ready(attributes))
+    record = CommitRecord(
+        kind=kind_of(attributes),
+        id=attributes_id(attributes),
+        attributes_sha256=sha256_hex(group),
+        arrays=dict(entries),
+    )
+    with disk_errors(f"commit {record.id}"):
+        for name, entry in entries.items():
+            write_file(stage / name / METADATA_FILE, array_metadata(entry))
+        write_file(stage / METADATA_FILE, group)
+        write_file(stage / COMMIT_FILE, encode_commit(record)[0])
+    publish_stage(stage, target, record)
+
+
+def publish_stage(stage: Path, target: Path, record: CommitRecord) -> None:
+    """Move a stage with a whole commit record into place.
+
+    Raises:
+        ConflictError: something is in that place.
+    """
+    # What a crash is mended from goes only when there is nothing left to mend.
+    for name in record.arrays:
+        forget_journal(stage, name)
+    with disk_errors(f"commit {record.id}"):
+        (stage / STAGE_FILE).unlink(missing_ok=True)
+        sync_folder(stage)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        _move_into_place(stage, target)
+        sync_folder(target.parent)
+
+
+def _move_into_place(stage: Path, target: Path) -> None:
+    # Renaming a folder onto one that is not empty fails, so a race cannot overwrite.
+    try:
+        stage.rename(target)
+    except OSError as error:
+        if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
+            raise
+        raise ConflictError(
+            f"{target.parent.name.rstrip('s')} {target.name!r} exists already; choose another id"
+        ) from error

@@ -1,0 +1,192 @@
+"""What a killed writer left in its stage → a committed group that says it was recovered."""
+
+import hashlib
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import (
+    COMMIT_FILE,
+    METADATA_FILE,
+    ArrayEntry,
+    CommitRecord,
+    Kind,
+    decode_commit,
+    shard_path,
+    stream_arrays,
+    with_rows,
+)
+from dextouch.episodes.journal import (
+    CHUNK_JOURNAL,
+    JournalWriter,
+    journal_path,
+    part_path,
+    read_payloads,
+    read_rows,
+)
+from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows
+from dextouch.episodes.shard_writer import finish_shard
+from dextouch.episodes.stage import (
+    Attributes,
+    attributes_id,
+    commit_stage,
+    kind_of,
+    publish_stage,
+    read_stage,
+)
+from dextouch.errors import CorruptDataError, StorageError
+
+
+@dataclass(frozen=True)
+class RecoveredGroup:
+    """One interrupted take that is complete again as far as it went."""
+
+    kind: Kind
+    item_id: str
+    num_samples: dict[str, int]
+
+
+def recover_stage(stage: Path, root: Path) -> RecoveredGroup | None:
+    """Cut every stream of a stage to its last whole storage chunk and commit the stage.
+
+    Args:
+        stage: that no writer holds any more.
+        root: of the store.
+
+    Returns:
+        What was recovered; None where nothing is worth keeping, and the stage is as it was.
+
+    Raises:
+        CorruptDataError: damage that is no torn end; nothing is changed.
+    """
+    record = _whole_commit(stage)
+    if record is not None:
+        target = root / f"{record.kind}s" / record.id
+        if target.exists():
+            # Its writer lost the race for the id and was told so, or never got to migrate it.
+            return None
+        publish_stage(stage, target, record)
+        counts = {name: entry.shape[0] for name, entry in record.arrays.items()}
+        return RecoveredGroup(record.kind, record.id, counts)
+    attributes = read_stage(stage)
+    if attributes is None:
+        return None
+    kind = kind_of(attributes)
+    num_samples = {
+        stream.name: _num_whole_samples(stage, stream_arrays(stream, kind))
+        for stream in attributes.streams
+    }
+    if not any(num_samples.values()):
+        return None
+    entries = {}
+    for stream in attributes.streams:
+        for name, entry in stream_arrays(stream, kind).items():
+            entries[name] = _cut_array(stage, name, entry, num_samples[stream.name])
+    for name in (METADATA_FILE, COMMIT_FILE):
+        (stage / name).unlink(missing_ok=True)
+    attributes = _free_id(attributes, root).model_copy(update={"recovered": True})
+    target = root / f"{kind}s" / attributes_id(attributes)
+    commit_stage(stage, target, attributes, entries)
+    return RecoveredGroup(kind, target.name, num_samples)
+
+
+def is_recoverable(stage: Path, root: Path) -> bool:
+    """Whether `recover_stage` would make something of an abandoned stage.
+
+    A damaged stage counts: somebody should look at it before it goes.
+    """
+    record = _whole_commit(stage)
+    if record is not None:
+        return not (root / f"{record.kind}s" / record.id).exists()
+    try:
+        attributes = read_stage(stage)
+        if attributes is None:
+            return False
+        kind = kind_of(attributes)
+        return any(
+            _num_whole_samples(stage, stream_arrays(stream, kind)) for stream in attributes.streams
+        )
+    except CorruptDataError:
+        return True
+
+
+def _whole_commit(stage: Path) -> CommitRecord | None:
+    path = stage / COMMIT_FILE
+    with disk_errors(f"read {path}"):
+        if not path.is_file():
+            return None
+        data = path.read_bytes()
+    try:
+        return decode_commit(data, what=stage.name)[0]
+    except StorageError:
+        # Torn by the crash: what it said is found again in the logs. Or of an older version,
+        # which a migration put aside.
+        return None
+
+
+def _num_whole_samples(stage: Path, arrays: dict[str, ArrayEntry]) -> int:
+    """Samples of a stream whose values and stamps are all on the disk."""
+    return min(
+        int(_trusted_rows(stage, name, entry)["num_rows"].sum()) for name, entry in arrays.items()
+    )
+
+
+def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
+    shard = stage / name / shard_path(len(entry.shape))
+    with disk_errors(f"recover {name}"):
+        if shard.is_file():
+            # The writer died while it committed: the shard becomes a log again.
+            shard.rename(part_path(stage, name))
+            shutil.rmtree(stage / name)
+        part_path(stage, name).touch()
+        journal_path(stage, name).touch()
+    rows = read_rows(stage, name, CHUNK_JOURNAL)
+    # After a power loss rows may be there whose payload is not.
+    while len(rows):
+        try:
+            read_payloads(stage, name, rows[-1:])
+        except CorruptDataError:
+            rows = rows[:-1]
+        else:
+            break
+    return rows
+
+
+def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> ArrayEntry:
+    rows = _trusted_rows(stage, name, entry)
+    ends = np.cumsum(rows["num_rows"], dtype=np.int64)
+    num_kept = int(np.searchsorted(ends, num_samples, side="right"))
+    num_rows = int(ends[num_kept - 1]) if num_kept else 0
+    if num_rows != num_samples:
+        raise CorruptDataError(
+            f"{stage.name}: array {name!r} has no storage chunk that ends after "
+            f"{num_samples} samples; it was not written by this release"
+        )
+    digest = hashlib.sha256()
+    for row in rows[:num_kept]:
+        payload = read_payloads(stage, name, np.array([row]))[0][:-CRC_BYTES]
+        if entry.codec == "zstd":
+            values = decode_rows(payload, entry, what=f"{stage.name}: array {name!r}")
+            payload = values[: int(row["num_rows"])].tobytes()
+        digest.update(payload)
+    index = [(int(row["offset"]), int(row["length"])) for row in rows[:num_kept]]
+    log = JournalWriter(stage, name, CHUNK_JOURNAL, num_rows=num_kept)
+    try:
+        finish_shard(stage, name, entry, log, index)
+    finally:
+        log.close()
+    return with_rows(entry, num_samples).model_copy(update={"sha256": digest.hexdigest()})
+
+
+def _free_id(attributes: Attributes, root: Path) -> Attributes:
+    """The same attributes, under another id if theirs was taken in the meantime."""
+    kind, item_id = kind_of(attributes), attributes_id(attributes)
+    number = 0
+    free = item_id
+    while (root / f"{kind}s" / free).exists():
+        number += 1
+        free = f"{item_id[:112]}-recovered-{number}"
+    return attributes.model_copy(update={f"{kind}_id": free})

@@ -1,0 +1,221 @@
+"""Images ↔ H.264 access units in closed groups of pictures: the only place that knows PyAV.
+
+One access unit is one image; without B-frames they come out in the order in which they went in, so
+image k of a group needs its first k + 1 access units and nothing else.
+"""
+
+import threading
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from dextouch.episodes.format import GOP_IMAGES
+from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
+
+if TYPE_CHECKING:
+    from av.video.frame import VideoFrame
+
+_IDR_SLICE, _SLICE = 5, 1
+# Averaging chroma over its 2×2 pixels costs nothing against the nearest one and gives 0.25 dB.
+_TO_YUV = "AREA"
+_TO_RGB = "BICUBIC"
+
+
+class VideoSettings(BaseModel):
+    """How images become H.264: the smaller `crf`, the better and the larger."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    crf: int = Field(default=26, ge=1, le=51)
+    preset: str = Field(default="ultrafast", pattern="^[a-z]+$")
+
+
+@dataclass(frozen=True)
+class ImageForm:
+    """What is wanted of each stored image: `half_size` in both axes, `gray` with one channel."""
+
+    half_size: bool = False
+    gray: bool = False
+
+    def shape(self, stored: tuple[int, ...]) -> tuple[int, int, int]:
+        """Height, width and channels of what comes out for a stored shape [h, w, 3]."""
+        divisor = 2 if self.half_size else 1
+        return stored[0] // divisor, stored[1] // divisor, 1 if self.gray else 3
+
+
+FULL_FORM = ImageForm()
+
+
+def is_keyframe(access_unit: bytes) -> bool:
+    """Whether an access unit of H.264 (Annex B) can be decoded without those before it."""
+    start = access_unit.find(b"\x00\x00\x01")
+    while start >= 0 and start + 3 < len(access_unit):
+        unit_type = access_unit[start + 3] & 0x1F
+        if unit_type in {_IDR_SLICE, _SLICE}:
+            return unit_type == _IDR_SLICE
+        start = access_unit.find(b"\x00\x00\x01", start + 3)
+    return False
+
+
+def check_video_size(height: int, width: int) -> None:
+    """Refuse images that H.264 with halved chroma cannot hold.
+
+    Raises:
+        InvalidInputError: an odd or empty side.
+    """
+    if height % 2 or width % 2 or not height or not width:
+        raise InvalidInputError(
+            f"H.264: got images of {height} x {width} pixels, expected even numbers; "
+            "use the unit 'jpeg' for this camera"
+        )
+
+
+class GopEncoder:
+    """One persistent encoder of one camera; every GOP_IMAGES-th access unit begins a group.
+
+    Args:
+        height: of the images, even.
+        width: of the images, even.
+        rate_hz: nominal, for players of the stream.
+        settings: quality and speed.
+
+    Raises:
+        InvalidInputError: a size or settings that H.264 cannot have.
+    """
+
+    def __init__(self, height: int, width: int, *, rate_hz: float, settings: VideoSettings) -> None:
+        import av
+        from av.video.reformatter import VideoReformatter
+
+        check_video_size(height, width)
+        self._shape, self._index = (height, width, 3), 0
+        self._context: Any = av.CodecContext.create("libx264", "w")
+        self._context.width, self._context.height = width, height
+        self._context.pix_fmt = "yuv420p"
+        rate = Fraction(rate_hz).limit_denominator(1001)
+        self._context.framerate, self._context.time_base = rate, 1 / rate
+        self._context.gop_size = GOP_IMAGES
+        x264 = (
+            f"keyint={GOP_IMAGES}:min-keyint={GOP_IMAGES}:scenecut=0:open-gop=0:bframes=0"
+            ":threads=1:sliced-threads=0"
+        )
+        self._context.options = {
+            "crf": str(settings.crf),
+            "preset": settings.preset,
+            "tune": "zerolatency",
+            "x264-params": x264,
+        }
+        try:
+            self._context.open()
+        except av.FFmpegError as error:
+            raise InvalidInputError(f"H.264 encoder: {settings} refused ({error})") from error
+        self._reformatter = VideoReformatter()
+        self.description = f"libx264 {settings.preset} crf {settings.crf} gop {GOP_IMAGES}"
+
+    def encode(self, image: np.ndarray) -> bytes:
+        """The access unit of the next image, uint8 [h, w, 3] RGB."""
+        import av
+
+        if image.shape != self._shape or image.dtype != np.uint8:
+            raise InvalidInputError(
+                f"H.264: got {image.dtype} {image.shape}, expected uint8 {self._shape}"
+            )
+        rgb = av.VideoFrame.from_numpy_buffer(np.ascontiguousarray(image), format="rgb24")
+        frame = self._reformatter.reformat(rgb, format="yuv420p", interpolation=_TO_YUV, threads=1)
+        frame.pts = self._index
+        packets = self._context.encode(frame)
+        if len(packets) != 1:
+            raise StorageError(
+                f"H.264: image {self._index} gave {len(packets)} access units, expected 1; "
+                "this build of libx264 delays its output"
+            )
+        self._index += 1
+        return bytes(packets[0])
+
+
+class GopDecoder:
+    """Decodes groups of pictures of one image size, each from its first access unit."""
+
+    def __init__(self, height: int, width: int) -> None:
+        import av
+        from av.video.reformatter import VideoReformatter
+
+        self._shape = (height, width)
+        self._context: Any = av.CodecContext.create("h264", "r")
+        self._context.thread_count = 1
+        # The bound keeps a forged header from allocating gigabytes.
+        pixels = (height + 16) * (width + 16)
+        self._context.options = {"flags": "+low_delay", "max_pixels": str(pixels)}
+        self._reformatter = VideoReformatter()
+
+    def decode(
+        self, access_units: list[bytes], wanted: list[int], form: ImageForm, out: np.ndarray
+    ) -> None:
+        """Write images of a group into `out`.
+
+        Args:
+            access_units: of the group from its first to the last one wanted.
+            wanted: places in the group, ascending.
+            form: of what comes out.
+            out: uint8 [len(wanted), *form.shape].
+
+        Raises:
+            CorruptDataError: bytes that are not the images they should be.
+        """
+        import av
+
+        rows = {place: row for row, place in enumerate(wanted)}
+        num_decoded = 0
+        self._context.flush_buffers()
+        try:
+            for access_unit in (*access_units, None):
+                packet = None if access_unit is None else av.Packet(access_unit)
+                if packet is None and num_decoded == len(access_units):
+                    break
+                for frame in self._context.decode(packet):
+                    if num_decoded in rows:
+                        self._write(frame, form, out[rows[num_decoded]])
+                    num_decoded += 1
+        except (av.FFmpegError, ValueError) as error:
+            raise CorruptDataError(f"H.264: group cannot be decoded ({error})") from error
+        if num_decoded != len(access_units):
+            raise CorruptDataError(
+                f"H.264: got {num_decoded} images from {len(access_units)} access units"
+            )
+
+    def _write(self, frame: "VideoFrame", form: ImageForm, out: np.ndarray) -> None:
+        if (frame.height, frame.width) != self._shape:
+            raise CorruptDataError(
+                f"H.264: got an image of {frame.height} x {frame.width} pixels, "
+                f"expected {self._shape[0]} x {self._shape[1]}"
+            )
+        height, width, channels = out.shape
+        converted = self._reformatter.reformat(
+            frame,
+            width=width,
+            height=height,
+            format="gray" if form.gray else "rgb24",
+            # Halving by area averages each 2×2 pixels, as the other codecs do.
+            interpolation="AREA" if form.half_size else _TO_RGB,
+            threads=1,
+        )
+        plane = converted.planes[0]
+        rows = np.frombuffer(memoryview(plane), dtype=np.uint8).reshape(-1, plane.line_size)
+        out[...] = rows[:height, : width * channels].reshape(out.shape)
+
+
+_DECODERS = threading.local()
+_MAX_DECODERS = 4
+
+
+def decoder_of_this_thread(height: int, width: int) -> GopDecoder:
+    """A decoder that no other thread uses; making one anew would cost more than an image."""
+    known: dict[tuple[int, int], GopDecoder] = _DECODERS.__dict__.setdefault("by_size", {})
+    if (height, width) not in known:
+        while len(known) >= _MAX_DECODERS:
+            known.pop(next(iter(known)))
+        known[height, width] = GopDecoder(height, width)
+    return known[height, width]

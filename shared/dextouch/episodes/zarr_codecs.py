@@ -1,0 +1,68 @@
+"""Image arrays for zarr-python: it calls these codecs where metadata says `dextouch.jpeg|h264`.
+
+zarr-python finds them by itself through the entry points of this package. They only decode: what
+is written to a store goes through `EpisodeWriter`.
+"""
+
+from dataclasses import dataclass
+from typing import Any, NoReturn
+
+import numpy as np
+from zarr.abc.codec import ArrayBytesCodec
+from zarr.core.array_spec import ArraySpec
+from zarr.core.buffer import Buffer, NDBuffer
+
+from dextouch.episodes.format import ZARR_CODECS, Codec
+from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.episodes.video import FULL_FORM
+from dextouch.errors import InvalidInputError
+
+
+@dataclass(frozen=True)
+class _ImageCodec(ArrayBytesCodec):
+    """Storage chunks of images → uint8 [n, h, w, 3]; rows that only pad a chunk are zero."""
+
+    is_fixed_size = False
+    codec: Codec = "jpeg"
+
+    @classmethod
+    def from_dict(cls, data: dict[str, Any]) -> "_ImageCodec":
+        """The codec as array metadata names it; it has no configuration."""
+        return cls()
+
+    def to_dict(self) -> dict[str, Any]:
+        """How array metadata names the codec."""
+        return {"name": ZARR_CODECS[self.codec]}
+
+    def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> NoReturn:
+        """Unknown before images are encoded."""
+        raise NotImplementedError
+
+    async def _encode_single(self, chunk_array: NDBuffer, chunk_spec: ArraySpec) -> NoReturn:
+        raise InvalidInputError(
+            f"{ZARR_CODECS[self.codec]}: got images to encode, but this codec only reads; write "
+            "through dextouch.episodes.EpisodeStore.writer"
+        )
+
+    async def _decode_single(self, chunk_bytes: Buffer, chunk_spec: ArraySpec) -> NDBuffer:
+        shape = chunk_spec.shape
+        chunks = ImageChunks(self.codec, shape[1:], shape[0], ZARR_CODECS[self.codec])
+        payload = chunk_bytes.to_bytes()
+        images = np.zeros(shape, dtype=np.uint8)
+        count = len(chunks.unpack(payload, 0))
+        chunks.decode(payload, 0, list(range(count)), FULL_FORM, images[:count])
+        return chunk_spec.prototype.nd_buffer.from_numpy_array(images)
+
+
+@dataclass(frozen=True)
+class JpegCodec(_ImageCodec):
+    """`dextouch.jpeg`."""
+
+    codec: Codec = "jpeg"
+
+
+@dataclass(frozen=True)
+class H264Codec(_ImageCodec):
+    """`dextouch.h264`."""
+
+    codec: Codec = "h264"
