@@ -2,9 +2,11 @@
 PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
+LEROBOT := tests/benchmarks/lerobot
+LEROBOT_VENV ?= .venv-lerobot
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow fix clean
+.PHONY: demo test check slow fix clean bench-lerobot check-lerobot-export
 .DEFAULT_GOAL := demo
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
@@ -35,6 +37,15 @@ check: $(VENV)/.dev      ## format, lint, types, import contracts
 fix: $(VENV)/.dev        ## let the tools mend what they can
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
+
+$(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $(LEROBOT)/prepare.py
+	PYTHON=$(PYTHON) $(LEROBOT)/make_venv.sh $(LEROBOT_VENV)
+
+bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: our store beside LeRobotDataset v3; ARGS="--rounds 5"
+	$(LEROBOT_VENV)/bin/python $(LEROBOT)/bench.py $(ARGS)
+
+check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: our exports open in lerobot itself
+	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py
 
 clean:
 	rm -rf demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import warnings
 from pathlib import Path
 
 _TAKES = Path(__file__).resolve().parents[2] / "unit" / "bridges"
@@ -17,8 +18,11 @@ def enter(cache: Path) -> None:
         HF_HOME=str(cache),
         HF_HUB_OFFLINE="1",
         HF_DATASETS_OFFLINE="1",
+        HF_DATASETS_DISABLE_PROGRESS_BARS="1",
         SVT_LOG="1",
     )
+    # lerobot switches the bars off and on again by itself, and datasets remarks on that.
+    warnings.filterwarnings("ignore", message="Cannot (enable|disable) progress bars")
     sys.path.append(str(_TAKES))
     import av.logging
 

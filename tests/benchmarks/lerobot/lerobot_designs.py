@@ -210,15 +210,12 @@ def _row(workload: Workload, index: int) -> dict[str, object]:
     return {**row, "task": "bench"}
 
 
-_STREAMING = LeRobotDesign("lerobot-streaming")
-_TUNED = LeRobotDesign(
-    "lerobot-h264", encoder={"vcodec": "h264", "preset": "ultrafast", "crf": 25, "g": 8}
-)
+STREAMING, TUNED = "lerobot-streaming", "lerobot-h264"
 _DESIGNS = (
-    _STREAMING,
-    LeRobotDesign("lerobot-streaming-direct", direct=True, reads=_STREAMING.name),
-    _TUNED,
-    LeRobotDesign("lerobot-h264-direct", direct=True, reads=_TUNED.name),
+    LeRobotDesign(STREAMING),
+    LeRobotDesign(f"{STREAMING}-direct", direct=True, reads=STREAMING),
+    LeRobotDesign(TUNED, encoder={"vcodec": "h264", "preset": "ultrafast", "crf": 25, "g": 8}),
+    LeRobotDesign(f"{TUNED}-direct", direct=True, reads=TUNED),
     LeRobotDesign("lerobot-default", streaming=False),
 )
 

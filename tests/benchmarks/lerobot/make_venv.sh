@@ -6,7 +6,7 @@ set -eu
 venv=${1:?"usage: make_venv.sh FOLDER"}
 here=$(cd "$(dirname "$0")" && pwd)
 root=$(cd "$here/../../.." && pwd)
-"${PYTHON:-python3.11}" -m venv --clear "$venv"
+"${PYTHON:-python3.11}" -m venv "$venv"
 pip() {
 	"$venv/bin/python" -m pip --disable-pip-version-check --quiet "$@"
 }

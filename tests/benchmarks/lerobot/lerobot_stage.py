@@ -1,0 +1,112 @@
+"""The stage `lerobot` of the benchmark: our store beside LeRobotDataset v3; a report out."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+
+from environment import enter
+from lerobot_designs import STREAMING, lerobot_designs
+
+from dextouch.errors import UnknownNameError
+from services.cli.bench.figures import Requirement
+from services.cli.bench.machine import describe_machine
+from services.cli.bench.report import StageReport
+from services.cli.bench.stages import Bar
+from services.cli.bench.store.compare import DesignResult, Effort, compare
+from services.cli.bench.store.designs import Design
+from services.cli.bench.store.our_design import OurDesign
+from services.cli.bench.store.tables import panels, read_table, write_table
+from services.cli.bench.store.take import make_take
+from services.cli.bench.store.workload import CAMERAS
+
+OURS = "ours-h264"
+PACKAGES = ("lerobot", "torch", "torchcodec", "datasets", "pyarrow", "av", "numpy")
+NOTES = (
+    "LeRobot has one rate: its files hold no native time stamps and nine of ten 100 Hz poses.",
+    "LeRobot's item decodes one image of each other camera too, in threads of its own.",
+)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this stage."""
+    names = ",".join(design.name for design in _designs())
+    parser.add_argument("--seconds", type=float, help="length of the take (10; quick 2)")
+    parser.add_argument("--rounds", type=int, help="rounds (3; quick 1)")
+    parser.add_argument("--windows", type=int, help="random windows a round (40; quick 4)")
+    parser.add_argument("--seed", type=int, default=0, help="of the scene (%(default)s)")
+    parser.add_argument("--designs", metavar="A,B", help=f"only these, by comma (all: {names})")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Write and read one take with every design in turns.
+
+    Raises:
+        UnknownNameError: a design that there is not.
+        InvalidInputError: no round.
+    """
+    enter(folder / "cache")
+    chosen = _choose(options.designs)
+    designs = [design for design in chosen if design.missing() is None]
+    notes = [f"{d.name} is left out: needs {d.missing()}" for d in chosen if d.missing()]
+    seconds = options.seconds or (2.0 if options.quick else 10.0)
+    effort = Effort(
+        num_rounds=options.rounds or (1 if options.quick else 3),
+        num_windows=options.windows or (4 if options.quick else 40),
+        num_compared=1 if options.quick else 3,
+        seed=options.seed,
+    )
+    with bar("making the scene", len(CAMERAS)) as step:
+        workload = make_take(seconds, options.seed, on_camera=step)
+    results = compare(designs, workload, folder, effort, bar)
+    return StageReport(
+        stage="lerobot",
+        machine=describe_machine(PACKAGES),
+        options={"seconds": seconds, **asdict(effort), "designs": list(results)},
+        tables=[write_table(results), read_table(results)],
+        panels=panels(results),
+        requirements=requirements(results),
+        data={"designs": {name: asdict(result) for name, result in results.items()}},
+        notes=[*NOTES, *notes],
+    )
+
+
+def requirements(results: Mapping[str, DesignResult]) -> list[Requirement]:
+    """What the store promises over LeRobot's streaming writer; the tuned one has no bound."""
+    ours, rival = results.get(OURS), results.get(STREAMING)
+    write, num_bytes, windows, decibels = _ratios(ours, rival)
+    return [
+        Requirement(f"write speed over {STREAMING}", write, "at least", 4.0, "times"),
+        Requirement(f"bytes over {STREAMING}", num_bytes, "at most", 0.7, "times"),
+        Requirement(
+            f"one-camera windows a second over {STREAMING}", windows, "at least", 6.0, "times"
+        ),
+        Requirement(f"mean PSNR below {STREAMING}", decibels, "at most", 0.0, "dB"),
+    ]
+
+
+def _ratios(
+    ours: DesignResult | None, rival: DesignResult | None
+) -> tuple[float | None, float | None, float | None, float | None]:
+    """Write speed, bytes and windows as multiples, and how many dB the rival is better."""
+    if ours is None or rival is None:
+        return None, None, None, None
+    return (
+        rival.write_s.over(ours.write_s).median,
+        ours.num_bytes / rival.num_bytes,
+        rival.window_ms.over(ours.window_ms).median,
+        rival.mean_psnr_db - ours.mean_psnr_db,
+    )
+
+
+def _designs() -> list[Design]:
+    return [OurDesign("h264"), *lerobot_designs()]
+
+
+def _choose(names: str | None) -> Sequence[Design]:
+    known = {design.name: design for design in _designs()}
+    wanted = list(known) if names is None else [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in known:
+            raise UnknownNameError("design", name, list(known))
+    return [known[name] for name in wanted]
