@@ -133,7 +133,7 @@ class EpisodeAttributes(BaseModel):
 
 
 class EpisodeSummary(BaseModel):
-    """One row of the catalog."""
+    """One row of the catalog; `duration_s` is that of the model grid, or of the longest stream."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -141,18 +141,50 @@ class EpisodeSummary(BaseModel):
     task: str
     domain: Domain
     origin: Origin
+    station: str | None = None
+    operator: str | None = None
     success: bool | None
+    recovered: bool = False
     num_steps: int
+    duration_s: float = Field(default=0.0, ge=0)
+    created_at: AwareDatetime | None = None
     content_sha256: str
 
 
 class EpisodeList(BaseModel):
-    """One page of the catalog and how many episodes match in all."""
+    """One page of the catalog and how many episodes match in all.
+
+    `next_after` is the id to ask on from; None on the last page.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     episodes: tuple[EpisodeSummary, ...]
     num_matching: int
+    next_after: str | None = None
+
+
+class HoursRow(BaseModel):
+    """How much there is of one task in one domain from one origin."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: str
+    domain: Domain
+    origin: Origin
+    num_episodes: int
+    num_successes: int
+    hours: float
+
+
+class CatalogHours(BaseModel):
+    """Hours by task, domain and origin, in this order, and their sum."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rows: tuple[HoursRow, ...]
+    num_episodes: int
+    hours: float
 
 
 class EpisodeDetail(BaseModel):

@@ -87,7 +87,10 @@ class FinishRecording(BaseModel):
 
 
 class RecordingSummary(BaseModel):
-    """One row of the list of recordings."""
+    """One row of the list of recordings.
+
+    `duration_s` is that of the longest stream at its nominal rate; `num_bytes` what lies on disk.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -95,14 +98,52 @@ class RecordingSummary(BaseModel):
     task: str
     domain: Domain
     station: str
+    operator: str | None = None
+    success: bool | None = None
+    recovered: bool = False
     num_samples: dict[str, int]
+    duration_s: float = Field(default=0.0, ge=0)
+    num_bytes: int = Field(default=0, ge=0)
+    started_at: AwareDatetime | None = None
     content_sha256: str
 
 
 class RecordingList(BaseModel):
-    """One page of the finished recordings, by id, and how many there are in all."""
+    """One page of the finished recordings, by id, and how many there are in all.
+
+    `next_after` is the id to ask on from; None on the last page.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     recordings: tuple[RecordingSummary, ...]
     num_matching: int
+    next_after: str | None = None
+
+
+class UploadSummary(BaseModel):
+    """An upload that is not finished, and how long nothing has come."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recording_id: StoreId
+    station: str
+    task: str
+    num_bytes: int = Field(ge=0)
+    idle_s: float = Field(ge=0)
+
+
+class UploadList(BaseModel):
+    """Uploads that are not finished, by id."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    uploads: tuple[UploadSummary, ...]
+
+
+class ExpireUploads(BaseModel):
+    """The request to drop every upload for which nothing has come for so long."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    idle_s: float = Field(ge=0, allow_inf_nan=False)
