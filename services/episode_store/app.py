@@ -1,5 +1,6 @@
 """Settings in, the store's application out."""
 
+import threading
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -8,11 +9,22 @@ from fastapi import FastAPI
 
 from dextouch import __version__
 from dextouch.episodes import EpisodeStore
+from dextouch.errors import StorageError
 from dextouch.serving.app import create_service_app
+from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.catalog import Catalog
+from services.episode_store.commit_process import CommitProcess
 from services.episode_store.ingest import Ingest
+from services.episode_store.intake import Intake
+from services.episode_store.ledger import UploadLedger
+from services.episode_store.metrics import StoreMetrics
 from services.episode_store.reading import StoreReader
-from services.episode_store.routes import episodes_router, recordings_router
+from services.episode_store.routes import (
+    catalog_router,
+    episodes_router,
+    recordings_router,
+    uploads_router,
+)
 from services.episode_store.settings import EpisodeStoreSettings
 
 logger = structlog.get_logger(__name__)
@@ -25,33 +37,79 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         settings: where the store is and what it allows.
     """
     store = EpisodeStore(settings.store_url)
-    ingest = Ingest(store, sync=settings.sync_uploads, max_open_uploads=settings.max_open_uploads)
+    commit = CommitProcess(settings.store_url) if settings.commit_in_process else None
+    ingest = Ingest(
+        store,
+        sync=settings.sync_uploads,
+        max_open_uploads=settings.max_open_uploads,
+        commit=commit,
+    )
     catalog = Catalog(store)
     reader = StoreReader(
         store,
         max_window_steps=settings.max_window_steps,
         max_answer_bytes=settings.max_answer_bytes,
     )
+    intake, metrics = _intake(settings, store, ingest, catalog)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         removed = store.sweep()
         if removed:
             logger.info("removed_unfinished_writes", count=removed)
+        # The first list of a large store takes seconds; it is read while nobody waits for it.
+        threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
         try:
             yield
         finally:
             ingest.close()
+            if commit is not None:
+                commit.close()
 
-    return create_service_app(
+    app = create_service_app(
         name="episode_store",
         version=__version__,
         settings=settings,
         routers=[
             recordings_router(
-                ingest=ingest, catalog=catalog, reader=reader, max_page=settings.max_page
+                intake=intake, catalog=catalog, reader=reader, max_page=settings.max_page
             ),
             episodes_router(catalog=catalog, reader=reader, max_page=settings.max_page),
+            catalog_router(catalog=catalog),
+            uploads_router(intake=intake),
         ],
         lifespan=lifespan,
     )
+    metrics.register(app.state.registry)
+    return app
+
+
+def _intake(
+    settings: EpisodeStoreSettings, store: EpisodeStore, ingest: Ingest, catalog: Catalog
+) -> tuple[Intake, StoreMetrics]:
+    reserve = DiskReserve(store.root, min_free_bytes=settings.min_free_bytes)
+    ledger = UploadLedger(
+        ingest.folder,
+        recordings=catalog.bytes_by_station,
+        quota_bytes=settings.quota_bytes_per_station,
+    )
+    metrics = StoreMetrics(open_uploads=lambda: ledger.num_open, free_bytes=reserve.free_bytes)
+    admission = Admission(
+        max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
+    )
+    intake = Intake(
+        ingest,
+        admission=admission,
+        reserve=reserve,
+        ledger=ledger,
+        metrics=metrics,
+        num_threads=settings.max_batches_in_flight,
+    )
+    return intake, metrics
+
+
+def _warm_up(catalog: Catalog) -> None:
+    try:
+        catalog.warm_up()
+    except StorageError as error:
+        logger.warning("fail_warm_up", reason=error.message)

@@ -1,39 +1,82 @@
-"""Filters in, the matching episodes and recordings out; what is committed is read once."""
+"""Filters in, the matching episodes, recordings and hours out; what is committed is read once."""
 
+import os
 import threading
-from collections.abc import Callable
+from bisect import bisect_right
+from collections import defaultdict
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from datetime import datetime
+from pathlib import Path
+from typing import Generic, TypeVar
 
 import structlog
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
+from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import Kind
 from dextouch.errors import NotFoundError, StorageError
-from dextouch.schemas.episodes import Domain, EpisodeList, EpisodeSummary, Origin
+from dextouch.schemas.episodes import CatalogHours, EpisodeList, EpisodeSummary, HoursRow
 from dextouch.schemas.recordings import RecordingList, RecordingSummary
+from services.episode_store.changes import FolderChanges, Revision
+from services.episode_store.filters import CatalogFilter, EpisodeFilter, RecordingFilter
+
+__all__ = ["Catalog", "EpisodeFilter", "RecordingFilter"]
 
 logger = structlog.get_logger(__name__)
 
-# An id and the revision under which it was read.
-_Key = tuple[str, int]
+SECONDS_AN_HOUR = 3600.0
 S = TypeVar("S", EpisodeSummary, RecordingSummary)
 
 
-@dataclass(frozen=True)
-class EpisodeFilter:
-    """What an episode must be; None takes any."""
+@dataclass(frozen=True, slots=True)
+class Entry(Generic[S]):
+    """One row, and what it is filtered by beside its fields."""
 
-    task: str | None = None
-    domain: Domain | None = None
-    origin: Origin | None = None
-    success: bool | None = None
+    summary: S
+    quality: Mapping[str, float]
+    created_at: datetime | None
 
-    def matches(self, episode: EpisodeSummary) -> bool:
-        """Whether an episode is what is asked for."""
-        wanted = (self.task, self.domain, self.origin, self.success)
-        got = (episode.task, episode.domain, episode.origin, episode.success)
-        return all(want is None or want == have for want, have in zip(wanted, got, strict=True))
+
+class _Shelf(Generic[S]):
+    """All entries of one kind in the order of ids, brought up to date by `entries`."""
+
+    def __init__(
+        self, store: EpisodeStore, kind: Kind, summarize: Callable[[str], Entry[S]]
+    ) -> None:
+        self._kind: Kind = kind
+        self._summarize: Callable[[str], Entry[S]] = summarize
+        self._changes = FolderChanges(store, kind)
+        self._known: dict[str, tuple[Revision, Entry[S] | None]] = {}
+        self._entries: dict[str, Entry[S]] = {}
+        self._guard = threading.Lock()
+
+    def entries(self) -> dict[str, Entry[S]]:
+        """By id; the dictionary is never changed afterwards."""
+        with self._guard:
+            found = self._changes.look()
+            if found is not None:
+                self._refresh(found)
+            return self._entries
+
+    def _refresh(self, found: Mapping[str, Revision]) -> None:
+        known = {}
+        for item_id, revision in found.items():
+            before = self._known.get(item_id)
+            if before is not None and before[0] == revision:
+                known[item_id] = before
+                continue
+            try:
+                known[item_id] = (revision, self._summarize(item_id))
+            except NotFoundError:
+                continue  # deleted while we were listing
+            except StorageError as error:
+                logger.warning(
+                    "left_out_of_catalog", kind=self._kind, id=item_id, reason=error.message
+                )
+                known[item_id] = (revision, None)
+        self._known = known
+        self._entries = {name: entry for name, (_, entry) in known.items() if entry is not None}
 
 
 class Catalog:
@@ -44,62 +87,143 @@ class Catalog:
 
     def __init__(self, store: EpisodeStore) -> None:
         self._store = store
-        self._episodes: dict[_Key, EpisodeSummary | None] = {}
-        self._recordings: dict[_Key, RecordingSummary | None] = {}
-        self._guard = threading.Lock()
+        self._episodes = _Shelf(store, "episode", self._episode)
+        self._recordings = _Shelf(store, "recording", self._recording)
 
-    def episodes(self, wanted: EpisodeFilter, *, limit: int, offset: int = 0) -> EpisodeList:
-        """One page of matching episodes in the order of their ids."""
-        with self._guard:
-            self._episodes = self._refreshed(self._episodes, "episode", self._episode)
-            found = [e for e in self._episodes.values() if e is not None and wanted.matches(e)]
-        return EpisodeList(episodes=tuple(found[offset : offset + limit]), num_matching=len(found))
+    def warm_up(self) -> None:
+        """Read what a first list would read."""
+        self._episodes.entries()
+        self._recordings.entries()
 
-    def recordings(self, *, limit: int, offset: int = 0) -> RecordingList:
-        """One page of finished recordings in the order of their ids."""
-        with self._guard:
-            self._recordings = self._refreshed(self._recordings, "recording", self._recording)
-            found = [r for r in self._recordings.values() if r is not None]
-        return RecordingList(
-            recordings=tuple(found[offset : offset + limit]), num_matching=len(found)
+    def episodes(
+        self, wanted: EpisodeFilter, *, limit: int, offset: int = 0, after: str | None = None
+    ) -> EpisodeList:
+        """One page of matching episodes in the order of their ids, those behind `after`."""
+        found = _matching(self._episodes.entries(), wanted)
+        page, next_after = _page(found, limit, offset, after)
+        return EpisodeList.model_construct(
+            episodes=tuple(page), num_matching=len(found), next_after=next_after
         )
 
-    def _refreshed(
-        self, known: dict[_Key, S | None], kind: Kind, summarize: Callable[[str], S]
-    ) -> dict[_Key, S | None]:
-        summaries: dict[_Key, S | None] = {}
-        for item_id in self._store.list(kind=kind):
-            try:
-                key = (item_id, self._store.revision(item_id, kind=kind))
-                summaries[key] = known[key] if key in known else summarize(item_id)
-            except NotFoundError:
-                continue  # deleted while we were listing
-            except StorageError as error:
-                logger.warning("left_out_of_catalog", kind=kind, id=item_id, reason=error.message)
-                summaries[key] = None
-        return summaries
+    def recordings(
+        self,
+        wanted: RecordingFilter | None = None,
+        *,
+        limit: int,
+        offset: int = 0,
+        after: str | None = None,
+    ) -> RecordingList:
+        """One page of matching finished recordings in the order of their ids, behind `after`."""
+        found = _matching(self._recordings.entries(), wanted or RecordingFilter())
+        page, next_after = _page(found, limit, offset, after)
+        return RecordingList.model_construct(
+            recordings=tuple(page), num_matching=len(found), next_after=next_after
+        )
 
-    def _episode(self, episode_id: str) -> EpisodeSummary:
+    def hours(self, wanted: EpisodeFilter) -> CatalogHours:
+        """How much there is of the matching episodes by task, domain and origin."""
+        groups: defaultdict[tuple[str, str, str], list[EpisodeSummary]] = defaultdict(list)
+        for episode in _matching(self._episodes.entries(), wanted).values():
+            groups[episode.task, episode.domain, episode.origin].append(episode)
+        rows = [_hours_row(group) for _, group in sorted(groups.items())]
+        return CatalogHours(
+            rows=tuple(rows),
+            num_episodes=sum(row.num_episodes for row in rows),
+            hours=sum(row.hours for row in rows),
+        )
+
+    def bytes_by_station(self) -> dict[str, int]:
+        """What the finished recordings of each station take on disk."""
+        totals: defaultdict[str, int] = defaultdict(int)
+        for entry in self._recordings.entries().values():
+            totals[entry.summary.station] += entry.summary.num_bytes
+        return dict(totals)
+
+    def _episode(self, episode_id: str) -> Entry[EpisodeSummary]:
         reader = self._store.open(episode_id)
-        attributes = reader.attributes
-        return EpisodeSummary(
+        attributes, num_steps = reader.attributes, reader.num_steps
+        on_grid_s = num_steps / attributes.model_rate_hz
+        summary = EpisodeSummary(
             episode_id=episode_id,
             task=attributes.task,
             domain=attributes.domain,
             origin=attributes.origin,
+            station=attributes.station,
+            operator=attributes.operator,
             success=attributes.success,
-            num_steps=reader.num_steps,
+            recovered=attributes.recovered,
+            num_steps=num_steps,
+            duration_s=on_grid_s or _nominal_duration_s(reader),
+            created_at=attributes.created_at,
             content_sha256=reader.content_sha256,
         )
+        return Entry(summary, dict(attributes.quality), attributes.created_at)
 
-    def _recording(self, recording_id: str) -> RecordingSummary:
+    def _recording(self, recording_id: str) -> Entry[RecordingSummary]:
         reader = self._store.recording(recording_id)
         attributes = reader.attributes
-        return RecordingSummary(
+        summary = RecordingSummary(
             recording_id=recording_id,
             task=attributes.task,
             domain=attributes.domain,
             station=attributes.station,
+            operator=attributes.operator,
+            success=attributes.success,
+            recovered=attributes.recovered,
             num_samples={name: reader.num_samples(name) for name in reader.streams},
+            duration_s=_nominal_duration_s(reader),
+            num_bytes=folder_bytes(self._store.root / "recordings" / recording_id),
+            started_at=attributes.started_at,
             content_sha256=reader.content_sha256,
         )
+        return Entry(summary, dict(attributes.quality), attributes.started_at)
+
+
+def folder_bytes(folder: Path) -> int:
+    """Bytes of all files below a folder; what vanishes meanwhile counts nothing."""
+    total = 0
+    with disk_errors(f"measure {folder.name}"):
+        for here, _, names in os.walk(folder):
+            for name in names:
+                try:
+                    total += Path(here, name).stat().st_size
+                except FileNotFoundError:
+                    continue
+    return total
+
+
+def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[str, S]:
+    matches = wanted.matcher()
+    return {name: entry.summary for name, entry in entries.items() if matches(entry)}
+
+
+def _page(
+    found: Mapping[str, S], limit: int, offset: int, after: str | None
+) -> tuple[list[S], str | None]:
+    names = list(found)
+    first = offset + (0 if after is None else bisect_right(names, after))
+    chosen = names[first : first + limit]
+    is_last = first + limit >= len(names)
+    return [found[name] for name in chosen], None if is_last else chosen[-1]
+
+
+def _hours_row(group: list[EpisodeSummary]) -> HoursRow:
+    return HoursRow(
+        task=group[0].task,
+        domain=group[0].domain,
+        origin=group[0].origin,
+        num_episodes=len(group),
+        num_successes=sum(episode.success is True for episode in group),
+        hours=sum(episode.duration_s for episode in group) / SECONDS_AN_HOUR,
+    )
+
+
+def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:
+    # No array is opened for a row of the catalog: counts are in the commit record.
+    return max(
+        (
+            reader.num_samples(name) / descriptor.nominal_rate_hz
+            for name, descriptor in reader.streams.items()
+        ),
+        default=0.0,
+    )

@@ -1,99 +1,35 @@
-"""Numbered batches of a recording → the spool, exactly once each; at the end → the store."""
+"""Numbered batches of recordings → their spools, exactly once each; at the end → the store."""
 
-import hashlib
 import shutil
 import threading
-import zlib
 from collections import OrderedDict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 
 import structlog
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import check_id
-from dextouch.episodes.log import SpoolReader, SpoolWriter
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.episodes.log import SpoolWriter
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas.recordings import (
     BatchReceipt,
     FinishRecording,
     RecordingAttributes,
     RecordingStatus,
 )
-from dextouch.streams.wire import decode_batch
-from services.episode_store.receipts import Receipts
+from services.episode_store.committing import Commit, commit_spool
+from services.episode_store.ledger import idle_seconds
+from services.episode_store.locks import KeyedLocks
+from services.episode_store.upload import Upload
 
 logger = structlog.get_logger(__name__)
 
-_COPY_SAMPLES = 256
-_UPLOADS = ".uploads"
-_NUM_LOCKS = 64
-
-
-class _Upload:
-    """One unfinished recording: its spool and its receipts, which always agree."""
-
-    def __init__(self, spool: SpoolWriter, *, sync: bool) -> None:
-        self.spool = spool
-        self._sync = sync
-        self._streams = {stream.name: stream for stream in spool.attributes.streams}
-        self.receipts = {name: Receipts(spool.path / f"{name}.receipts") for name in self._streams}
-        for name, receipts in self.receipts.items():
-            # What was written but never acknowledged comes again.
-            spool.truncate(name, receipts.num_samples)
-
-    def status(self) -> RecordingStatus:
-        return RecordingStatus(
-            recording_id=self.spool.attributes.recording_id,
-            state="open",
-            next_batch={name: len(receipts) for name, receipts in self.receipts.items()},
-        )
-
-    def put(self, stream: str, number: int, data: bytes) -> BatchReceipt:
-        if stream not in self.receipts:
-            raise UnknownNameError("stream", stream, list(self.receipts))
-        receipts, recording_id = self.receipts[stream], self.spool.attributes.recording_id
-        if number > len(receipts):
-            raise ConflictError(
-                f"{recording_id} {stream}: got batch {number}, expected {len(receipts)}; "
-                "send the missing ones first",
-                got=number,
-                expected=len(receipts),
-            )
-        replayed = number < len(receipts)
-        if replayed:
-            if hashlib.sha256(data).digest() != receipts[number].sha256:
-                raise ConflictError(
-                    f"{recording_id} {stream}: batch {number} is here with other bytes; "
-                    "a batch never changes",
-                    got=number,
-                    expected=len(receipts),
-                )
-        else:
-            self._append(stream, number, data)
-        before = receipts[number - 1].end_sample if number else 0
-        return BatchReceipt(
-            recording_id=recording_id,
-            stream=stream,
-            number=number,
-            num_samples=receipts[number].end_sample - before,
-            replayed=replayed,
-        )
-
-    def _append(self, stream: str, number: int, data: bytes) -> None:
-        receipts = self.receipts[stream]
-        batch = decode_batch(data, self._streams[stream], number=number)
-        self.spool.append(stream, batch)
-        acknowledged = False
-        try:
-            self.spool.flush()
-            end_sample = self.spool.num_samples(stream)
-            receipts.append(data, end_sample=end_sample, sync=self._sync)
-            acknowledged = True
-        finally:
-            if not acknowledged:
-                self.spool.truncate(stream, receipts.num_samples)
+UPLOADS_FOLDER = ".uploads"
+# A finish of a long take holds its recording this long at most before others are told to wait.
+PATIENCE_S = 20.0
 
 
 class Ingest:
@@ -103,14 +39,23 @@ class Ingest:
         store: where finished recordings go; unfinished ones lie in a folder below it.
         sync: whether an acknowledged batch survives a power loss.
         max_open_uploads: how many keep their files open; others are opened when asked for.
+        commit: moves a complete upload into the store; here and now when None.
     """
 
-    def __init__(self, store: EpisodeStore, *, sync: bool, max_open_uploads: int) -> None:
+    def __init__(
+        self,
+        store: EpisodeStore,
+        *,
+        sync: bool,
+        max_open_uploads: int,
+        commit: Commit | None = None,
+    ) -> None:
         self._store = store
-        self._folder = store.root / _UPLOADS
+        self.folder = store.root / UPLOADS_FOLDER
         self._sync, self._max_open = sync, max_open_uploads
-        self._open: OrderedDict[str, _Upload] = OrderedDict()
-        self._locks = [threading.Lock() for _ in range(_NUM_LOCKS)]
+        self._commit = commit or partial(commit_spool, store)
+        self._open: OrderedDict[str, Upload] = OrderedDict()
+        self._locks = KeyedLocks(patience_s=PATIENCE_S)
         self._guard = threading.Lock()
 
     def create(self, attributes: RecordingAttributes) -> RecordingStatus:
@@ -128,12 +73,12 @@ class Ingest:
             path = self._path(recording_id)
             if path.exists():
                 upload = self._upload(recording_id)
-                _check_same(attributes, upload.spool.attributes)
+                _check_same(attributes, upload.attributes)
                 return upload.status()
-            spool = SpoolWriter(path, attributes, sync=self._sync)
-            self._keep(recording_id, _Upload(spool, sync=self._sync))
+            upload = Upload(SpoolWriter(path, attributes, sync=self._sync), sync=self._sync)
+            self._keep(recording_id, upload)
             logger.info("recording_created", recording_id=recording_id)
-            return self._open[recording_id].status()
+            return upload.status()
 
     def status(self, recording_id: str) -> RecordingStatus:
         """Where an upload stands.
@@ -154,11 +99,10 @@ class Ingest:
             UnknownNameError: no such stream.
             ConflictError: a gap, other bytes under a known number, or a finished recording.
             PacketError, InvalidInputError: bytes that are no batch of this stream.
+            UnavailableError: the recording is being finished; try again later.
             StorageFullError: no space; all that was acknowledged stays.
         """
         with self._working_on(recording_id):
-            if self._store.exists(recording_id, kind="recording"):
-                raise ConflictError(f"recording {recording_id!r} is finished; it never changes")
             return self._upload(recording_id).put(stream, number, data)
 
     def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
@@ -168,82 +112,90 @@ class Ingest:
             NotFoundError: no such recording.
             ConflictError: batches are missing, or more are here than announced.
             InvalidInputError: not all streams are announced, or none has a sample.
+            UnavailableError: it is being finished already; try again later.
+            StorageFullError: no space; the upload stays as it is.
         """
         with self._working_on(recording_id):
             if not self._store.exists(recording_id, kind="recording"):
                 upload = self._upload(recording_id)
                 _check_complete(upload, body)
-                self._commit(upload, body)
+                self._move(upload, body)
             shutil.rmtree(self._path(recording_id), ignore_errors=True)
         return RecordingStatus(recording_id=recording_id, state="finished")
+
+    def expire(self, recording_id: str, *, idle_s: float) -> bool:
+        """Drop an unfinished upload if nothing has come for so long; whether it went.
+
+        Raises:
+            UnavailableError: it is being worked on.
+        """
+        with self._working_on(recording_id):
+            path = self._path(recording_id)
+            if not path.exists() or idle_seconds(path) < idle_s:
+                return False
+            with self._guard:
+                upload = self._open.pop(recording_id, None)
+            if upload is not None:
+                upload.abandon()
+            shutil.rmtree(path)
+        logger.warning("expire_upload", recording_id=recording_id)
+        return True
 
     def close(self) -> None:
         """Give all files back; uploads go on after the next start."""
         with self._guard:
             while self._open:
-                self._open.popitem()[1].spool.abandon()
+                self._open.popitem()[1].abandon()
 
-    def _commit(self, upload: _Upload, body: FinishRecording) -> None:
-        spool = upload.spool
-        attributes = spool.attributes.model_copy(
+    def _move(self, upload: Upload, body: FinishRecording) -> None:
+        known = upload.attributes
+        attributes = known.model_copy(
             update={
-                "success": spool.attributes.success if body.success is None else body.success,
-                "ledger": body.ledger or spool.attributes.ledger,
+                "success": known.success if body.success is None else body.success,
+                "ledger": body.ledger or known.ledger,
             }
         )
         recording_id = attributes.recording_id
         with self._guard:
             self._open.pop(recording_id)
-        spool.close()
-        reader = SpoolReader(spool.path)
-        with self._store.writer(kind="recording", attributes=attributes) as writer:
-            for name in reader.streams:
-                for batch in reader.batches(name, num_samples=_COPY_SAMPLES):
-                    writer.append(
-                        name,
-                        values=batch.values,
-                        t_host_ns=batch.t_host_ns,
-                        t_device_ns=batch.t_device_ns,
-                        sequence=batch.sequence,
-                    )
-        counts = {name: reader.num_samples(name) for name in reader.streams}
+        upload.close()
+        counts = self._commit(self._path(recording_id), attributes)
         logger.info("recording_finished", recording_id=recording_id, num_samples=counts)
 
     @contextmanager
     def _working_on(self, recording_id: str) -> Iterator[None]:
         check_id(recording_id, kind="recording id")
-        with self._lock_of(recording_id):
+        with self._locks.holding(recording_id):
             yield
 
-    def _lock_of(self, recording_id: str) -> threading.Lock:
-        # A fixed set of locks, so that asking for unknown ids costs no memory.
-        return self._locks[zlib.crc32(recording_id.encode()) % _NUM_LOCKS]
-
-    def _upload(self, recording_id: str) -> _Upload:
+    def _upload(self, recording_id: str) -> Upload:
         """The open upload; the caller holds its lock."""
         with self._guard:
             if recording_id in self._open:
                 self._open.move_to_end(recording_id)
                 return self._open[recording_id]
+        if self._store.exists(recording_id, kind="recording"):
+            raise ConflictError(f"recording {recording_id!r} is finished; it never changes")
         path = self._path(recording_id)
         if not path.exists():
             raise NotFoundError(f"recording {recording_id!r}: no upload was begun under this id")
-        upload = _Upload(SpoolWriter.resume(path, sync=self._sync), sync=self._sync)
+        upload = Upload(SpoolWriter.resume(path, sync=self._sync), sync=self._sync)
         self._keep(recording_id, upload)
         return upload
 
-    def _keep(self, recording_id: str, upload: _Upload) -> None:
+    def _keep(self, recording_id: str, upload: Upload) -> None:
         with self._guard:
             self._open[recording_id] = upload
-            idle = [other for other in self._open if not self._lock_of(other).locked()]
+            idle = [other for other in self._open if not self._locks.is_wanted(other)]
             for other in idle[: max(0, len(self._open) - self._max_open)]:
-                self._open.pop(other).spool.abandon()
+                self._open.pop(other).abandon()
 
     def _path(self, recording_id: str) -> Path:
-        return self._folder / recording_id
+        return self.folder / recording_id
 
 
 def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
+    # What is known only at the end may have been told after the upload began.
     late = {"success": ours.success, "ledger": ours.ledger}
     if got.model_copy(update=late) != ours:
         raise ConflictError(
@@ -251,8 +203,8 @@ def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
         )
 
 
-def _check_complete(upload: _Upload, body: FinishRecording) -> None:
-    recording_id = upload.spool.attributes.recording_id
+def _check_complete(upload: Upload, body: FinishRecording) -> None:
+    recording_id = upload.attributes.recording_id
     here = upload.status().next_batch
     if set(body.num_batches) != set(here):
         raise InvalidInputError(

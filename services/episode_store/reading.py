@@ -1,8 +1,12 @@
 """Ids and times in, msgpack of windows and samples out, within the bounds of one answer."""
 
+import hashlib
+from dataclasses import dataclass
 from math import prod
+from typing import Literal
 
 import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
 from dextouch.episodes.window_codec import encode_window
@@ -12,11 +16,44 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.schemas.rollouts import ActionKind
 from dextouch.streams.packing import pack
 
-MSGPACK = "application/msgpack"
+# Raised whenever the same query gives other bytes.
+ANSWER_VERSION = 1
+
+
+class WindowQuery(BaseModel):
+    """Which window is asked for; `cameras` are names with commas between, none when empty."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start: int = Field(ge=0)
+    num_steps: int = Field(default=17, ge=1)
+    cameras: str = "camera_head"
+    action_kind: ActionKind = "measured"
+
+    def camera_names(self) -> tuple[str, ...]:
+        """The names."""
+        return tuple(name for name in self.cameras.split(",") if name)
+
+
+class SpanQuery(BaseModel):
+    """Which samples are asked for: start_ns ≤ t < stop_ns, all without bounds."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start_ns: int | None = None
+    stop_ns: int | None = None
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Bytes and the tag that names them; no bytes for an asker who has them already."""
+
+    etag: str
+    data: bytes | None
 
 
 class StoreReader:
-    """What the routes read, each answer bounded.
+    """What the routes read, each answer bounded, and not made at all for those who have it.
 
     Args:
         store: that is read.
@@ -43,72 +80,104 @@ class StoreReader:
         """Attributes of a finished recording."""
         return self._store.recording(recording_id).attributes
 
-    def window(
-        self,
-        episode_id: str,
-        start: int,
-        num_steps: int,
-        *,
-        cameras: tuple[str, ...],
-        action_kind: ActionKind,
-    ) -> bytes:
+    def window(self, episode_id: str, query: WindowQuery, *, known: str | None = None) -> Answer:
         """One window.
+
+        Args:
+            episode_id: of a committed episode.
+            query: the window.
+            known: `If-None-Match` of the asker.
 
         Raises:
             LimitExceededError: more steps or bytes of images than allowed.
         """
-        if num_steps > self._max_steps:
+        if query.num_steps > self._max_steps:
             raise LimitExceededError(
-                f"window: got {num_steps} steps, expected at most {self._max_steps}"
+                f"window: got {query.num_steps} steps, expected at most {self._max_steps}",
+                got=query.num_steps,
+                expected=self._max_steps,
             )
         reader = self._store.open(episode_id)
-        known = [reader.streams[camera] for camera in cameras if camera in reader.streams]
-        num_bytes = num_steps * sum(prod(descriptor.shape) for descriptor in known)
-        if num_bytes > self._max_bytes:
+        etag = etag_of(reader, "window", query)
+        if is_known(etag, known):
+            return Answer(etag, None)
+        cameras = query.camera_names()
+        step_bytes = sum(prod(reader.streams[c].shape) for c in cameras if c in reader.streams)
+        if query.num_steps * step_bytes > self._max_bytes:
+            allowed = self._max_bytes // step_bytes
             raise LimitExceededError(
-                f"window: {num_steps} steps hold {num_bytes} bytes of images, expected at most "
-                f"{self._max_bytes}; ask for fewer steps or cameras"
+                f"window: {query.num_steps} steps hold {query.num_steps * step_bytes} bytes of "
+                f"images, expected at most {self._max_bytes}, which are {allowed} steps; "
+                "ask for fewer steps or cameras",
+                got=query.num_steps,
+                expected=allowed,
             )
-        return encode_window(
-            reader.window(start, num_steps, cameras=cameras, action_kind=action_kind)
+        window = reader.window(
+            query.start, query.num_steps, cameras=cameras, action_kind=query.action_kind
         )
+        return Answer(etag, encode_window(window))
 
-    def episode_samples(
-        self, episode_id: str, stream: str, start_ns: int | None, stop_ns: int | None
-    ) -> bytes:
-        """Stamps and values of one stream of an episode."""
-        reader = self._store.open(episode_id)
-        self._check_size(reader, stream, start_ns, stop_ns)
-        data = reader.read(stream, start_ns, stop_ns)
-        return pack({"stream": stream}, {"t_ref_ns": data.t_ref_ns, "values": data.values})
+    def samples(
+        self,
+        kind: Literal["episode", "recording"],
+        item_id: str,
+        stream: str,
+        span: SpanQuery,
+        *,
+        known: str | None = None,
+    ) -> Answer:
+        """Stamps and values of one stream of an episode or a recording.
 
-    def recording_samples(
-        self, recording_id: str, stream: str, start_ns: int | None, stop_ns: int | None
-    ) -> bytes:
-        """Stamps and values of one stream of a recording."""
-        reader = self._store.recording(recording_id)
-        self._check_size(reader, stream, start_ns, stop_ns)
-        batch = reader.read(stream, start_ns, stop_ns)
-        arrays = {
-            "t_host_ns": batch.t_host_ns,
-            "t_device_ns": batch.t_device_ns,
-            "sequence": batch.sequence,
-            "values": batch.values,
-        }
-        return pack({"stream": stream}, arrays)
+        Raises:
+            LimitExceededError: more bytes than allowed.
+        """
+        reader: EpisodeReader | RecordingReader
+        reader = self._store.open(item_id) if kind == "episode" else self._store.recording(item_id)
+        etag = etag_of(reader, stream, span)
+        if is_known(etag, known):
+            return Answer(etag, None)
+        self._check_size(reader, stream, span)
+        return Answer(etag, _packed(reader, stream, span))
 
     def _check_size(
-        self,
-        reader: EpisodeReader | RecordingReader,
-        stream: str,
-        start_ns: int | None,
-        stop_ns: int | None,
+        self, reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuery
     ) -> None:
-        count = reader.count(stream, start_ns, stop_ns)
+        count = reader.count(stream, span.start_ns, span.stop_ns)
         descriptor = reader.streams[stream]
-        num_bytes = count * (prod(descriptor.shape) * np.dtype(descriptor.dtype).itemsize + 24)
-        if num_bytes > self._max_bytes:
+        sample_bytes = prod(descriptor.shape) * np.dtype(descriptor.dtype).itemsize + 24
+        if count * sample_bytes > self._max_bytes:
+            allowed = self._max_bytes // sample_bytes
             raise LimitExceededError(
-                f"{stream}: {count} samples are {num_bytes} bytes, expected at most "
-                f"{self._max_bytes}; ask for a shorter time"
+                f"{stream}: {count} samples are {count * sample_bytes} bytes, expected at most "
+                f"{self._max_bytes}, which are {allowed} samples; ask for a shorter time",
+                got=count,
+                expected=allowed,
             )
+
+
+def _packed(reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuery) -> bytes:
+    if isinstance(reader, EpisodeReader):
+        data = reader.read(stream, span.start_ns, span.stop_ns)
+        return pack({"stream": stream}, {"t_ref_ns": data.t_ref_ns, "values": data.values})
+    batch = reader.read(stream, span.start_ns, span.stop_ns)
+    arrays = {
+        "t_host_ns": batch.t_host_ns,
+        "t_device_ns": batch.t_device_ns,
+        "sequence": batch.sequence,
+        "values": batch.values,
+    }
+    return pack({"stream": stream}, arrays)
+
+
+def etag_of(reader: EpisodeReader | RecordingReader, what: str, query: BaseModel) -> str:
+    """A tag that is equal exactly where content and query are: what is committed never changes."""
+    text = f"{ANSWER_VERSION} {reader.content_sha256} {what} {query.model_dump_json()}"
+    return f'"{hashlib.sha256(text.encode()).hexdigest()[:40]}"'
+
+
+def is_known(etag: str, known: str | None) -> bool:
+    """Whether a tag is among those of an `If-None-Match` header."""
+    if known is None:
+        return False
+    tags = {tag.strip().removeprefix("W/") for tag in known.split(",")}
+    return etag in tags or "*" in tags

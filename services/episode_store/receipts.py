@@ -39,6 +39,7 @@ class Receipts:
         with disk_errors(f"read {path.name}"):
             data = path.read_bytes() if path.exists() else b""
         self._receipts: list[Receipt] = []
+        self._descriptor = -1
         size = ROW_BYTES
         for start in range(0, len(data) - size + 1, size):
             row = data[start : start + size]
@@ -70,13 +71,17 @@ class Receipts:
         body = receipt.sha256 + end_sample.to_bytes(8, "little")
         row = body + google_crc32c.value(body).to_bytes(4, "little")
         with disk_errors(f"acknowledge in {self._path.name}"):
-            descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o644)
-            try:
-                # At its own place: what a failed attempt left there is written over.
-                os.lseek(descriptor, len(self._receipts) * ROW_BYTES, os.SEEK_SET)
-                write_all(descriptor, row)
-                if sync:
-                    os.fdatasync(descriptor)
-            finally:
-                os.close(descriptor)
+            if self._descriptor < 0:
+                self._descriptor = os.open(self._path, os.O_WRONLY | os.O_CREAT, 0o644)
+            # At its own place: what a failed attempt left there is written over.
+            os.lseek(self._descriptor, len(self._receipts) * ROW_BYTES, os.SEEK_SET)
+            write_all(self._descriptor, row)
+            if sync:
+                os.fdatasync(self._descriptor)
         self._receipts.append(receipt)
+
+    def close(self) -> None:
+        """Give the file back."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1

@@ -6,10 +6,13 @@ from dextouch.serving.settings import ServiceSettings, service_config
 
 
 class EpisodeStoreSettings(ServiceSettings):
-    """Where episodes lie, and the bounds of one request.
+    """Where episodes lie, and the bounds of one request, of all at once, and of a station.
 
     `store_url` is a local folder or file:///…; uploads that are not finished lie below it too.
-    `max_body_bytes` must hold one batch of the wire format.
+    `max_body_bytes` must hold one batch of the wire format. Batches beyond `max_batches_in_flight`
+    or `max_bytes_in_flight` are refused with 429; those that leave less than `min_free_bytes` on
+    the disk, or bring a station above its quota (unfinished and finished), with 507.
+    `commit_in_process` writes finished recordings in a process of its own.
     """
 
     model_config = service_config("episode_store")
@@ -17,6 +20,11 @@ class EpisodeStoreSettings(ServiceSettings):
     store_url: str = Field(default="data/store", min_length=1)
     sync_uploads: bool = True
     max_open_uploads: int = Field(default=16, ge=1, le=1024)
+    max_batches_in_flight: int = Field(default=32, ge=1, le=1024)
+    max_bytes_in_flight: int = Field(default=128 * 2**20, ge=1024)
+    min_free_bytes: int = Field(default=512 * 2**20, ge=0)
+    quota_bytes_per_station: int | None = Field(default=None, ge=1)
+    commit_in_process: bool = True
     max_page: int = Field(default=1000, ge=1, le=100_000)
     max_window_steps: int = Field(default=321, ge=1, le=10_000)
     max_answer_bytes: int = Field(default=64 * 2**20, ge=1024)

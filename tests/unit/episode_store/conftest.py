@@ -75,7 +75,9 @@ def attributes():
 
 @pytest.fixture
 def settings(tmp_path):
-    return EpisodeStoreSettings(store_url=str(tmp_path / "store"), sync_uploads=False)
+    return EpisodeStoreSettings(
+        store_url=str(tmp_path / "store"), sync_uploads=False, commit_in_process=False
+    )
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from dextouch.schemas.recordings import FinishRecording, LedgerEntry
 from dextouch.streams.samples import SampleBatch
 from dextouch.streams.wire import encode_batch
 from services.episode_store import ingest as ingest_module
+from services.episode_store import upload as upload_module
 from services.episode_store.ingest import Ingest
 
 
@@ -157,7 +158,7 @@ def test_a_crash_between_data_and_receipt_counts_once(
     send(first, 0)
     with monkeypatch.context() as patch:
         # The process dies after the samples were spooled and before the receipt was written.
-        patch.setattr(ingest_module.Receipts, "append", _die)
+        patch.setattr(upload_module.Receipts, "append", _die)
         patch.setattr(ingest_module.SpoolWriter, "truncate", lambda *_: None)
         with pytest.raises(KeyboardInterrupt):
             send(first, 1)

@@ -1,0 +1,52 @@
+"""A store in, the revision of every committed id out, or word that nothing changed."""
+
+import os
+import time
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import COMMIT_FILE, Kind
+
+# Stamps of a file system can be this coarse: a change as young may have a twin with its stamp.
+SETTLED_NS = 2_000_000_000
+
+Revision = tuple[int, int]
+
+
+class FolderChanges:
+    """Looks at one kind of a store with one `stat` while nothing comes or goes.
+
+    Committing and deleting rename folders in and out, which sets the stamp of the folder above.
+    What was changed in place behind the store's back shows at the next coming or going only.
+    """
+
+    def __init__(self, store: EpisodeStore, kind: Kind) -> None:
+        self._folder = store.root / f"{kind}s"
+        self._stamp_ns: int | None = None
+        self._is_settled = False
+
+    def look(self) -> dict[str, Revision] | None:
+        """Revisions by id, in order; None when nothing changed since the last look."""
+        with disk_errors(f"list {self._folder.name}"):
+            try:
+                stamp_ns = self._folder.stat().st_mtime_ns
+            except FileNotFoundError:
+                self._stamp_ns = None
+                return {}
+            if self._is_settled and stamp_ns == self._stamp_ns:
+                return None
+            now_ns = time.time_ns()
+            found = self._scan()
+        self._stamp_ns, self._is_settled = stamp_ns, now_ns - stamp_ns > SETTLED_NS
+        return found
+
+    def _scan(self) -> dict[str, Revision]:
+        found = {}
+        # Plain names, one stat an id: thousands of Path objects would be in the way of a list.
+        for name in sorted(os.listdir(self._folder)):  # noqa: PTH208
+            try:
+                state = os.stat(f"{self._folder}/{name}/{COMMIT_FILE}")  # noqa: PTH116
+            except (FileNotFoundError, NotADirectoryError):
+                continue
+            found[name] = (state.st_mtime_ns, state.st_ino)
+        return found

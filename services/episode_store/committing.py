@@ -1,0 +1,41 @@
+"""A complete spool in, a finished recording of the store out, with bounded memory."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.log import SpoolReader
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.checks import JPEG_UNIT
+
+COPY_SAMPLES = 256
+# Images are some fifty thousand bytes each.
+COPY_IMAGES = 32
+
+# Moves the spool in a folder into the store, under the attributes that are known at the end.
+Commit = Callable[[Path, RecordingAttributes], dict[str, int]]
+
+
+def commit_spool(
+    store: EpisodeStore, spool: Path, attributes: RecordingAttributes
+) -> dict[str, int]:
+    """Copy all samples of a closed spool into a new recording; samples by stream come back.
+
+    Raises:
+        ConflictError: the recording exists.
+        CorruptDataError: the spool is damaged; nothing is written.
+        StorageFullError: no space; nothing remains, the spool stays.
+    """
+    reader = SpoolReader(spool)
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, descriptor in reader.streams.items():
+            num_samples = COPY_IMAGES if descriptor.unit == JPEG_UNIT else COPY_SAMPLES
+            for batch in reader.batches(name, num_samples=num_samples):
+                writer.append(
+                    name,
+                    values=batch.values,
+                    t_host_ns=batch.t_host_ns,
+                    t_device_ns=batch.t_device_ns,
+                    sequence=batch.sequence,
+                )
+    return {name: reader.num_samples(name) for name in reader.streams}

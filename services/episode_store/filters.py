@@ -1,0 +1,130 @@
+"""What is asked for in a catalog: query parameters in, a test of one entry out."""
+
+import math
+from collections.abc import Callable, Mapping
+from datetime import datetime
+from operator import attrgetter
+from typing import Annotated, Any, Protocol, runtime_checkable
+
+from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
+
+from dextouch.schemas.episodes import Domain, Origin
+
+
+@runtime_checkable
+class Filterable(Protocol):
+    """What a catalog knows of an episode or a recording, beside the fields it is filtered by."""
+
+    @property
+    def summary(self) -> Any:  # noqa: ANN401 - of either kind
+        """Its row."""
+        ...
+
+    @property
+    def quality(self) -> Mapping[str, float]:
+        """Its figures by name."""
+        ...
+
+    @property
+    def created_at(self) -> datetime | None:
+        """When it was made."""
+        ...
+
+
+def quality_bound(text: str) -> tuple[str, float]:
+    """Name and least figure of `NAME:NUMBER`.
+
+    Raises:
+        ValueError: anything else, and NaN.
+    """
+    name, colon, figure = text.rpartition(":")
+    try:
+        least = float(figure)
+    except ValueError:
+        least = math.nan
+    if not (name and colon) or math.isnan(least):
+        raise ValueError(f"got {text!r}, expected NAME:NUMBER such as coverage:0.95")
+    return name, least
+
+
+def _checked(text: str) -> str:
+    quality_bound(text)
+    return text
+
+
+class CatalogFilter(BaseModel):
+    """What an episode or recording must be; what is not given takes any.
+
+    `min_quality` are bounds `NAME:NUMBER`, all of which hold: what does not have a figure does not
+    match. Times are created_after ≤ t < created_before; what has none does not match.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    task: str | None = None
+    operator: str | None = None
+    station: str | None = None
+    domain: Domain | None = None
+    success: bool | None = None
+    recovered: bool | None = None
+    min_quality: tuple[Annotated[str, AfterValidator(_checked)], ...] = ()
+    created_after: AwareDatetime | None = None
+    created_before: AwareDatetime | None = None
+
+    def matcher(self) -> Callable[[Filterable], bool]:
+        """A quick test of many entries."""
+        fields = [name for name in self._fields() if getattr(self, name) is not None]
+        get = attrgetter(*fields) if fields else None
+        expected = get(self) if get else None
+        bounds = [quality_bound(text) for text in self.min_quality]
+        after, before = self.created_after, self.created_before
+
+        def matches(entry: Filterable) -> bool:
+            if get is not None and get(entry.summary) != expected:
+                return False
+            if any(not entry.quality.get(name, -math.inf) >= least for name, least in bounds):
+                return False
+            if after is None and before is None:
+                return True
+            at = entry.created_at
+            return (
+                at is not None
+                and (after is None or after <= at)
+                and (before is None or at < before)
+            )
+
+        return matches
+
+    def _fields(self) -> tuple[str, ...]:
+        return ("task", "operator", "station", "domain", "success", "recovered")
+
+
+class RecordingFilter(CatalogFilter):
+    """What a recording must be."""
+
+
+class EpisodeFilter(CatalogFilter):
+    """What an episode must be."""
+
+    origin: Origin | None = None
+
+    def _fields(self) -> tuple[str, ...]:
+        return (*super()._fields(), "origin")
+
+
+class Page(BaseModel):
+    """Which part of a list is wanted: after an id, or from a place in it."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    limit: int | None = Field(default=None, ge=1)
+    offset: int = Field(default=0, ge=0)
+    after: str | None = Field(default=None, description="only ids behind this one")
+
+
+class EpisodeQuery(EpisodeFilter, Page):
+    """One page of the episodes that match."""
+
+
+class RecordingQuery(RecordingFilter, Page):
+    """One page of the recordings that match."""

@@ -1,0 +1,63 @@
+"""What the store counts for Prometheus: batches, bytes, acknowledgement times, refusals, room."""
+
+from collections.abc import Callable
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram
+
+SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
+
+
+class StoreMetrics:
+    """Counters of one store service; `register` shows them."""
+
+    def __init__(
+        self, *, open_uploads: Callable[[], float], free_bytes: Callable[[], float]
+    ) -> None:
+        self.batches = Counter(
+            "dextouch_store_batches",
+            "Acknowledged batches; replayed ones were here already.",
+            ("replayed",),
+            registry=None,
+        )
+        self.bytes = Counter(
+            "dextouch_store_batch_bytes", "Bytes of acknowledged new batches.", registry=None
+        )
+        self.ack_seconds = Histogram(
+            "dextouch_store_ack_seconds",
+            "From admitting a batch to its acknowledgement.",
+            buckets=SECONDS,
+            registry=None,
+        )
+        self.finish_seconds = Histogram(
+            "dextouch_store_finish_seconds",
+            "From the wish to finish an upload to the recording.",
+            buckets=SECONDS,
+            registry=None,
+        )
+        self.refused = Counter(
+            "dextouch_store_refused",
+            "Uploads told to come again later, by what is short.",
+            ("reason",),
+            registry=None,
+        )
+        self.open_uploads = Gauge(
+            "dextouch_store_open_uploads", "Uploads that are not finished.", registry=None
+        )
+        self.open_uploads.set_function(open_uploads)
+        self.free_bytes = Gauge(
+            "dextouch_store_free_bytes", "Free bytes on the store's disk.", registry=None
+        )
+        self.free_bytes.set_function(free_bytes)
+
+    def register(self, registry: CollectorRegistry) -> None:
+        """Show all of them in a registry."""
+        for metric in (
+            self.batches,
+            self.bytes,
+            self.ack_seconds,
+            self.finish_seconds,
+            self.refused,
+            self.open_uploads,
+            self.free_bytes,
+        ):
+            registry.register(metric)

@@ -1,0 +1,20 @@
+"""The page that is asked for and the longest one in, how many rows to give out."""
+
+from dextouch.errors import LimitExceededError
+from services.episode_store.filters import Page
+
+
+def page_limit(page: Page, max_page: int) -> int:
+    """Rows of this page: as many as allowed when none are named.
+
+    Raises:
+        LimitExceededError: more than allowed.
+    """
+    if page.limit is not None and page.limit > max_page:
+        raise LimitExceededError(
+            f"limit: got {page.limit}, expected at most {max_page}; "
+            "ask for the next page with after=NEXT_AFTER",
+            got=page.limit,
+            expected=max_page,
+        )
+    return page.limit or max_page
