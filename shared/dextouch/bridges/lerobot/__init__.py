@@ -1,5 +1,6 @@
 """Episodes of the store ↔ folders of LeRobotDataset v3.0."""
 
 from dextouch.bridges.lerobot.exporting import ExportOptions, export_lerobot
+from dextouch.bridges.lerobot.importing import ImportOptions, import_lerobot
 
-__all__ = ["ExportOptions", "export_lerobot"]
+__all__ = ["ExportOptions", "ImportOptions", "export_lerobot", "import_lerobot"]

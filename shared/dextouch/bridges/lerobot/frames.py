@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 
 from dextouch.episodes import EpisodeReader
 from dextouch.episodes.window import mean_over_ranges, nearest_indices, step_ranges
-from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry.interpolation import bracket, interpolate_linear, interpolate_poses
 from dextouch.hands.actions import (
     ACTION_DIM,
@@ -48,18 +48,6 @@ class EpisodeFrames:
 
     def __len__(self) -> int:
         return len(self.t_ref_ns)
-
-
-def stream_stamps(reader: EpisodeReader, name: str) -> Int64[np.ndarray, " n"]:
-    """Stamps of a stream's samples; its values are not read.
-
-    Raises:
-        UnknownNameError: no such stream.
-    """
-    if name not in reader.streams:
-        raise UnknownNameError("stream", name, list(reader.streams))
-    # The reader offers no public way to stamps without values, and values may be video.
-    return reader._column(f"{name}_t_ref_ns")  # noqa: SLF001
 
 
 def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> EpisodeFrames:
@@ -110,7 +98,7 @@ def frames_of(reader: EpisodeReader, cameras: Sequence[str], fps: int) -> Episod
 
 
 def _image_stamps(reader: EpisodeReader, camera: str) -> Int64[np.ndarray, " n"]:
-    stamps = stream_stamps(reader, camera)
+    stamps = reader.stamps_ns(camera)
     if not len(stamps):
         raise NotFoundError(
             f"episode {reader.attributes.episode_id!r}: {camera!r} holds no image; "
@@ -181,17 +169,17 @@ def images_at(
     Raises:
         CorruptDataError: damaged bytes.
     """
+    # JPEG images are decoded one by one, so that left out ones cost nothing.
     is_jpeg = reader.streams[camera].unit == "jpeg"
-    stamps = stream_stamps(reader, camera)
     for start in range(0, len(indices), BLOCK_IMAGES):
         wanted = [int(index) for index in indices[start : start + BLOCK_IMAGES]]
-        first, last = wanted[0], wanted[-1]
+        first, stop = wanted[0], wanted[-1] + 1
         if is_jpeg:
-            encoded = reader.encoded_images(camera, first, last + 1)
+            encoded = reader.encoded_images(camera, first, stop)
             where = f"episode {reader.attributes.episode_id!r}: {camera!r} image"
             for index in wanted:
                 yield decode_jpeg(encoded[index - first], where=f"{where} {index}")
         else:
-            block = reader.read(camera, int(stamps[first]), int(stamps[last]) + 1).values
+            block = reader.images(camera, first, stop)
             for index in wanted:
                 yield block[index - first]

@@ -1,0 +1,140 @@
+"""One episode of a dataset in, its numbers and the places of its images out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from dextouch.bridges.lerobot import layout
+from dextouch.bridges.lerobot.frames import WORLD
+from dextouch.bridges.lerobot.mapping import FeatureMap
+from dextouch.bridges.lerobot.sidecar import Sidecar
+from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
+from dextouch.bridges.lerobot.video_reader import VideoSpan
+from dextouch.errors import CorruptDataError
+from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
+
+
+@dataclass(frozen=True)
+class CameraContent:
+    """Where a camera's images lie, and the stamp of the image of each frame.
+
+    A stamp that comes twice is one image that was the nearest to two frames.
+    """
+
+    span: VideoSpan
+    t_ref_ns: Int64[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class EpisodeContent:
+    """An episode's frames as the store wants them.
+
+    Actions are relative to the measured poses of the first frame, which `anchor` holds where they
+    are not those that the dataset's description gives.
+    """
+
+    t_ref_ns: Int64[np.ndarray, " n"]
+    measured: Float64[np.ndarray, "n 67"]
+    commanded: Float64[np.ndarray, "n 67"] | None
+    anchor: AnchorPoses | None
+    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    tactile_valid: Bool[np.ndarray, "n 2"]
+    cameras: dict[str, CameraContent]
+
+
+def content_of(
+    source: LeRobotFolder, entry: EpisodeEntry, features: FeatureMap, sidecar: Sidecar | None
+) -> EpisodeContent:
+    """Read an episode's numbers and find its videos.
+
+    Raises:
+        NotFoundError: a file is missing.
+        CorruptDataError: a damaged file, or stamps that do not rise.
+        InvalidInputError: actions that are no poses.
+    """
+    where = f"{source.folder}: episode {entry.index}"
+    columns = _columns(source, entry, features)
+    t_ns = columns.get(layout.STAMP)
+    if t_ns is None:
+        t_ns = np.rint(np.arange(entry.length) * (1e9 / source.info.fps))
+    t_ns = t_ns.astype(np.int64)
+    if (np.diff(t_ns) <= 0).any():
+        raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
+    measured, commanded, anchor = _actions(columns, features, sidecar, where)
+    kpa, valid = _tactile(columns, features, entry.length)
+    return EpisodeContent(
+        t_ref_ns=t_ns,
+        measured=measured,
+        commanded=commanded,
+        anchor=anchor,
+        tactile_kpa=kpa,
+        tactile_valid=valid,
+        cameras={
+            camera: CameraContent(
+                source.span(entry, key),
+                _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where),
+            )
+            for camera, key in features.cameras.items()
+        },
+    )
+
+
+def _columns(
+    source: LeRobotFolder, entry: EpisodeEntry, features: FeatureMap
+) -> dict[str, np.ndarray]:
+    ours = (layout.MEASURED, layout.VALID, layout.STAMP, layout.IMAGE_DT)
+    wanted = [features.action, features.state, features.tactile]
+    wanted += [name for name in ours if name in source.info.features]
+    return source.columns(entry, [name for name in wanted if name is not None])
+
+
+def _actions(
+    columns: dict[str, np.ndarray], features: FeatureMap, sidecar: Sidecar | None, where: str
+) -> tuple[np.ndarray, np.ndarray | None, AnchorPoses | None]:
+    """Measured and commanded actions, and the poses that they are relative to."""
+    action = columns[features.action].astype(np.float64)
+    if sidecar is None:
+        if features.state is None:
+            return action, None, None
+        state = columns[features.state][:1].astype(np.float64)
+        return action, None, poses_from_actions(state, WORLD).anchor(0)
+    measured, commanded = action, None
+    if sidecar.action_kind == "commanded":
+        if layout.MEASURED not in columns:
+            raise CorruptDataError(f"{where}: feature {layout.MEASURED!r} is missing")
+        measured, commanded = columns[layout.MEASURED].astype(np.float64), action
+    if sidecar.grid == "model":
+        return measured, commanded, None
+    # Frame 0 need not be step 0: actions become relative to what they now begin with.
+    anchor = poses_from_actions(measured[:1], sidecar.attributes.anchor.to_poses()).anchor(0)
+    if commanded is not None:
+        commanded = reanchor(commanded, 0, anchor_action=measured[0])
+    return reanchor(measured, 0), commanded, anchor
+
+
+def _tactile(
+    columns: dict[str, np.ndarray], features: FeatureMap, count: int
+) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+    if features.tactile is None:
+        return np.zeros((count, 2, 320), dtype=np.float32), np.zeros((count, 2), dtype=bool)
+    kpa = columns[features.tactile].astype(np.float32)
+    valid = columns.get(layout.VALID)
+    return kpa, np.ones((count, 2), dtype=bool) if valid is None else valid.astype(bool)
+
+
+def _image_stamps(
+    source: LeRobotFolder, key: str, t_ns: np.ndarray, offsets_ns: np.ndarray | None, where: str
+) -> Int64[np.ndarray, " n"]:
+    """Stamp of the image of each frame: the frame's own where the dataset says nothing."""
+    if offsets_ns is None:
+        return t_ns
+    names = source.info.features[layout.IMAGE_DT].names
+    columns = offsets_ns.reshape(len(t_ns), -1)
+    camera = key.removeprefix(layout.IMAGES)
+    if not isinstance(names, list) or camera not in names[: columns.shape[1]]:
+        return t_ns
+    stamps = t_ns + columns[:, names.index(camera)].astype(np.int64)
+    if (np.diff(stamps) < 0).any():
+        raise CorruptDataError(f"{where}: stamps of {camera!r} in {layout.IMAGE_DT!r} go back")
+    return stamps

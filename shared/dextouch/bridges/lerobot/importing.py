@@ -1,0 +1,138 @@
+"""A LeRobotDataset v3 folder in, episodes of the store out."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.bridges.lerobot.content import EpisodeContent, content_of
+from dextouch.bridges.lerobot.mapping import FeatureMap, map_features
+from dextouch.bridges.lerobot.sidecar import Sidecar, read_sidecar
+from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
+from dextouch.bridges.lerobot.storing import ImageUnit, store_episode
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas.episodes import (
+    Domain,
+    EpisodeAttributes,
+    LineageEntry,
+    Matrix,
+    StoredAnchor,
+)
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """What a dataset does not say itself.
+
+    `mapping`: our name → the dataset's feature. `id_prefix`: put before every id (needed when ids
+    exist already); `images`: the unit that images are stored in. Only for datasets of other origin:
+    `K_head` in pixels, `domain` and `task` (without it the dataset's own text).
+    """
+
+    mapping: Mapping[str, str] = field(default_factory=dict)
+    id_prefix: str = ""
+    images: ImageUnit = "h264"
+    K_head: Matrix | None = None
+    domain: Domain = "robot"
+    task: str | None = None
+
+
+DEFAULTS = ImportOptions()
+
+
+def import_lerobot(
+    folder: Path, store: EpisodeStore, *, options: ImportOptions = DEFAULTS
+) -> list[str]:
+    """Write every episode of a dataset into the store; their ids come back.
+
+    Each episode appears whole or not at all; after an error those before it stay.
+
+    Args:
+        folder: root of the dataset; nothing outside it is read.
+        store: that takes the episodes.
+        options: names of features, ids, images, and what other datasets do not say.
+
+    Raises:
+        NotFoundError: a file is missing.
+        InvalidInputError: another version of the format, or features that do not fit.
+        CorruptDataError: damaged or truncated files, or paths that lead out of the folder.
+        LimitExceededError: larger than this reader takes.
+        ConflictError: an id exists already.
+    """
+    source = LeRobotFolder(folder)
+    features = map_features(source.info, options.mapping)
+    ids: list[str] = []
+    for entry in source.episodes:
+        sidecar = read_sidecar(folder, entry.index)
+        content = content_of(source, entry, features, sidecar)
+        if sidecar is None:
+            attributes = _foreign_attributes(source, entry, content, features, options)
+        else:
+            attributes = _known_attributes(source, content, sidecar, options)
+        if store.exists(attributes.episode_id):
+            raise ConflictError(
+                f"episode {attributes.episode_id!r} exists already; give another id_prefix"
+            )
+        store_episode(store, attributes, content, images=options.images)
+        ids.append(attributes.episode_id)
+    return ids
+
+
+def _known_attributes(
+    source: LeRobotFolder, content: EpisodeContent, sidecar: Sidecar, options: ImportOptions
+) -> EpisodeAttributes:
+    """As they were, with the anchor of the first frame and the origin in the lineage."""
+    known = sidecar.attributes
+    came_from = LineageEntry(kind="episode", id=known.episode_id, sha256=sidecar.content_sha256)
+    changes = {
+        "episode_id": f"{options.id_prefix}{known.episode_id}",
+        "model_rate_hz": float(source.info.fps),
+        "lineage": (*known.lineage, came_from),
+        "anchor": known.anchor if content.anchor is None else _stored(content.anchor),
+        "streams": (),
+    }
+    return EpisodeAttributes.model_validate(known.model_dump() | changes)
+
+
+def _foreign_attributes(
+    source: LeRobotFolder,
+    entry: EpisodeEntry,
+    content: EpisodeContent,
+    features: FeatureMap,
+    options: ImportOptions,
+) -> EpisodeAttributes:
+    if options.K_head is None:
+        raise InvalidInputError(
+            f"{source.folder}: says nothing about its head camera "
+            f"({features.cameras['camera_head']!r}); give K_head= in pixels"
+        )
+    name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")
+    data_file = source.data_file(entry)
+    with disk_errors(f"read {data_file}"), data_file.open("rb") as file:
+        digest = hashlib.file_digest(file, "sha256").hexdigest()
+    anchor = content.anchor or AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
+    return EpisodeAttributes(
+        episode_id=f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
+        task=(options.task or entry.task or "unknown")[:128],
+        instruction=entry.task[:2000],
+        domain=options.domain,
+        origin="recorded",
+        model_rate_hz=float(source.info.fps),
+        anchor=_stored(anchor),
+        K_head=options.K_head,
+        lineage=(
+            LineageEntry(
+                kind="recording", id=f"lerobot:{name}/episode-{entry.index:06d}", sha256=digest
+            ),
+        ),
+    )
+
+
+def _stored(anchor: AnchorPoses) -> StoredAnchor:
+    return StoredAnchor.from_poses(anchor)

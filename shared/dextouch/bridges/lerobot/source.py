@@ -1,0 +1,220 @@
+"""A folder that claims to be a LeRobotDataset v3 in, its checked metadata and episodes out."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pyarrow as pa
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from dextouch.bridges.lerobot import layout
+from dextouch.bridges.lerobot.tables import column_values, read_table
+from dextouch.bridges.lerobot.video_reader import VideoSpan
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+
+MAX_INFO_BYTES: Final = 1 << 24
+MAX_EPISODES: Final = 1_000_000
+MAX_EPISODE_FRAMES: Final = 1_000_000
+
+
+class FeatureInfo(BaseModel):
+    """One feature of `info.json`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    dtype: str = Field(max_length=32)
+    shape: tuple[int, ...] = Field(max_length=5)
+    names: Any = None
+
+    def numbers(self) -> tuple[int, ...]:
+        """Shape of a row, images as [height, width, channels] whatever their order is."""
+        if self.dtype == "video" and len(self.shape) == 3 and self.shape[0] == 3 != self.shape[2]:
+            return (self.shape[1], self.shape[2], 3)
+        return self.shape
+
+
+class DatasetInfo(BaseModel):
+    """What a reader needs from `info.json`."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    codebase_version: str = Field(max_length=32)
+    fps: int = Field(ge=1, le=1000)
+    features: dict[str, FeatureInfo] = Field(max_length=10_000)
+    total_episodes: int = Field(ge=0, le=MAX_EPISODES)
+    data_path: str = Field(max_length=512)
+    video_path: str | None = Field(default=None, max_length=512)
+    robot_type: str | None = None
+
+
+@dataclass(frozen=True)
+class EpisodeEntry:
+    """One row of the table of episodes."""
+
+    index: int
+    length: int
+    task: str
+    row: dict[str, Any]
+
+
+class LeRobotFolder:
+    """A dataset on disk; only its metadata is read before something is asked for.
+
+    Args:
+        folder: root of the dataset.
+
+    Raises:
+        NotFoundError: a file of the metadata is missing.
+        InvalidInputError: another version of the format.
+        CorruptDataError: metadata that is damaged or leads out of the folder.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.info = _read_info(folder)
+        tasks = _read_tasks(folder)
+        self.episodes = _read_episodes(folder, self.info, tasks)
+        self._table: tuple[Path, pa.Table] | None = None
+
+    def columns(self, entry: EpisodeEntry, names: list[str]) -> dict[str, np.ndarray]:
+        """Columns [n, *shape] of one episode by feature.
+
+        Raises:
+            NotFoundError: the data file is missing.
+            CorruptDataError: it does not hold the episode's frames in order.
+        """
+        path = self.data_file(entry)
+        table = self._rows(path, entry)
+        where = f"{path}: episode {entry.index}"
+        if table.num_rows != entry.length:
+            raise CorruptDataError(f"{where}: got {table.num_rows} frames, expected {entry.length}")
+        order = column_values(table, "frame_index", [1], where=where)
+        if not np.array_equal(order, np.arange(entry.length)):
+            raise CorruptDataError(f"{where}: frame_index does not count its frames from 0")
+        shapes = {name: self.info.features[name].shape for name in names}
+        return {name: column_values(table, name, shapes[name], where=where) for name in names}
+
+    def data_file(self, entry: EpisodeEntry) -> Path:
+        """The parquet file with an episode's frames."""
+        return self._path(self.info.data_path, entry, "data")
+
+    def span(self, entry: EpisodeEntry, key: str) -> VideoSpan:
+        """Where the images of an episode's camera are.
+
+        Raises:
+            CorruptDataError: the table of episodes does not say.
+        """
+        if self.info.video_path is None:
+            raise CorruptDataError(f"{self.folder}: has video features but no video_path")
+        start = entry.row.get(f"videos/{key}/from_timestamp")
+        if not isinstance(start, float) or not 0 <= start < 1e9:
+            raise CorruptDataError(
+                f"{self.folder}: episode {entry.index} does not say where {key!r} begins ({start})"
+            )
+        path = self._path(self.info.video_path, entry, f"videos/{key}", video_key=key)
+        shape = self.info.features[key].numbers()
+        return VideoSpan(path, start, entry.length, self.info.fps, shape)
+
+    def _path(self, template: str, entry: EpisodeEntry, prefix: str, **values: str) -> Path:
+        numbers = {n: entry.row.get(f"{prefix}/{n}") for n in ("chunk_index", "file_index")}
+        places = {n: v for n, v in numbers.items() if isinstance(v, int) and v >= 0}
+        if len(places) != len(numbers):
+            raise CorruptDataError(
+                f"{self.folder}: episode {entry.index} does not say its file of {prefix!r}"
+            )
+        return layout.confined(self.folder, layout.fill_path(template, **places, **values))
+
+    def _rows(self, path: Path, entry: EpisodeEntry) -> pa.Table:
+        # Episodes share files and come in order: the last file is most often the next one, too.
+        if self._table is None or self._table[0] != path:
+            wanted = [n for n, f in self.info.features.items() if f.dtype != "video"]
+            self._table = path, read_table(path, wanted)
+        table = self._table[1]
+        missing = {"episode_index", "frame_index"} - set(table.column_names)
+        if missing:
+            raise CorruptDataError(f"{path}: has no columns {sorted(missing)}")
+        owners = column_values(table, "episode_index", [1], where=str(path))
+        rows = np.flatnonzero(owners == entry.index)
+        if len(rows) and int(rows[-1]) - int(rows[0]) + 1 != len(rows):
+            raise CorruptDataError(f"{path}: frames of episode {entry.index} lie apart")
+        return table.slice(int(rows[0]) if len(rows) else 0, len(rows))
+
+
+def _read_info(folder: Path) -> DatasetInfo:
+    path = layout.confined(folder, layout.INFO_FILE)
+    if not path.is_file():
+        raise NotFoundError(f"{path}: is missing; {folder} is no LeRobot dataset")
+    with disk_errors(f"read {path}"):
+        if path.stat().st_size > MAX_INFO_BYTES:
+            raise CorruptDataError(f"{path}: is larger than {MAX_INFO_BYTES} bytes")
+        data = path.read_bytes()
+    try:
+        plain = json.loads(data)
+        version = plain["codebase_version"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CorruptDataError(f"{path}: is no description of a dataset ({error})") from error
+    if not isinstance(version, str) or not version.startswith("v3."):
+        raise InvalidInputError(
+            f"{path}: got format {version!r}, expected v3.x; convert it with "
+            "lerobot.scripts.convert_dataset_v21_to_v30"
+        )
+    try:
+        return DatasetInfo.model_validate(plain)
+    except ValidationError as error:
+        raise CorruptDataError(f"{path}: is no description of a dataset ({error})") from error
+
+
+def _read_tasks(folder: Path) -> dict[int, str]:
+    path = layout.confined(folder, layout.TASKS_FILE)
+    table = read_table(path)
+    # Older writers call the index column as pandas does when it has no name.
+    text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
+    if text is None or "task_index" not in table.column_names:
+        raise CorruptDataError(
+            f"{path}: got columns {table.column_names}, expected task_index, task"
+        )
+    numbers, texts = table.column("task_index").to_pylist(), table.column(text).to_pylist()
+    return {int(n): str(t) for n, t in zip(numbers, texts, strict=True) if n is not None}
+
+
+def _episode_rows(folder: Path, info: DatasetInfo) -> Iterator[dict[str, Any]]:
+    videos = [name for name, feature in info.features.items() if feature.dtype == "video"]
+    places = [f"{p}/{i}" for p in ("data", *(f"videos/{v}" for v in videos)) for i in _INDICES]
+    starts = [f"videos/{name}/from_timestamp" for name in videos]
+    wanted = ["episode_index", "length", "tasks", *places, *starts]
+    paths = sorted((folder / "meta" / "episodes").glob("*/*.parquet"))
+    if not paths:
+        raise NotFoundError(f"{folder}: meta/episodes holds no table of episodes")
+    for path in paths:
+        inside = layout.confined(folder, str(path.relative_to(folder)))
+        yield from read_table(inside, wanted).to_pylist()
+
+
+_INDICES = ("chunk_index", "file_index")
+
+
+def _read_episodes(
+    folder: Path, info: DatasetInfo, tasks: dict[int, str]
+) -> tuple[EpisodeEntry, ...]:
+    entries: list[EpisodeEntry] = []
+    for row in _episode_rows(folder, info):
+        index, length = row.get("episode_index"), row.get("length")
+        if not isinstance(index, int) or not isinstance(length, int):
+            raise CorruptDataError(f"{folder}: an episode has no index or no length ({row})")
+        if index != len(entries) or not 1 <= length <= MAX_EPISODE_FRAMES:
+            raise CorruptDataError(
+                f"{folder}: got episode {index} of {length} frames, expected episode "
+                f"{len(entries)} of 1 … {MAX_EPISODE_FRAMES} frames"
+            )
+        said = row.get("tasks") or list(tasks.values())[:1] or [""]
+        entries.append(EpisodeEntry(index, length, str(said[0]), row))
+    if len(entries) != info.total_episodes:
+        raise CorruptDataError(
+            f"{folder}: table lists {len(entries)} episodes, info.json says {info.total_episodes}; "
+            "the dataset was not finished"
+        )
+    return tuple(entries)
