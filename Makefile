@@ -6,7 +6,7 @@ LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow fix clean bench-lerobot check-lerobot-export
+.PHONY: demo test check slow fix clean bench bench-lerobot check-lerobot-export
 .DEFAULT_GOAL := demo
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
@@ -33,6 +33,9 @@ check: $(VENV)/.dev      ## format, lint, types, import contracts
 	$(BIN)/ruff check .
 	$(BIN)/mypy -p dextouch -p services
 	PYTHONPATH=.:shared $(BIN)/lint-imports
+
+bench: $(VENV)/.dev      ## time the stages against their errors; results in runs/bench
+	$(BIN)/dextouch bench store --out runs/bench $(ARGS)
 
 fix: $(VENV)/.dev        ## let the tools mend what they can
 	$(BIN)/ruff format .

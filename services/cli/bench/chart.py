@@ -7,6 +7,8 @@ from html import escape
 
 _WIDTH, _HEIGHT = 460, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 18, 34, 48
+# About the mean width of a letter at the font size of the chart.
+_CHARACTER_PX = 6.6
 _OURS, _RIVAL, _LINE, _TEXT = "#c2410c", "#475569", "#cbd5e1", "#1e293b"
 
 
@@ -105,22 +107,38 @@ def _panel(panel: Panel) -> list[str]:
 
 
 def _points(points: Sequence[Point], axes: _Axes) -> list[str]:
-    """Dots with whiskers; labels move down where one would lie on another."""
-    parts, taken = [], list[tuple[float, float]]()
-    for point in sorted(points, key=lambda p: (p.error, p.time), reverse=True):
-        x, y = axes.x_px(point.time), axes.y_px(point.error)
+    """Dots with whiskers, each with its label where it covers neither a dot nor a label."""
+    parts = []
+    dots = [(axes.x_px(point.time), axes.y_px(point.error)) for point in points]
+    taken = [(x - 6, y - 6, x + 6, y + 6) for x, y in dots]
+    for point, (x, y) in zip(points, dots, strict=True):
         colour = _OURS if point.is_ours else _RIVAL
-        label_y = y - 8
-        while any(abs(label_y - ty) < 12 and abs(x - tx) < 110 for tx, ty in taken):
-            label_y += 13
-        taken.append((x, label_y))
-        anchor = "end" if x > _WIDTH * 0.62 else "start"
+        left, baseline = _label_place(len(point.label) * _CHARACTER_PX, x, y, taken)
         parts.append(
             f'<path d="M{axes.x_px(point.time_low):.1f} {y:.1f}H{axes.x_px(point.time_high):.1f}" '
             f'stroke="{colour}" stroke-width="2"/>'
             f'<circle cx="{x:.1f}" cy="{y:.1f}" r="5" fill="{colour}">'
             f"<title>{escape(point.label)}: {point.time:.3g}, {point.error:.3g}</title></circle>"
-            f'<text x="{x:.1f}" y="{label_y:.1f}" text-anchor="{anchor}" fill="{colour}">'
-            f"{escape(point.label)}</text>"
+            f'<text x="{left:.1f}" y="{baseline:.1f}" fill="{colour}">{escape(point.label)}</text>'
         )
     return parts
+
+
+def _label_place(
+    width: float, x: float, y: float, taken: list[tuple[float, float, float, float]]
+) -> tuple[float, float]:
+    """Left end and baseline of a label near its dot; its box is added to those taken."""
+    right = _WIDTH - _RIGHT
+    for row in (0, 1, -1, 2, -2, 3, -3, 4):
+        baseline = y - 9 + 13 * row + (6 if row > 0 else 0)
+        for left in (x - 4, x - width + 4):
+            box = (left, baseline - 10, left + width, baseline + 3)
+            inside = left >= _LEFT - 8 and left + width <= right + 8 and baseline > _TOP - 4
+            if inside and not any(_overlap(box, other) for other in taken):
+                taken.append(box)
+                return left, baseline
+    return max(_LEFT, min(x, right - width)), y - 9
+
+
+def _overlap(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
