@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, WriteOptions
 from dextouch.episodes.log import SpoolReader
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import JPEG_UNIT
+from dextouch.streams.checks import ENCODED_UNITS
 
 COPY_SAMPLES = 256
 # Images are some fifty thousand bytes each.
@@ -27,9 +27,12 @@ def commit_spool(
         StorageFullError: no space; nothing remains, the spool stays.
     """
     reader = SpoolReader(spool)
-    with store.writer(kind="recording", attributes=attributes) as writer:
+    # What a kill leaves of the copy is worth nothing: the spool has it all, and a recording that
+    # was recovered from half a copy would stand in the way of the whole one.
+    options = WriteOptions(recoverable=False)
+    with store.writer(kind="recording", attributes=attributes, options=options) as writer:
         for name, descriptor in reader.streams.items():
-            num_samples = COPY_IMAGES if descriptor.unit == JPEG_UNIT else COPY_SAMPLES
+            num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else COPY_SAMPLES
             for batch in reader.batches(name, num_samples=num_samples):
                 writer.append(
                     name,

@@ -159,7 +159,13 @@ class Ingest:
         with self._guard:
             self._open.pop(recording_id)
         upload.close()
-        counts = self._commit(self._path(recording_id), attributes)
+        try:
+            counts = self._commit(self._path(recording_id), attributes)
+        except ConflictError:
+            # A process that outlived the service before this one may have ended its commit.
+            if not self._store.exists(recording_id, kind="recording"):
+                raise
+            return
         logger.info("recording_finished", recording_id=recording_id, num_samples=counts)
 
     @contextmanager

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
+from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader
 from dextouch.episodes.window_codec import encode_window
 from dextouch.errors import LimitExceededError
 from dextouch.schemas.episodes import EpisodeDetail
@@ -21,7 +21,10 @@ ANSWER_VERSION = 1
 
 
 class WindowQuery(BaseModel):
-    """Which window is asked for; `cameras` are names with commas between, none when empty."""
+    """Which window is asked for; `cameras` are names with commas between, none when empty.
+
+    Images come at half size in both axes, or gray with one channel, if so asked.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -29,10 +32,16 @@ class WindowQuery(BaseModel):
     num_steps: int = Field(default=17, ge=1)
     cameras: str = "camera_head"
     action_kind: ActionKind = "measured"
+    half_size: bool = False
+    gray: bool = False
 
     def camera_names(self) -> tuple[str, ...]:
         """The names."""
         return tuple(name for name in self.cameras.split(",") if name)
+
+    def image_form(self) -> ImageForm:
+        """What is wanted of each image."""
+        return ImageForm(half_size=self.half_size, gray=self.gray)
 
 
 class SpanQuery(BaseModel):
@@ -101,8 +110,12 @@ class StoreReader:
         etag = etag_of(reader, "window", query)
         if is_known(etag, known):
             return Answer(etag, None)
-        cameras = query.camera_names()
-        step_bytes = sum(prod(reader.streams[c].shape) for c in cameras if c in reader.streams)
+        cameras, form = query.camera_names(), query.image_form()
+        # An unknown camera is the reader's to refuse.
+        known_cameras = [reader.streams[name] for name in cameras if name in reader.streams]
+        step_bytes = sum(
+            prod(form.shape(stream.shape)) for stream in known_cameras if len(stream.shape) == 3
+        )
         if query.num_steps * step_bytes > self._max_bytes:
             allowed = self._max_bytes // step_bytes
             raise LimitExceededError(
@@ -113,7 +126,11 @@ class StoreReader:
                 expected=allowed,
             )
         window = reader.window(
-            query.start, query.num_steps, cameras=cameras, action_kind=query.action_kind
+            query.start,
+            query.num_steps,
+            cameras=cameras,
+            action_kind=query.action_kind,
+            form=form,
         )
         return Answer(etag, encode_window(window))
 

@@ -1,6 +1,7 @@
 """The store over HTTP: attributes and batches in, receipts, lists, windows and samples out."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from datetime import datetime
 from types import TracebackType
 from typing import TypeVar
 from urllib.parse import quote
@@ -12,15 +13,17 @@ from pydantic import BaseModel, ValidationError
 from dextouch.episodes.window import StreamData, Window
 from dextouch.episodes.window_codec import decode_window
 from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.schemas.episodes import EpisodeDetail, EpisodeList
+from dextouch.schemas.episodes import CatalogHours, EpisodeDetail, EpisodeList
 from dextouch.schemas.problems import Problem, error_from_problem
 from dextouch.schemas.recordings import (
     BatchReceipt,
+    ExpireUploads,
     FinishRecording,
     LedgerEntry,
     RecordingAttributes,
     RecordingList,
     RecordingStatus,
+    UploadList,
 )
 from dextouch.schemas.rollouts import ActionKind
 from dextouch.streams.descriptors import StreamDescriptor
@@ -29,7 +32,9 @@ from dextouch.streams.samples import SampleBatch
 from dextouch.streams.wire import encode_batch
 
 M = TypeVar("M", bound=BaseModel)
-Query = Mapping[str, str | int | None]
+Scalar = str | int | float | bool | datetime
+Query = Mapping[str, Scalar | Sequence[str] | None]
+WINDOW_TYPE = "application/vnd.dextouch.window+msgpack"
 MAX_ANSWER_BYTES = 128 * 2**20
 DEFAULT_TIMEOUT_S = 30.0
 
@@ -110,9 +115,14 @@ class EpisodeStoreClient:
         path = f"/v1/recordings/{_part(recording_id)}/finish"
         return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
 
-    def recordings(self) -> RecordingList:
-        """Finished recordings."""
-        return self._model(RecordingList, "GET", "/v1/recordings")
+    def recordings(self, **wanted: Scalar | Sequence[str] | None) -> RecordingList:
+        """Finished recordings that match every given filter.
+
+        Args:
+            wanted: filters and page, as the service names them (docs/wire_format.md), such as
+                `station="bench"`, `min_quality=["coverage:0.95"]`, `after="take-7"`.
+        """
+        return self._model(RecordingList, "GET", "/v1/recordings", query=wanted)
 
     def recording_attributes(self, recording_id: str) -> RecordingAttributes:
         """What a finished recording says about itself."""
@@ -134,12 +144,22 @@ class EpisodeStoreClient:
             arrays["t_host_ns"], arrays["t_device_ns"], arrays["sequence"], arrays["values"]
         )
 
-    def episodes(
-        self, *, task: str | None = None, domain: str | None = None, origin: str | None = None
-    ) -> EpisodeList:
-        """Episodes that match every given filter."""
-        query = {"task": task, "domain": domain, "origin": origin}
-        return self._model(EpisodeList, "GET", "/v1/episodes", query=query)
+    def episodes(self, **wanted: Scalar | Sequence[str] | None) -> EpisodeList:
+        """One page of the episodes that match every given filter, named as in `recordings`."""
+        return self._model(EpisodeList, "GET", "/v1/episodes", query=wanted)
+
+    def hours(self, **wanted: Scalar | Sequence[str] | None) -> CatalogHours:
+        """Hours of the episodes that match, by task, domain and origin."""
+        return self._model(CatalogHours, "GET", "/v1/catalog/hours", query=wanted)
+
+    def uploads(self, *, idle_s: float = 0.0) -> UploadList:
+        """Unfinished uploads for which nothing has come for so long."""
+        return self._model(UploadList, "GET", "/v1/uploads", query={"idle_s": idle_s})
+
+    def expire_uploads(self, *, idle_s: float) -> UploadList:
+        """Drop unfinished uploads for which nothing has come for so long; those that went."""
+        body = ExpireUploads(idle_s=idle_s).model_dump_json()
+        return self._model(UploadList, "POST", "/v1/uploads/expire", content=body)
 
     def episode(self, episode_id: str) -> EpisodeDetail:
         """What an episode says about itself."""
@@ -166,6 +186,7 @@ class EpisodeStoreClient:
         *,
         cameras: tuple[str, ...] = ("camera_head",),
         action_kind: ActionKind = "measured",
+        half_size: bool = False,
     ) -> Window:
         """A window on the model grid, as `EpisodeReader.window` gives it."""
         query: Query = {
@@ -173,8 +194,10 @@ class EpisodeStoreClient:
             "num_steps": num_steps,
             "cameras": ",".join(cameras),
             "action_kind": action_kind,
+            "half_size": half_size,
         }
-        response = self._send("GET", f"/v1/episodes/{_part(episode_id)}/windows", query=query)
+        path = f"/v1/episodes/{_part(episode_id)}/windows"
+        response = self._send("GET", path, query=query, accept=WINDOW_TYPE)
         return decode_window(response.content, max_bytes=MAX_ANSWER_BYTES)
 
     def _arrays(self, path: str, query: Query) -> dict[str, np.ndarray]:
@@ -205,16 +228,19 @@ class EpisodeStoreClient:
         *,
         query: Query | None = None,
         content: bytes | str | None = None,
+        accept: str = "*/*",
     ) -> httpx.Response:
-        kind = "application/octet-stream" if isinstance(content, bytes) else "application/json"
-        asked = {key: value for key, value in (query or {}).items() if value is not None}
+        headers = {"accept": accept}
+        if content is not None:
+            binary = isinstance(content, bytes)
+            headers["content-type"] = "application/octet-stream" if binary else "application/json"
         try:
             response = self._http.request(
                 method,
                 path,
-                params=httpx.QueryParams(asked),
+                params=httpx.QueryParams(_params(query or {})),
                 content=content,
-                headers={"content-type": kind} if content is not None else {},
+                headers=headers,
             )
         except httpx.TransportError as error:
             raise UnavailableError(
@@ -230,10 +256,21 @@ def _refusal(response: httpx.Response) -> DexTouchError:
     try:
         return error_from_problem(Problem.model_validate_json(response.content))
     except ValidationError:
+        # A proxy in between may say when to come again, too.
+        seconds = response.headers.get("retry-after", "")
         return UnavailableError(
             f"episode store: {response.request.method} {response.request.url.path} answered "
-            f"{response.status_code} without a reason"
+            f"{response.status_code} without a reason",
+            **({"retry_after_s": int(seconds)} if seconds.isdecimal() else {}),
         )
+
+
+def _params(query: Query) -> dict[str, str | int | float | bool | Sequence[str]]:
+    return {
+        key: value.isoformat() if isinstance(value, datetime) else value
+        for key, value in query.items()
+        if value is not None
+    }
 
 
 def _part(text: str) -> str:
