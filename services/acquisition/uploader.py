@@ -80,6 +80,8 @@ class Uploader:
         self._period_s = period_s
         self._keep_uploaded = keep_uploaded
         self._errors: dict[str, str] = {}
+        # How long the store asked to be left alone.
+        self._retry_after_s = 0.0
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="upload", daemon=True)
 
@@ -111,9 +113,11 @@ class Uploader:
     def upload_all(self) -> list[str]:
         """Send every closed take that the store lacks; ids of those that it has now.
 
-        A take that cannot be sent is reported by `status` and tried again at the next call.
+        A take that cannot be sent is reported by `status` and tried again at the next call. A
+        store that is busy or full says when to come again, and is asked for nothing else before.
         """
         done = []
+        self._retry_after_s = 0.0
         for path in _spools(self._spool_root):
             if (path / UPLOADED_FILE).exists() or self._stopping.is_set():
                 continue
@@ -125,12 +129,15 @@ class Uploader:
                 if self._errors.get(path.name) != error.message:
                     logger.warning("fail_upload", recording_id=path.name, error=error.message)
                 self._errors[path.name] = error.message
+                if "retry_after_s" in error.details:
+                    self._retry_after_s = float(str(error.details["retry_after_s"]))
+                    break
         return done
 
     def _run(self) -> None:
         while not self._stopping.is_set():
             self.upload_all()
-            self._stopping.wait(self._period_s)
+            self._stopping.wait(max(self._period_s, self._retry_after_s))
 
     def _upload(self, path: Path) -> bool:
         spool = SpoolReader(path)
