@@ -50,12 +50,12 @@ class _MappedFiles:
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._guard = threading.Lock()
-        self._maps: OrderedDict[tuple[str, int, int, int], mmap.mmap] = OrderedDict()
+        self._maps: OrderedDict[tuple[Path, int, int, int], mmap.mmap] = OrderedDict()
 
-    def get(self, path: str) -> memoryview | None:
+    def get(self, path: Path) -> memoryview | None:
         """The file's bytes; None where it is missing or empty."""
         try:
-            status = Path(path).stat()
+            status = path.stat()
         except (FileNotFoundError, NotADirectoryError):
             return None
         # A file of the same name that was written anew is another file.
@@ -80,7 +80,7 @@ class _MappedFiles:
         self._maps.clear()
 
     @staticmethod
-    def _map(path: str) -> mmap.mmap:
+    def _map(path: Path) -> mmap.mmap:
         descriptor = os.open(path, os.O_RDONLY)
         try:
             return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
@@ -97,7 +97,7 @@ class LocalFile:
     """A file on this machine, mapped into memory when it is first read."""
 
     def __init__(self, path: Path) -> None:
-        self._path = str(path)
+        self._path = path
 
     def size(self) -> int | None:
         """Its length in bytes; None where there is no such file."""

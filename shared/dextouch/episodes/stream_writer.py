@@ -37,6 +37,8 @@ class StreamWriter:
     ) -> None:
         self.descriptor, self._kind, self._options = descriptor, kind, options
         self._last_stamp_ns: int | None = None
+        # Whether values come as numbers or as encoded images; the first block decides.
+        self._plain: bool | None = None
         self._images = _EncodedImages(descriptor, options.video)
         self._queue: ImageQueue | None = None
         entries = stream_arrays(descriptor, kind)
@@ -62,11 +64,18 @@ class StreamWriter:
         if not len(values):
             return
         # All checks come before the first byte, so that a refused block leaves no trace.
-        if codec_of(self.descriptor) == "zstd" or values.dtype != object:
+        plain = codec_of(self.descriptor) == "zstd" or values.dtype != object
+        if self._plain is not None and self._plain != plain:
+            raise InvalidInputError(
+                f"{name}: got {'plain' if plain else 'encoded'} images after "
+                f"{'encoded' if plain else 'plain'} ones, expected one kind in a stream"
+            )
+        if plain:
             self._check_values(values)
         else:
             self._images.check(values)
         self._check_order(stamps[STAMPS[self._kind][0]])
+        self._plain = plain
         if codec_of(self.descriptor) == "zstd":
             self.arrays[name].append(values)
             self._append_stamps(stamps)
@@ -164,10 +173,6 @@ class _EncodedImages:
     def check(self, values: np.ndarray) -> None:
         """Refuse encoded images that are none of this stream."""
         name = self._descriptor.name
-        if self.encoder is not None:
-            raise InvalidInputError(
-                f"{name}: got encoded images after plain ones, expected one kind in a stream"
-            )
         for index, data in enumerate(values):
             number = self._num_given + index
             where = f"{name}: image {number}"
@@ -202,11 +207,6 @@ class _EncodedImages:
             self.encoder = f"simplejpeg quality {DEFAULT_QUALITY}"
             return encode_jpeg(image)
         if self._video is None:
-            if self._num_given:
-                raise InvalidInputError(
-                    f"{self._descriptor.name}: got plain images after encoded ones, expected one "
-                    "kind in a stream"
-                )
             height, width, _ = self._descriptor.shape
             rate_hz = self._descriptor.nominal_rate_hz
             self._video = GopEncoder(height, width, rate_hz=rate_hz, settings=self._settings)

@@ -1,0 +1,283 @@
+"""H.264 groups: what goes in comes out near, only what is asked is decoded, nothing is mixed up."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore, ImageForm, VideoSettings, WriteOptions
+from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes.image_codecs import ImageChunks, pack_chunk, transform_pixels
+from dextouch.episodes.video import GopDecoder, GopEncoder, is_keyframe
+from dextouch.errors import (
+    CorruptDataError,
+    InvalidInputError,
+    ShapeError,
+    StorageFullError,
+    UnknownNameError,
+)
+from dextouch.images.jpeg import encode_jpeg, jpeg_values
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+
+HEIGHT, WIDTH, COUNT = 48, 64, 21
+FULL = ImageForm()
+
+
+def moving_images(count=COUNT, *, seed=5):
+    """A smooth coloured scene that moves two pixels an image."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[: HEIGHT + 16, : WIDTH + 48][..., None] / 12.0
+    waves = [np.sin(rng.uniform(-1, 1) * x + rng.uniform(-1, 1) * y + [0, 1, 2]) for _ in range(4)]
+    scene = 128 + 28 * np.sum(waves, axis=0)
+    return np.stack(
+        [scene[i % 16 : i % 16 + HEIGHT, 2 * i % 48 : 2 * i % 48 + WIDTH] for i in range(count)]
+    ).astype(np.uint8)
+
+
+def camera(name="camera_head", unit="h264", shape=(HEIGHT, WIDTH, 3)):
+    return StreamDescriptor(
+        name=name, kind="image", shape=shape, dtype="uint8", unit=unit, nominal_rate_hz=30
+    )
+
+
+def attributes(*streams, recording_id="take-1"):
+    return RecordingAttributes(
+        recording_id=recording_id,
+        task="stand_bottle",
+        instruction="",
+        domain="human",
+        station="bench",
+        streams=streams,
+    )
+
+
+def stamps(count, first=0):
+    return np.arange(first, first + count, dtype=np.int64)
+
+
+def write(store, images, *, unit="h264", options=None, block=1, recording_id="take-1"):
+    take = attributes(camera(unit=unit), recording_id=recording_id)
+    with store.writer(kind="recording", attributes=take, options=options) as writer:
+        for start in range(0, len(images), block):
+            values = images[start : start + block]
+            writer.append("camera_head", values=values, t_host_ns=stamps(len(values), start))
+    return store.recording(recording_id)
+
+
+def psnr_db(got, true):
+    return 10 * np.log10(255**2 / np.mean((got.astype(float) - true) ** 2))
+
+
+@pytest.fixture
+def encoder():
+    return GopEncoder(HEIGHT, WIDTH, rate_hz=30.0, settings=VideoSettings())
+
+
+def test_every_eighth_image_begins_a_group(encoder):
+    kinds = [is_keyframe(encoder.encode(image)) for image in moving_images()]
+    assert kinds == [index % GOP_IMAGES == 0 for index in range(COUNT)]
+    assert not is_keyframe(b"")
+    assert not is_keyframe(b"\x00\x00\x01")
+
+
+@pytest.mark.parametrize("crf", [10, 26, 40])
+def test_images_come_back_near(store, crf):
+    images = moving_images()
+    options = WriteOptions(video=VideoSettings(crf=crf))
+    got = write(store, images, options=options).images("camera_head")
+    least_db = {10: 38, 26: 30, 40: 22}[crf]
+    assert psnr_db(got, images) > least_db
+    # An image in another place would be far off.
+    assert psnr_db(got[1:], images[:-1]) < least_db - 5
+
+
+def test_any_span_equals_the_whole(store):
+    reader = write(store, moving_images())
+    whole = reader.images("camera_head")
+    for start in range(COUNT):
+        for stop in range(start, COUNT + 1):
+            np.testing.assert_array_equal(
+                reader.images("camera_head", start, stop), whole[start:stop]
+            )
+
+
+@pytest.mark.parametrize("unit", ["h264", "jpeg", "rgb8"])
+def test_forms_are_near_the_plain_way(store, unit):
+    images = moving_images()
+    reader = write(store, images, unit=unit)
+    full = reader.images("camera_head", 3, 14)
+    for form in (
+        ImageForm(half_size=True),
+        ImageForm(gray=True),
+        ImageForm(half_size=True, gray=True),
+    ):
+        got = reader.images("camera_head", 3, 14, form=form)
+        assert got.shape == (11, *form.shape((HEIGHT, WIDTH, 3)))
+        assert abs(got.astype(int) - transform_pixels(full, form)).mean() < 2.5, form
+
+
+def test_images_go_into_the_callers_buffer(store):
+    reader = write(store, moving_images())
+    out = np.zeros((5, HEIGHT, WIDTH, 3), np.uint8)
+    assert reader.images("camera_head", 6, 11, out=out) is out
+    np.testing.assert_array_equal(out, reader.images("camera_head", 6, 11))
+    with pytest.raises(ShapeError, match="out is"):
+        reader.images("camera_head", 6, 12, out=out)
+    with pytest.raises(InvalidInputError, match="within 0 … 21"):
+        reader.images("camera_head", 6, 22)
+    with pytest.raises(UnknownNameError, match="camera_head"):
+        reader.images("camera")
+
+
+def test_threads_and_blocks_do_not_matter(store):
+    images = moving_images(40)
+    digests = set()
+    for number, (threads, block) in enumerate([(True, 1), (False, 1), (True, 7), (False, 40)]):
+        options = WriteOptions(threads=threads)
+        reader = write(store, images, options=options, block=block, recording_id=f"take-{number}")
+        digests.add(reader.array_sha256("camera_head"))
+    assert len(digests) == 1
+
+
+def test_the_writer_keeps_its_own_copy(store):
+    images = moving_images(16)
+    buffer = np.empty((1, HEIGHT, WIDTH, 3), np.uint8)
+    with store.writer(kind="recording", attributes=attributes(camera())) as writer:
+        for index, image in enumerate(images):
+            buffer[0] = image
+            writer.append("camera_head", values=buffer, t_host_ns=stamps(1, index))
+            buffer[0] = 0
+    assert psnr_db(store.recording("take-1").images("camera_head"), images) > 30
+
+
+def test_access_units_are_kept_as_they_come(store, encoder):
+    images = moving_images()
+    units = [encoder.encode(image) for image in images]
+    reader = write(store, jpeg_values(units), block=5)
+    for start, stop in [(0, COUNT), (0, 0), (7, 9), (20, 21)]:
+        assert reader.encoded_images("camera_head", start, stop) == units[start:stop]
+    assert psnr_db(reader.images("camera_head"), images) > 30
+
+
+def test_groups_of_another_length_are_refused(store, encoder):
+    units = [encoder.encode(image) for image in moving_images(9)]
+    with store.writer(kind="recording", attributes=attributes(camera())) as writer:
+        with pytest.raises(InvalidInputError, match="image 0: is no key frame"):
+            writer.append("camera_head", values=jpeg_values(units[1:2]), t_host_ns=stamps(1))
+        writer.append("camera_head", values=jpeg_values(units[:3]), t_host_ns=stamps(3))
+        with pytest.raises(InvalidInputError, match="image 3: is a key frame"):
+            writer.append("camera_head", values=jpeg_values(units[:1]), t_host_ns=stamps(1, 3))
+        with pytest.raises(InvalidInputError, match="start code"):
+            writer.append("camera_head", values=jpeg_values([b"abc"]), t_host_ns=stamps(1, 3))
+        bad = np.array([None], dtype=object)
+        with pytest.raises(ShapeError, match="expected bytes"):
+            writer.append("camera_head", values=bad, t_host_ns=stamps(1, 3))
+        writer.append("camera_head", values=jpeg_values(units[3:]), t_host_ns=stamps(6, 3))
+    assert store.recording("take-1").encoded_images("camera_head", 0, 9) == units
+
+
+def test_plain_and_encoded_images_are_not_mixed(store, encoder):
+    images = moving_images(8)
+    unit = jpeg_values([encoder.encode(images[0])])
+    with store.writer(kind="recording", attributes=attributes(camera())) as writer:
+        writer.append("camera_head", values=images, t_host_ns=stamps(8))
+        with pytest.raises(InvalidInputError, match="got encoded images after plain ones"):
+            writer.append("camera_head", values=unit, t_host_ns=stamps(1, 8))
+    assert store.recording("take-1").num_samples("camera_head") == 8
+
+
+@pytest.mark.parametrize("shape", [(47, 64, 3), (48, 63, 3)])
+def test_odd_sizes_are_refused_at_once(store, shape):
+    with pytest.raises(InvalidInputError, match="even"):
+        store.writer(kind="recording", attributes=attributes(camera(shape=shape)))
+
+
+def test_what_finds_the_queue_full_is_dropped_and_counted(store, monkeypatch):
+    gate = threading.Event()
+    real = GopEncoder.encode
+
+    def slow(self, image):
+        gate.wait()
+        return real(self, image)
+
+    monkeypatch.setattr(GopEncoder, "encode", slow)
+    images = moving_images(50)
+    options = WriteOptions(when_full="drop")
+    with store.writer(kind="recording", attributes=attributes(camera()), options=options) as writer:
+        for index, image in enumerate(images):
+            writer.append("camera_head", values=image[None], t_host_ns=stamps(1, index))
+        gate.set()
+    reader = store.recording("take-1")
+    (entry,) = reader.attributes.ledger
+    assert (entry.event, entry.count) == ("dropped_before_encoder", 18)
+    kept = reader.read("camera_head").t_host_ns
+    assert kept.tolist() == list(range(32))
+    assert psnr_db(reader.images("camera_head"), images[kept]) > 30
+
+
+def test_a_full_disk_in_the_encoders_thread_is_said(store, file_size_limit):
+    noise = np.random.default_rng(1).integers(0, 255, (64, HEIGHT, WIDTH, 3), dtype=np.uint8)
+    with file_size_limit(8192), pytest.raises(StorageFullError, match="no space left"):
+        write(store, noise)
+    assert store.list(kind="recording") == []
+
+
+def test_a_live_take_is_followed(store):
+    images = moving_images(30)
+    options = WriteOptions(threads=False)
+    glove = StreamDescriptor(
+        name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
+    )
+    take = attributes(camera(), glove)
+    with store.writer(kind="recording", attributes=take, options=options) as writer:
+        counts = []
+        for index, image in enumerate(images):
+            writer.append("camera_head", values=image[None], t_host_ns=stamps(1, index))
+            writer.append("force", values=np.full((1, 2), index, "f4"), t_host_ns=stamps(1, index))
+            live = store.live("take-1")
+            counts.append((live.num_samples("camera_head"), live.num_samples("force")))
+            force = live.read("force")
+            assert (force.values[:, 0] == force.t_host_ns).all()
+        got = live.images("camera_head")
+        with pytest.raises(InvalidInputError, match="still being written"):
+            live.verify()
+    assert counts == [((n + 1) // 8 * 8, (n + 1) // 5 * 5) for n in range(30)]
+    np.testing.assert_array_equal(got, store.recording("take-1").images("camera_head", 0, 24))
+
+
+def test_a_forged_size_is_refused_before_it_is_decoded():
+    large = GopEncoder(4096, 4096, rate_hz=30.0, settings=VideoSettings())
+    unit = large.encode(np.zeros((4096, 4096, 3), np.uint8))
+    chunks = ImageChunks("h264", (HEIGHT, WIDTH, 3), GOP_IMAGES, "camera")
+    out = np.empty((1, HEIGHT, WIDTH, 3), np.uint8)
+    with pytest.raises(CorruptDataError, match="camera: storage chunk 4"):
+        chunks.decode(pack_chunk("h264", [unit]), 4, [0], FULL, out)
+    jpeg = ImageChunks("jpeg", (HEIGHT, WIDTH, 3), 1, "camera")
+    with pytest.raises(CorruptDataError, match="expected"):
+        jpeg.decode(encode_jpeg(np.zeros((8, 8, 3), np.uint8)), 0, [0], FULL, out)
+
+
+def test_bytes_that_are_no_group_are_refused(encoder):
+    units = [encoder.encode(image) for image in moving_images(8)]
+    chunks = ImageChunks("h264", (HEIGHT, WIDTH, 3), GOP_IMAGES, "camera")
+    out = np.empty((1, HEIGHT, WIDTH, 3), np.uint8)
+    whole = pack_chunk("h264", units)
+    assert chunks.unpack(whole, 0) == units
+    for bad in (b"", whole[:3], whole[:20], whole[:-1], whole + b"x", bytes(40)):
+        with pytest.raises(CorruptDataError, match="storage chunk 0"):
+            chunks.decode(bad, 0, [0], FULL, out)
+    with pytest.raises(CorruptDataError, match="expected image 5"):
+        chunks.decode(pack_chunk("h264", units[:5]), 0, [5], FULL, out)
+    decoder = GopDecoder(HEIGHT, WIDTH)
+    with pytest.raises(CorruptDataError):
+        decoder.decode(units[1:3], [0, 1], FULL, np.empty((2, HEIGHT, WIDTH, 3), np.uint8))
+    # The decoder is as good as new afterwards.
+    decoder.decode(units[:1], [0], FULL, out)
+    assert psnr_db(out[0], moving_images(1)[0]) > 30
+
+
+def test_encoded_images_are_asked_of_encoded_streams_only(store):
+    reader = write(EpisodeStore(store.root), moving_images(3), unit="rgb8")
+    with pytest.raises(InvalidInputError, match="rgb8"):
+        reader.encoded_images("camera_head", 0, 1)
