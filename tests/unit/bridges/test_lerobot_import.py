@@ -1,0 +1,273 @@
+"""Datasets back into the store: our own as they were on the grid, others by a mapping of names."""
+
+import shutil
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError, NonFiniteError, UnknownNameError
+from dextouch.hands.actions import poses_from_actions
+from tests.unit.bridges.lerobot_edits import (
+    DATA,
+    EPISODES,
+    INFO,
+    drop_columns,
+    edit_column,
+    edit_json,
+    rename_columns,
+    set_item,
+)
+from tests.unit.bridges.lerobot_episodes import CAMERAS, make_episode
+from tests.unit.bridges.lerobot_structure import problems
+
+K_HEAD = ((50.0, 0.0, 32.0), (0.0, 50.0, 24.0), (0.0, 0.0, 1.0))
+OURS = ("dextouch.action_measured", "dextouch.tactile_valid", "dextouch.t_ref_ns")
+
+
+@pytest.fixture
+def store(tmp_path):
+    return EpisodeStore(tmp_path / "store")
+
+
+@pytest.fixture
+def other(tmp_path):
+    return EpisodeStore(tmp_path / "other")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "dataset"
+
+
+def two(store, **changes):
+    lengths = {3: 17, 4: 21}
+    return [make_episode(seed=s, num_steps=n, **changes).write(store) for s, n in lengths.items()]
+
+
+def foreign(store, folder):
+    """A dataset as others write it: their camera's name, no columns and files of ours."""
+    export_lerobot(two(store), folder, repo_id="touch")
+    shutil.rmtree(folder / "meta/dextouch")
+
+    def theirs(name):
+        return name.replace("images.camera_head", "images.top")
+
+    def features(info):
+        kept = {n: f for n, f in info["features"].items() if not n.startswith("dextouch.")}
+        info["features"] = {theirs(name): feature for name, feature in kept.items()}
+
+    edit_json(folder, INFO, features)
+    drop_columns(folder, DATA, *OURS, "dextouch.image_dt_ns")
+    rename_columns(folder, EPISODES, theirs)
+    videos = folder / "videos"
+    (videos / "observation.images.camera_head").rename(videos / "observation.images.top")
+    return folder
+
+
+@pytest.mark.parametrize("unit", ["rgb8", "jpeg", "h264"])
+def test_our_own_dataset_gives_back_the_episodes(store, other, folder, unit):
+    readers = two(store)
+    export_lerobot(readers, folder, repo_id="touch")
+    assert import_lerobot(folder, other, options=ImportOptions(images=unit)) == other.list()
+    assert other.list() == [reader.attributes.episode_id for reader in readers]
+    for reader in readers:
+        back = other.open(reader.attributes.episode_id)
+        back.verify()
+        count = reader.num_steps
+        expected, got = (e.window(0, count, cameras=CAMERAS) for e in (reader, back))
+        np.testing.assert_array_equal(got.t_ref_ns, expected.t_ref_ns)
+        np.testing.assert_array_equal(got.tactile_kpa, expected.tactile_kpa)
+        np.testing.assert_array_equal(got.tactile_valid, expected.tactile_valid)
+        np.testing.assert_array_equal(got.K_head, expected.K_head)
+        assert got.instruction == expected.instruction
+        for stream in ("action", "action_commanded"):
+            values = reader.read(stream).values.astype(np.float32).astype(np.float64)
+            np.testing.assert_array_equal(back.read(stream).values, values)
+        for camera in CAMERAS:
+            np.testing.assert_array_equal(got.image_dt_ns[camera], expected.image_dt_ns[camera])
+            error = got.images[camera].astype(int) - expected.images[camera]
+            assert np.abs(error).mean() < 5
+            assert back.streams[camera].unit == unit
+
+
+def test_attributes_come_back_with_the_episode_in_the_lineage(store, other, folder):
+    reader = two(store)[0]
+    export_lerobot([reader], folder, repo_id="touch")
+    import_lerobot(folder, other)
+    back = other.open(reader.attributes.episode_id).attributes
+    assert back.lineage[:-1] == reader.attributes.lineage
+    assert back.lineage[-1].model_dump() == {
+        "kind": "episode",
+        "id": reader.attributes.episode_id,
+        "sha256": reader.content_sha256,
+    }
+    for name in set(type(back).model_fields) - {"lineage", "streams"}:
+        assert getattr(back, name) == getattr(reader.attributes, name), name
+
+
+@pytest.mark.parametrize("fps", [15, 30, 20])
+def test_what_was_imported_exports_to_the_same_numbers(store, other, tmp_path, fps):
+    options = ExportOptions(fps=fps)
+    export_lerobot(two(store), tmp_path / "first", repo_id="touch", options=options)
+    ids = import_lerobot(tmp_path / "first", other, options=ImportOptions(images="rgb8"))
+    again = [other.open(name) for name in ids]
+    export_lerobot(again, tmp_path / "second", repo_id="touch", options=options)
+    assert problems(tmp_path / "second") == []
+    first, second = (pq.read_table(tmp_path / name / DATA) for name in ("first", "second"))
+    assert first.column_names == second.column_names
+    for name in first.column_names:
+        before, after = (np.array(t.column(name).to_pylist()) for t in (first, second))
+        np.testing.assert_allclose(after, before, atol=2e-6, err_msg=name)
+
+
+def test_h264_comes_back_to_the_byte(store, other, folder):
+    readers = two(store, unit="h264")
+    export_lerobot(readers, folder, repo_id="touch", options=ExportOptions(fps=30))
+    import_lerobot(folder, other)
+    for reader in readers:
+        back = other.open(reader.attributes.episode_id)
+        for camera in CAMERAS:
+            count = reader.num_samples(camera)
+            stored, copied = (e.encoded_images(camera, 0, count) for e in (reader, back))
+            assert copied == stored
+            np.testing.assert_array_equal(back.stamps_ns(camera), reader.stamps_ns(camera))
+
+
+def test_lost_touch_stays_lost_and_repeated_images_come_once(store, other, folder):
+    made = make_episode(camera_hz=10)
+    keep = np.ones(len(made.stamps_ns["tactile_left"]), dtype=bool)
+    keep[9:13] = False
+    for arrays in (made.stamps_ns, made.values):
+        arrays["tactile_left"] = arrays["tactile_left"][keep]
+    reader = made.write(store)
+    export_lerobot([reader], folder, repo_id="touch")
+    import_lerobot(folder, other, options=ImportOptions(images="rgb8"))
+    back = other.open(reader.attributes.episode_id)
+    window = back.window(0, 17)
+    assert window.tactile_valid[:, 0].tolist() == [True] * 3 + [False] + [True] * 13
+    np.testing.assert_array_equal(window.tactile_kpa, reader.window(0, 17).tactile_kpa)
+    np.testing.assert_array_equal(back.stamps_ns("camera_head"), reader.stamps_ns("camera_head"))
+    error = back.images("camera_head").astype(int) - reader.images("camera_head")
+    assert np.abs(error).mean() < 4
+
+
+def test_frames_off_the_model_grid_keep_their_absolute_poses(store, other, folder):
+    made = make_episode()
+    made.stamps_ns["camera_head"] = made.stamps_ns["camera_head"] + 5_000_000
+    reader = made.write(store)
+    export_lerobot([reader], folder, repo_id="touch", options=ExportOptions(fps=30))
+    import_lerobot(folder, other)
+    back = other.open(reader.attributes.episode_id)
+    assert back.attributes.model_rate_hz == 30
+    np.testing.assert_allclose(
+        back.read("action").values[0, :9], [0, 0, 0, 1, 0, 0, 0, 1, 0], atol=1e-6
+    )
+    state = np.array(pq.read_table(folder / DATA).column("observation.state").to_pylist())
+    poses = poses_from_actions(back.read("action").values, back.attributes.anchor.to_poses())
+    np.testing.assert_allclose(poses.Ts_world_wrist_left[:, :3, 3], state[:, :3], atol=2e-6)
+    sent = poses_from_actions(
+        back.read("action_commanded").values, back.attributes.anchor.to_poses()
+    )
+    moved = np.linalg.norm(sent.Ts_world_wrist_left - poses.Ts_world_wrist_left, axis=(1, 2))
+    np.testing.assert_allclose(moved, 0.01 * np.sqrt(3), atol=1e-5)
+
+
+def test_ids_that_exist_are_refused_and_a_prefix_helps(store, folder):
+    readers = two(store)
+    export_lerobot(readers, folder, repo_id="touch")
+    with pytest.raises(ConflictError, match="id_prefix"):
+        import_lerobot(folder, store)
+    ids = import_lerobot(folder, store, options=ImportOptions(id_prefix="again-"))
+    assert ids == [f"again-{reader.attributes.episode_id}" for reader in readers]
+
+
+def test_datasets_of_others_come_in_by_a_mapping(store, other, folder):
+    readers = two(store)
+    shutil.rmtree(store.root)
+    foreign(store, folder)
+    options = ImportOptions(
+        mapping={"camera_head": "observation.images.top"}, K_head=K_HEAD, images="rgb8", task="pour"
+    )
+    assert import_lerobot(folder, other, options=options) == ["dataset-000000", "dataset-000001"]
+    back = other.open("dataset-000001")
+    said = back.attributes
+    assert (said.origin, said.domain, said.task) == ("recorded", "robot", "pour")
+    assert said.instruction == "lift the bottle"
+    assert said.K_head == K_HEAD
+    assert said.lineage[0].id == "lerobot:dataset/episode-000001"
+    assert len(said.lineage[0].sha256) == 64
+    assert set(back.streams) == {"tactile_left", "tactile_right", "action", *CAMERAS}
+    original = make_episode(seed=4, num_steps=21)
+    np.testing.assert_allclose(
+        back.read("action").values, original.values["action_commanded"], atol=1e-6
+    )
+    np.testing.assert_array_equal(
+        back.stamps_ns("action"), np.rint(np.arange(21) * 1e9 / 15).astype(np.int64)
+    )
+    np.testing.assert_allclose(
+        said.anchor.to_poses().T_world_wrist_left,
+        original.trajectory.Ts_world_wrist_left[0],
+        atol=1e-6,
+    )
+    assert len(readers) == 2
+
+
+def test_what_is_missing_is_listed_with_what_there_is(store, other, folder):
+    foreign(store, folder)
+    edit_json(folder, INFO, lambda info: info["features"]["action"].update(shape=[7]))
+    with pytest.raises(InvalidInputError) as caught:
+        import_lerobot(folder, other)
+    message = caught.value.message
+    assert "'action': 'action' is float32 [7], expected float32 [67]" in message
+    assert "'camera_head': no video feature 'observation.images.camera_head'" in message
+    assert "'observation.images.top' video [48, 64, 3]" in message
+    assert "mapping=" in message
+    assert other.list() == []
+
+
+def test_a_mapping_of_unknown_names_is_refused(store, other, folder):
+    foreign(store, folder)
+    for mapping, words in (
+        ({"gripper": "action"}, "gripper"),
+        ({"camera_head": "observation.images.front"}, "observation.images.front"),
+    ):
+        with pytest.raises(UnknownNameError, match=words):
+            import_lerobot(folder, other, options=ImportOptions(mapping=mapping))
+    wrong = {"camera_head": "observation.state"}
+    with pytest.raises(InvalidInputError, match="expected video"):
+        import_lerobot(folder, other, options=ImportOptions(mapping=wrong))
+
+
+def test_other_datasets_need_a_camera_matrix(store, other, folder):
+    foreign(store, folder)
+    mapping = {"camera_head": "observation.images.top"}
+    with pytest.raises(InvalidInputError, match="K_head="):
+        import_lerobot(folder, other, options=ImportOptions(mapping=mapping))
+    assert other.list() == []
+
+
+def test_other_datasets_with_channels_first_and_without_touch(store, other, folder):
+    foreign(store, folder)
+
+    def change(info):
+        info["features"]["observation.images.top"]["shape"] = [3, 48, 64]
+        del info["features"]["observation.tactile"]
+        del info["features"]["observation.state"]
+
+    edit_json(folder, INFO, change)
+    mapping = {"camera_head": "observation.images.top"}
+    import_lerobot(folder, other, options=ImportOptions(mapping=mapping, K_head=K_HEAD))
+    back = other.open("dataset-000000")
+    assert set(back.streams) == {"action", *CAMERAS}
+    assert back.attributes.anchor.to_poses().T_world_wrist_left.tolist() == np.eye(4).tolist()
+
+
+def test_nan_is_refused_and_nothing_of_the_episode_stays(store, other, folder):
+    export_lerobot(two(store), folder, repo_id="touch")
+    edit_column(folder, DATA, "action", set_item(20, [float("nan")] * 67))
+    with pytest.raises(NonFiniteError, match="NaN"):
+        import_lerobot(folder, other)
+    assert other.list() == ["stand-bottle-0003"]
