@@ -2,12 +2,14 @@
 
 import errno
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
 from dextouch.errors import StorageError, StorageFullError
 
+_SYNC_THREADS = 16
 # EFBIG: the file size limit of the process or file system; for a recording the same decision.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
@@ -47,11 +49,30 @@ def sync_folder(path: Path) -> None:
         os.close(descriptor)
 
 
-def write_file(path: Path, data: bytes) -> None:
-    """A new file with these bytes, on the disk when this returns."""
+def write_file(path: Path, data: bytes, *, sync: bool = True) -> None:
+    """A new file with these bytes, on the disk when this returns unless `sync` is off."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
     try:
         write_all(descriptor, data)
+        if sync:
+            os.fdatasync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def sync_files(paths: Iterable[Path]) -> None:
+    """Make many files survive a power loss.
+
+    At the same time, because a file system then writes its journal once for many of them.
+    """
+    with ThreadPoolExecutor(_SYNC_THREADS, thread_name_prefix="sync") as threads:
+        for _ in threads.map(_sync_file, paths):
+            pass
+
+
+def _sync_file(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
         os.fdatasync(descriptor)
     finally:
         os.close(descriptor)

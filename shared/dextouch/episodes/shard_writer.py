@@ -93,13 +93,12 @@ class ShardWriter:
 def finish_shard(
     stage: Path, name: str, entry: ArrayEntry, log: JournalWriter, index: list[tuple[int, int]]
 ) -> None:
-    """Append the shard's index to a log's part file, sync it, and put it in the shard's place.
+    """Append the shard's index to a log's part file and put it in the shard's place.
 
     The journal stays until the whole group is committed: a crash before that is mended from it.
     """
     data = np.array(index, dtype="<u8").reshape(-1, 2).tobytes()
     log.write_tail(data + google_crc32c.value(data).to_bytes(4, "little"))
-    log.sync()
     log.close()
     target = stage / name / shard_path(len(entry.shape))
     with disk_errors(f"close array {name}"):

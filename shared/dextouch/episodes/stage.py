@@ -11,7 +11,7 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
+from dextouch.episodes.files import disk_errors, replace_file, sync_files, sync_folder, write_file
 from dextouch.episodes.format import (
     COMMIT_FILE,
     METADATA_FILE,
@@ -22,6 +22,7 @@ from dextouch.episodes.format import (
     encode_commit,
     group_metadata,
     sha256_hex,
+    shard_path,
 )
 from dextouch.episodes.shard_writer import forget_journal
 from dextouch.errors import ConflictError, CorruptDataError
@@ -87,8 +88,12 @@ def commit_stage(
     )
     with disk_errors(f"commit {record.id}"):
         for name, entry in entries.items():
-            write_file(stage / name / METADATA_FILE, array_metadata(entry))
-        write_file(stage / METADATA_FILE, group)
+            write_file(stage / name / METADATA_FILE, array_metadata(entry), sync=False)
+        write_file(stage / METADATA_FILE, group, sync=False)
+        # All that the commit record vouches for is on the disk before the record is.
+        shards = [stage / name / shard_path(len(entry.shape)) for name, entry in entries.items()]
+        metadata = [stage / name / METADATA_FILE for name in entries]
+        sync_files([*shards, *metadata, stage / METADATA_FILE])
         write_file(stage / COMMIT_FILE, encode_commit(record)[0])
     publish_stage(stage, target, record)
 
