@@ -232,6 +232,7 @@ def test_a_mapping_of_unknown_names_is_refused(store, other, folder):
     foreign(store, folder)
     for mapping, words in (
         ({"gripper": "action"}, "gripper"),
+        ({"camera_../x": "action"}, "camera_../x"),
         ({"camera_head": "observation.images.front"}, "observation.images.front"),
     ):
         with pytest.raises(UnknownNameError, match=words):
@@ -246,6 +247,9 @@ def test_other_datasets_need_a_camera_matrix(store, other, folder):
     mapping = {"camera_head": "observation.images.top"}
     with pytest.raises(InvalidInputError, match="K_head="):
         import_lerobot(folder, other, options=ImportOptions(mapping=mapping))
+    for wrong in ({"K_head": ((1.0,),)}, {"K_head": K_HEAD, "id_prefix": "../"}):
+        with pytest.raises(InvalidInputError, match="no episode"):
+            import_lerobot(folder, other, options=ImportOptions(mapping=mapping, **wrong))
     assert other.list() == []
 
 

@@ -12,7 +12,16 @@ from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
 from dextouch.bridges.lerobot.video_reader import VideoSpan
 from dextouch.errors import CorruptDataError
-from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
+from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
+from dextouch.tactile.layout import NUM_TAXELS
+
+# What our own exports keep beside LeRobot's features; None: one number a camera.
+_OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
+    layout.MEASURED: ("float32", (ACTION_DIM,)),
+    layout.VALID: ("bool", (2,)),
+    layout.STAMP: ("int64", (1,)),
+    layout.IMAGE_DT: ("int64", None),
+}
 
 
 @dataclass(frozen=True)
@@ -83,9 +92,17 @@ def content_of(
 def _columns(
     source: LeRobotFolder, entry: EpisodeEntry, features: FeatureMap
 ) -> dict[str, np.ndarray]:
-    ours = (layout.MEASURED, layout.VALID, layout.STAMP, layout.IMAGE_DT)
     wanted = [features.action, features.state, features.tactile]
-    wanted += [name for name in ours if name in source.info.features]
+    for name, (dtype, shape) in _OURS.items():
+        feature = source.info.features.get(name)
+        if feature is None:
+            continue
+        if feature.dtype != dtype or (shape is not None and feature.shape != shape):
+            raise CorruptDataError(
+                f"{source.folder}: feature {name!r} is {feature.dtype} {list(feature.shape)}, "
+                f"expected {dtype} {list(shape or ['cameras'])}"
+            )
+        wanted.append(name)
     return source.columns(entry, [name for name in wanted if name is not None])
 
 
@@ -117,7 +134,7 @@ def _tactile(
     columns: dict[str, np.ndarray], features: FeatureMap, count: int
 ) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
     if features.tactile is None:
-        return np.zeros((count, 2, 320), dtype=np.float32), np.zeros((count, 2), dtype=bool)
+        return np.zeros((count, 2, NUM_TAXELS), dtype=np.float32), np.zeros((count, 2), dtype=bool)
     kpa = columns[features.tactile].astype(np.float32)
     valid = columns.get(layout.VALID)
     return kpa, np.ones((count, 2), dtype=bool) if valid is None else valid.astype(bool)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from pydantic import ValidationError
 
 from dextouch.bridges.lerobot.content import EpisodeContent, content_of
 from dextouch.bridges.lerobot.mapping import FeatureMap, map_features
@@ -97,7 +98,7 @@ def _known_attributes(
         "anchor": known.anchor if content.anchor is None else _stored(content.anchor),
         "streams": (),
     }
-    return EpisodeAttributes.model_validate(known.model_dump() | changes)
+    return _checked(known.model_dump() | changes)
 
 
 def _foreign_attributes(
@@ -117,21 +118,32 @@ def _foreign_attributes(
     with disk_errors(f"read {data_file}"), data_file.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
     anchor = content.anchor or AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
-    return EpisodeAttributes(
-        episode_id=f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
-        task=(options.task or entry.task or "unknown")[:128],
-        instruction=entry.task[:2000],
-        domain=options.domain,
-        origin="recorded",
-        model_rate_hz=float(source.info.fps),
-        anchor=_stored(anchor),
-        K_head=options.K_head,
-        lineage=(
-            LineageEntry(
-                kind="recording", id=f"lerobot:{name}/episode-{entry.index:06d}", sha256=digest
+    return _checked(
+        {
+            "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
+            "task": (options.task or entry.task or "unknown")[:128],
+            "instruction": entry.task[:2000],
+            "domain": options.domain,
+            "origin": "recorded",
+            "model_rate_hz": float(source.info.fps),
+            "anchor": _stored(anchor),
+            "K_head": options.K_head,
+            "lineage": (
+                LineageEntry(
+                    kind="recording", id=f"lerobot:{name}/episode-{entry.index:06d}", sha256=digest
+                ),
             ),
-        ),
+        }
     )
+
+
+def _checked(fields: Mapping[str, object]) -> EpisodeAttributes:
+    try:
+        return EpisodeAttributes.model_validate(fields)
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"import from LeRobot: the options make no episode ({error})"
+        ) from error
 
 
 def _stored(anchor: AnchorPoses) -> StoredAnchor:

@@ -1,5 +1,6 @@
 """Features of any LeRobot dataset and a few names in, which of them are what of an episode out."""
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -10,8 +11,9 @@ from dextouch.hands.actions import ACTION_DIM
 from dextouch.tactile.layout import NUM_TAXELS
 
 FLOATS = ("float32", "float64")
-ACTION, STATE, TACTILE, CAMERA_PREFIX = "action", "state", "tactile", "camera_"
+ACTION, STATE, TACTILE = "action", "state", "tactile"
 HEAD = "camera_head"
+_CAMERA_NAME = re.compile(r"camera_[a-z0-9_]{1,57}")
 _DEFAULTS = {ACTION: layout.ACTION, STATE: layout.STATE, TACTILE: layout.TACTILE}
 _SHAPES = {ACTION: (ACTION_DIM,), STATE: (ACTION_DIM,), TACTILE: (2, NUM_TAXELS)}
 
@@ -40,7 +42,7 @@ def map_features(info: DatasetInfo, names: Mapping[str, str]) -> FeatureMap:
             listed, with what the dataset has instead.
     """
     for ours, theirs in names.items():
-        if ours not in _DEFAULTS and not ours.startswith(CAMERA_PREFIX):
+        if ours not in _DEFAULTS and not _CAMERA_NAME.fullmatch(ours):
             raise UnknownNameError("name of a mapping", ours, [*_DEFAULTS, "camera_…"])
         if theirs not in info.features:
             raise UnknownNameError("feature of the dataset", theirs, list(info.features))
@@ -75,11 +77,12 @@ def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
     cameras = {
         name.removeprefix(layout.IMAGES): name
         for name, feature in info.features.items()
-        if name.startswith(layout.IMAGES + CAMERA_PREFIX)
+        if name.startswith(layout.IMAGES)
+        and _CAMERA_NAME.fullmatch(name.removeprefix(layout.IMAGES))
         and feature.dtype == "video"
         and name not in taken
     }
-    return cameras | {n: f for n, f in names.items() if n.startswith(CAMERA_PREFIX)}
+    return cameras | {n: f for n, f in names.items() if n not in _DEFAULTS}
 
 
 def _problem(info: DatasetInfo, ours: str, feature: str, *, needed: bool) -> str | None:

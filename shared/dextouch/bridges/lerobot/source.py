@@ -11,7 +11,7 @@ import pyarrow as pa
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.tables import column_values, read_table
+from dextouch.bridges.lerobot.tables import column_values, read_table, table_rows
 from dextouch.bridges.lerobot.video_reader import VideoSpan
 from dextouch.episodes.files import disk_errors
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
@@ -95,8 +95,16 @@ class LeRobotFolder:
         order = column_values(table, "frame_index", [1], where=where)
         if not np.array_equal(order, np.arange(entry.length)):
             raise CorruptDataError(f"{where}: frame_index does not count its frames from 0")
-        shapes = {name: self.info.features[name].shape for name in names}
-        return {name: column_values(table, name, shapes[name], where=where) for name in names}
+        return {name: self._column(table, name, where) for name in names}
+
+    def _column(self, table: pa.Table, name: str, where: str) -> np.ndarray:
+        feature = self.info.features[name]
+        values = column_values(table, name, feature.shape, where=where)
+        if values.dtype.name != feature.dtype:
+            raise CorruptDataError(
+                f"{where}: column {name!r} is {values.dtype}, info.json promises {feature.dtype}"
+            )
+        return values
 
     def data_file(self, entry: EpisodeEntry) -> Path:
         """The parquet file with an episode's frames."""
@@ -134,9 +142,6 @@ class LeRobotFolder:
             wanted = [n for n, f in self.info.features.items() if f.dtype != "video"]
             self._table = path, read_table(path, wanted)
         table = self._table[1]
-        missing = {"episode_index", "frame_index"} - set(table.column_names)
-        if missing:
-            raise CorruptDataError(f"{path}: has no columns {sorted(missing)}")
         owners = column_values(table, "episode_index", [1], where=str(path))
         rows = np.flatnonzero(owners == entry.index)
         if len(rows) and int(rows[-1]) - int(rows[0]) + 1 != len(rows):
@@ -168,7 +173,7 @@ def _read_info(folder: Path) -> DatasetInfo:
         raise CorruptDataError(f"{path}: is no description of a dataset ({error})") from error
 
 
-def _read_tasks(folder: Path) -> dict[int, str]:
+def _read_tasks(folder: Path) -> list[str]:
     path = layout.confined(folder, layout.TASKS_FILE)
     table = read_table(path)
     # Older writers call the index column as pandas does when it has no name.
@@ -177,8 +182,7 @@ def _read_tasks(folder: Path) -> dict[int, str]:
         raise CorruptDataError(
             f"{path}: got columns {table.column_names}, expected task_index, task"
         )
-    numbers, texts = table.column("task_index").to_pylist(), table.column(text).to_pylist()
-    return {int(n): str(t) for n, t in zip(numbers, texts, strict=True) if n is not None}
+    return [str(row[text]) for row in table_rows(table, where=str(path))]
 
 
 def _episode_rows(folder: Path, info: DatasetInfo) -> Iterator[dict[str, Any]]:
@@ -191,15 +195,13 @@ def _episode_rows(folder: Path, info: DatasetInfo) -> Iterator[dict[str, Any]]:
         raise NotFoundError(f"{folder}: meta/episodes holds no table of episodes")
     for path in paths:
         inside = layout.confined(folder, str(path.relative_to(folder)))
-        yield from read_table(inside, wanted).to_pylist()
+        yield from table_rows(read_table(inside, wanted), where=str(path))
 
 
 _INDICES = ("chunk_index", "file_index")
 
 
-def _read_episodes(
-    folder: Path, info: DatasetInfo, tasks: dict[int, str]
-) -> tuple[EpisodeEntry, ...]:
+def _read_episodes(folder: Path, info: DatasetInfo, tasks: list[str]) -> tuple[EpisodeEntry, ...]:
     entries: list[EpisodeEntry] = []
     for row in _episode_rows(folder, info):
         index, length = row.get("episode_index"), row.get("length")
@@ -210,8 +212,9 @@ def _read_episodes(
                 f"{folder}: got episode {index} of {length} frames, expected episode "
                 f"{len(entries)} of 1 … {MAX_EPISODE_FRAMES} frames"
             )
-        said = row.get("tasks") or list(tasks.values())[:1] or [""]
-        entries.append(EpisodeEntry(index, length, str(said[0]), row))
+        said = row.get("tasks") or tasks[:1] or [""]
+        text = str(said[0]) if isinstance(said, list) else str(said)
+        entries.append(EpisodeEntry(index, length, text, row))
     if len(entries) != info.total_episodes:
         raise CorruptDataError(
             f"{folder}: table lists {len(entries)} episodes, info.json says {info.total_episodes}; "

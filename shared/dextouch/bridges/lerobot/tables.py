@@ -209,28 +209,52 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
         ) from error
 
 
+def table_rows(table: pa.Table, *, where: str) -> list[dict[str, Any]]:
+    """A small table as plain rows.
+
+    Raises:
+        CorruptDataError: values that cannot be represented.
+    """
+    try:
+        return table.to_pylist()
+    except (pa.ArrowException, ValueError, OverflowError) as error:
+        raise CorruptDataError(f"{where}: holds values that are none ({error})") from error
+
+
 def column_values(table: pa.Table, name: str, shape: Sequence[int], *, where: str) -> np.ndarray:
     """A column as an array [n, *shape]; shape [1] gives [n].
 
     Raises:
-        CorruptDataError: rows that are missing values or have another shape.
+        CorruptDataError: no such column, rows that are missing values or have another shape, or
+            values that are no numbers.
     """
+    if name not in table.column_names:
+        raise CorruptDataError(f"{where}: has no column {name!r}, which info.json promises")
+    try:
+        return _plain(table, name, shape, where)
+    except pa.ArrowException as error:
+        raise CorruptDataError(f"{where}: column {name!r} is damaged ({error})") from error
+
+
+def _plain(table: pa.Table, name: str, shape: Sequence[int], where: str) -> np.ndarray:
     column: Any = table.column(name).combine_chunks()
-    if column.null_count:
-        raise CorruptDataError(f"{where}: column {name!r} has {column.null_count} empty rows")
+    # Some writers wrap arrays in a type of their own.
+    column = getattr(column, "storage", column)
     row_shape = () if list(shape) == [1] else tuple(shape)
     lengths: list[int] = []
-    while "list" in str(column.type):
-        sizes = np.unique(column.value_lengths().to_numpy(zero_copy_only=False))
+    num_empty = int(column.null_count)
+    while hasattr(column, "value_lengths"):
         # Rows of unequal length would shift all that follow.
-        lengths.append(int(sizes[0]) if len(sizes) == 1 else -1)
+        sizes = np.unique(column.value_lengths().to_numpy(zero_copy_only=False))
+        lengths.append(int(sizes[0]) if len(sizes) == 1 and num_empty == 0 else -1)
         column = column.flatten()
-    if table.num_rows and (column.null_count or lengths not in ([*row_shape], [*shape])):
+        num_empty += int(column.null_count)
+    if table.num_rows and (num_empty or lengths not in ([*row_shape], [*shape])):
         raise CorruptDataError(
-            f"{where}: column {name!r} holds rows of {lengths or 'single values'}, "
-            f"expected {list(shape)} and no empty values"
+            f"{where}: column {name!r} holds rows of {lengths or 'single values'} with "
+            f"{num_empty} empty values, expected {list(shape)} and none"
         )
     values = column.to_numpy(zero_copy_only=False)
-    if values.dtype == object:
+    if values.dtype.kind not in "biuf":
         raise CorruptDataError(f"{where}: column {name!r} holds no numbers ({column.type})")
     return values.reshape(table.num_rows, *row_shape)
