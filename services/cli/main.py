@@ -31,6 +31,12 @@ COMMANDS = {
     "store": Command(
         "services.episode_store.__main__", "list, show, verify, delete, serve episodes"
     ),
+    "export": Command(
+        "services.cli.exports", "write LeRobot, MCAP, Rerun or UMI files from a store", ("export",)
+    ),
+    "import": Command(
+        "services.cli.exports", "read LeRobot, MCAP or UMI files into a store", ("import",)
+    ),
     "align": Command("services.alignment.__main__", "turn recordings into synchronized episodes"),
     "train": Command("services.cli.train", "train the world model, a policy or the success probe"),
     "serve": Command(

@@ -1,0 +1,307 @@
+"""`dextouch export …` and `dextouch import …`: a store in, files of other tools out, and back."""
+
+import argparse
+import json
+import shutil
+import textwrap
+import uuid
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.console import Console
+from rich.progress import track
+
+from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
+from dextouch.errors import (
+    ConflictError,
+    InvalidInputError,
+    NotFoundError,
+    UnavailableError,
+)
+
+Reader = EpisodeReader | RecordingReader
+Report = dict[str, object]
+
+_EXPORT_HELP = """\
+formats:
+  lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
+  umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
+  mcap     one file an episode or recording, every sample; opens in Foxglove
+  rrd      one file an episode or recording, every sample; opens in Rerun (cannot be imported)
+
+examples:
+  dextouch export --format mcap --store data/store stand-bottle-0003 --to take.mcap
+  dextouch export --format mcap --store data/store --kind recording --operator p17 --to takes/
+  dextouch export --format lerobot --store data/store --task stand_bottle --to data/lerobot
+  dextouch export --format umi --store data/store --domain robot --to robot.zarr.zip
+  dextouch export --format rrd --store data/store stand-bottle-0003 --to take.rrd
+"""
+_IMPORT_HELP = """\
+examples:
+  dextouch import --format mcap take.mcap --store data/store
+  dextouch import --format mcap takes/ --store data/store
+  dextouch import --format umi robot.zarr.zip --store data/store
+  dextouch import --format lerobot data/lerobot --store data/store --id-prefix theirs-
+
+What each format keeps and loses: docs/bridges.md
+"""
+
+
+class _Single(NamedTuple):
+    """A format with one file an episode or recording."""
+
+    suffix: str
+    export: Callable[[Reader, Path, argparse.Namespace], int]
+
+
+def _export_mcap(reader: Reader, path: Path, options: argparse.Namespace) -> int:
+    from dextouch.bridges.mcap import export_mcap
+
+    return export_mcap(reader, path, overwrite=options.force, jpeg_quality=options.jpeg_quality)
+
+
+def _export_rrd(reader: Reader, path: Path, options: argparse.Namespace) -> int:
+    from dextouch.bridges.rerun import export_rrd
+
+    return export_rrd(reader, path, overwrite=options.force)
+
+
+def _export_umi(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
+    from dextouch.bridges.umi import export_umi
+
+    return export_umi(readers, options.to, overwrite=options.force)
+
+
+def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespace) -> int:
+    from dextouch.bridges.lerobot import ExportOptions, export_lerobot
+
+    with _replaced(options.to, force=options.force):
+        chosen = ExportOptions(fps=options.fps)
+        return export_lerobot(readers, options.to, repo_id=options.repo_id, options=chosen)
+
+
+_SINGLE = {"mcap": _Single(".mcap", _export_mcap), "rrd": _Single(".rrd", _export_rrd)}
+_JOINT = {"umi": _export_umi, "lerobot": _export_lerobot}
+_EXTRAS = {"rrd": "rerun"}
+
+
+@contextmanager
+def _needs(format_name: str) -> Iterator[None]:
+    """Say which extra brings a missing package.
+
+    Raises:
+        UnavailableError: a package of the format is not installed.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        extra = _EXTRAS.get(format_name, "export")
+        raise UnavailableError(
+            f"format {format_name!r} needs the package {error.name!r}; "
+            f"pip install 'dextouch-wm[{extra}]'"
+        ) from error
+
+
+@contextmanager
+def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
+    """Put an existing data set aside; it comes back if the new one fails.
+
+    Raises:
+        ConflictError: the folder exists and may not, or must not, be replaced.
+    """
+    if not folder.exists():
+        yield
+        return
+    if not force:
+        raise ConflictError(f"{folder}: exists already; choose another folder or add --force")
+    if not (folder / "meta" / "info.json").is_file():
+        raise ConflictError(f"{folder}: is no LeRobot data set, so --force does not remove it")
+    aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.old")
+    folder.rename(aside)
+    try:
+        yield
+    except BaseException:
+        aside.rename(folder)
+        raise
+    shutil.rmtree(aside)
+
+
+def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
+    """The named ids, or those that pass the filters.
+
+    Raises:
+        InvalidInputError: both ids and filters, or an id twice.
+        NotFoundError: nothing to export.
+    """
+    wanted = {key: getattr(options, key) for key in ("task", "domain", "operator")}
+    wanted = {key: value for key, value in wanted.items() if value is not None}
+    if options.ids and wanted:
+        raise InvalidInputError(f"got ids and filters {sorted(wanted)}; expected one of the two")
+    if len(set(options.ids)) != len(options.ids):
+        raise InvalidInputError("got an id twice; expected every id once")
+    if options.ids:
+        return list(options.ids)
+    found = []
+    for item_id in store.list(kind=options.kind):
+        attributes = _open(store, options.kind, item_id).attributes
+        if all(getattr(attributes, key) == value for key, value in wanted.items()):
+            found.append(item_id)
+    if not found:
+        raise NotFoundError(
+            f"{options.store}: no {options.kind} matches {wanted or 'anything'}; "
+            "`dextouch store list` says what is there"
+        )
+    return found
+
+
+def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
+    return store.recording(item_id) if kind == "recording" else store.open(item_id)
+
+
+def _progress(items: Iterable[str], total: int, what: str) -> Iterable[str]:
+    """The items, with a bar on stderr where somebody looks at it."""
+    console = Console(stderr=True)
+    return track(
+        items, total=total, description=what, console=console, disable=not console.is_terminal
+    )
+
+
+def _export(options: argparse.Namespace) -> Report:
+    store = EpisodeStore(options.store)
+    if options.format in _JOINT and options.kind == "recording":
+        raise InvalidInputError(
+            f"format {options.format!r} holds episodes only; export recordings as mcap or rrd"
+        )
+    ids = _ids(store, options)
+    report: Report = {"format": options.format, "kind": options.kind, "ids": ids}
+    if options.format in _SINGLE:
+        return report | {"files": _export_each(store, ids, options)}
+    readers = (
+        store.open(item_id) for item_id in _progress(ids, len(ids), f"export {options.format}")
+    )
+    num_steps = _JOINT[options.format](readers, options)
+    print(f"{options.to}  {len(ids)} episodes  {num_steps} steps")
+    return report | {"path": str(options.to), "num_steps": num_steps}
+
+
+def _export_each(
+    store: EpisodeStore, ids: list[str], options: argparse.Namespace
+) -> list[dict[str, object]]:
+    form = _SINGLE[options.format]
+    paths = _paths(ids, options.to, form.suffix)
+    taken = [path for path in paths.values() if path.exists()]
+    if taken and not options.force:
+        raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
+    files: list[dict[str, object]] = []
+    for item_id in _progress(ids, len(ids), f"export {options.format}"):
+        path = paths[item_id]
+        count = form.export(_open(store, options.kind, item_id), path, options)
+        files.append({"id": item_id, "path": str(path), "num_messages": count})
+        print(f"{path}  {count} messages")
+    return files
+
+
+def _paths(ids: list[str], to: Path, suffix: str) -> dict[str, Path]:
+    """One file for one id, a folder of files otherwise."""
+    if to.suffix != suffix:
+        return {item_id: to / f"{item_id}{suffix}" for item_id in ids}
+    if len(ids) > 1:
+        raise InvalidInputError(f"--to {to}: got one file for {len(ids)} ids; name a folder")
+    return {ids[0]: to}
+
+
+def _import(options: argparse.Namespace) -> Report:
+    store, path = EpisodeStore(options.store), options.path
+    if not path.exists():
+        raise NotFoundError(f"{path}: no such file or folder")
+    if options.format == "mcap":
+        from dextouch.bridges.mcap import import_mcap
+
+        files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
+        if not files:
+            raise NotFoundError(f"{path}: holds no .mcap file")
+        names = _progress([str(file) for file in files], len(files), "import mcap")
+        ids = [import_mcap(Path(name), store) for name in names]
+    elif options.format == "umi":
+        from dextouch.bridges.umi import import_umi
+
+        ids = import_umi(path, store)
+    else:
+        from dextouch.bridges.lerobot import ImportOptions, import_lerobot
+
+        chosen = ImportOptions(id_prefix=options.id_prefix, images=options.images)
+        ids = import_lerobot(path, store, options=chosen)
+    for item_id in ids:
+        print(item_id)
+    return {"format": options.format, "store": options.store, "ids": ids}
+
+
+def main(argv: Sequence[str]) -> int:
+    """`dextouch export` and `dextouch import`, told apart by the first word.
+
+    Raises:
+        UnavailableError: a package of the format is not installed.
+    """
+    word, *rest = argv
+    options = (_export_parser() if word == "export" else _import_parser()).parse_args(rest)
+    with _needs(options.format):
+        report = _export(options) if word == "export" else _import(options)
+    if options.json is not None:
+        options.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    return 0
+
+
+def _parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog=f"dextouch {word}",
+        description=does,
+        epilog=textwrap.dedent(more),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--store", metavar="URL", required=True, help="folder of the store")
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
+    return parser
+
+
+def _export_parser() -> argparse.ArgumentParser:
+    parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
+    parser.add_argument("ids", nargs="*", metavar="ID", help="all that match when none is named")
+    parser.add_argument("--format", required=True, choices=sorted([*_SINGLE, *_JOINT]))
+    parser.add_argument(
+        "--to", required=True, type=Path, metavar="PATH", help="file; mcap and rrd: or a folder"
+    )
+    parser.add_argument("--kind", choices=("episode", "recording"), default="episode")
+    parser.add_argument("--task", help="only of this task")
+    parser.add_argument("--domain", choices=("human", "robot"), help="only of this domain")
+    parser.add_argument("--operator", help="only of this operator")
+    parser.add_argument("--force", action="store_true", help="replace what is there")
+    parser.add_argument(
+        "--jpeg-quality",
+        type=int,
+        metavar="1…100",
+        help="mcap: rgb8 images as JPEG; without it they stay exact",
+    )
+    parser.add_argument("--fps", type=int, help="lerobot: frames a second (the model rate)")
+    parser.add_argument(
+        "--repo-id",
+        default="dextouch/export",
+        metavar="USER/NAME",
+        help="lerobot: name of the data set (%(default)s)",
+    )
+    return parser
+
+
+def _import_parser() -> argparse.ArgumentParser:
+    parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
+    parser.add_argument("path", type=Path, help="file or folder to read")
+    parser.add_argument("--format", required=True, choices=("lerobot", "mcap", "umi"))
+    parser.add_argument("--id-prefix", default="", help="lerobot: put before every id")
+    parser.add_argument(
+        "--images",
+        choices=("h264", "jpeg", "rgb8"),
+        default="h264",
+        help="lerobot: how images are stored (%(default)s)",
+    )
+    return parser

@@ -1,0 +1,169 @@
+"""`dextouch export` and `dextouch import`: what is chosen, where it goes, what is refused."""
+
+import json
+import sys
+
+import pytest
+import zarr
+
+from dextouch.episodes import EpisodeStore
+from services.cli import main
+from tests.unit.bridges.takes import differing_streams, write_episode, write_recording
+
+
+@pytest.fixture
+def store(tmp_path):
+    return EpisodeStore(tmp_path / "store")
+
+
+@pytest.fixture
+def dextouch(tmp_path, capsys):
+    """Run the command line on the store; its status, its stdout and its stderr."""
+
+    def run(*words, store="store"):
+        status = main.main([*map(str, words), "--store", str(tmp_path / store)])
+        return status, *capsys.readouterr()
+
+    return run
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_one_episode_goes_to_one_file_and_comes_back(store, dextouch, tmp_path):
+    reader = write_episode(store)
+    path, report = tmp_path / "take.mcap", tmp_path / "report.json"
+    words = ("export", "--format", "mcap", "stand-bottle-0003", "--to", path, "--json", report)
+    status, out, _ = dextouch(*words)
+    assert status == 0
+    assert str(path) in out
+    (file,) = json.loads(report.read_text())["files"]
+    assert (file["id"], file["path"]) == ("stand-bottle-0003", str(path))
+    assert file["num_messages"] > sum(reader.num_samples(name) for name in reader.streams)
+    status, out, _ = dextouch("import", "--format", "mcap", path, store="other")
+    assert (status, out) == (0, "stand-bottle-0003\n")
+    again = EpisodeStore(tmp_path / "other").open("stand-bottle-0003")
+    assert differing_streams(reader, again) == []
+
+
+def test_filters_choose_and_files_go_into_a_folder(store, dextouch, tmp_path):
+    write_recording(store, "take-0001", count=5)
+    write_recording(store, "take-0002", count=5)
+    folder = tmp_path / "takes"
+    words = ("export", "--format", "mcap", "--kind", "recording", "--to", folder)
+    status, _, err = dextouch(*words, "--operator", "p18")
+    assert (status, folder.exists()) == (main.EXIT_REFUSED, False)
+    assert "p18" in err
+    assert dextouch(*words, "--operator", "p17", "--domain", "human")[0] == 0
+    assert names(folder) == ["take-0001.mcap", "take-0002.mcap"]
+    assert dextouch("import", "--format", "mcap", folder, store="other")[0] == 0
+    assert EpisodeStore(tmp_path / "other").list(kind="recording") == ["take-0001", "take-0002"]
+
+
+def test_filters_and_ids_exclude_each_other(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=3)
+    words = ("export", "--format", "mcap", "--to", tmp_path / "out")
+    for more, expected in (
+        (("one", "--task", "stand_bottle"), "filters"),
+        (("one", "one"), "twice"),
+        (("two",), "'two'"),
+        (("--task", "stack_bowls"), "stack_bowls"),
+    ):
+        status, _, err = dextouch(*words, *more)
+        assert status == main.EXIT_REFUSED
+        assert expected in err
+    assert not (tmp_path / "out").exists()
+
+
+def test_nothing_is_written_over_without_force(store, dextouch, tmp_path):
+    for episode_id in ("one", "two"):
+        write_episode(store, episode_id, num_steps=3)
+    folder = tmp_path / "takes"
+    folder.mkdir()
+    (folder / "two.mcap").write_bytes(b"mine")
+    words = ("export", "--format", "mcap", "--to", folder)
+    status, _, err = dextouch(*words)
+    assert status == main.EXIT_REFUSED
+    assert "--force" in err
+    assert names(folder) == ["two.mcap"]
+    assert dextouch(*words, "--force")[0] == 0
+    assert (folder / "two.mcap").read_bytes() != b"mine"
+    status, _, err = dextouch("export", "--format", "mcap", "--to", tmp_path / "all.mcap")
+    assert status == main.EXIT_REFUSED
+    assert "name a folder" in err
+
+
+def test_umi_takes_all_episodes_into_one_zip(store, dextouch, tmp_path):
+    for seed, episode_id in enumerate(("one", "two")):
+        write_episode(store, episode_id, num_steps=5, seed=seed)
+    path = tmp_path / "all.zarr.zip"
+    status, out, _ = dextouch("export", "--format", "umi", "--to", path)
+    assert status == 0
+    assert "2 episodes  10 steps" in out
+    group = zarr.open_group(zarr.storage.ZipStore(path, mode="r"), mode="r")
+    assert group["meta/episode_ends"][:].tolist() == [5, 10]
+    status, out, _ = dextouch("import", "--format", "umi", path, store="other")
+    assert (status, out.split()) == (0, ["one", "two"])
+    status, _, err = dextouch(
+        "export", "--format", "umi", "--kind", "recording", "--to", tmp_path / "x.zip"
+    )
+    assert status == main.EXIT_REFUSED
+    assert "episodes only" in err
+
+
+def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
+    write_episode(store, "one", num_steps=5)
+    folder = tmp_path / "data"
+    words = ("export", "--format", "lerobot", "--to", folder)
+    assert dextouch(*words)[0] == 0
+    assert json.loads((folder / "meta" / "info.json").read_text())["total_episodes"] == 1
+    status, _, err = dextouch(*words)
+    assert status == main.EXIT_REFUSED
+    assert "--force" in err
+    assert dextouch(*words, "--fps", "0", "--force")[0] == main.EXIT_REFUSED
+    assert (folder / "meta" / "info.json").is_file()
+    assert dextouch(*words, "--force")[0] == 0
+    assert names(tmp_path) == ["data", "store"]
+    status, out, _ = dextouch("import", "--format", "lerobot", folder, store="other")
+    assert (status, out) == (0, "one\n")
+    (folder / "meta" / "info.json").unlink()
+    status, _, err = dextouch(*words, "--force")
+    assert status == main.EXIT_REFUSED
+    assert "no LeRobot data set" in err
+
+
+def test_rerun_files_are_written(store, dextouch, tmp_path):
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip install '.[rerun]'")
+    write_episode(store, "one", num_steps=3)
+    assert dextouch("export", "--format", "rrd", "one", "--to", tmp_path / "one.rrd")[0] == 0
+    assert (tmp_path / "one.rrd").stat().st_size > 0
+
+
+def test_a_missing_package_is_named_with_its_extra(store, dextouch, tmp_path, monkeypatch):
+    write_episode(store, "one", num_steps=3)
+    monkeypatch.delitem(sys.modules, "dextouch.bridges.rerun", raising=False)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    status, _, err = dextouch("export", "--format", "rrd", "one", "--to", tmp_path / "one.rrd")
+    assert status == main.EXIT_REFUSED
+    assert "dextouch-wm[rerun]" in err
+
+
+def test_files_that_are_not_there_are_refused(dextouch, tmp_path):
+    for form in ("mcap", "umi", "lerobot"):
+        status, _, err = dextouch("import", "--format", form, tmp_path / "nothing")
+        assert status == main.EXIT_REFUSED
+        assert "nothing" in err
+    (tmp_path / "empty").mkdir()
+    status, _, err = dextouch("import", "--format", "mcap", tmp_path / "empty")
+    assert status == main.EXIT_REFUSED
+    assert "no .mcap" in err
+
+
+@pytest.mark.parametrize("word", ["export", "import"])
+def test_help_teaches_with_examples(word, capsys):
+    with pytest.raises(SystemExit):
+        main.main([word, "--help"])
+    text = capsys.readouterr().out
+    assert f"dextouch {word} --format mcap" in text
+    assert "lerobot" in text
