@@ -14,7 +14,6 @@ from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
 Reader = EpisodeReader | RecordingReader
 ENCODED_UNITS: Final = ("jpeg", "h264")
 BLOCK_SECONDS: Final = 1.0
-_MIN_NS, _MAX_NS = -(1 << 63), (1 << 63) - 1
 
 
 @dataclass(frozen=True)
@@ -46,24 +45,6 @@ def objects(items: list[bytes]) -> Shaped[np.ndarray, " n"]:
     return array
 
 
-def stamp_at(reader: Reader, name: str, index: int) -> int:
-    """Time of one sample of a stream (nanoseconds), found through the reader's counts.
-
-    Args:
-        reader: of the episode or recording.
-        name: of the stream.
-        index: 0 … number of samples − 1.
-    """
-    low, high = _MIN_NS, _MAX_NS
-    while low < high:
-        middle = (low + high) // 2
-        if reader.count(name, None, middle) > index:
-            high = middle
-        else:
-            low = middle + 1
-    return low - 1
-
-
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
     """All samples of a stream in order, about a second at a time; encoded images stay encoded.
 
@@ -71,27 +52,32 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
         reader: of the episode or recording.
         name: of the stream.
     """
-    descriptor = reader.streams[name]
-    num_samples = reader.num_samples(name)
+    descriptor, stamps_ns = reader.streams[name], reader.stamps_ns(name)
     each = max(1, round(descriptor.nominal_rate_hz * BLOCK_SECONDS))
-    edges: list[int | None] = [stamp_at(reader, name, k) for k in range(0, num_samples, each)]
-    done = 0
-    # Samples with the stamp of an edge belong to the block that starts there.
-    for start_ns, stop_ns in zip(edges, [*edges[1:], None], strict=True):
-        if start_ns == stop_ns:
-            continue
-        block = _read(reader, name, start_ns, stop_ns)
-        if is_encoded(descriptor):
-            encoded = objects(reader.encoded_images(name, done, done + len(block)))
-            block = Block(block.t_ns, block.t_device_ns, block.sequence, encoded)
-        done += len(block)
-        yield block
+    # Samples of one instant stay together, since a reader is asked by time.
+    starts = np.unique(np.searchsorted(stamps_ns, stamps_ns[::each]))
+    for start, stop in zip(starts, [*starts[1:], len(stamps_ns)], strict=True):
+        yield _block(reader, name, int(start), int(stop))
 
 
-def _read(reader: Reader, name: str, start_ns: int | None, stop_ns: int | None) -> Block:
-    data = reader.read(name, start_ns, stop_ns)
+def _block(reader: Reader, name: str, start: int, stop: int) -> Block:
+    stamps_ns = reader.stamps_ns(name)
+    encoded: np.ndarray | None = None
+    if is_encoded(reader.streams[name]):
+        encoded = objects(reader.encoded_images(name, start, stop))
+    if encoded is not None and isinstance(reader, EpisodeReader):
+        return _of_episode(stamps_ns[start:stop], encoded)
+    data = reader.read(
+        name, int(stamps_ns[start]), int(stamps_ns[stop]) if stop < len(stamps_ns) else None
+    )
+    values = data.values if encoded is None else encoded
     if isinstance(data, SampleBatch):
-        return Block(data.t_host_ns, data.t_device_ns, data.sequence, data.values)
-    absent = np.full(len(data), NO_DEVICE_TIME, dtype=np.int64)
-    unnumbered = np.full(len(data), NO_SEQUENCE, dtype=np.int64)
-    return Block(data.t_ref_ns, absent, unnumbered, data.values)
+        # Of images too: the device's stamps come with the decoded values only.
+        return Block(data.t_host_ns, data.t_device_ns, data.sequence, values)
+    return _of_episode(data.t_ref_ns, values)
+
+
+def _of_episode(t_ref_ns: np.ndarray, values: np.ndarray) -> Block:
+    absent = np.full(len(t_ref_ns), NO_DEVICE_TIME, dtype=np.int64)
+    unnumbered = np.full(len(t_ref_ns), NO_SEQUENCE, dtype=np.int64)
+    return Block(t_ref_ns, absent, unnumbered, values)

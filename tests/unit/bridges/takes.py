@@ -120,13 +120,13 @@ def write_recording(store, recording_id="take-0001", *, count=70):
     """A raw take: counts, NaN poses, JPEG images, repeated stamps, absent device stamps."""
     rng = np.random.default_rng(11)
     t_host_ns = 10**15 + np.sort(rng.integers(0, 10**9, count))
-    t_host_ns[5:9] = t_host_ns[5]
+    t_host_ns[25:33] = t_host_ns[min(25, count - 1)]
     device_ns = rng.integers(0, 2**62, count)
     device_ns[3] = -1
     sequence = np.arange(count) + 2**40
     sequence[4] = -1
     poses = rng.normal(size=(count, 7))
-    poses[6] = np.nan
+    poses[2] = np.nan
     jpegs = jpeg_values([encode_jpeg(image) for image in images_of(count, 32)])
     values = {
         "tactile_left": rng.integers(0, 65536, (count, 360)).astype("u2"),

@@ -141,13 +141,15 @@ def test_attachments_and_metadata_say_where_it_comes_from(store, tmp_path):
 
 @pytest.mark.parametrize("unit", ["rgb8", "jpeg", "h264"])
 def test_an_episode_comes_back_equal(unit, store, other, tmp_path):
-    reader = write_episode(store, unit=unit, num_steps=40)
+    reader = write_episode(store, unit=unit, num_steps=17)
     export_mcap(reader, tmp_path / "take.mcap")
     assert import_mcap(tmp_path / "take.mcap", other) == "stand-bottle-0003"
     again = other.open("stand-bottle-0003")
     assert differing_streams(reader, again) == []
     assert again.attributes == reader.attributes
-    assert again.verify().content_sha256 == reader.content_sha256
+    assert again.verify().num_arrays == reader.verify().num_arrays
+    for name in reader.streams:
+        assert again.array_sha256(name) == reader.array_sha256(name)
 
 
 def test_a_recording_comes_back_equal(store, other, tmp_path):
@@ -174,7 +176,7 @@ def test_rgb_images_become_jpeg_when_that_is_asked_for(store, other, tmp_path):
 
 
 def test_video_frames_stand_alone_where_they_say_so(store, tmp_path):
-    reader = write_episode(store, unit="h264", num_steps=40)
+    reader = write_episode(store, unit="h264", num_steps=17)
     export_mcap(reader, tmp_path / "take.mcap")
     schema, messages = messages_of(tmp_path / "take.mcap")["/camera_head"]
     assert schema == "foxglove.CompressedVideo"

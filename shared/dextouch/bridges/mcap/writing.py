@@ -10,7 +10,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from dextouch import __version__
-from dextouch.bridges.blocks import Reader, blocks, is_encoded, stamp_at
+from dextouch.bridges.blocks import Reader, blocks, is_encoded
 from dextouch.bridges.mcap.messages import MessageCodec, Sent, calibration_message
 from dextouch.bridges.mcap.protobuf import descriptor_set
 from dextouch.bridges.mcap.schemas import CALIBRATION, TABLE, raw_encoding
@@ -82,7 +82,7 @@ class _Export:
         self._streams = [self._as_sent(stream) for stream in self._sources]
         counts = {stream.name: reader.num_samples(stream.name) for stream in self._streams}
         self._counts = counts
-        firsts = [stamp_at(reader, name, 0) for name, count in counts.items() if count]
+        firsts = [int(reader.stamps_ns(name)[0]) for name, count in counts.items() if count]
         # MCAP's times cannot be negative; the messages' own stamps stay as they are.
         self._zero_ns = min([0, *firsts])
         self._schema_ids: dict[str, int] = {}
@@ -164,7 +164,7 @@ class _Export:
         camera = self._reader.streams.get(HEAD_CAMERA)
         if K is None or camera is None or not self._counts[HEAD_CAMERA]:
             return 0
-        first_ns = stamp_at(self._reader, HEAD_CAMERA, 0)
+        first_ns = int(self._reader.stamps_ns(HEAD_CAMERA)[0])
         height_px, width_px = camera.shape[:2]
         data = calibration_message(
             np.array(K),
