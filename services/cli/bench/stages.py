@@ -5,7 +5,7 @@ import importlib
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import NamedTuple, Protocol, cast
+from typing import NamedTuple, Protocol, cast, runtime_checkable
 
 from dextouch.errors import UnknownNameError
 from services.cli.bench.report import StageReport
@@ -14,6 +14,7 @@ from services.cli.bench.report import StageReport
 Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
 
+@runtime_checkable
 class Stage(Protocol):
     """One stage of the platform that can be timed against its error.
 

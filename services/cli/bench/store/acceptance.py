@@ -31,7 +31,7 @@ def requirements(
             f"rows late or dropped, station live at {SPEED:g} times real time",
             float(max(run.num_untimely for run in live)) if live else None,
             "at most",
-            0,
+            0.0,
         ),
         _append("numeric append, p99", SPOOL, appends, bound_ms=0.1),
         _append("numeric append on the disk, p99", SPOOL_SYNCED, appends, bound_ms=1.0),

@@ -21,7 +21,8 @@ from services.cli.bench.stages import Bar
 from services.cli.bench.store.designs import Design, OpenStore, ReadsTouch, StoreWindow
 from services.cli.bench.store.workload import CAMERAS, WINDOW_IMAGES, WINDOW_TACTILE, Workload
 
-_WARM_SECONDS = 1.0
+# Just enough for one window.
+_WARM_SECONDS = 0.6
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ class ReadsTouch(Protocol):
         """34 samples of the left and of the right hand, those of the window at image `start`."""
 
 
+@runtime_checkable
 class Design(Protocol):
     """One way to keep a take on disk."""
 

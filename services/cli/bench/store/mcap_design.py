@@ -12,12 +12,12 @@ import simplejpeg
 
 from services.cli.bench.store.designs import OpenStore, StoreWindow
 from services.cli.bench.store.workload import (
+    JPEG_QUALITY,
     WINDOW_IMAGES,
     WINDOW_TACTILE,
     TimedStream,
     Workload,
 )
-from services.cli.bench.store.zarr_codec import QUALITY
 
 _FILE = "take.mcap"
 
@@ -100,10 +100,10 @@ class _OpenMcap(OpenStore):
         from mcap.reader import SeekingReader
 
         stamps = self._stamps[name]
-        # A reader a call, since threads must not share one; the end of the span is exclusive.
+        # A reader a call, since threads must not share one.
         with self._path.open("rb") as file:
             found = SeekingReader(file).iter_messages(
-                topics=[name], start_time=stamps[start], end_time=stamps[start + count - 1] + 1
+                topics=[name], starting_at=stamps[start], ending_at=stamps[start + count - 1]
             )
             return [message.data for _, _, message in found]
 
@@ -112,7 +112,7 @@ def _messages(workload: Workload) -> Iterator[tuple[str, bytes, int]]:
     for index in range(workload.num_images):
         for name, stream in workload.images.items():
             image = np.ascontiguousarray(stream.values[index])
-            payload = simplejpeg.encode_jpeg(image, quality=QUALITY, colorsubsampling="420")
+            payload = simplejpeg.encode_jpeg(image, quality=JPEG_QUALITY, colorsubsampling="420")
             yield name, payload, int(stream.t_ref_ns[index])
         for name, stream in workload.numbers.items():
             yield from _numbers(name, stream, workload.arrived_with(name, index))

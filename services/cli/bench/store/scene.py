@@ -27,14 +27,15 @@ class Scene:
     """The still parts of what one camera sees.
 
     `pairs` holds each pixel of the background beside its right neighbour, and a fourth colour
-    that is never seen: rows of 32 bytes are what numpy gathers fastest.
+    that is never seen: rows of 32 bytes are what numpy gathers fastest. `noise` is as wide as two
+    images, the same twice, so that it can be shifted by looking elsewhere.
     """
 
     pairs: Float32[np.ndarray, "1300000 2 4"]
     objects: Float32[np.ndarray, "3 160 160 3"]
     hand: Float32[np.ndarray, "200 260 3"]
     hand_alpha: Float32[np.ndarray, "200 260 1"]
-    noise: Float32[np.ndarray, "4 480 640 3"]
+    noise: Float32[np.ndarray, "4 480 1280 3"]
     camera: str
 
 
@@ -53,7 +54,7 @@ def make_scene(camera: str, rng: np.random.Generator) -> Scene:
         objects=np.stack([_texture(rng, _OBJECT_PX, _OBJECT_PX) for _ in range(_NUM_OBJECTS)]),
         hand=np.array(_SKIN, dtype=np.float32) + grain,
         hand_alpha=_hand_alpha()[..., None],
-        noise=noise * np.float32(NOISE_SIGMA_LEVELS),
+        noise=np.tile(noise * np.float32(NOISE_SIGMA_LEVELS), (1, 1, 2, 1)),
         camera=camera,
     )
 
@@ -66,7 +67,7 @@ def render(
     for index in range(num_images):
         view = _view(scene, index / IMAGE_RATE_HZ)
         shift = int(rng.integers(IMAGE_SHAPE[1]))
-        view += np.roll(scene.noise[int(rng.integers(len(scene.noise)))], shift, axis=1)
+        view += scene.noise[int(rng.integers(len(scene.noise))), :, shift : shift + IMAGE_SHAPE[1]]
         np.clip(view, 0.0, 255.0, out=view)
         images[index] = view
     return images
@@ -97,8 +98,8 @@ def _background(scene: Scene, t_s: float, phase: int) -> Float32[np.ndarray, "48
     x = (cos * x_px - sin * y_px + width_px / 2).astype(np.float32)
     row, column = y.astype(np.intp), x.astype(np.intp)
     index = row * width_px + column
-    below = (y - row)[..., None, None]
-    right = (x - column)[..., None]
+    below = (y - row.astype(np.float32))[..., None, None]
+    right = (x - column.astype(np.float32))[..., None]
     pair = scene.pairs[index]
     pair += below * (scene.pairs[index + width_px] - pair)
     return (pair[:, :, 0] + right * (pair[:, :, 1] - pair[:, :, 0]))[..., :3]
@@ -114,7 +115,8 @@ def _texture(
     )
     gain = np.maximum(cycles, 2.0) ** -_SLOPE * np.exp(-((cycles / _CUTOFF_CYCLES) ** 2))
     gain[0, 0] = 0.0
-    spectrum = np.fft.rfft2(rng.standard_normal((3, height_px, width_px))) * gain
+    noise = rng.standard_normal((3, height_px, width_px), dtype=np.float32)
+    spectrum = np.fft.rfft2(noise) * gain.astype(np.float32)
     texture = np.fft.irfft2(spectrum, s=(height_px, width_px)).transpose(1, 2, 0)
     low, high = texture.min(), texture.max()
     return np.ascontiguousarray((texture - low) / (high - low) * 255.0, dtype=np.float32)

@@ -9,6 +9,8 @@ from jaxtyping import Int64, Shaped
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
 IMAGE_SHAPE = (480, 640, 3)
 IMAGE_RATE_HZ = 30
+# Of every rival that keeps JPEG.
+JPEG_QUALITY = 90
 # A window: images of one camera with the touch and the actions of their time.
 WINDOW_IMAGES = 17
 WINDOW_TACTILE = 34

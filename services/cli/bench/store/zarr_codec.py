@@ -2,7 +2,6 @@
 
 import asyncio
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 import simplejpeg
@@ -13,8 +12,7 @@ from zarr.core.common import JSON, parse_named_configuration
 from zarr.registry import register_codec
 
 from dextouch.errors import InvalidInputError
-
-QUALITY = 90
+from services.cli.bench.store.workload import JPEG_QUALITY
 
 
 @dataclass(frozen=True)
@@ -25,7 +23,7 @@ class JpegCodec(ArrayBytesCodec):
     """
 
     is_fixed_size = False
-    quality: int = QUALITY
+    quality: int = JPEG_QUALITY
 
     @classmethod
     def key(cls) -> str:
@@ -33,7 +31,7 @@ class JpegCodec(ArrayBytesCodec):
         return "dextouch_bench.jpeg"
 
     @classmethod
-    def from_dict(cls, data: dict[str, JSON]) -> Self:
+    def from_dict(cls, data: dict[str, JSON]) -> "JpegCodec":
         """The codec that zarr.json describes."""
         _, configuration = parse_named_configuration(data, cls.key())
         quality = configuration["quality"]
