@@ -72,7 +72,7 @@ class DiskReserve:
     Args:
         folder: on the disk in question.
         min_free_bytes: that stay free.
-        free_bytes: another way to measure.
+        free_bytes: another way to measure; None asks the file system.
     """
 
     def __init__(
@@ -80,13 +80,14 @@ class DiskReserve:
         folder: Path,
         *,
         min_free_bytes: int,
-        free_bytes: Callable[[Path], int] = free_bytes_of,
+        free_bytes: Callable[[Path], int] | None = None,
     ) -> None:
-        self._folder, self._min_free, self._measure = folder, min_free_bytes, free_bytes
+        self._folder, self._min_free = folder, min_free_bytes
+        self._measure = free_bytes
 
     def free_bytes(self) -> int:
         """What is free now, the reserve included."""
-        return self._measure(self._folder)
+        return (self._measure or free_bytes_of)(self._folder)
 
     def check_upload(self, num_bytes: int) -> None:
         """Refuse bytes that would go into the reserve.

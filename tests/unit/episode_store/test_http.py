@@ -20,65 +20,11 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.geometry.transforms import transform
-from dextouch.hands.actions import IDENTITY_POSE_9D, pack_action
-from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.serving.settings import ApiKey
-from dextouch.streams.descriptors import StreamDescriptor
 from services.episode_store import __main__ as command_line
 from services.episode_store.__main__ import main
 from services.episode_store.app import create_app
-
-IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
-
-
-def write_episode(store, episode_id, *, task="stand_bottle", domain="robot", success=True):
-    attributes = EpisodeAttributes.model_validate(
-        {
-            "episode_id": episode_id,
-            "task": task,
-            "instruction": "do it",
-            "domain": domain,
-            "origin": "twin",
-            "success": success,
-            "anchor": dict.fromkeys(
-                ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head"), IDENTITY_ROWS
-            ),
-            "K_head": [[60, 0, 16], [0, 60, 16], [0, 0, 1]],
-        }
-    )
-    pose = np.tile(IDENTITY_POSE_9D, (9, 1))
-    pose[:, 0] = 0.01 * np.arange(9)
-    joints = np.zeros((9, 20))
-    actions = pack_action(
-        wrist_left=pose,
-        wrist_right=pose,
-        joints_left_rad=joints,
-        joints_right_rad=joints,
-        camera_head=np.tile(IDENTITY_POSE_9D, (9, 1)),
-    )
-    grid_ns = np.array([round(k * 1e9 / 15) for k in range(9)])
-    image = np.arange(32 * 32 * 3).reshape(32, 32, 3) % 251
-    images = ((image + np.arange(9)[:, None, None, None]) % 256).astype("u1")
-    tactile = np.random.default_rng(0).gamma(2.0, 2.0, size=(9, 320)).astype("f4")
-    blocks = [
-        ("action", "robot_state", "float64", "action", actions),
-        ("camera_head", "image", "uint8", "rgb8", images),
-        ("tactile_left", "tactile", "float32", "kPa", tactile),
-    ]
-    with store.writer(attributes=attributes) as writer:
-        for name, kind, dtype, unit, values in blocks:
-            writer.add_stream(
-                StreamDescriptor(
-                    name=name,
-                    kind=kind,
-                    shape=values.shape[1:],
-                    dtype=dtype,
-                    unit=unit,
-                    nominal_rate_hz=15,
-                )
-            )
-            writer.append(name, values=values, t_ref_ns=grid_ns)
-    return store.open(episode_id)
+from tests.unit.episode_store.episodes import write_episode
 
 
 @pytest.fixture
