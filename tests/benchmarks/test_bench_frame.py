@@ -197,6 +197,9 @@ def test_json_and_folder_are_written(fake_stage, tmp_path, capsys):
     assert report["requirements"][0]["verdict"] == "FAIL"
     assert (out / "bench_fake.json").read_text() == (tmp_path / "a" / "b.json").read_text()
     assert (out / "bench_fake.svg").is_file()
+    text = (out / "bench_fake.md").read_text()
+    assert "| design | time |\n| --- | --- |\n| ours | 1 [s] |\n" in text
+    assert "| speed | 1 | at least 2 m/s | FAIL |" in text
     assert [p.name for p in (out / "written").iterdir()] == ["something"]
     assert "chart" in capsys.readouterr().out
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from dextouch.errors import UnknownNameError
 from services.cli.bench.chart import draw
 from services.cli.bench.machine import refuse_shape_checks
-from services.cli.bench.report import StageReport, show, write_json
+from services.cli.bench.report import StageReport, show, to_markdown, write_json
 from services.cli.bench.stages import STAGES, load_stage
 
 EXIT_MISSED = 1
@@ -74,7 +74,7 @@ def stage_parser(name: str) -> argparse.ArgumentParser:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="keep the chart, the JSON and all that was written here (default: nothing is kept)",
+        help="keep the chart, the tables, the JSON and all that was written here (default: nothing is kept)",
     )
     parser.add_argument(
         "--check", action="store_true", help="exit with 1 where a requirement is not met"
@@ -92,6 +92,8 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
         write_json(report, options.json)
     if options.out is not None:
         write_json(report, options.out / f"bench_{report.stage}.json")
+        text = options.out / f"bench_{report.stage}.md"
+        text.write_text(to_markdown(report), encoding="utf-8")
         chart = options.out / f"bench_{report.stage}.svg"
         chart.write_text(draw(report.panels, title=f"bench {report.stage}"), encoding="utf-8")
         print(f"\nchart: {chart}")

@@ -1,4 +1,4 @@
-"""What a stage found: tables, points and requirements in; a terminal's tables and JSON out."""
+"""What a stage found: tables, points and requirements in; a terminal's tables, Markdown, JSON out."""
 
 import json
 from collections.abc import Sequence
@@ -67,6 +67,22 @@ def show(report: StageReport, console: Console) -> None:
         console.print(_table(table.title, table.columns, table.rows))
     for note in report.notes:
         console.print(f"Note: {note}", markup=False, highlight=False)
+    verdicts = _acceptance(report)
+    console.print(_table(verdicts.title, verdicts.columns, verdicts.rows))
+
+
+def to_markdown(report: StageReport) -> str:
+    """The report as Markdown, to be pasted into the documents: what ran where, and the tables."""
+    about = ", ".join(f"{name} {value}" for name, value in report.machine.items())
+    parts = [f"Machine: {about}.\n"]
+    for table in (*report.tables, _acceptance(report)):
+        lines = [table.columns, ("---",) * len(table.columns), *table.rows]
+        parts.append(f"**{table.title}**\n")
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n")
+    return "\n".join(parts)
+
+
+def _acceptance(report: StageReport) -> ResultTable:
     rows = [
         (
             requirement.what,
@@ -76,7 +92,7 @@ def show(report: StageReport, console: Console) -> None:
         )
         for requirement in report.requirements
     ]
-    console.print(_table("Acceptance", ("requirement", "measured", "bound", "verdict"), rows))
+    return ResultTable("Acceptance", ("requirement", "measured", "bound", "verdict"), rows)
 
 
 def write_json(report: StageReport, path: Path) -> None:
