@@ -74,7 +74,7 @@ def stage_parser(name: str) -> argparse.ArgumentParser:
         "--out",
         type=Path,
         metavar="FOLDER",
-        help="keep the chart, the tables, the JSON and all that was written here (default: nothing is kept)",
+        help="keep tables, chart, JSON and all that was written here (default: nothing is kept)",
     )
     parser.add_argument(
         "--check", action="store_true", help="exit with 1 where a requirement is not met"

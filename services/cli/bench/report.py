@@ -1,4 +1,4 @@
-"""What a stage found: tables, points and requirements in; a terminal's tables, Markdown, JSON out."""
+"""What a stage found: tables, points, requirements in; tables, Markdown and JSON out."""
 
 import json
 from collections.abc import Sequence
