@@ -174,6 +174,10 @@ class Checker:
             places[place] = stop
         on_disk = len(list((self.folder / "videos" / key).glob("*/*.mp4")))
         self.need(on_disk == len(places), f"video: {key} has other files than episodes say")
+        starts = {}
+        for row in rows:
+            place = (row[f"videos/{key}/chunk_index"], row[f"videos/{key}/file_index"])
+            starts.setdefault(place, set()).add(round(row[f"videos/{key}/from_timestamp"] * fps))
         for (chunk, file), stop in places.items():
             path = self.folder / f"videos/{key}/chunk-{chunk:03d}/file-{file:03d}.mp4"
             with av.open(path) as container:
@@ -187,6 +191,15 @@ class Checker:
                 wanted = np.arange(round(stop * fps)) / fps
                 fits = len(times) == len(wanted) and np.abs(times - wanted).max() < 1e-4
                 self.need(fits, f"video: {key} holds other frames than its episodes")
+            with av.open(path) as container:
+                stream = container.streams.video[0]
+                entries = {
+                    round(packet.pts * stream.time_base * fps)
+                    for packet in container.demux(stream)
+                    if packet.size and packet.is_keyframe
+                }
+                fits = starts[chunk, file] <= entries
+                self.need(fits, f"video: {key} cannot be entered where an episode begins")
 
     def check_statistics(self, stats, count, where):
         self.need(set(stats) == set(self.features), f"{where}: statistics of other features")
