@@ -1,4 +1,4 @@
-"""Many stations at once against a store process: nothing lost or doubled, memory that stays flat."""
+"""Many stations at once against a store process: nothing lost or doubled, memory stays flat."""
 
 import json
 import os

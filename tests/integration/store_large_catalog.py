@@ -1,0 +1,67 @@
+"""A folder and a count in, how long a catalog of so many episodes takes out (JSON, milliseconds).
+
+A process of its own, since the shape checks of tests are no part of what is measured.
+"""
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.format import decode_commit, encode_commit, group_metadata, sha256_hex
+from services.episode_store.catalog import Catalog, EpisodeFilter
+from services.episode_store.changes import SETTLED_NS
+from tests.unit.episode_store.episodes import write_episode
+
+NUM_ROUNDS = 9
+
+
+def fill(store, count):
+    """Episodes with attributes of their own and no arrays, which a catalog does not open."""
+    write_episode(store, "e-00000", quality={f"figure_{i}": float(i) for i in range(30)})
+    source = store.root / "episodes" / "e-00000"
+    record, _ = decode_commit((source / "commit.json").read_bytes(), what="e-00000")
+    attributes = json.loads((source / "zarr.json").read_bytes())["attributes"]["dextouch"]
+    for number in range(1, count):
+        folder = store.root / "episodes" / f"e-{number:05d}"
+        folder.mkdir()
+        own = {"episode_id": folder.name, "task": f"task_{number % 7}"}
+        group = group_metadata(attributes | own)
+        mine = record.model_copy(update={"id": folder.name, "attributes_sha256": sha256_hex(group)})
+        (folder / "zarr.json").write_bytes(group)
+        (folder / "commit.json").write_bytes(encode_commit(mine)[0])
+
+
+def median_ms(work):
+    """Of some rounds."""
+    times = []
+    for _ in range(NUM_ROUNDS):
+        started = time.perf_counter()
+        work()
+        times.append((time.perf_counter() - started) * 1e3)
+    return sorted(times)[NUM_ROUNDS // 2]
+
+
+def main(folder, count):
+    """Fill a store and measure."""
+    store = EpisodeStore(Path(folder))
+    fill(store, int(count))
+    catalog, everything = Catalog(store), EpisodeFilter()
+    started = time.perf_counter()
+    found = catalog.episodes(everything, limit=10**6)
+    report = {"num": found.num_matching, "first_scan_ms": (time.perf_counter() - started) * 1e3}
+    now_ns = time.time_ns()
+    wanted = EpisodeFilter(task="task_3", min_quality=("figure_3:2",))
+    for name, age_ns in (("young", 0), ("settled", 2 * SETTLED_NS)):
+        os.utime(store.root / "episodes", ns=(now_ns - age_ns, now_ns - age_ns))
+        catalog.episodes(everything, limit=1)
+        report[f"{name}_list_ms"] = median_ms(lambda: catalog.episodes(everything, limit=10**6))
+        report[f"{name}_filtered_ms"] = median_ms(lambda: catalog.episodes(wanted, limit=1000))
+        report[f"{name}_hours_ms"] = median_ms(lambda: catalog.hours(everything))
+    print(json.dumps(report))  # noqa: T201
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
