@@ -4,7 +4,7 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -26,6 +26,9 @@ ZSTD_LEVEL = 1
 GOP_IMAGES = 8
 # Names under which zarr-python finds the image codecs (dextouch.episodes.zarr_codecs).
 ZARR_CODECS: Mapping[Codec, str] = {"jpeg": "dextouch.jpeg", "h264": "dextouch.h264"}
+# No array of ours comes near; a forged one must not overflow what is computed from it.
+MAX_ROWS = 1 << 40
+Size = Annotated[int, Field(ge=0, le=MAX_ROWS)]
 STAMPS: Mapping[Kind, tuple[str, ...]] = {
     "episode": ("t_ref_ns",),
     "recording": ("t_host_ns", "t_device_ns", "sequence"),
@@ -42,8 +45,8 @@ class ArrayEntry(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
-    shape: tuple[int, ...] = Field(min_length=1)
-    chunk_rows: int = Field(ge=1)
+    shape: tuple[Size, ...] = Field(min_length=1)
+    chunk_rows: int = Field(ge=1, le=MAX_ROWS)
     codec: Codec = "zstd"
     encoder: str | None = None
     dimension_names: tuple[str, ...]
@@ -188,7 +191,7 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
         plain, digest = outer["record"], outer["sha256"]
         version = plain["format_version"]
         whole = sha256_hex(canonical_json(plain)) == digest
-    except (ValueError, KeyError, TypeError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is damaged ({error})") from error
     if not whole:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} does not match its own sha256")

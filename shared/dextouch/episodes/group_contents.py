@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Generic, TypeVar
@@ -10,6 +11,7 @@ from typing import Generic, TypeVar
 import numpy as np
 from pydantic import ValidationError
 
+from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     ATTRIBUTES_KEY,
     COMMIT_FILE,
@@ -25,7 +27,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.journal import CHUNK_JOURNAL, journal_path, part_path, read_rows
 from dextouch.episodes.shard_reader import ShardReader
-from dextouch.episodes.sources import GroupFiles, LocalFile
+from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.stage import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from dextouch.schemas.episodes import EpisodeAttributes, Verification
@@ -33,6 +35,9 @@ from dextouch.schemas.recordings import RecordingAttributes
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
 VERIFY_BYTES = 1 << 24
+MAX_METADATA_BYTES = 1 << 24
+# The largest picture of H.264 (level 6.2): 139,264 macroblocks.
+MAX_IMAGE_PIXELS = 139_264 * 256
 
 
 @dataclass
@@ -51,7 +56,9 @@ class CommittedGroup(Generic[A]):
         """One array; its index is kept."""
         if name not in self._shards:
             entry = self.entries[name]
-            source = self.files.source(f"{name}/{shard_path(len(entry.shape))}")
+            path = f"{name}/{shard_path(len(entry.shape))}"
+            refuse_links(self.files, path, what=self.what)
+            source = self.files.source(path)
             self._shards[name] = ShardReader(source, entry, what=f"{self.what}: array {name!r}")
         return self._shards[name]
 
@@ -67,10 +74,10 @@ class CommittedGroup(Generic[A]):
         )
 
     def _verify_array(self, name: str, entry: ArrayEntry) -> int:
-        if self.files.get(f"{name}/{METADATA_FILE}") != array_metadata(entry):
+        if get_metadata(self.files, f"{name}/{METADATA_FILE}", self.what) != array_metadata(entry):
             raise CorruptDataError(f"{self.what}: {METADATA_FILE} of {name!r} is damaged")
         shard, digest, num_bytes = self.shard(name), hashlib.sha256(), 0
-        shard.check_whole()
+        shard.check_index()
         rows = entry.chunk_rows
         row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
         # Image codecs are hashed as they are stored, a storage chunk at a time.
@@ -120,7 +127,7 @@ def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[
         StorageError: written by another version of the format.
     """
     what = f"{kind} {files.item_id}"
-    commit, group = files.get(COMMIT_FILE), files.get(METADATA_FILE)
+    commit, group = (get_metadata(files, name, what) for name in (COMMIT_FILE, METADATA_FILE))
     if commit is None:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is missing")
     record, content_sha256 = decode_commit(commit, what=what)
@@ -133,13 +140,81 @@ def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[
     try:
         text = json.dumps(json.loads(group)["attributes"][ATTRIBUTES_KEY])
         attributes = model.model_validate_json(text)
-    except (ValidationError, ValueError, KeyError) as error:
+        expected = {stream.name: stream_arrays(stream, kind) for stream in attributes.streams}
+    except (ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise StorageError(f"{what}: attributes of an unknown kind ({error})") from error
-    wanted = [name for stream in attributes.streams for name in stream_arrays(stream, kind)]
-    missing = [name for name in wanted if name not in record.arrays]
-    if missing:
-        raise CorruptDataError(f"{what}: arrays {missing} are not in the commit record")
+    _check_arrays(expected, record.arrays, what)
     return CommittedGroup(files, kind, attributes, record.arrays, content_sha256, what)
+
+
+def _check_arrays(
+    expected: Mapping[str, Mapping[str, ArrayEntry]], arrays: Mapping[str, ArrayEntry], what: str
+) -> None:
+    """Refuse a commit record whose arrays are not those of the streams, each of one length."""
+    names: list[str] = []
+    for stream, wanted in expected.items():
+        names += wanted
+        missing = [name for name in wanted if name not in arrays]
+        if missing:
+            raise CorruptDataError(f"{what}: arrays {missing} are not in the commit record")
+        for name, entry in wanted.items():
+            got = arrays[name]
+            if _layout(got) != _layout(entry) or len({arrays[n].shape[0] for n in wanted}) != 1:
+                raise CorruptDataError(
+                    f"{what}: commit record says {got.dtype} {got.shape} {got.codec} of array "
+                    f"{name!r}, which is not what the attributes say of stream {stream!r}"
+                )
+            if got.codec != "zstd" and math.prod(got.shape[1:3]) > MAX_IMAGE_PIXELS:
+                raise CorruptDataError(
+                    f"{what}: images of {name!r} are {got.shape[1]} x {got.shape[2]} pixels, "
+                    f"expected at most {MAX_IMAGE_PIXELS} in all"
+                )
+    foreign = sorted(set(arrays) - set(names))
+    if foreign or len(set(names)) != len(names):
+        raise CorruptDataError(
+            f"{what}: commit record lists arrays {foreign or sorted(names)}, "
+            f"expected those of {len(expected)} streams, each once"
+        )
+
+
+def _layout(entry: ArrayEntry) -> tuple[object, ...]:
+    return entry.dtype, entry.shape[1:], entry.codec
+
+
+def get_metadata(files: GroupFiles, name: str, what: str) -> bytes | None:
+    """All bytes of a small file inside a group; None where there is none.
+
+    Raises:
+        CorruptDataError: a link, or a file far larger than metadata ever is.
+    """
+    refuse_links(files, name, what=what)
+    if isinstance(files, LocalGroup):
+        path = files.folder / name
+        with disk_errors(f"read {name} of {what}"):
+            size = path.stat().st_size if path.is_file() else 0
+        if size > MAX_METADATA_BYTES:
+            raise CorruptDataError(
+                f"{what}: {name} holds {size} bytes, expected at most {MAX_METADATA_BYTES}"
+            )
+    return files.get(name)
+
+
+def refuse_links(files: GroupFiles, name: str, *, what: str) -> None:
+    """A group's files lie inside it: what a link points at may be anybody's.
+
+    Raises:
+        CorruptDataError: the group's folder, the file or a folder between is a symbolic link.
+    """
+    if not isinstance(files, LocalGroup):
+        return
+    path = files.folder
+    for part in ("", *name.split("/")):
+        path = path / part
+        if path.is_symlink():
+            raise CorruptDataError(
+                f"{what}: {path.name!r} on the way to {name} is a symbolic link, expected a file "
+                "of the group itself; put the file in its place"
+            )
 
 
 def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:

@@ -8,7 +8,7 @@ from dextouch.episodes.format import STAMPS, codec_of
 from dextouch.episodes.group_contents import CommittedGroup, GroupContents
 from dextouch.episodes.image_codecs import ImageChunks, transform_pixels
 from dextouch.episodes.video import FULL_FORM, ImageForm
-from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
+from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError, UnknownNameError
 from dextouch.schemas.episodes import EpisodeAttributes, Verification
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
@@ -80,6 +80,8 @@ class GroupReader(Generic[A]):
                 f"{self._what}: got images {start} … {stop} of {name!r}, expected within "
                 f"0 … {self.num_samples(name)}"
             )
+        # A forged length must not become a list of numbers.
+        self._contents.shard(name).check_index()
         return self._pick_images(self._stream(name), np.arange(start, stop), form, out)
 
     def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
@@ -98,11 +100,17 @@ class GroupReader(Generic[A]):
             raise InvalidInputError(f"{self._what}: {name!r} has no images {start} … {stop}")
         chunks, shard = self._image_chunks(descriptor), self._contents.shard(name)
         first = start // chunks.rows
-        images = [
-            image
-            for number in range(first, -(-stop // chunks.rows) if stop > start else first)
-            for image in chunks.unpack(shard.payload(number), number)
-        ]
+        shard.check_index()
+        images: list[bytes] = []
+        for number in range(first, -(-stop // chunks.rows) if stop > start else first):
+            group = chunks.unpack(shard.payload(number), number)
+            expected = min(chunks.rows, self.num_samples(name) - number * chunks.rows)
+            if len(group) != expected:
+                raise CorruptDataError(
+                    f"{self._what}: array {name!r}: storage chunk {number} holds {len(group)} "
+                    f"images, expected {expected}"
+                )
+            images += group
         return images[start - first * chunks.rows : stop - first * chunks.rows]
 
     def verify(self) -> Verification:

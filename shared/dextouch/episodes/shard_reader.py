@@ -20,6 +20,11 @@ CRC_BYTES = 4
 INDEX_ENTRY_BYTES = 16
 _ZSTD = Zstd()
 _ZSTD_MAGIC = bytes.fromhex("28b52ffd")
+# The four bytes of a block that repeats one byte unpack to 128 KiB (RFC 8878, 3.1.1.2).
+_ZSTD_MAX_RATIO = 1 << 15
+_ZSTD_REPEATED = 1
+# The length of an access unit, a start code and the header of its first unit.
+_H264_MIN_BYTES = 4 + 3 + 1
 
 
 def with_crc(data: bytes) -> bytes:
@@ -68,6 +73,7 @@ class ShardReader:
             raise InvalidInputError(
                 f"{self._what}: got rows {start} … {stop}, expected within 0 … {num_rows}"
             )
+        self.check_index()
         rows = np.empty((stop - start, *self._entry.shape[1:]), dtype=self._dtype)
         for number in range(start // rows_each, -(-stop // rows_each) if stop > start else 0):
             chunk = self._decode(number)
@@ -82,34 +88,63 @@ class ShardReader:
         Raises:
             CorruptDataError: a checksum does not hold, or bytes are missing.
         """
-        size = self._source.size()
-        if size is None:
-            raise CorruptDataError(f"{self._what}: its shard file is missing")
-        if self._index is None:
-            self._index = self._read_index(size)
-        offset, length = (int(value) for value in self._index[number])
+        offset, length = (int(value) for value in self.check_index()[number])
         what = f"{self._what}: storage chunk {number}"
-        if offset + length > size:
+        data = self._source.read(offset, length)
+        if len(data) != length:
             raise CorruptDataError(f"{what} lies outside the file")
-        return _without_crc(self._source.read(offset, length), what)
+        return _without_crc(data, what)
 
-    def check_whole(self) -> None:
-        """Refuse a file with bytes that belong to nothing, which reading would never notice.
+    def check_index(self) -> np.ndarray:
+        """The (offset, length) of every storage chunk, read once, before anything is allocated.
 
         Raises:
-            CorruptDataError: storage chunks that do not follow each other up to the index.
+            CorruptDataError: a missing file; storage chunks that do not follow each other up to the
+                index, or are too short for the rows that the commit record claims.
         """
-        size = self._source.size()
-        if size is None:
-            raise CorruptDataError(f"{self._what}: its shard file is missing")
-        index = self._read_index(size).astype(np.int64)
-        ends = index.sum(axis=1)
-        follows = index[:, 0] == np.concatenate([[0], ends])[: len(index)]
-        end = int(ends[-1]) if len(index) else 0
-        if not follows.all() or end + len(index) * INDEX_ENTRY_BYTES + CRC_BYTES != size:
+        if self._index is None:
+            size = self._source.size()
+            if size is None:
+                raise CorruptDataError(f"{self._what}: its shard file is missing")
+            index = self._read_index(size)
+            self._check_follows(index, size - len(index) * INDEX_ENTRY_BYTES - CRC_BYTES)
+            self._check_claim(index)
+            self._index = index
+        return self._index
+
+    def _check_follows(self, index: np.ndarray, end: int) -> None:
+        """Refuse overlaps, gaps, and bytes that belong to nothing."""
+        # First alone, since the sum of two forged numbers could come round to a small one.
+        inside = bool((index <= end).all())
+        ends = np.concatenate([np.zeros(1, "<u8"), index.sum(axis=1)])
+        if not inside or int(ends[-1]) != end or not np.array_equal(index[:, 0], ends[:-1]):
             raise CorruptDataError(
-                f"{self._what}: file holds {size} bytes that do not fit its index"
+                f"{self._what}: shard index does not fit the {end} bytes of its storage chunks"
             )
+
+    def _check_claim(self, index: np.ndarray) -> None:
+        """Refuse more rows than the bytes there can hold."""
+        entry, lengths = self._entry, index[:, 1].astype(np.int64)
+        if not len(lengths):
+            return
+        bound = int(lengths.min())
+        if entry.codec == "zstd":
+            claimed = -(-self._chunk_bytes() // _ZSTD_MAX_RATIO)
+        elif entry.codec == "h264":
+            full = lengths[: entry.shape[0] // entry.chunk_rows]
+            bound = int(full.min()) if len(full) else int(lengths[-1])
+            rows = entry.chunk_rows if len(full) else entry.shape[0]
+            claimed = rows * _H264_MIN_BYTES
+        else:
+            claimed = entry.chunk_rows
+        if claimed > bound:
+            raise CorruptDataError(
+                f"{self._what}: storage chunks of {entry.chunk_rows} rows need at least {claimed} "
+                f"bytes, got one of {bound}"
+            )
+
+    def _chunk_bytes(self) -> int:
+        return self._entry.chunk_rows * math.prod(self._entry.shape[1:]) * self._dtype.itemsize
 
     def _read_index(self, file_size: int) -> np.ndarray:
         size = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
@@ -136,6 +171,9 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
     # Asked before anything is unpacked: a bomb says a size that we never allocate.
     if (size := zstd_content_size(payload)) != expected:
         raise CorruptDataError(f"{what}: holds {size} bytes, expected {expected}")
+    # A second frame would be unpacked as well, whatever size it has.
+    if (end := zstd_frame_bytes(payload)) != len(payload):
+        raise CorruptDataError(f"{what}: zstd frame ends at byte {end} of {len(payload)}")
     try:
         data = _ZSTD.decode(payload)
     except (RuntimeError, ValueError) as error:
@@ -145,13 +183,33 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
 
 def zstd_content_size(frame: bytes) -> int | None:
     """How many bytes a zstd frame says it unpacks to (RFC 8878, 3.1.1); None if it does not say."""
-    if len(frame) < 6 or frame[:4] != _ZSTD_MAGIC:
-        return None
-    descriptor = frame[4]
-    single_segment = bool(descriptor & 0x20)
-    start = 5 + (not single_segment) + (0, 1, 2, 4)[descriptor & 0x03]
-    length = (int(single_segment), 2, 4, 8)[descriptor >> 6]
+    start, length = _zstd_size_field(frame)
     if length == 0 or len(frame) < start + length:
         return None
     size = int.from_bytes(frame[start : start + length], "little")
     return size + 256 if length == 2 else size
+
+
+def zstd_frame_bytes(frame: bytes) -> int | None:
+    """Where the first zstd frame of some bytes ends, going from block to block; None if nowhere."""
+    place, length = _zstd_size_field(frame)
+    place += length
+    last = False
+    while place > 0 and not last:
+        header = int.from_bytes(frame[place : place + 3], "little")
+        last, kind, size = bool(header & 1), header >> 1 & 3, header >> 3
+        place += 3 + (1 if kind == _ZSTD_REPEATED else size)
+        if place > len(frame):
+            return None
+    place += 4 * bool(last and frame[4] & 0x04)
+    return place if 0 < place <= len(frame) else None
+
+
+def _zstd_size_field(frame: bytes) -> tuple[int, int]:
+    """Where a zstd frame says its size, and in how many bytes; (0, 0) if it is none."""
+    if len(frame) < 6 or frame[:4] != _ZSTD_MAGIC:
+        return 0, 0
+    descriptor = frame[4]
+    single_segment = bool(descriptor & 0x20)
+    start = 5 + (not single_segment) + (0, 1, 2, 4)[descriptor & 0x03]
+    return start, (int(single_segment), 2, 4, 8)[descriptor >> 6]

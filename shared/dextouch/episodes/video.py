@@ -18,7 +18,8 @@ from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
 
-_IDR_SLICE, _SLICE = 5, 1
+_IDR_SLICE, _SLICE, _SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS = 5, 1, 7, 8
+_START_CODE = b"\x00\x00\x01"
 # Averaging chroma over its 2×2 pixels costs nothing against the nearest one and gives 0.25 dB.
 _TO_YUV = "AREA"
 _TO_RGB = "BICUBIC"
@@ -50,14 +51,29 @@ FULL_FORM = ImageForm()
 
 
 def is_keyframe(access_unit: bytes) -> bool:
-    """Whether an access unit of H.264 (Annex B) can be decoded without those before it."""
-    start = access_unit.find(b"\x00\x00\x01")
+    """Whether an access unit of H.264 (Annex B) can be decoded without those before it.
+
+    It is an IDR picture with its parameter sets in front of it.
+    """
+    return bool(parameter_sets(access_unit))
+
+
+def parameter_sets(access_unit: bytes) -> bytes:
+    """The sequence and picture parameter sets in front of an IDR picture; none: empty."""
+    kinds: set[int] = set()
+    found = b""
+    start = access_unit.find(_START_CODE)
     while start >= 0 and start + 3 < len(access_unit):
-        unit_type = access_unit[start + 3] & 0x1F
-        if unit_type in {_IDR_SLICE, _SLICE}:
-            return unit_type == _IDR_SLICE
-        start = access_unit.find(b"\x00\x00\x01", start + 3)
-    return False
+        kind = access_unit[start + 3] & 0x1F
+        if kind in {_IDR_SLICE, _SLICE}:
+            whole = kinds == {_SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS} and kind == _IDR_SLICE
+            return found if whole else b""
+        stop = access_unit.find(_START_CODE, start + 3)
+        if kind in {_SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS}:
+            kinds.add(kind)
+            found += access_unit[start : stop if stop >= 0 else len(access_unit)]
+        start = stop
+    return b""
 
 
 def check_video_size(height: int, width: int) -> None:
@@ -140,15 +156,11 @@ class GopDecoder:
     """Decodes groups of pictures of one image size, each from its first access unit."""
 
     def __init__(self, height: int, width: int) -> None:
-        import av
         from av.video.reformatter import VideoReformatter
 
         self._shape = (height, width)
-        self._context: Any = av.CodecContext.create("h264", "r")
-        self._context.thread_count = 1
-        # The bound keeps a forged header from allocating gigabytes.
-        pixels = (height + 16) * (width + 16)
-        self._context.options = {"flags": "+low_delay", "max_pixels": str(pixels)}
+        self._context: Any = None
+        self._parameters = b""
         self._reformatter = VideoReformatter()
 
     def decode(
@@ -169,7 +181,7 @@ class GopDecoder:
 
         rows = {place: row for row, place in enumerate(wanted)}
         num_decoded = 0
-        self._context.flush_buffers()
+        self._begin(parameter_sets(access_units[0]))
         try:
             for access_unit in (*access_units, None):
                 packet = None if access_unit is None else av.Packet(access_unit)
@@ -185,6 +197,23 @@ class GopDecoder:
             raise CorruptDataError(
                 f"H.264: got {num_decoded} images from {len(access_units)} access units"
             )
+
+    def _begin(self, parameters: bytes) -> None:
+        """Make sure that what is decoded next depends on nothing that was decoded before."""
+        import av
+
+        if not parameters:
+            raise CorruptDataError("H.264: first image of a group has no parameter sets")
+        if parameters == self._parameters:
+            self._context.flush_buffers()
+            return
+        # A decoder that refuses parameter sets goes on with those that it had.
+        self._context = av.CodecContext.create("h264", "r")
+        self._context.thread_count = 1
+        # The bound keeps a forged header from allocating gigabytes.
+        pixels = (self._shape[0] + 16) * (self._shape[1] + 16)
+        self._context.options = {"flags": "+low_delay", "max_pixels": str(pixels)}
+        self._parameters = parameters
 
     def _write(self, frame: "VideoFrame", form: ImageForm, out: np.ndarray) -> None:
         if (frame.height, frame.width) != self._shape:
