@@ -1,0 +1,154 @@
+"""Folders of a store → its trash, from which they come back whole or are removed for good.
+
+An entry is a folder `.trash/KIND.ID.TIME`, TIME being nanoseconds since 1970. Going in and coming
+back are one rename each, so that a thing is there whole or not at all.
+"""
+
+import contextlib
+import re
+import shutil
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+from dextouch.episodes.files import disk_errors, sync_folder
+from dextouch.episodes.format import COMMIT_FILE, KINDS
+from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
+
+TRASH = ".trash"
+# Beside groups: unfinished uploads and stages that were too damaged to be completed.
+TrashKind = Literal["episode", "recording", "upload", "stage"]
+TRASH_KINDS: tuple[TrashKind, ...] = get_args(TrashKind)
+HOMES: dict[TrashKind, str] = {
+    "episode": "episodes",
+    "recording": "recordings",
+    "upload": ".uploads",
+    "stage": ".staging",
+}
+_NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
+
+
+@dataclass(frozen=True)
+class TrashEntry:
+    """One deleted thing; `num_bytes` is what removing it for good would free."""
+
+    kind: TrashKind
+    item_id: str
+    deleted_at_ns: int
+    num_bytes: int
+    folder: Path
+
+
+def put_into_trash(root: Path, kind: TrashKind, item_id: str, *, now_ns: int | None = None) -> Path:
+    """Make a folder vanish from its place; it can be restored until it is purged.
+
+    Args:
+        root: of the store.
+        kind: of the thing.
+        item_id: name of its folder.
+        now_ns: nanoseconds since 1970; the clock's when None.
+
+    Returns:
+        Where it lies now.
+
+    Raises:
+        NotFoundError: it is not there.
+    """
+    home = root / _home(kind)
+    number = time.time_ns() if now_ns is None else now_ns
+    with disk_errors(f"delete {kind} {item_id}"):
+        (root / TRASH).mkdir(parents=True, exist_ok=True)
+        while (place := root / TRASH / f"{kind}.{item_id}.{number}").exists():
+            number += 1
+        try:
+            (home / item_id).rename(place)
+        except FileNotFoundError as error:
+            raise NotFoundError(f"{kind} {item_id!r}: not in the store {root}") from error
+        sync_folder(home)
+        sync_folder(root / TRASH)
+    return place
+
+
+def list_trash(root: Path) -> list[TrashEntry]:
+    """What is in the trash, the oldest first; what a purge began to remove counts too."""
+    folder = root / TRASH
+    entries = []
+    with disk_errors("list the trash"):
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            match = _NAME.fullmatch(path.name)
+            if match is not None:
+                kind = next(known for known in TRASH_KINDS if known == match[1])
+                size = _num_bytes(path)
+                entries.append(TrashEntry(kind, match[2], int(match[3]), size, path))
+    return sorted(entries, key=lambda entry: entry.deleted_at_ns)
+
+
+def restore_from_trash(root: Path, kind: TrashKind, item_id: str) -> TrashEntry:
+    """Put what was deleted last under an id back into its place.
+
+    Raises:
+        NotFoundError: nothing whole of that kind and id is in the trash.
+        ConflictError: the id was taken in the meantime.
+    """
+    home = _home(kind)
+    entries = [
+        entry
+        for entry in list_trash(root)
+        if (entry.kind, entry.item_id) == (kind, item_id) and _is_whole(entry)
+    ]
+    if not entries:
+        raise NotFoundError(f"{kind} {item_id!r}: not in the trash of {root}")
+    entry, target = entries[-1], root / home / item_id
+    with disk_errors(f"restore {kind} {item_id}"):
+        if target.exists() or target.is_symlink():
+            raise ConflictError(
+                f"{kind} {item_id!r} exists; delete it first, then restore the older one"
+            )
+        target.parent.mkdir(parents=True, exist_ok=True)
+        entry.folder.rename(target)
+        sync_folder(target.parent)
+    return entry
+
+
+def purge_trash(
+    root: Path, *, older_than_s: float = 0.0, now_ns: int | None = None
+) -> list[TrashEntry]:
+    """Remove what has been in the trash for so long; it cannot be restored. What went comes back.
+
+    A purge that was interrupted is completed by the next one.
+    """
+    now_ns = time.time_ns() if now_ns is None else now_ns
+    old = [e for e in list_trash(root) if e.deleted_at_ns <= now_ns - round(older_than_s * 1e9)]
+    for entry in old:
+        remove_for_good(entry.folder)
+    return old
+
+
+def remove_for_good(folder: Path) -> None:
+    """Remove a folder outside the places of groups; a link goes, what it points at stays."""
+    with disk_errors(f"remove {folder.name}"), contextlib.suppress(FileNotFoundError):
+        if folder.is_symlink() or folder.is_file():
+            folder.unlink()
+            return
+        # First, so that what is only half removed is never taken for whole.
+        (folder / COMMIT_FILE).unlink(missing_ok=True)
+        shutil.rmtree(folder)
+
+
+def _is_whole(entry: TrashEntry) -> bool:
+    return entry.kind not in KINDS or (entry.folder / COMMIT_FILE).is_file()
+
+
+def _home(kind: TrashKind) -> str:
+    if kind not in HOMES:
+        raise UnknownNameError("kind", kind, list(HOMES))
+    return HOMES[kind]
+
+
+def _num_bytes(folder: Path) -> int:
+    total = 0
+    for path in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):
+            total += path.lstat().st_size if path.is_file() else 0
+    return total
