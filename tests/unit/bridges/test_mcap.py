@@ -2,6 +2,7 @@
 
 import json
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -286,8 +287,13 @@ def test_a_bomb_is_not_unfolded(announced, error, other, tmp_path):
     header = b"\x01" + struct.pack("<Q", 8) + b"\0" * 8
     path = tmp_path / "bomb.mcap"
     path.write_bytes(b"\x89MCAP0\r\n" + header + chunk_record(announced=announced, data=bomb))
-    with pytest.raises(error):
-        import_mcap(path, other)
+    tracemalloc.start()
+    try:
+        with pytest.raises(error):
+            import_mcap(path, other)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()
 
 
 def rewrite(path, *, drop=0, about=None, attributes=None):

@@ -1,6 +1,7 @@
 """UMI zip: read by zarr-python as it stands, back into a store, and refused when foreign."""
 
 import json
+import tracemalloc
 import zipfile
 
 import numpy as np
@@ -201,6 +202,22 @@ def test_an_episode_without_end_is_refused(store, other, tmp_path, monkeypatch):
     monkeypatch.setattr("dextouch.bridges.umi.reading.MAX_STEPS", 4)
     with pytest.raises(LimitExceededError, match="5 steps"):
         import_umi(path, other)
+
+
+def test_a_storage_chunk_is_unfolded_no_further_than_its_size(store, tmp_path):
+    path = tmp_path / "take.zip"
+    export_umi([write_episode(store, "all", num_steps=5)], path)
+    bomb = Zstd().encode(b"\0" * (1 << 26))
+    rewritten(path, lambda e: e.update({"data/camera0_rgb/3.0.0.0": bomb}))
+    with ZarrZipReader(path) as archive:
+        archive.metadata("data/camera0_rgb")
+        tracemalloc.start()
+        try:
+            with pytest.raises(CorruptDataError, match="or more"):
+                archive.read("data/camera0_rgb", 3, 4)
+            assert tracemalloc.get_traced_memory()[1] < 1 << 23
+        finally:
+            tracemalloc.stop()
 
 
 def test_a_deflated_bomb_is_not_unfolded(store, other, tmp_path):
