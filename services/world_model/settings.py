@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
-from pydantic_settings import BaseSettings
+from pydantic_settings import BaseSettings, CliImplicitFlag
 
 from dextouch.serving.settings import service_config
 from dextouch.worlds.serve import WorldServiceSettings
@@ -54,6 +54,12 @@ class TrainSettings(BaseModel):
     num_threads: int = Field(default=1, ge=1)
     heldout_percent: int = Field(default=10, ge=1, le=50)
     evaluation_stride: int = Field(default=8, ge=1)
+    streaming: CliImplicitFlag[bool] = Field(
+        default=False, description="leave episodes on the disk: for more of them than memory holds"
+    )
+    loader_workers: int = Field(
+        default=1, ge=0, le=64, description="processes that read windows, with --streaming"
+    )
     network: NetworkConfig = NetworkConfig()
     optimizer: OptimizerSettings = OptimizerSettings()
     windows: WindowSettings = WindowSettings()
@@ -98,6 +104,9 @@ def command_line(settings: TrainSettings) -> str:
     if settings.heldout is not None:
         flags.append(f"--heldout={_last_name(settings.heldout)}")
     for name, value in given.items():
+        if isinstance(value, bool):
+            flags.append(f"--{name}" if value else f"--no-{name}")
+            continue
         fields = value.items() if isinstance(value, dict) else [("", value)]
         flags += [f"--{name}{'.' if field else ''}{field}={number}" for field, number in fields]
     return " ".join(["python -m services.world_model train", *flags])

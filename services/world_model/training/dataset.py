@@ -1,12 +1,14 @@
-"""Episodes in, random windows as requests and targets out; everything held in memory.
+"""Episodes in, random windows as requests and targets out.
 
 Windows are cut from whole episodes read once, through the same re-anchoring that the store's
-reader uses, so that an epoch touches no disk.
+reader uses, so that an epoch touches no disk. `services.world_model.training.streaming` has the
+same windows of episodes that stay on the disk.
 """
 
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -17,6 +19,57 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
 from dextouch.worlds.world import ActionKind
 from services.world_model.network.inputs import PredictionRequest
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where a window lies: steps start … start + num_steps − 1 of one of several episodes.
+
+    `from_command` anchors commanded actions at the first step's *commanded* pose.
+    """
+
+    episode_index: int
+    start: int
+    num_steps: int
+    action_kind: ActionKind = "measured"
+    from_command: bool = False
+
+
+@runtime_checkable
+class TrainingEpisode(Protocol):
+    """An episode that windows are cut from, in memory or on the disk."""
+
+    @property
+    def episode_id(self) -> str:
+        """Its name in the store."""
+        ...
+
+    @property
+    def task(self) -> str:
+        """What is done in it."""
+        ...
+
+    @property
+    def seed(self) -> int | None:
+        """Of the scene, if it was made by the twin."""
+        ...
+
+    @property
+    def action_kinds(self) -> tuple[ActionKind, ...]:
+        """The kinds of actions it holds."""
+        ...
+
+    def content_hash(self) -> str:
+        """The `fingerprint` of its content."""
+        ...
+
+    def __len__(self) -> int:
+        """Its steps."""
+        ...
+
+    def cut(self, place: Place) -> "Window":
+        """The window at a place in this episode."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -37,6 +90,25 @@ class EpisodeArrays:
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
+
+    @property
+    def action_kinds(self) -> tuple[ActionKind, ...]:
+        """The kinds of actions it holds."""
+        return tuple(self.actions)
+
+    def content_hash(self) -> str:
+        """The `fingerprint` of its content."""
+        return fingerprint(self)
+
+    def cut(self, place: Place) -> "Window":
+        """The window at a place in this episode."""
+        return cut_window(
+            self,
+            place.start,
+            place.num_steps,
+            action_kind=place.action_kind,
+            from_command=place.from_command,
+        )
 
 
 @dataclass(frozen=True)
@@ -149,7 +221,7 @@ class WindowSampler:
 
     def __init__(
         self,
-        episodes: Sequence[EpisodeArrays],
+        episodes: Sequence[TrainingEpisode],
         rng: np.random.Generator,
         *,
         max_steps: int,
@@ -169,15 +241,22 @@ class WindowSampler:
 
     def draw(self, batch: int, num_steps: int) -> WindowBatch:
         """A batch of random windows."""
-        return stack_windows([self._draw_one(num_steps) for _ in range(batch)])
+        return self.cut(self.places(batch, num_steps))
 
-    def _draw_one(self, num_steps: int) -> Window:
-        episode = self._episodes[self._rng.integers(len(self._episodes))]
+    def places(self, batch: int, num_steps: int) -> list[Place]:
+        """Where the windows of the next batch lie."""
+        return [self._place(num_steps) for _ in range(batch)]
+
+    def cut(self, places: Sequence[Place]) -> WindowBatch:
+        """The windows at these places."""
+        return stack_windows([self._episodes[p.episode_index].cut(p) for p in places])
+
+    def _place(self, num_steps: int) -> Place:
+        index = int(self._rng.integers(len(self._episodes)))
+        episode = self._episodes[index]
         start = int(self._rng.integers(len(episode) - num_steps + 1))
         is_commanded = self._rng.random() < self._commanded_fraction
-        is_chained = self._rng.random() < self._chained_fraction
-        if not is_commanded or "commanded" not in episode.actions:
-            return cut_window(episode, start, num_steps)
-        return cut_window(
-            episode, start, num_steps, action_kind="commanded", from_command=is_chained
-        )
+        is_chained = bool(self._rng.random() < self._chained_fraction)
+        if not is_commanded or "commanded" not in episode.action_kinds:
+            return Place(index, start, num_steps)
+        return Place(index, start, num_steps, action_kind="commanded", from_command=is_chained)

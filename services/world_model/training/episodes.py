@@ -1,6 +1,7 @@
 """An episode store in, episodes as arrays on the model grid out, and their split by hash."""
 
 from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -8,9 +9,10 @@ from jaxtyping import Float64
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.worlds.world import ActionKind
-from services.world_model.training.dataset import EpisodeArrays, fingerprint
+from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
 
 CAMERA = "camera_head"
+E = TypeVar("E", bound=TrainingEpisode)
 
 
 def load_episodes(url: str) -> list[EpisodeArrays]:
@@ -22,14 +24,22 @@ def load_episodes(url: str) -> list[EpisodeArrays]:
     """
     store = EpisodeStore(url)
     episodes = [read_episode(store.open(episode_id)) for episode_id in store.list()]
-    if not episodes:
+    check_rates({episode.model_rate_hz for episode in episodes}, url)
+    return episodes
+
+
+def check_rates(rates_hz: set[float], url: str) -> None:
+    """Refuse a store without episodes, or with several model rates.
+
+    Raises:
+        InvalidInputError: what `load_episodes` says.
+    """
+    if not rates_hz:
         raise InvalidInputError(
             f"episodes: the store {url} holds none; record some first (dextouch twin record)"
         )
-    rates = {episode.model_rate_hz for episode in episodes}
-    if len(rates) > 1:
-        raise InvalidInputError(f"episodes: model rates {sorted(rates)} Hz in one store {url}")
-    return episodes
+    if len(rates_hz) > 1:
+        raise InvalidInputError(f"episodes: model rates {sorted(rates_hz)} Hz in one store {url}")
 
 
 def read_episode(reader: EpisodeReader) -> EpisodeArrays:
@@ -55,18 +65,16 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
     )
 
 
-def split_by_hash(
-    episodes: Sequence[EpisodeArrays], *, heldout_percent: int
-) -> tuple[list[EpisodeArrays], list[EpisodeArrays]]:
+def split_by_hash(episodes: Sequence[E], *, heldout_percent: int) -> tuple[list[E], list[E]]:
     """Training and held-out episodes; which is which depends on an episode's content alone.
 
     Raises:
         InvalidInputError: one of the two sides would be empty.
     """
-    trained: list[EpisodeArrays] = []
-    heldout: list[EpisodeArrays] = []
+    trained: list[E] = []
+    heldout: list[E] = []
     for episode in episodes:
-        bucket = int(fingerprint(episode)[:8], 16) % 100
+        bucket = int(episode.content_hash()[:8], 16) % 100
         (heldout if bucket < heldout_percent else trained).append(episode)
     if not trained or not heldout:
         raise InvalidInputError(

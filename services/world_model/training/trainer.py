@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -20,13 +20,16 @@ from services.world_model.network.model import JointWorldModel
 from services.world_model.settings import OptimizerSettings, TrainSettings, command_line
 from services.world_model.training.dataset import (
     EpisodeArrays,
+    Place,
+    TrainingEpisode,
+    WindowBatch,
     WindowSampler,
     combined_hash,
-    fingerprint,
 )
 from services.world_model.training.episodes import load_episodes, split_by_hash
 from services.world_model.training.evaluation import evaluate_prediction
 from services.world_model.training.objective import losses
+from services.world_model.training.streaming import index_episodes, read_batches
 
 LOG_EVERY_STEPS = 20
 MIN_LEARNING_RATE_SHARE = 0.01
@@ -70,27 +73,41 @@ def train(settings: TrainSettings, on_progress: OnProgress | None = None) -> Tra
     return train_on(trained, heldout, settings, on_progress)
 
 
-def load_split(settings: TrainSettings) -> tuple[list[EpisodeArrays], list[EpisodeArrays]]:
-    """Training and held-out episodes of the settings' stores."""
+def load_split(
+    settings: TrainSettings,
+) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
+    """Training and held-out episodes of the settings' stores; the latter always in memory."""
+    if settings.streaming:
+        return _stream_split(settings)
     episodes = load_episodes(settings.episodes)
     if settings.heldout is None:
         return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
     return episodes, load_episodes(settings.heldout)
 
 
+def _stream_split(
+    settings: TrainSettings,
+) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
+    episodes = index_episodes(settings.episodes)
+    if settings.heldout is not None:
+        return episodes, load_episodes(settings.heldout)
+    trained, heldout = split_by_hash(episodes, heldout_percent=settings.heldout_percent)
+    return trained, [episode.load() for episode in heldout]
+
+
 def train_on(
-    trained: Sequence[EpisodeArrays],
+    trained: Sequence[TrainingEpisode],
     heldout: Sequence[EpisodeArrays],
     settings: TrainSettings,
     on_progress: OnProgress | None = None,
 ) -> TrainingReport:
-    """`train` with episodes that are already in memory."""
+    """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     torch.set_num_threads(settings.num_threads)
     run = TrainingRun(trained, settings)
     run.fit_codecs()
     log = run.run(on_progress)
-    prints = sorted(fingerprint(episode) for episode in trained)
+    prints = sorted(episode.content_hash() for episode in trained)
     metadata = CheckpointMetadata(
         name=settings.name,
         network=settings.network,
@@ -128,14 +145,14 @@ def train_on(
     )
 
 
-def check_disjoint(trained: Sequence[EpisodeArrays], heldout: Sequence[EpisodeArrays]) -> None:
+def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
     """Raise if a held-out episode, or a seed of its task, is also trained on."""
-    prints = {fingerprint(episode) for episode in trained}
+    prints = {episode.content_hash() for episode in trained}
     seeds = {(e.task, e.seed) for e in trained if e.seed is not None}
     both = [
         episode.episode_id
         for episode in heldout
-        if fingerprint(episode) in prints or (episode.task, episode.seed) in seeds
+        if episode.content_hash() in prints or (episode.task, episode.seed) in seeds
     ]
     if both:
         raise InvalidInputError(
@@ -146,10 +163,14 @@ def check_disjoint(trained: Sequence[EpisodeArrays], heldout: Sequence[EpisodeAr
 
 
 class TrainingRun:
-    """One run: network, its running average, optimizer and clock."""
+    """One run: network, its running average, optimizer and clock.
 
-    def __init__(self, episodes: Sequence[EpisodeArrays], settings: TrainSettings) -> None:
+    Windows of a seed are the same ones whether they are cut in memory or streamed from the disk.
+    """
+
+    def __init__(self, episodes: Sequence[TrainingEpisode], settings: TrainSettings) -> None:
         self.settings = settings
+        self._episodes = episodes
         self.step = 0
         self.cpu_s = 0.0
         with torch.random.fork_rng(devices=[]):
@@ -192,8 +213,9 @@ class TrainingRun:
         log: list[TrainingProgress] = []
         start_s = time.process_time()
         self.model.train()
+        batches = self._batches()
         while self.share() < 1.0:
-            loss_video, loss_tactile = self._one_step()
+            loss_video, loss_tactile = self.learn(next(batches))
             self.step += 1
             self.cpu_s = time.process_time() - start_s
             if self.step % LOG_EVERY_STEPS == 0 or self.share() >= 1.0:
@@ -211,9 +233,9 @@ class TrainingRun:
         limit = self.settings.max_steps
         return by_time if limit is None else max(by_time, self.step / limit)
 
-    def _one_step(self) -> tuple[float, float]:
+    def learn(self, batch: WindowBatch) -> tuple[float, float]:
+        """One step of the optimizer; the losses of sight and touch come back."""
         settings = self.settings.optimizer
-        batch = self._sampler.draw(settings.batch, self._num_steps())
         inputs = build_inputs(batch.requests, self.settings.network)
         loss = losses(
             self.model,
@@ -232,6 +254,17 @@ class TrainingRun:
         self._optimizer.step()
         self._average()
         return loss.video.item(), loss.tactile.item()
+
+    def _batches(self) -> Iterator[WindowBatch]:
+        """The windows of each step, for ever."""
+        if self.settings.streaming:
+            workers = self.settings.loader_workers
+            return read_batches(self._episodes, self._places(), num_workers=workers)
+        return map(self._sampler.cut, self._places())
+
+    def _places(self) -> Iterator[list[Place]]:
+        while True:
+            yield self._sampler.places(self.settings.optimizer.batch, self._num_steps())
 
     def _num_steps(self) -> int:
         """Mostly the full window; sometimes 5, 9, … steps, since short chunks are served too."""

@@ -1,0 +1,188 @@
+"""An episode store in, the trainer's windows read from the disk when they are needed out.
+
+For more episodes than memory holds. A window is read through the store's reader, which decodes one
+camera and the span of the window only.
+"""
+
+import multiprocessing
+from collections.abc import Generator, Iterable, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from itertools import accumulate
+from typing import Literal
+
+import numpy as np
+import torch
+from torch.utils.data import DataLoader, Dataset
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import poses_from_actions, reanchor
+from dextouch.worlds.world import ActionKind
+from services.world_model.network.inputs import PredictionRequest
+from services.world_model.training.dataset import (
+    EpisodeArrays,
+    Place,
+    TrainingEpisode,
+    Window,
+    WindowBatch,
+    fingerprint,
+    stack_windows,
+)
+from services.world_model.training.episodes import CAMERA, check_rates, read_episode
+
+# Readers that a process keeps open; each holds an episode's stamps and actions.
+MAX_OPEN_READERS = 512
+StartMethod = Literal["fork", "spawn", "forkserver"]
+
+
+@lru_cache(maxsize=MAX_OPEN_READERS)
+def _reader(url: str, episode_id: str) -> EpisodeReader:
+    return EpisodeStore(url).open(episode_id)
+
+
+@dataclass(frozen=True)
+class StoredEpisode:
+    """One episode that stays on the disk; `index_episodes` makes it."""
+
+    url: str
+    episode_id: str
+    task: str
+    seed: int | None
+    num_steps: int
+    action_kinds: tuple[ActionKind, ...]
+    content_sha256: str
+
+    def __len__(self) -> int:
+        return self.num_steps
+
+    def content_hash(self) -> str:
+        """The `fingerprint` of its content when it was indexed."""
+        return self.content_sha256
+
+    def load(self) -> EpisodeArrays:
+        """The whole episode in memory."""
+        return read_episode(_reader(self.url, self.episode_id))
+
+    def cut(self, place: Place) -> Window:
+        """The window at a place in this episode, read now.
+
+        Raises:
+            InvalidInputError: steps outside the episode.
+            UnknownNameError: a kind of action that it does not hold.
+            CorruptDataError: damaged bytes.
+        """
+        read = _reader(self.url, self.episode_id).window(
+            place.start, place.num_steps, cameras=(CAMERA,), action_kind=place.action_kind
+        )
+        actions, anchor = read.actions, read.anchor
+        if place.from_command and place.action_kind == "commanded":
+            anchor = poses_from_actions(actions[:1], anchor).anchor(0)
+            actions = reanchor(actions, 0)
+        images = read.images[CAMERA]
+        request = PredictionRequest(
+            first_image=images[0],
+            first_tactile_kpa=read.tactile_kpa[0],
+            actions=actions,
+            action_kind=place.action_kind,
+            instruction=read.instruction,
+            anchor=anchor,
+            K_head=read.K_head,
+        )
+        return Window(request, images, read.tactile_kpa, read.tactile_valid)
+
+
+def index_episodes(url: str) -> list[StoredEpisode]:
+    """All episodes of a store; each is read once, for the hash of its content, and let go.
+
+    Raises:
+        InvalidInputError: a store without episodes, or one of another rate than the others.
+        UnknownNameError: an episode without the head camera.
+    """
+    # An id may hold something else than when it was last read.
+    _reader.cache_clear()
+    store = EpisodeStore(url)
+    episodes, rates_hz = [], set()
+    for episode_id in store.list():
+        arrays = read_episode(store.open(episode_id))
+        rates_hz.add(arrays.model_rate_hz)
+        episodes.append(
+            StoredEpisode(
+                url=url,
+                episode_id=episode_id,
+                task=arrays.task,
+                seed=arrays.seed,
+                num_steps=len(arrays),
+                action_kinds=arrays.action_kinds,
+                content_sha256=fingerprint(arrays),
+            )
+        )
+    check_rates(rates_hz, url)
+    return episodes
+
+
+class WindowDataset(Dataset[Window]):
+    """Every window of `num_steps` steps with measured actions, by number; others by place.
+
+    Windows are numbered by episode, then by start. It may be taken along into the worker processes
+    of a DataLoader, forked or spawned.
+
+    Args:
+        episodes: to cut from; those shorter than a window give none.
+        num_steps: of the windows that are asked for by number.
+    """
+
+    def __init__(self, episodes: Sequence[TrainingEpisode], *, num_steps: int) -> None:
+        self._episodes, self._num_steps = list(episodes), num_steps
+        counts = (max(0, len(episode) - num_steps + 1) for episode in self._episodes)
+        # First number of each episode's windows, and one past the last of all.
+        self._firsts = np.array(list(accumulate(counts, initial=0)), dtype=np.int64)
+
+    def __len__(self) -> int:
+        return int(self._firsts[-1])
+
+    def place(self, number: int) -> Place:
+        """Where window `number` lies.
+
+        Raises:
+            InvalidInputError: no such window.
+        """
+        if not 0 <= number < len(self):
+            raise InvalidInputError(f"window: got {number}, expected 0 … {len(self) - 1}")
+        index = int(np.searchsorted(self._firsts, number, side="right")) - 1
+        return Place(index, number - int(self._firsts[index]), self._num_steps)
+
+    def __getitem__(self, wanted: int | Place) -> Window:
+        place = wanted if isinstance(wanted, Place) else self.place(wanted)
+        return self._episodes[place.episode_index].cut(place)
+
+
+def read_batches(
+    episodes: Sequence[TrainingEpisode],
+    places: Iterable[list[Place]],
+    *,
+    num_workers: int = 0,
+    start_method: StartMethod | None = None,
+) -> Generator[WindowBatch, None, None]:
+    """The batches at these places, in their order, however many processes read them.
+
+    Args:
+        episodes: that the places count from.
+        places: of each batch; may be endless, some are asked for ahead.
+        num_workers: processes that read; 0 reads in this one. They end with the iterator.
+        start_method: of the processes; None for the platform's own.
+    """
+    loader = DataLoader(
+        WindowDataset(episodes, num_steps=1),
+        batch_sampler=places,
+        collate_fn=stack_windows,
+        num_workers=num_workers,
+        multiprocessing_context=_context(start_method) if num_workers else None,
+        # Its own generator: otherwise the loader draws a seed for its workers from the global one.
+        generator=torch.Generator().manual_seed(0),
+    )
+    yield from loader
+
+
+def _context(start_method: StartMethod | None) -> multiprocessing.context.BaseContext:
+    return multiprocessing.get_context(start_method)

@@ -1,0 +1,228 @@
+"""Windows read from the disk are those cut in memory, in the same order, in any process."""
+
+import json
+from itertools import islice
+
+import numpy as np
+import pytest
+import torch
+from torch.utils.data import DataLoader
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import InvalidInputError
+from services.world_model.__main__ import main
+from services.world_model.checkpoints import read_checkpoint
+from services.world_model.training.dataset import (
+    Place,
+    WindowSampler,
+    fingerprint,
+    stack_windows,
+)
+from services.world_model.training.episodes import load_episodes
+from services.world_model.training.streaming import (
+    WindowDataset,
+    index_episodes,
+    read_batches,
+)
+from services.world_model.training.trainer import TrainingRun, load_split, train
+from tests.unit.world_model.conftest import write_episode
+
+PLACES = [
+    Place(0, 0, 17),
+    Place(2, 7, 9, action_kind="commanded"),
+    Place(2, 24, 17, action_kind="commanded", from_command=True),
+    Place(5, 36, 5),
+]
+
+
+@pytest.fixture
+def url(toy_store):
+    return str(toy_store.root)
+
+
+@pytest.fixture
+def stored(url):
+    return index_episodes(url)
+
+
+@pytest.fixture
+def in_memory(url):
+    return load_episodes(url)
+
+
+def assert_same_window(got, expected):
+    np.testing.assert_array_equal(got.images, expected.images)
+    np.testing.assert_array_equal(got.tactile_kpa, expected.tactile_kpa)
+    np.testing.assert_array_equal(got.tactile_valid, expected.tactile_valid)
+    ours, theirs = got.request, expected.request
+    np.testing.assert_array_equal(ours.first_image, theirs.first_image)
+    np.testing.assert_array_equal(ours.first_tactile_kpa, theirs.first_tactile_kpa)
+    # Re-anchored once here and twice there.
+    np.testing.assert_allclose(ours.actions, theirs.actions, atol=1e-12)
+    for a, b in zip(ours.anchor.as_tuple(), theirs.anchor.as_tuple(), strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-12)
+    np.testing.assert_array_equal(ours.K_head, theirs.K_head)
+    assert (ours.action_kind, ours.instruction) == (theirs.action_kind, theirs.instruction)
+
+
+def assert_same_batch(got, expected):
+    assert torch.equal(got.images, expected.images)
+    assert torch.equal(got.tactile_kpa, expected.tactile_kpa)
+    assert torch.equal(got.tactile_valid, expected.tactile_valid)
+    for ours, theirs in zip(got.requests, expected.requests, strict=True):
+        np.testing.assert_allclose(ours.actions, theirs.actions, atol=1e-12)
+        assert ours.action_kind == theirs.action_kind
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_streamed_window_is_the_one_cut_in_memory(stored, in_memory, place):
+    index = place.episode_index
+    assert_same_window(stored[index].cut(place), in_memory[index].cut(place))
+
+
+def test_an_indexed_episode_says_what_it_is(stored, in_memory):
+    for ours, theirs in zip(stored, in_memory, strict=True):
+        assert (ours.episode_id, ours.task, ours.seed) == (
+            theirs.episode_id, theirs.task, theirs.seed,
+        )  # fmt: skip
+        assert len(ours) == len(theirs)
+        assert set(ours.action_kinds) == {"measured", "commanded"}
+        assert ours.content_hash() == fingerprint(theirs)
+        assert fingerprint(ours.load()) == ours.content_hash()
+
+
+@pytest.mark.parametrize(("num_workers", "start_method"), [(0, None), (2, "fork"), (1, "spawn")])
+def test_batches_are_the_same_in_any_process(stored, in_memory, num_workers, start_method):
+    def sampler(episodes):
+        return WindowSampler(episodes, np.random.default_rng(3), max_steps=17)
+
+    lengths = (17, 9, 5, 17)
+    memory, streamed = sampler(in_memory), sampler(stored)
+    expected = [memory.draw(4, n) for n in lengths]
+    places = [streamed.places(4, n) for n in lengths]
+    got = read_batches(stored, places, num_workers=num_workers, start_method=start_method)
+    for ours, theirs in zip(got, expected, strict=True):
+        assert_same_batch(ours, theirs)
+
+
+def test_batches_of_endless_places_end_with_their_reader(stored):
+    sampler = WindowSampler(stored, np.random.default_rng(0), max_steps=17)
+    batches = read_batches(stored, iter(lambda: sampler.places(2, 5), None), num_workers=1)
+    assert [len(batch.requests) for batch in islice(batches, 3)] == [2, 2, 2]
+    batches.close()
+    assert torch.multiprocessing.active_children() == []
+
+
+def test_reading_ahead_leaves_the_global_random_numbers_alone(stored):
+    torch.manual_seed(5)
+    before = torch.random.get_rng_state()
+    list(read_batches(stored, [PLACES[:1]]))
+    assert torch.equal(torch.random.get_rng_state(), before)
+
+
+def test_every_window_has_a_number(stored):
+    dataset = WindowDataset(stored, num_steps=17)
+    assert len(dataset) == 6 * (41 - 17 + 1)
+    assert dataset.place(0) == Place(0, 0, 17)
+    assert dataset.place(24) == Place(0, 24, 17)
+    assert dataset.place(25) == Place(1, 0, 17)
+    assert dataset.place(len(dataset) - 1) == Place(5, 24, 17)
+    for number in (-1, len(dataset)):
+        with pytest.raises(InvalidInputError, match="expected 0 … 149"):
+            dataset[number]
+
+
+def test_short_episodes_have_no_window(tmp_path, toy_episode):
+    store = EpisodeStore(tmp_path / "mixed")
+    for seed, num_steps in ((0, 20), (1, 9), (2, 17)):
+        write_episode(store, toy_episode(seed, num_steps))
+    dataset = WindowDataset(index_episodes(str(store.root)), num_steps=17)
+    places = [dataset.place(number) for number in range(len(dataset))]
+    assert [(p.episode_index, p.start) for p in places] == [(0, 0), (0, 1), (0, 2), (0, 3), (2, 0)]
+
+
+def test_a_passed_generator_shuffles_the_same_way(stored, in_memory):
+    def shuffled(episodes):
+        dataset = WindowDataset(episodes, num_steps=9)
+        generator = torch.Generator().manual_seed(8)
+        return DataLoader(
+            dataset, batch_size=16, shuffle=True, generator=generator, collate_fn=stack_windows
+        )
+
+    first, again = shuffled(stored), shuffled(in_memory)
+    pairs = list(islice(zip(first, again, strict=True), 3))
+    for ours, theirs in pairs:
+        assert_same_batch(ours, theirs)
+    plain = next(iter(DataLoader(
+        WindowDataset(stored, num_steps=9), batch_size=16, collate_fn=stack_windows
+    )))  # fmt: skip
+    assert not torch.equal(pairs[0][0].images, plain.images)
+
+
+def test_only_the_models_camera_is_decoded(stored, monkeypatch):
+    asked = []
+    window = EpisodeStore(stored[0].url).open("toy-0").__class__.window
+
+    def noted(self, *arguments, **options):
+        asked.append(options["cameras"])
+        return window(self, *arguments, **options)
+
+    monkeypatch.setattr("dextouch.episodes.EpisodeReader.window", noted)
+    stored[0].cut(PLACES[0])
+    assert asked == [("camera_head",)]
+
+
+def test_what_does_not_exist_is_refused(stored, tmp_path):
+    with pytest.raises(InvalidInputError, match="steps 30"):
+        stored[0].cut(Place(0, 30, 17))
+    with pytest.raises(InvalidInputError, match="holds none"):
+        index_episodes(str(tmp_path / "empty"))
+
+
+def test_streamed_training_gives_the_weights_of_training_in_memory(
+    stored, in_memory, train_settings
+):
+    def weights(episodes, **changes):
+        settings = train_settings.model_copy(update={"max_steps": 6, **changes})
+        run = TrainingRun(episodes, settings)
+        run.fit_codecs()
+        run.run()
+        return run.averaged.state_dict()
+
+    expected = weights(in_memory)
+    for workers in (0, 1):
+        got = weights(stored, streaming=True, loader_workers=workers)
+        for name, weight in expected.items():
+            torch.testing.assert_close(got[name], weight, rtol=1e-4, atol=1e-6, msg=name)
+
+
+def test_streaming_splits_and_reports_as_training_in_memory(toy_store, train_settings):
+    settings = train_settings.model_copy(
+        update={"heldout_percent": 50, "max_steps": 2, "streaming": True, "loader_workers": 0}
+    )
+    trained, heldout = load_split(settings)
+    plain = load_split(settings.model_copy(update={"streaming": False}))
+    assert [e.episode_id for e in trained] == [e.episode_id for e in plain[0]]
+    assert [e.episode_id for e in heldout] == [e.episode_id for e in plain[1]]
+    metadata = read_checkpoint(train(settings).checkpoint).metadata
+    assert metadata.train_fingerprints == tuple(sorted(fingerprint(e) for e in plain[0]))
+    given = settings.model_copy(update={"heldout": settings.episodes})
+    with pytest.raises(InvalidInputError, match="also trained on"):
+        train(given)
+
+
+def test_the_command_line_streams(toy_store, tmp_path, capsys):
+    output, report = tmp_path / "m.safetensors", tmp_path / "report.json"
+    flags = {
+        "episodes": toy_store.root, "output": output, "json": report, "max_steps": 2,
+        "heldout_percent": 50, "network.image_px": 32, "network.video_width": 16,
+        "network.tactile_width": 16, "network.num_layers": 1, "network.num_heads": 1,
+        "network.codec_channels": 8, "windows.fit_windows": 8, "optimizer.batch": 2,
+        "loader_workers": 0,
+    }  # fmt: skip
+    arguments = [f"--{name}={value}" for name, value in flags.items()]
+    assert main(["train", "--streaming", *arguments]) == 0
+    assert json.loads(report.read_text())["steps"] == 2
+    command = read_checkpoint(output).metadata.command
+    assert " --streaming " in command
+    capsys.readouterr()
