@@ -23,6 +23,7 @@ from dextouch.errors import (
 )
 from tests.unit.bridges.takes import (
     K_HEAD,
+    descriptor,
     differing_streams,
     write_episode,
     write_recording,
@@ -160,6 +161,31 @@ def test_a_recording_comes_back_equal(store, other, tmp_path):
     again = other.recording("take-0001")
     assert differing_streams(reader, again) == []
     assert again.attributes == reader.attributes
+
+
+def test_times_before_zero_and_images_without_colour_come_back(store, other, tmp_path):
+    reader = write_episode(store, "plain", num_steps=3)
+    attributes = reader.attributes.model_copy(update={"episode_id": "odd", "streams": ()})
+    t_ref_ns = np.array([-(10**9) - 7, -1, 5], dtype=np.int64)
+    shapes = {"depth": ((4, 5), "uint16"), "gray": ((4, 5), "uint8"), "mask": ((2, 3, 4), "uint8")}
+    rng = np.random.default_rng(2)
+    with store.writer(attributes=attributes) as writer:
+        for name, (shape, dtype) in shapes.items():
+            writer.add_stream(descriptor(name, "image", shape, dtype, "mm", 30))
+            values = rng.integers(0, 256, (3, *shape)).astype(dtype)
+            writer.append(name, values=values, t_ref_ns=t_ref_ns)
+    path = tmp_path / "take.mcap"
+    export_mcap(store.open("odd"), path)
+    found = messages_of(path)
+    encodings = {topic: name for topic, (name, _) in found.items()}
+    assert encodings["/depth"] == encodings["/gray"] == "foxglove.RawImage"
+    assert encodings["/mask"] == "dextouch.UInt8Array"
+    depth = found["/depth"][1]
+    assert (depth[0][1].encoding, depth[0][1].step) == ("mono16", 10)
+    assert [message.log_time for message, _ in depth] == (t_ref_ns - t_ref_ns[0]).tolist()
+    assert [nanoseconds(parsed) for _, parsed in depth] == t_ref_ns.tolist()
+    import_mcap(path, other)
+    assert differing_streams(store.open("odd"), other.open("odd")) == []
 
 
 def test_rgb_images_become_jpeg_when_that_is_asked_for(store, other, tmp_path):

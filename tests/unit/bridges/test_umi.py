@@ -10,7 +10,7 @@ import zarr
 from numcodecs import Zstd
 
 from dextouch.bridges.umi import export_umi, import_umi
-from dextouch.bridges.umi.zarr_zip import MAX_CHUNK_BYTES, ZarrZipReader, ZarrZipWriter
+from dextouch.bridges.umi.zarr_zip import ZarrZipReader, ZarrZipWriter
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import (
     ConflictError,
@@ -220,13 +220,19 @@ def test_a_storage_chunk_is_unfolded_no_further_than_its_size(store, tmp_path):
             tracemalloc.stop()
 
 
-def test_a_deflated_bomb_is_not_unfolded(store, other, tmp_path):
+def test_a_deflated_bomb_is_not_unfolded(store, other, tmp_path, monkeypatch):
     path = tmp_path / "take.zip"
     export_umi([write_episode(store, "all", num_steps=5)], path)
-    rewritten(path, lambda e: e.update({"data/action/0.0": b"\0" * (MAX_CHUNK_BYTES + 1)}))
-    assert path.stat().st_size < MAX_CHUNK_BYTES // 50
-    with pytest.raises(LimitExceededError, match=r"data/action/0\.0"):
-        import_umi(path, other)
+    rewritten(path, lambda e: e.update({"data/action/0.0": b"\0" * (1 << 26)}))
+    assert path.stat().st_size < 1 << 20
+    monkeypatch.setattr("dextouch.bridges.umi.zarr_zip.MAX_CHUNK_BYTES", 1 << 20)
+    tracemalloc.start()
+    try:
+        with pytest.raises(LimitExceededError, match=r"data/action/0\.0"):
+            import_umi(path, other)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 23
+    finally:
+        tracemalloc.stop()
 
 
 def test_files_that_are_no_zip_are_refused(other, tmp_path):
