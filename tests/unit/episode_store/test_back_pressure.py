@@ -17,6 +17,7 @@ from services.episode_store import ingest as ingest_module
 from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.app import create_app
 from services.episode_store.ingest import Ingest
+from services.episode_store.intake import CREATE_BYTES
 from services.episode_store.ledger import UploadLedger
 from services.episode_store.locks import KeyedLocks
 
@@ -195,11 +196,11 @@ def test_a_station_keeps_to_its_quota(start, attributes, batch_of, settings):
     client.finish("take-1", {"glove_left": 4, "wrist_left": 0})
     used = client.recordings(station="bench").recordings[0].num_bytes
     third = attributes.model_copy(update={"recording_id": "take-3"})
-    tight = start(quota_bytes_per_station=used + 1000)
+    bound = used + CREATE_BYTES - 1
     with pytest.raises(StorageFullError):
-        tight.create(third)
+        start(quota_bytes_per_station=bound).create(third)
     store.delete("take-1", kind="recording")
-    assert start(quota_bytes_per_station=70_000).create(third).state == "open"
+    assert start(quota_bytes_per_station=bound).create(third).state == "open"
 
 
 def test_stale_uploads_go_only_when_told_to(start, attributes, batch_of, settings):

@@ -119,6 +119,16 @@ def test_what_did_not_change_is_not_looked_at(store, monkeypatch):
     assert opened == ["a"]
 
 
+def test_a_young_stamp_is_not_believed(store):
+    """Two changes may have one stamp, where the stamps of a file system are coarse."""
+    catalog, folder, now_ns = Catalog(store), store.root / "episodes", time.time_ns()
+    os.utime(folder, ns=(now_ns, now_ns))
+    assert ids(catalog) == "abcd"
+    store.delete("a")
+    os.utime(folder, ns=(now_ns, now_ns))
+    assert ids(catalog) == "bcd"
+
+
 def test_recordings_are_filtered_too(start, attributes, batch_of, store):
     client = start()
     for number, changes in enumerate(

@@ -203,6 +203,16 @@ def test_a_full_disk_refuses_the_batch_and_keeps_the_rest(
     assert_complete(store, batch_of, 10)
 
 
+def test_an_upload_that_goes_on_is_not_dropped(ingest, attributes, send):
+    """Something may come between the list of stale uploads and their end."""
+    ingest.create(attributes)
+    send(ingest, 0)
+    assert not ingest.expire("take-1", idle_s=3600.0)
+    assert send(ingest, 1).num_samples == 5
+    assert ingest.expire("take-1", idle_s=0.0)
+    assert not ingest.expire("take-1", idle_s=0.0)
+
+
 def test_many_uploads_share_few_open_files(ingest, store, attributes, send, batch_of):
     for index in range(5):
         ingest.create(attributes.model_copy(update={"recording_id": f"take-{index}"}))
