@@ -1,0 +1,276 @@
+"""A store → all damage in it, by item, array and storage chunk, and what is foreign or unfinished.
+
+Where a reader stops at the first thing that does not hold, an inspection goes on and names all.
+"""
+
+import fcntl
+import hashlib
+import os
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import google_crc32c
+import numpy as np
+
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import (
+    COMMIT_FILE,
+    METADATA_FILE,
+    STAMPS,
+    ArrayEntry,
+    Kind,
+    array_metadata,
+    shard_path,
+    stream_arrays,
+)
+from dextouch.episodes.group_contents import CommittedGroup, get_metadata, read_group
+from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.episodes.journal import (
+    CHUNK_JOURNAL,
+    SAMPLE_JOURNAL,
+    JournalLayout,
+    journal_path,
+    part_path,
+    read_payloads,
+    read_rows,
+)
+from dextouch.episodes.shard_reader import decode_rows
+from dextouch.episodes.sources import GroupFiles, LocalGroup
+from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
+from dextouch.episodes.stage import kind_of, read_stage
+from dextouch.errors import CorruptDataError, StorageError
+from dextouch.images.jpeg import jpeg_size
+from dextouch.schemas.episodes import EpisodeAttributes
+from dextouch.schemas.recordings import RecordingAttributes
+
+UPLOADS = ".uploads"
+STAGING = ".staging"
+Group = CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes]
+# Told how many bytes were read, as they are.
+Progress = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that does not hold; without `array` the whole item, without `chunk` the array."""
+
+    message: str
+    array: str | None = None
+    chunk: int | None = None
+    foreign: bool = False
+
+
+@dataclass(frozen=True)
+class ItemReport:
+    """What was found of one group, unfinished upload or stage; `busy` if a writer holds it."""
+
+    kind: str
+    item_id: str
+    num_arrays: int = 0
+    num_bytes: int = 0
+    findings: tuple[Finding, ...] = ()
+    busy: bool = False
+
+    @property
+    def damaged(self) -> bool:
+        """Whether anything does not hold."""
+        return bool(self.findings)
+
+
+def open_contents(files: GroupFiles, kind: Kind) -> Group:
+    """The contents of a committed group of either kind; raises as `read_group`."""
+    if kind == "episode":
+        return read_group(files, kind, EpisodeAttributes)
+    return read_group(files, kind, RecordingAttributes)
+
+
+def inspect_group(
+    files: GroupFiles, kind: Kind, *, progress: Progress = lambda _: None
+) -> ItemReport:
+    """Read everything of a committed group and name all that does not hold.
+
+    Args:
+        files: of the group.
+        kind: of the group.
+        progress: told about every storage chunk.
+    """
+    try:
+        contents = open_contents(files, kind)
+    except StorageError as error:
+        return ItemReport(kind, files.item_id, findings=(Finding(error.message),))
+    findings: list[Finding] = []
+    num_bytes = 0
+    for name in contents.entries:
+        found, size = _inspect_array(contents, name, progress)
+        findings += found
+        num_bytes += size
+    if not findings:
+        findings += _stamp_findings(contents)
+    if isinstance(files, LocalGroup):
+        findings += [
+            Finding(f"{contents.what}: {path} belongs to no array; move it away", foreign=True)
+            for path in foreign_paths(files.folder, contents.entries)
+        ]
+    return ItemReport(kind, files.item_id, len(contents.entries), num_bytes, tuple(findings))
+
+
+def _inspect_array(contents: Group, name: str, progress: Progress) -> tuple[list[Finding], int]:
+    what, num_bytes = f"{contents.what}: array {name!r}", 0
+    findings = []
+    try:
+        metadata = get_metadata(contents.files, f"{name}/{METADATA_FILE}", contents.what)
+        if metadata != array_metadata(contents.entries[name]):
+            findings.append(Finding(f"{what}: {METADATA_FILE} is damaged", name))
+        shard = contents.shard(name)
+        num_chunks = len(shard.check_index())
+    except StorageError as error:
+        return [*findings, Finding(error.message, name)], 0
+    digest = hashlib.sha256()
+    for number in range(num_chunks):
+        try:
+            payload = shard.payload(number)
+            digest.update(hashed_bytes(payload, contents.entries[name], number, what))
+        except StorageError as error:
+            findings.append(Finding(error.message, name, number))
+        else:
+            num_bytes += len(payload)
+            progress(len(payload))
+    # Sees also what checksums of a forger hold for.
+    if not findings and digest.hexdigest() != contents.entries[name].sha256:
+        findings.append(Finding(f"{what}: sha256 does not hold", name))
+    return findings, num_bytes
+
+
+def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes:
+    """What a storage chunk adds to its array's hash.
+
+    Of images the number and the headers are looked at, not the pixels.
+
+    Raises:
+        CorruptDataError: it does not hold the rows that it should.
+    """
+    where = f"{what}: storage chunk {number}"
+    num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
+    if entry.codec == "zstd":
+        return decode_rows(payload, entry, what=where)[:num_rows].tobytes()
+    chunks = ImageChunks(entry.codec, entry.shape[1:], entry.chunk_rows, what)
+    images = chunks.unpack(payload, number)
+    if len(images) != num_rows:
+        raise CorruptDataError(f"{where} holds {len(images)} images, expected {num_rows}")
+    if entry.codec == "jpeg" and (size := jpeg_size(payload, where=where)) != entry.shape[1:3]:
+        raise CorruptDataError(f"{where} is {size} pixels, expected {entry.shape[1:3]}")
+    return payload
+
+
+def _stamp_findings(contents: Group) -> list[Finding]:
+    """Stamps that are out of order, by which every search in them would go wrong."""
+    first, least = STAMPS[contents.kind][0], 1 if contents.kind == "episode" else 0
+    findings = []
+    for stream in contents.attributes.streams:
+        name = f"{stream.name}_{first}"
+        steps = np.diff(contents.shard(name).read())
+        if len(bad := np.flatnonzero(steps < least)):
+            message = f"{contents.what}: array {name!r}: goes back after row {int(bad[0])}"
+            findings.append(Finding(message, name))
+    return findings
+
+
+def foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
+    """Files, folders and links in a group's folder that belong to none of its arrays."""
+    wanted = {COMMIT_FILE, METADATA_FILE}
+    for name, entry in entries.items():
+        wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
+    folders = {str(parent) for path in wanted for parent in Path(path).parents}
+    found = []
+    with disk_errors(f"look through {folder.name}"):
+        for path in sorted(folder.rglob("*")):
+            relative = path.relative_to(folder).as_posix()
+            right = relative in folders if path.is_dir() else relative in wanted
+            if not right or path.is_symlink():
+                found.append(relative)
+    return found
+
+
+def inspect_upload(folder: Path) -> ItemReport:
+    """Read an unfinished upload, or any other spool; a torn end is no damage."""
+    with disk_errors(f"look at upload {folder.name}"):
+        # A name with a dot, or without attributes, is one that is only being born.
+        if not (folder / RECORDING_FILE).exists():
+            return ItemReport("upload", folder.name)
+    try:
+        names = [stream.name for stream in read_attributes(folder).streams]
+    except StorageError as error:
+        return ItemReport("upload", folder.name, findings=(Finding(error.message),))
+    return _inspect_logs(folder, "upload", names, SAMPLE_JOURNAL)
+
+
+def inspect_stage(folder: Path) -> ItemReport:
+    """Read what a writer left, or has written so far."""
+    try:
+        attributes = read_stage(folder)
+    except StorageError as error:
+        return ItemReport("stage", folder.name, findings=(Finding(error.message),))
+    if attributes is None:
+        return ItemReport("stage", folder.name, busy=is_held(folder))
+    kind = kind_of(attributes)
+    names = [name for stream in attributes.streams for name in stream_arrays(stream, kind)]
+    return _inspect_logs(folder, "stage", names, CHUNK_JOURNAL)
+
+
+def _inspect_logs(folder: Path, kind: str, names: list[str], layout: JournalLayout) -> ItemReport:
+    findings, num_bytes, busy = [], 0, is_held(folder)
+    present = [n for n in names if journal_path(folder, n).is_file() and _part(folder, n)]
+    for name in present:
+        try:
+            rows = read_rows(folder, name, layout)
+        except StorageError as error:
+            findings.append(Finding(f"{kind} {folder.name}: {error.message}", name))
+            continue
+        # What a writer that lives has not written yet is no damage, nor is a torn end.
+        for number, row in enumerate(rows):
+            try:
+                (payload,) = read_payloads(folder, name, np.array([row]))
+            except StorageError as error:
+                if not _only_bad_follow(folder, name, rows[number:]):
+                    message = f"{kind} {folder.name}: row {number}: {error.message}"
+                    findings.append(Finding(message, name, number))
+            else:
+                num_bytes += len(payload)
+    return ItemReport(kind, folder.name, len(present), num_bytes, tuple(findings), busy)
+
+
+def _part(folder: Path, name: str) -> bool:
+    return part_path(folder, name).is_file()
+
+
+def _only_bad_follow(folder: Path, name: str, rows: np.ndarray) -> bool:
+    with disk_errors(f"read {name}"):
+        data = part_path(folder, name).read_bytes()
+    return not any(
+        google_crc32c.value(data[int(r["offset"]) : int(r["offset"]) + int(r["length"])])
+        == int(r["payload_crc32c"])
+        for r in rows
+    )
+
+
+def is_held(folder: Path) -> bool:
+    """Whether a writer holds a stage or a spool."""
+    with disk_errors(f"look at {folder.name}"):
+        descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def unfinished(root: Path) -> Iterator[tuple[str, Path]]:
+    """Kind and folder of every upload and stage below a store's folder."""
+    for kind, name in (("upload", UPLOADS), ("stage", STAGING)):
+        folder = root / name
+        with disk_errors(f"list {name}"):
+            paths = sorted(folder.iterdir()) if folder.is_dir() else []
+        yield from ((kind, path) for path in paths)

@@ -1,0 +1,318 @@
+"""What an inspection found damaged → mended from a copy, or salvaged as a group of its own.
+
+Nothing is lost by repairing: what was damaged goes to the trash, from where it can be restored.
+"""
+
+import json
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
+from dextouch.episodes.format import (
+    ATTRIBUTES_KEY,
+    COMMIT_FILE,
+    METADATA_FILE,
+    ArrayEntry,
+    CommitRecord,
+    Kind,
+    array_metadata,
+    decode_commit,
+    sha256_hex,
+    shard_path,
+    stream_arrays,
+    with_rows,
+)
+from dextouch.episodes.group_contents import CommittedGroup, get_metadata
+from dextouch.episodes.inspection import (
+    STAGING,
+    UPLOADS,
+    ItemReport,
+    inspect_group,
+    inspect_upload,
+    open_contents,
+)
+from dextouch.episodes.salvage import (
+    SalvagedStream,
+    group_streams,
+    spool_streams,
+    stage_streams,
+    write_salvaged,
+)
+from dextouch.episodes.sources import GroupFiles, LocalGroup
+from dextouch.episodes.spool_reader import read_attributes
+from dextouch.episodes.stage import Attributes, attributes_id, kind_of, read_stage
+from dextouch.episodes.stage_recovery import recover_stage
+from dextouch.episodes.staging import unheld_folders
+from dextouch.episodes.trash import TrashKind, put_into_trash
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    DexTouchError,
+    InvalidInputError,
+    StorageError,
+)
+from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
+from dextouch.schemas.recordings import RecordingAttributes
+
+WHOLE, MENDED, SALVAGED, RECOVERED, LEFT = "whole", "mended", "salvaged", "recovered", "left"
+
+
+@dataclass(frozen=True)
+class RepairReport:
+    """What was done about one item.
+
+    `action` is `whole` (nothing to do), `mended` (as it was before the damage), `salvaged` (what
+    holds is under `new_id`, the damaged one in the trash), `recovered` (an interrupted take is
+    complete as far as it went) or `left` (as it was, `notes` say why). `lost` counts the samples
+    that a salvage left out.
+    """
+
+    kind: str
+    item_id: str
+    action: str
+    new_id: str | None = None
+    lost: Mapping[str, int] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
+
+
+def repair_group(
+    root: Path, kind: Kind, item_id: str, *, copy: GroupFiles | None = None
+) -> RepairReport:
+    """Make a committed group whole, or salvage what holds of it.
+
+    Args:
+        root: of the store.
+        kind: of the group.
+        item_id: of the group.
+        copy: of the same content, from which good arrays are taken.
+
+    Raises:
+        ConflictError: a copy of other content.
+    """
+    folder = root / f"{kind}s" / item_id
+    files = LocalGroup(folder)
+    report = inspect_group(files, kind)
+    if not report.damaged:
+        return RepairReport(kind, item_id, WHOLE)
+    notes = tuple(finding.message for finding in report.findings)
+    if all(finding.foreign for finding in report.findings):
+        return RepairReport(kind, item_id, LEFT, notes=notes)
+    if copy is not None:
+        _mend_from(folder, kind, copy)
+    _mend_metadata(files, kind)
+    report = inspect_group(files, kind)
+    if all(finding.foreign for finding in report.findings):
+        return RepairReport(kind, item_id, MENDED, notes=notes)
+    try:
+        attributes, entries, sha256 = _known(files, kind, report)
+        source = LineageEntry(kind=kind, id=item_id, sha256=sha256)
+        streams = group_streams(folder, attributes, entries)
+        new_id, lost = _write_once(root, attributes, streams, source)
+    except (StorageError, InvalidInputError) as error:
+        return RepairReport(kind, item_id, LEFT, notes=(*notes, error.message))
+    put_into_trash(root, kind, item_id)
+    return RepairReport(kind, item_id, SALVAGED, new_id, lost, notes)
+
+
+def repair_unfinished(root: Path) -> list[RepairReport]:
+    """Complete what killed writers left, and salvage stages and uploads that are damaged.
+
+    Uploads without damage stay as they are: their station goes on with them. Of damaged ones what
+    holds becomes a recording `ID-salvaged-N`, so that the station may send all of it anew.
+    """
+    reports = []
+    for stage in unheld_folders(root / STAGING):
+        report = _repair_stage(root, stage)
+        if report is not None:
+            reports.append(report)
+    for spool in unheld_folders(root / UPLOADS):
+        found = inspect_upload(spool)
+        if found.damaged:
+            reports.append(_salvage(root, "upload", spool, found))
+    return reports
+
+
+def _repair_stage(root: Path, stage: Path) -> RepairReport | None:
+    try:
+        group = recover_stage(stage, root)
+    except CorruptDataError as error:
+        found = ItemReport("stage", stage.name)
+        report = _salvage(root, "stage", stage, found)
+        return RepairReport(
+            report.kind,
+            report.item_id,
+            report.action,
+            report.new_id,
+            report.lost,
+            (error.message, *report.notes),
+        )
+    if group is None:
+        return None
+    return RepairReport(group.kind, group.item_id, RECOVERED)
+
+
+def _salvage(root: Path, kind: TrashKind, folder: Path, found: ItemReport) -> RepairReport:
+    notes = tuple(finding.message for finding in found.findings)
+    try:
+        attributes: Attributes | None
+        if kind == "upload":
+            attributes = read_attributes(folder)
+            streams = spool_streams(folder, attributes)
+        else:
+            attributes = read_stage(folder)
+            if attributes is None:
+                return RepairReport(kind, folder.name, LEFT, notes=notes)
+            streams = stage_streams(folder, attributes)
+        source = LineageEntry(kind=kind_of(attributes), id=attributes_id(attributes))
+        new_id, lost = _write_once(root, attributes, streams, source)
+    except DexTouchError as error:
+        return RepairReport(kind, folder.name, LEFT, notes=(*notes, error.message))
+    put_into_trash(root, kind, folder.name)
+    return RepairReport(kind, folder.name, SALVAGED, new_id, lost, notes)
+
+
+def _write_once(
+    root: Path, attributes: Attributes, streams: list[SalvagedStream], source: LineageEntry
+) -> tuple[str, dict[str, int]]:
+    """Write what holds, unless a repair that was interrupted has done it already."""
+    kind, item_id = kind_of(attributes), attributes_id(attributes)
+    for folder in sorted((root / f"{kind}s").glob(f"{item_id[:112]}-salvaged-*")):
+        try:
+            known = open_contents(LocalGroup(folder), kind)
+        except StorageError:
+            continue
+        if source in known.attributes.lineage:
+            return folder.name, {s.descriptor.name: s.num_lost for s in streams if s.num_lost}
+    return write_salvaged(root, attributes, streams, source)
+
+
+def _mend_metadata(files: LocalGroup, kind: Kind) -> None:
+    """Write `zarr.json` of arrays anew: it says nothing that the commit record does not say."""
+    try:
+        contents = open_contents(files, kind)
+    except StorageError:
+        return
+    for name, entry in contents.entries.items():
+        _put(files.folder, f"{name}/{METADATA_FILE}", array_metadata(entry))
+
+
+def _put(folder: Path, name: str, data: bytes) -> None:
+    """Give a file of a group these bytes; links on the way to it go, what they point at stays."""
+    with disk_errors(f"mend {name} of {folder.name}"):
+        place = folder
+        for part in name.split("/"):
+            place = place / part
+            if place.is_symlink():
+                place.unlink()
+        if place.is_file() and place.stat().st_size == len(data) and place.read_bytes() == data:
+            return
+        place.parent.mkdir(parents=True, exist_ok=True)
+        replace_file(place, data)
+
+
+def _mend_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
+    """Take from a copy all that differs or does not hold here and holds there."""
+    theirs = open_contents(copy, kind)
+    what = f"{kind} {folder.name}"
+    _check_same_content(LocalGroup(folder), theirs, what)
+    for name in (METADATA_FILE, COMMIT_FILE):
+        data = copy.get(name)
+        if data is not None:
+            _put(folder, name, data)
+    _mend_metadata(LocalGroup(folder), kind)
+    bad_here = _damaged_arrays(LocalGroup(folder), kind)
+    bad_there = _damaged_arrays(copy, kind)
+    for name in sorted(bad_here - bad_there):
+        path = f"{name}/{shard_path(len(theirs.entries[name].shape))}"
+        source = copy.source(path)
+        _put_shard(folder, path, bytes(source.read(0, source.size() or 0)))
+
+
+def _put_shard(folder: Path, name: str, data: bytes) -> None:
+    # Written beside the group: nothing half is ever seen in its place.
+    partial = folder.parent.parent / STAGING / f"mend-{folder.name}-{uuid.uuid4().hex}"
+    _put(folder, name, b"")
+    with disk_errors(f"mend {name} of {folder.name}"):
+        partial.mkdir(parents=True)
+        write_file(partial / "shard", data)
+        (partial / "shard").replace(folder / name)
+        sync_folder((folder / name).parent)
+        partial.rmdir()
+
+
+def _damaged_arrays(files: GroupFiles, kind: Kind) -> set[str]:
+    return {f.array for f in inspect_group(files, kind).findings if f.array is not None}
+
+
+def _check_same_content(
+    ours: LocalGroup,
+    theirs: CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes],
+    what: str,
+) -> None:
+    record = _commit_of(ours, what)
+    if record is not None:
+        same = record[1] == theirs.content_sha256
+    else:
+        # The attributes name the streams and where they come from: enough to know them by.
+        group, other = ours.get(METADATA_FILE), theirs.files.get(METADATA_FILE)
+        same = group is not None and group == other
+    if not same:
+        raise ConflictError(
+            f"{what}: the copy holds content {theirs.content_sha256[:12]}, which is not proven to "
+            f"be ours ({record[1][:12] if record else f'{COMMIT_FILE} is damaged'}); "
+            "name a copy of the same content"
+        )
+
+
+def _commit_of(files: LocalGroup, what: str) -> tuple[CommitRecord, str] | None:
+    try:
+        data = get_metadata(files, COMMIT_FILE, what)
+        return None if data is None else decode_commit(data, what=what)
+    except CorruptDataError:
+        return None
+
+
+def _known(
+    files: LocalGroup, kind: Kind, report: ItemReport
+) -> tuple[Attributes, Mapping[str, ArrayEntry], str | None]:
+    """Attributes, arrays and content hash of a damaged group, as far as they can be trusted.
+
+    Raises:
+        StorageError: another version, or attributes that are damaged.
+    """
+    what = f"{kind} {files.item_id}"
+    record, group = _commit_of(files, what), get_metadata(files, METADATA_FILE, what)
+    if group is None or (record and sha256_hex(group) != record[0].attributes_sha256):
+        raise CorruptDataError(
+            f"{what}: attributes are damaged, without which nobody can say what the samples are; "
+            "name a copy with --from, or delete it"
+        )
+    model = EpisodeAttributes if kind == "episode" else RecordingAttributes
+    try:
+        text = json.dumps(json.loads(group)["attributes"][ATTRIBUTES_KEY])
+        attributes = model.model_validate_json(text)
+    except (ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise CorruptDataError(f"{what}: attributes are damaged ({error})") from error
+    if attributes_id(attributes) != files.item_id:
+        raise CorruptDataError(f"{what}: attributes are those of {attributes_id(attributes)!r}")
+    if record is not None:
+        return attributes, record[0].arrays, record[1]
+    return attributes, _entries(files, attributes), None
+
+
+def _entries(files: LocalGroup, attributes: Attributes) -> dict[str, ArrayEntry]:
+    """Arrays without a commit record: their lengths as their own metadata say."""
+    entries = {}
+    for stream in attributes.streams:
+        for name, entry in stream_arrays(stream, kind_of(attributes)).items():
+            try:
+                plain = json.loads(files.get(f"{name}/{METADATA_FILE}") or b"")
+                count = int(plain["shape"][0])
+            except (ValueError, KeyError, TypeError, IndexError, RecursionError):
+                count = 0
+            entries[name] = with_rows(entry, max(0, count))
+    return entries

@@ -1,0 +1,328 @@
+"""Damaged arrays and logs → the samples of them that hold, written as a new group that says so.
+
+Nothing is filled in: a storage chunk or sample that does not hold is left out with its stamps, and
+counted as `lost_to_damage`.
+"""
+
+import uuid
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import google_crc32c
+import numpy as np
+
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import (
+    GOP_IMAGES,
+    STAMPS,
+    ArrayEntry,
+    Kind,
+    codec_of,
+    shard_path,
+    stream_arrays,
+    with_rows,
+)
+from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.episodes.inspection import STAGING, hashed_bytes
+from dextouch.episodes.journal import (
+    CHUNK_JOURNAL,
+    SAMPLE_JOURNAL,
+    JournalLayout,
+    journal_path,
+    part_path,
+)
+from dextouch.episodes.shard_index import salvaged_index
+from dextouch.episodes.shard_reader import ShardReader, decode_rows
+from dextouch.episodes.sources import LocalFile
+from dextouch.episodes.stage import Attributes, attributes_id, kind_of
+from dextouch.episodes.write_options import WriteOptions
+from dextouch.episodes.writer import EpisodeWriter
+from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.images.jpeg import jpeg_values
+from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
+from dextouch.schemas.recordings import LedgerEntry
+from dextouch.streams.checks import ENCODED_UNITS, check_encoded_image
+from dextouch.streams.descriptors import StreamDescriptor
+
+LOST = "lost_to_damage"
+# Rows of these belong to each other by their number: the steps of the model grid.
+GRID_STREAMS = ("action", "action_commanded")
+BLOCK_SAMPLES = 256
+
+Block = tuple[np.ndarray, dict[str, np.ndarray]]
+
+
+@dataclass(frozen=True)
+class SalvagedStream:
+    """What holds of one stream.
+
+    `kept` says of each sample whether it is wanted; `read` gives values and stamps of the wanted
+    ones among some consecutive samples, which begin and end at multiples of `block`.
+    """
+
+    descriptor: StreamDescriptor
+    kept: np.ndarray
+    read: Callable[[int, int, np.ndarray], Block]
+    block: int = BLOCK_SAMPLES
+
+    @property
+    def num_lost(self) -> int:
+        """Samples that are left out."""
+        return int((~self.kept).sum())
+
+    def blocks(self) -> Iterator[Block]:
+        """The kept samples, some at a time."""
+        for start in range(0, len(self.kept), self.block):
+            stop = min(start + self.block, len(self.kept))
+            if self.kept[start:stop].any():
+                yield self.read(start, stop, self.kept[start:stop])
+
+
+class _SalvagedArray:
+    """One array by its storage chunks, of which some do not hold."""
+
+    def __init__(self, path: Path, entry: ArrayEntry, index: np.ndarray) -> None:
+        self.entry, self._what = entry, f"array {path.name!r}"
+        self._shard = ShardReader(LocalFile(path), entry, what=self._what, index=index)
+        holds = [self._holds(number) for number in range(len(index))]
+        self.rows_hold = np.repeat(np.array(holds, dtype=bool), entry.chunk_rows)[: entry.shape[0]]
+
+    def _holds(self, number: int) -> bool:
+        try:
+            hashed_bytes(self._shard.payload(number), self.entry, number, self._what)
+        except CorruptDataError:
+            return False
+        return True
+
+    def values(self, number: int) -> np.ndarray:
+        """Rows of a storage chunk that holds; of images the encoded bytes."""
+        payload = self._shard.payload(number)
+        if self.entry.codec == "zstd":
+            return decode_rows(payload, self.entry, what=self._what)
+        shape = self.entry.shape[1:]
+        chunks = ImageChunks(self.entry.codec, shape, self.entry.chunk_rows, self._what)
+        return jpeg_values(chunks.unpack(payload, number))
+
+    def column(self) -> np.ndarray:
+        """All rows; those that do not hold are of no meaning."""
+        column, rows = np.zeros(self.entry.shape[0], dtype=np.int64), self.entry.chunk_rows
+        for number in range(-(-len(column) // rows)):
+            if self.rows_hold[number * rows]:
+                part = column[number * rows : (number + 1) * rows]
+                part[:] = self.values(number)[: len(part)]
+        return column
+
+
+def group_streams(
+    folder: Path, attributes: Attributes, entries: Mapping[str, ArrayEntry]
+) -> list[SalvagedStream]:
+    """What holds of a committed group.
+
+    Args:
+        folder: of the group.
+        attributes: of the group.
+        entries: what is known of its arrays.
+    """
+
+    def array(name: str) -> _SalvagedArray:
+        entry = entries[name]
+        path = folder / name / shard_path(len(entry.shape))
+        return _SalvagedArray(path, entry, salvaged_index(LocalFile(path), entry))
+
+    return _streams(attributes, array)
+
+
+def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
+    """What holds of a stage that a killed writer left."""
+    kind = kind_of(attributes)
+    layouts = {n: e for s in attributes.streams for n, e in stream_arrays(s, kind).items()}
+
+    def array(name: str) -> _SalvagedArray:
+        entry = layouts[name]
+        # A writer, or a recovery, that died while it committed has closed some shards.
+        closed = stage / name / shard_path(len(entry.shape))
+        path = closed if closed.is_file() else part_path(stage, name)
+        rows, hold = lenient_rows(stage, name, CHUNK_JOURNAL, _bytes_of(path))
+        numbers = np.flatnonzero(hold)
+        index = np.zeros((len(rows), 2), dtype=np.uint64)
+        index[hold] = np.stack([rows["offset"][hold], rows["length"][hold]], axis=1)
+        count = 0
+        if len(numbers):
+            count = int(numbers[-1]) * entry.chunk_rows + int(rows["num_rows"][numbers[-1]])
+        return _SalvagedArray(path, with_rows(entry, count), index[: -(-count // entry.chunk_rows)])
+
+    return _streams(attributes, array)
+
+
+def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
+    """What holds of a spool, sample by sample."""
+    return [_spooled(spool, stream) for stream in attributes.streams]
+
+
+def write_salvaged(
+    root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
+) -> tuple[str, dict[str, int]]:
+    """Write what holds as a new group `ID-salvaged-N` of a store.
+
+    Args:
+        root: of the store.
+        attributes: of the damaged thing.
+        streams: what holds of it.
+        source: the damaged thing.
+
+    Returns:
+        The new id, and the samples that are left out by stream.
+
+    Raises:
+        InvalidInputError: nothing holds.
+    """
+    kind, item_id = kind_of(attributes), attributes_id(attributes)
+    streams = _on_one_grid(streams) if kind == "episode" else list(streams)
+    if not any(stream.kept.any() for stream in streams):
+        raise InvalidInputError(f"{kind} {item_id!r}: not one sample holds; delete it")
+    lost = {stream.descriptor.name: stream.num_lost for stream in streams if stream.num_lost}
+    free = _free_id(root, kind, item_id)
+    update: dict[str, object] = {f"{kind}_id": free, "recovered": True}
+    update["lineage"] = (*attributes.lineage, source)
+    if isinstance(attributes, EpisodeAttributes):
+        figures = {f"{name}_{LOST}": float(count) for name, count in lost.items()}
+        update["quality"] = attributes.quality | figures
+    else:
+        counted = (LedgerEntry(stream=n, event=LOST, count=c) for n, c in lost.items())
+        update["ledger"] = (*attributes.ledger, *counted)
+    with EpisodeWriter(
+        stage=root / STAGING / f"{kind}-{free}-{uuid.uuid4().hex}",
+        target=root / f"{kind}s" / free,
+        attributes=attributes.model_copy(update=update),
+        options=WriteOptions(recoverable=False),
+    ) as writer:
+        for stream in streams:
+            for values, stamps in stream.blocks():
+                writer.append(stream.descriptor.name, values=values, **stamps)
+    return free, lost
+
+
+def _free_id(root: Path, kind: Kind, item_id: str) -> str:
+    number = 1
+    while (root / f"{kind}s" / (free := f"{item_id[:112]}-salvaged-{number}")).exists():
+        number += 1
+    return free
+
+
+def _streams(
+    attributes: Attributes, array: Callable[[str], _SalvagedArray]
+) -> list[SalvagedStream]:
+    kind = kind_of(attributes)
+    found = []
+    for stream in attributes.streams:
+        values = array(stream.name)
+        stamps = {stamp: array(f"{stream.name}_{stamp}") for stamp in STAMPS[kind]}
+        count = min(len(part.rows_hold) for part in (values, *stamps.values()))
+        kept = values.rows_hold[:count].copy()
+        for part in stamps.values():
+            kept &= part.rows_hold[:count]
+        if values.entry.codec == "h264":
+            kept = _whole_groups(kept, values.entry.chunk_rows)
+        columns = {stamp: part.column()[:count] for stamp, part in stamps.items()}
+        read = _array_reader(values, columns)
+        found.append(SalvagedStream(stream, kept, read, values.entry.chunk_rows))
+    return found
+
+
+def _array_reader(
+    values: _SalvagedArray, columns: Mapping[str, np.ndarray]
+) -> Callable[[int, int, np.ndarray], Block]:
+    def read(start: int, stop: int, kept: np.ndarray) -> Block:
+        rows = values.values(start // values.entry.chunk_rows)[: stop - start][kept]
+        return rows, {stamp: column[start:stop][kept] for stamp, column in columns.items()}
+
+    return read
+
+
+def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
+    """Images of a group of pictures need those before them: a group stays whole or goes."""
+    starts = np.arange(0, len(kept), size)
+    if not len(starts):
+        return kept
+    whole = np.logical_and.reduceat(kept, starts)
+    return np.repeat(whole, size)[: len(kept)]
+
+
+def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
+    """Of the model grid the longest run of steps without a hole: steps are found by number."""
+    grid = [stream for stream in streams if stream.descriptor.name in GRID_STREAMS]
+    if not grid:
+        return list(streams)
+    count = max(len(stream.kept) for stream in grid)
+    whole = np.ones(count, dtype=bool)
+    for stream in grid:
+        whole[: len(stream.kept)] &= stream.kept
+        whole[len(stream.kept) :] = False
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], whole, [False]]).astype(np.int8)))
+    run = np.zeros(count, dtype=bool)
+    if len(edges):
+        best = int(np.argmax(edges[1::2] - edges[::2]))
+        run[edges[2 * best] : edges[2 * best + 1]] = True
+    return [
+        replace(s, kept=run[: len(s.kept)]) if s.descriptor.name in GRID_STREAMS else s
+        for s in streams
+    ]
+
+
+def lenient_rows(
+    folder: Path, name: str, layout: JournalLayout, payloads: bytes
+) -> tuple[np.ndarray, np.ndarray]:
+    """All rows of a journal, and of each whether it and its payload hold, whatever is around it."""
+    data = _bytes_of(journal_path(folder, name))[len(layout.magic) :]
+    size = layout.dtype.itemsize
+    rows = np.frombuffer(data[: len(data) // size * size], layout.dtype)
+    hold = np.zeros(len(rows), dtype=bool)
+    for number, row in enumerate(rows):
+        body = data[number * size : (number + 1) * size - 4]
+        start, length = int(row["offset"]), int(row["length"])
+        hold[number] = (
+            google_crc32c.value(body) == int(row["row_crc32c"])
+            and start + length <= len(payloads)
+            and google_crc32c.value(payloads[start : start + length]) == int(row["payload_crc32c"])
+        )
+    return rows, hold
+
+
+def _bytes_of(path: Path) -> bytes:
+    with disk_errors(f"read {path.name}"):
+        return path.read_bytes() if path.is_file() else b""
+
+
+def _spooled(spool: Path, descriptor: StreamDescriptor) -> SalvagedStream:
+    data = _bytes_of(part_path(spool, descriptor.name))
+    rows, kept = lenient_rows(spool, descriptor.name, SAMPLE_JOURNAL, data)
+    # What is torn off at the end was never acknowledged; it is no loss.
+    count = int(np.flatnonzero(kept)[-1]) + 1 if kept.any() else 0
+    rows, kept = rows[:count], kept[:count]
+    payloads = [data[int(r["offset"]) : int(r["offset"]) + int(r["length"])] for r in rows]
+    kept &= np.array([_fits(descriptor, payload) for payload in payloads], dtype=bool)
+    if codec_of(descriptor) == "h264":
+        kept = _whole_groups(kept, GOP_IMAGES)
+
+    def read(start: int, stop: int, wanted: np.ndarray) -> Block:
+        chosen = rows[start:stop][wanted]
+        mine = [payload for payload, want in zip(payloads[start:stop], wanted, strict=True) if want]
+        stamps = {stamp: chosen[stamp].astype(np.int64) for stamp in STAMPS["recording"]}
+        if descriptor.unit in ENCODED_UNITS:
+            return jpeg_values(mine), stamps
+        values = np.frombuffer(b"".join(mine), dtype=descriptor.numpy_dtype())
+        return values.reshape(len(mine), *descriptor.shape), stamps
+
+    return SalvagedStream(descriptor, kept, read)
+
+
+def _fits(descriptor: StreamDescriptor, payload: bytes) -> bool:
+    if descriptor.unit not in ENCODED_UNITS:
+        size = int(np.prod(descriptor.shape, dtype=np.int64)) * descriptor.numpy_dtype().itemsize
+        return len(payload) == size
+    try:
+        check_encoded_image(descriptor, payload, where=descriptor.name)
+    except InvalidInputError:
+        return False
+    return True

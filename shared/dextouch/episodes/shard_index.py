@@ -1,0 +1,101 @@
+"""A shard file whose index may be damaged or gone → where its whole storage chunks lie."""
+
+import math
+import struct
+
+import google_crc32c
+import numpy as np
+
+from dextouch.episodes.format import ArrayEntry
+from dextouch.episodes.shard_reader import CRC_BYTES, INDEX_ENTRY_BYTES, zstd_frame_bytes
+from dextouch.episodes.sources import ByteSource
+from dextouch.errors import CorruptDataError
+
+# A day of 30 images a second, each a storage chunk.
+_MAX_CHUNKS = 86_400 * 30
+_JPEG_END = b"\xff\xd9"
+
+
+def salvaged_index(source: ByteSource, entry: ArrayEntry) -> np.ndarray:
+    """(offset, length) of each storage chunk whose checksum holds, (0, 0) of the others.
+
+    Places come from the index as far as it makes sense, else from the neighbours, since storage
+    chunks follow each other without gaps; of a truncated file from the storage chunks themselves.
+
+    Raises:
+        CorruptDataError: more storage chunks than any file of ours has.
+    """
+    num_chunks = -(-entry.shape[0] // entry.chunk_rows)
+    if num_chunks > _MAX_CHUNKS:
+        raise CorruptDataError(
+            f"shard: got {num_chunks} storage chunks to look for, expected at most {_MAX_CHUNKS}"
+        )
+    data = bytes(source.read(0, source.size() or 0))
+    end = len(data) - num_chunks * INDEX_ENTRY_BYTES - CRC_BYTES
+    if end >= 0:
+        body = data[end : len(data) - CRC_BYTES]
+        places = np.frombuffer(body, dtype="<u8").reshape(-1, 2).tolist()
+    else:
+        places = [[0, 0]] * num_chunks
+    found = [_place(data, places, number, max(end, 0)) for number in range(num_chunks)]
+    if not any(length for _, length in found):
+        walked = _walk(data, entry)[:num_chunks]
+        found = walked + [(0, 0)] * (num_chunks - len(walked))
+    return np.array(found, dtype=np.uint64).reshape(-1, 2)
+
+
+def _place(data: bytes, places: list[list[int]], number: int, end: int) -> tuple[int, int]:
+    """Where a storage chunk lies, by its own entry of the index or by those beside it."""
+    offset, length = places[number]
+    before = sum(places[number - 1]) if number else 0
+    after = places[number + 1][0] if number + 1 < len(places) else end
+    for start, stop in (
+        (offset, offset + length),
+        (before, after),
+        (before, before + length),
+        (offset, after),
+    ):
+        if start < stop <= end and _holds(data[start:stop]):
+            return start, stop - start
+    return 0, 0
+
+
+def _holds(chunk: bytes) -> bool:
+    if len(chunk) <= CRC_BYTES:
+        return False
+    crc = int.from_bytes(chunk[-CRC_BYTES:], "little")
+    return google_crc32c.value(chunk[:-CRC_BYTES]) == crc
+
+
+def _walk(data: bytes, entry: ArrayEntry) -> list[tuple[int, int]]:
+    """Storage chunks from the first byte up to the first that does not hold."""
+    found, start = [], 0
+    while start < len(data) and (length := _chunk_bytes(data, start, entry)):
+        found.append((start, length))
+        start += length
+    return found
+
+
+def _chunk_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
+    """Length of the storage chunk that begins at a byte, its checksum included; 0 for none."""
+    if entry.codec == "jpeg":
+        stop = data.find(_JPEG_END, start)
+        # An end inside a thumbnail is none: the checksum tells.
+        while stop >= 0 and not _holds(data[start : stop + 2 + CRC_BYTES]):
+            stop = data.find(_JPEG_END, stop + 1)
+        return stop + 2 + CRC_BYTES - start if stop >= 0 else 0
+    length = _encoded_bytes(data, start, entry)
+    return length + CRC_BYTES if length and _holds(data[start : start + length + CRC_BYTES]) else 0
+
+
+def _encoded_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
+    """Length that a zstd frame or a group of pictures says it has; 0 for none."""
+    if entry.codec == "zstd":
+        # Far less is looked at than copied: the headers of its blocks.
+        longest = entry.chunk_rows * math.prod(entry.shape[1:]) * np.dtype(entry.dtype).itemsize
+        return zstd_frame_bytes(data[start : start + longest + longest // 8 + 1024]) or 0
+    count = int.from_bytes(data[start : start + 4], "little")
+    head = 4 * (1 + count)
+    if not 1 <= count <= entry.chunk_rows or len(data) < start + head:
+        return 0
+    return head + sum(struct.unpack_from(f"<{count}I", data, start + 4))
