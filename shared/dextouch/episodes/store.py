@@ -1,66 +1,82 @@
-"""A folder of episodes and recordings: open, list, write and delete them by id."""
+"""A folder, or a bucket, of episodes and recordings: open, list, write and delete them by id."""
 
-import fcntl
-import os
-import shutil
-import uuid
-from collections.abc import Iterator
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from urllib.parse import unquote, urlsplit
 
-from dextouch.episodes.files import disk_errors, sync_folder
-from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, check_id
+from dextouch.episodes.format import KINDS, Kind, check_id
 from dextouch.episodes.group_contents import read_group, read_live
-from dextouch.episodes.migration import OldGroup, is_current
+from dextouch.episodes.local_storage import LocalStorage, local_folder
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
-from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.stage import Attributes, attributes_id
-from dextouch.episodes.stage_recovery import RecoveredGroup, is_recoverable, recover_stage
+from dextouch.episodes.stage_recovery import RecoveredGroup
+from dextouch.episodes.staging import stages_of
+from dextouch.episodes.storage import Storage
+from dextouch.episodes.trash import (
+    TrashEntry,
+    TrashKind,
+    list_trash,
+    purge_trash,
+    put_into_trash,
+    remove_for_good,
+    restore_from_trash,
+)
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError, UnknownNameError
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.schemas.recordings import RecordingAttributes
 
-_STAGING = ".staging"
-# Names of stages end in a uuid4 in hexadecimal.
-_STAGE_NUMBER = "[0-9a-f]" * 32
+_OBJECT_SCHEME = "s3://"
 
 
-def local_folder(url: str | Path) -> Path:
-    """The folder that a store's address names.
-
-    Args:
-        url: a path, or `file:///…`.
-
-    Raises:
-        InvalidInputError: an address of another scheme, or of another host.
-    """
-    if isinstance(url, Path):
-        return url
-    parts = urlsplit(url)
-    if not parts.scheme and url:
-        return Path(url)
-    if parts.scheme == "file" and parts.netloc in {"", "localhost"} and parts.path:
-        return Path(unquote(parts.path))
-    raise InvalidInputError(
-        f"episode store: got {url!r}, expected a local folder or file:///…; "
-        "other kinds of storage are not supported yet"
-    )
+def open_storage(
+    url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
+) -> Storage:
+    """The storage that an address names; see `EpisodeStore` for the arguments."""
+    if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
+        # Here, so that a store in a folder needs no obstore.
+        try:
+            from dextouch.episodes.object_storage import open_object_storage
+        except ModuleNotFoundError as error:
+            if error.name != "obstore":
+                raise
+            raise UnavailableError(
+                "episode store: s3://… needs obstore; run `pip install 'dextouch-wm[s3]'`"
+            ) from error
+        return open_object_storage(url, storage_options or {}, work_folder)
+    if storage_options or work_folder is not None:
+        raise InvalidInputError(
+            f"episode store: got storage options or a work folder for {str(url)!r}, "
+            "expected them with s3://bucket/prefix only"
+        )
+    return LocalStorage(local_folder(url))
 
 
 class EpisodeStore:
-    """All episodes and recordings below one folder.
+    """All episodes and recordings below one address.
 
     Reading and writing from several processes at once is safe: what is committed never changes,
     and what is not committed is not seen.
 
     Args:
-        url: local folder or `file:///…`; created when the first thing is written.
+        url: local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
+            `region` and others of `dextouch.episodes.object_address` behind a `?`.
+        storage_options: of an `s3://…` store; secrets belong here or into the usual AWS_*
+            environment, which obstore reads.
+        work_folder: of an `s3://…` store: where groups are written before they are uploaded.
+
+    `root` is the folder of this machine that unfinished things lie in: the store itself where
+    that is a folder, else the work folder.
     """
 
-    def __init__(self, url: str | Path) -> None:
-        self.root = local_folder(url)
+    def __init__(
+        self,
+        url: str | Path,
+        storage_options: Mapping[str, str] | None = None,
+        work_folder: str | Path | None = None,
+    ) -> None:
+        self._storage = open_storage(url, storage_options, work_folder)
+        self.root = self._storage.root
 
     def writer(
         self,
@@ -87,13 +103,8 @@ class EpisodeStore:
             raise InvalidInputError(
                 f"writer: got {type(attributes).__name__}, expected {model.__name__} for {kind!r}"
             )
-        target = self._folder(kind, attributes_id(attributes))
-        if target.exists():
-            raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
-        stage = self.root / _STAGING / f"{kind}-{target.name}-{uuid.uuid4().hex}"
-        return EpisodeWriter(
-            stage=stage, target=target, attributes=attributes, options=options or WriteOptions()
-        )
+        _check(kind, attributes_id(attributes))
+        return self._storage.writer(kind, attributes, options or WriteOptions())
 
     def open(self, episode_id: str) -> EpisodeReader:
         """The reader of a committed episode.
@@ -102,30 +113,28 @@ class EpisodeStore:
             NotFoundError: no such episode.
             CorruptDataError, StorageError: damaged, or of a newer format.
         """
-        group = LocalGroup(self._existing("episode", episode_id))
+        group = self._storage.group(*_check("episode", episode_id))
         return EpisodeReader(read_group(group, "episode", EpisodeAttributes))
 
     def recording(self, recording_id: str) -> RecordingReader:
         """The reader of a finished recording; raises as `open`."""
-        group = LocalGroup(self._existing("recording", recording_id))
+        group = self._storage.group(*_check("recording", recording_id))
         return RecordingReader(read_group(group, "recording", RecordingAttributes))
 
     def live(self, recording_id: str) -> RecordingReader:
         """A reader of what an unfinished recording holds at this moment; ask again for more.
 
         Raises:
-            NotFoundError: no writer is at work under this id.
+            NotFoundError: no writer of this machine is at work under this id.
         """
-        stages = sorted(
-            (self.root / _STAGING).glob(f"recording-{check_id(recording_id)}-{_STAGE_NUMBER}")
-        )
+        stages = stages_of(self.root, *_check("recording", recording_id))
         if not stages:
             raise NotFoundError(f"recording {recording_id!r}: is not being written")
         return RecordingReader(read_live(stages[-1], "recording", RecordingAttributes))
 
     def exists(self, item_id: str, *, kind: Kind = "episode") -> bool:
         """Whether an id is committed."""
-        return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
+        return self._storage.exists(*_check(kind, item_id))
 
     def revision(self, item_id: str, *, kind: Kind = "episode") -> int:
         """A number that changes when an id is deleted and written again.
@@ -133,31 +142,54 @@ class EpisodeStore:
         Raises:
             NotFoundError: no such id.
         """
-        with disk_errors(f"look at {kind} {item_id}"):
-            return (self._existing(kind, item_id) / COMMIT_FILE).stat().st_mtime_ns
+        return self._storage.revision(*_check(kind, item_id))
 
     def list(self, *, kind: Kind = "episode") -> list[str]:
         """Committed ids in order."""
         if kind not in KINDS:
             raise UnknownNameError("kind", kind, list(KINDS))
-        folder = self.root / f"{kind}s"
-        with disk_errors(f"list {kind}s"):
-            if not folder.is_dir():
-                return []
-            return sorted(path.name for path in folder.iterdir() if (path / COMMIT_FILE).is_file())
+        return self._storage.list(kind)
 
-    def delete(self, item_id: str, *, kind: Kind = "episode") -> None:
-        """Remove an episode or recording; it vanishes at once, its bytes a moment later.
+    def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
+        """Put an episode or recording into the trash, where nobody sees it.
+
+        Args:
+            item_id: of the group.
+            kind: of the group.
+            for_good: remove it instead; so does object storage, which has no trash.
 
         Raises:
             NotFoundError: no such id.
         """
-        folder = self._existing(kind, item_id)
-        trash = self.root / _STAGING / f"deleted-{item_id}-{uuid.uuid4().hex}"
-        with disk_errors(f"delete {kind} {item_id}"):
-            trash.parent.mkdir(parents=True, exist_ok=True)
-            folder.rename(trash)
-            shutil.rmtree(trash)
+        kind, item_id = _check(kind, item_id)
+        if not isinstance(self._storage, LocalStorage):
+            self._storage.delete(kind, item_id)
+            return
+        if not self.exists(item_id, kind=kind):
+            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
+        entry = put_into_trash(self.root, kind, item_id)
+        if for_good:
+            remove_for_good(entry)
+
+    def restore(self, item_id: str, *, kind: TrashKind = "episode") -> None:
+        """Put what was deleted last under an id back; raises as `restore_from_trash`."""
+        restore_from_trash(self._trash_root(), kind, check_id(item_id))
+
+    def trash_list(self) -> Sequence[TrashEntry]:
+        """What can be restored or purged, the oldest first."""
+        return list_trash(self._trash_root())
+
+    def purge(self, *, older_than_s: float = 0.0) -> Sequence[TrashEntry]:
+        """Remove for good what has been in the trash for so long; what went comes back."""
+        return purge_trash(self._trash_root(), older_than_s=older_than_s)
+
+    def _trash_root(self) -> Path:
+        if not isinstance(self._storage, LocalStorage):
+            raise InvalidInputError(
+                "trash: got a store in a bucket, expected one in a folder; what is deleted from a "
+                "bucket comes back from its older versions only"
+            )
+        return self.root
 
     def migrate(self, item_id: str, *, kind: Kind = "episode") -> bool:
         """Bring a group of an older format version over; False if it is of the current one.
@@ -167,84 +199,32 @@ class EpisodeStore:
         Raises:
             NotFoundError: no such id.
             CorruptDataError: damaged; it stays as it is.
-            StorageError: of a newer version.
+            StorageError: of a newer version, or of an older one in object storage.
         """
-        folder = self._existing(kind, item_id)
-        files = LocalGroup(folder)
-        if is_current(files, what=f"{kind} {item_id}"):
-            return False
-        old = OldGroup(files, kind)
-        staging, number = self.root / _STAGING, uuid.uuid4().hex
-        # Committed beside the store first: a kill between the two renames below is mended by
-        # `recover`, which finds a whole group whose place is free.
-        whole = staging / f"migrated-{item_id}-{number}"
-        with EpisodeWriter(
-            stage=staging / f"{kind}-{item_id}-{number}",
-            target=whole,
-            attributes=old.attributes,
-            options=WriteOptions(recoverable=False),
-        ) as writer:
-            for stream in old.attributes.streams:
-                for values, stamps in old.blocks(stream):
-                    writer.append(stream.name, values=values, **stamps)
-        trash = staging / f"old-{item_id}-{number}"
-        with disk_errors(f"migrate {item_id}"):
-            folder.rename(trash)
-            whole.rename(folder)
-            sync_folder(folder.parent)
-            shutil.rmtree(trash)
-        return True
+        return self._storage.migrate(*_check(kind, item_id))
 
     def recover(self) -> tuple[RecoveredGroup, ...]:
         """Complete the recordings that killed writers left behind, as far as they went.
 
         Each is there afterwards with `recovered` set, cut to its last whole storage chunks. Stages
         with nothing worth keeping stay for `sweep`, and those of running writers are not touched.
+        Uploads that were cut off are completed.
 
         Raises:
             CorruptDataError: damage that is no torn end; that stage is as it was.
         """
-        recovered = []
-        for stage in self._abandoned_stages():
-            group = recover_stage(stage, self.root)
-            if group is not None:
-                recovered.append(group)
-        return tuple(recovered)
+        return tuple(self._storage.recover())
 
     def sweep(self) -> int:
-        """Remove what crashed writers left behind; the number of removed stages comes back.
+        """Remove what crashed writers left behind; the number of removed things comes back.
 
         Recordings that `recover` can complete stay until it did.
         """
-        removed = 0
-        with disk_errors("sweep"):
-            for stage in self._abandoned_stages():
-                if not is_recoverable(stage, self.root):
-                    shutil.rmtree(stage)
-                    removed += 1
-        return removed
+        return self._storage.sweep()
 
-    def _abandoned_stages(self) -> Iterator[Path]:
-        """Stages that no writer holds, each held while the caller looks at it."""
-        staging = self.root / _STAGING
-        for stage in sorted(staging.iterdir()) if staging.is_dir() else []:
-            descriptor = os.open(stage, os.O_RDONLY)
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
-                continue
-            else:
-                yield stage
-            finally:
-                os.close(descriptor)
 
-    def _folder(self, kind: Kind, item_id: str) -> Path:
-        if kind not in KINDS:
-            raise UnknownNameError("kind", kind, list(KINDS))
-        return self.root / f"{kind}s" / check_id(item_id, kind=f"{kind} id")
-
-    def _existing(self, kind: Kind, item_id: str) -> Path:
-        folder = self._folder(kind, item_id)
-        if not (folder / COMMIT_FILE).is_file():
-            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
-        return folder
+def _check(kind: Kind, item_id: str) -> tuple[Kind, str]:
+    """Kind and id, if they are one of each."""
+    if kind not in KINDS:
+        raise UnknownNameError("kind", kind, list(KINDS))
+    return kind, check_id(item_id, kind=f"{kind} id")

@@ -164,7 +164,7 @@ def test_ids_are_no_paths(store, bad):
         store.open(bad)
 
 
-@pytest.mark.parametrize("url", ["s3://bucket", "file://elsewhere/x", "http://host/x", ""])
+@pytest.mark.parametrize("url", ["gs://bucket", "file://elsewhere/x", "http://host/x", ""])
 def test_only_local_folders(url):
     with pytest.raises(InvalidInputError, match="local folder"):
         EpisodeStore(url)

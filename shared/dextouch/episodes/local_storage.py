@@ -1,0 +1,168 @@
+"""Groups in a folder of this machine: a commit is a rename, an id is the name of a folder."""
+
+import builtins
+import shutil
+import uuid
+from pathlib import Path
+from urllib.parse import unquote, urlsplit
+
+from dextouch.episodes.files import disk_errors, sync_folder
+from dextouch.episodes.format import COMMIT_FILE, Kind
+from dextouch.episodes.migration import OldGroup, is_current
+from dextouch.episodes.sources import LocalGroup
+from dextouch.episodes.stage import Attributes, attributes_id
+from dextouch.episodes.stage_recovery import RecoveredGroup, recover_stage
+from dextouch.episodes.staging import STAGING, abandoned_stages, new_stage, sweep_stages
+from dextouch.episodes.write_options import WriteOptions
+from dextouch.episodes.writer import EpisodeWriter
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+
+
+def local_folder(url: str | Path) -> Path:
+    """The folder that a store's address names.
+
+    Args:
+        url: a path, or `file:///…`.
+
+    Raises:
+        InvalidInputError: an address of another scheme, or of another host.
+    """
+    if isinstance(url, Path):
+        return url
+    parts = urlsplit(url)
+    if not parts.scheme and url:
+        return Path(url)
+    if parts.scheme == "file" and parts.netloc in {"", "localhost"} and parts.path:
+        return Path(unquote(parts.path))
+    raise InvalidInputError(
+        f"episode store: got {url!r}, expected a local folder, file:///… or s3://bucket/prefix"
+    )
+
+
+class LocalStorage:
+    """Committed groups as folders `episodes/ID` and `recordings/ID` below one folder.
+
+    Args:
+        root: that folder; made when the first thing is written.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+
+    @property
+    def root(self) -> Path:
+        """The folder of the store."""
+        return self._root
+
+    def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
+        """A writer whose commit puts a group here.
+
+        Raises:
+            ConflictError: the id exists already.
+        """
+        target = self._folder(kind, attributes_id(attributes))
+        if target.exists():
+            raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
+        stage = new_stage(self.root, kind, target.name)
+        return EpisodeWriter(stage=stage, target=target, attributes=attributes, options=options)
+
+    def group(self, kind: Kind, item_id: str) -> LocalGroup:
+        """The files of a committed group.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        return LocalGroup(self._existing(kind, item_id))
+
+    def exists(self, kind: Kind, item_id: str) -> bool:
+        """Whether an id is committed."""
+        return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
+
+    def revision(self, kind: Kind, item_id: str) -> int:
+        """A number that changes when an id is deleted and written again.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        with disk_errors(f"look at {kind} {item_id}"):
+            return (self._existing(kind, item_id) / COMMIT_FILE).stat().st_mtime_ns
+
+    def list(self, kind: Kind) -> list[str]:
+        """Committed ids in order."""
+        folder = self.root / f"{kind}s"
+        with disk_errors(f"list {kind}s"):
+            if not folder.is_dir():
+                return []
+            return sorted(path.name for path in folder.iterdir() if (path / COMMIT_FILE).is_file())
+
+    def delete(self, kind: Kind, item_id: str) -> None:
+        """Remove a group; it vanishes at once, its bytes a moment later.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        folder = self._existing(kind, item_id)
+        trash = self.root / STAGING / f"deleted-{item_id}-{uuid.uuid4().hex}"
+        with disk_errors(f"delete {kind} {item_id}"):
+            trash.parent.mkdir(parents=True, exist_ok=True)
+            folder.rename(trash)
+            shutil.rmtree(trash)
+
+    def migrate(self, kind: Kind, item_id: str) -> bool:
+        """Bring a group of an older format version over; False if it is of the current one.
+
+        The new group takes the old one's place in one moment; its lineage names the old content.
+
+        Raises:
+            NotFoundError: no such id.
+            CorruptDataError: damaged; it stays as it is.
+            StorageError: of a newer version.
+        """
+        folder = self._existing(kind, item_id)
+        files = LocalGroup(folder)
+        if is_current(files, what=f"{kind} {item_id}"):
+            return False
+        old = OldGroup(files, kind)
+        staging, number = self.root / STAGING, uuid.uuid4().hex
+        # Committed beside the store first: a kill between the two renames below is mended by
+        # `recover`, which finds a whole group whose place is free.
+        whole = staging / f"migrated-{item_id}-{number}"
+        with EpisodeWriter(
+            stage=staging / f"{kind}-{item_id}-{number}",
+            target=whole,
+            attributes=old.attributes,
+            options=WriteOptions(recoverable=False),
+        ) as writer:
+            for stream in old.attributes.streams:
+                for values, stamps in old.blocks(stream):
+                    writer.append(stream.name, values=values, **stamps)
+        trash = staging / f"old-{item_id}-{number}"
+        with disk_errors(f"migrate {item_id}"):
+            folder.rename(trash)
+            whole.rename(folder)
+            sync_folder(folder.parent)
+            shutil.rmtree(trash)
+        return True
+
+    def recover(self) -> builtins.list[RecoveredGroup]:
+        """Complete what killed writers left behind, as far as they went.
+
+        Raises:
+            CorruptDataError: damage that is no torn end; that stage is as it was.
+        """
+        found = (recover_stage(stage, self.root) for stage in abandoned_stages(self.root))
+        return [group for group in found if group is not None]
+
+    def sweep(self) -> int:
+        """Remove stages of which nothing can be made; how many went comes back."""
+        with disk_errors("sweep"):
+            return sweep_stages(self.root, self.root)
+
+    def _folder(self, kind: Kind, item_id: str) -> Path:
+        return self.root / f"{kind}s" / item_id
+
+    def _existing(self, kind: Kind, item_id: str) -> Path:
+        folder = self._folder(kind, item_id)
+        if not (folder / COMMIT_FILE).is_file():
+            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
+        return folder

@@ -1,0 +1,113 @@
+"""`s3://bucket/prefix?option=value` and a mapping of options → one checked address."""
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import parse_qsl, unquote, urlsplit
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from dextouch.errors import InvalidInputError, UnknownNameError
+
+MIB = 1 << 20
+_SECRETS = frozenset({"access_key_id", "secret_access_key", "session_token"})
+
+
+class ObjectOptions(BaseModel):
+    """How a bucket is reached; what is None is left to the AWS_* environment that obstore reads.
+
+    Attributes:
+        endpoint: address of the service where it is not Amazon's, `https://…`.
+        region: of the bucket.
+        allow_http: whether an endpoint `http://…` may be used, which sends everything in clear.
+        skip_signature: read a public bucket without credentials.
+        virtual_hosted_style_request: whether the bucket is part of the host's name.
+        access_key_id, secret_access_key, session_token: credentials; refused in an address.
+        max_retries: of one request that failed for a reason that may pass.
+        retry_timeout_s: after which no retry begins.
+        cache_bytes: of memory for parts of objects that were read; 0 keeps nothing.
+        work_folder: where groups are written before they are uploaded.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    endpoint: str | None = None
+    region: str | None = None
+    allow_http: bool | None = None
+    skip_signature: bool | None = None
+    virtual_hosted_style_request: bool | None = None
+    access_key_id: str | None = Field(default=None, repr=False)
+    secret_access_key: str | None = Field(default=None, repr=False)
+    session_token: str | None = Field(default=None, repr=False)
+    max_retries: int = Field(default=5, ge=0, le=100)
+    retry_timeout_s: float = Field(default=30.0, gt=0, le=300)
+    cache_bytes: int = Field(default=64 * MIB, ge=0)
+    work_folder: Path | None = None
+
+
+@dataclass(frozen=True)
+class ObjectAddress:
+    """A bucket, the prefix of all keys in it (without slashes around), and how it is reached."""
+
+    bucket: str
+    prefix: str
+    options: ObjectOptions
+
+    def __str__(self) -> str:
+        return "/".join(part for part in (f"s3://{self.bucket}", self.prefix) if part)
+
+    @property
+    def work_folder(self) -> Path:
+        """The folder that was given, or one below `data/work` that no other address has."""
+        if self.options.work_folder is not None:
+            return self.options.work_folder
+        name = re.sub(r"[^a-z0-9]+", "-", str(self).removeprefix("s3://").lower()).strip("-")
+        return Path("data/work") / f"{name[:80]}-{self.fingerprint[:8]}"
+
+    @property
+    def fingerprint(self) -> str:
+        """Hexadecimal; the same for two addresses of one place."""
+        place = f"{self.options.endpoint or ''} {self}"
+        return hashlib.sha256(place.encode()).hexdigest()
+
+
+def parse_address(
+    url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
+) -> ObjectAddress:
+    """The address that a URL and options name; options given apart win over the URL's.
+
+    Raises:
+        InvalidInputError: no bucket, secrets in the URL, or an option's value that does not fit.
+        UnknownNameError: an option that there is not.
+    """
+    parts = urlsplit(url)
+    where = f"{parts.scheme}://{parts.hostname or ''}{parts.path}"
+    if not parts.hostname or parts.username or parts.port or parts.fragment:
+        raise InvalidInputError(
+            f"episode store: got {where!r}, expected s3://bucket/prefix?options"
+        )
+    query = dict(parse_qsl(parts.query, keep_blank_values=True))
+    if secrets := sorted(_SECRETS & set(query)):
+        raise InvalidInputError(
+            f"{where}: got {secrets} in the address, which ends up in logs; give them as storage "
+            "options or as AWS_* environment"
+        )
+    given: dict[str, object] = {**query, **storage_options}
+    if work_folder is not None:
+        given["work_folder"] = work_folder
+    for name in given:
+        if name not in ObjectOptions.model_fields:
+            raise UnknownNameError(f"option of {where}", name, list(ObjectOptions.model_fields))
+    prefix = unquote(parts.path).strip("/")
+    if any(part in {"", ".", ".."} for part in prefix.split("/")) and prefix:
+        raise InvalidInputError(f"{where}: got an empty or dotted part in the prefix {prefix!r}")
+    try:
+        options = ObjectOptions.model_validate(given)
+    except ValidationError as error:
+        # Only the names: the values may be secret.
+        names = sorted({str(problem["loc"][0]) for problem in error.errors()})
+        problem = error.errors(include_input=False)[0]["msg"]
+        raise InvalidInputError(f"{where}: options {names} do not fit ({problem})") from None
+    return ObjectAddress(parts.hostname, prefix, options)

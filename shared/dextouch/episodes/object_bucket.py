@@ -1,0 +1,236 @@
+"""Requests for keys below one prefix of a bucket → bytes, or one of our errors that says why not.
+
+The only module that knows obstore.
+"""
+
+import os
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import obstore
+from obstore.exceptions import (
+    AlreadyExistsError,
+    BaseError,
+    PermissionDeniedError,
+    PreconditionError,
+    UnauthenticatedError,
+)
+from obstore.store import S3Store
+
+from dextouch.episodes.object_address import ObjectAddress
+from dextouch.errors import CorruptDataError, InvalidInputError, StorageError, UnavailableError
+
+_PASSED_ON = (
+    "endpoint", "region", "skip_signature", "virtual_hosted_style_request", "access_key_id",
+    "secret_access_key", "session_token",
+)  # fmt: skip
+# How the library tells why a request failed where it has no class of error for it.
+_STATUS = re.compile(r"status code: (\d{3})")
+_CODE = re.compile(r"<Code>(\w+)</Code>")
+_CREDENTIAL_HOST = "169.254.16"
+
+
+@dataclass(frozen=True)
+class ObjectFacts:
+    """What is known of an object without reading it."""
+
+    key: str
+    size: int
+    etag: str
+    modified: datetime
+
+
+class _Runtime:
+    """The process whose threads do the library's work; a forked child has none of them."""
+
+    owner: int | None = None
+
+    @classmethod
+    def check(cls, what: str) -> None:
+        if cls.owner is None:
+            cls.owner = os.getpid()
+        if cls.owner != os.getpid():
+            raise UnavailableError(
+                f"{what}: object storage was used before this process was forked, which the "
+                "connection does not survive; start workers with 'spawn' or 'forkserver' "
+                "(DataLoader: multiprocessing_context='spawn')"
+            )
+
+
+class Bucket:
+    """One bucket below one prefix.
+
+    May be used by several threads, and pickled into processes that were not forked.
+    """
+
+    def __init__(self, address: ObjectAddress) -> None:
+        self.address = address
+        options = address.options
+        config: Any = {
+            name: value for name in _PASSED_ON if (value := getattr(options, name)) is not None
+        }
+        client: Any = {} if options.allow_http is None else {"allow_http": options.allow_http}
+        try:
+            self._store = S3Store(
+                address.bucket,
+                prefix=address.prefix or None,
+                config=config,
+                client_options=client,
+                retry_config={
+                    "max_retries": options.max_retries,
+                    "retry_timeout": timedelta(seconds=options.retry_timeout_s),
+                },
+            )
+        except (BaseError, ValueError) as error:
+            raise InvalidInputError(
+                f"{address}: options do not fit ({_first_line(error)})"
+            ) from error
+
+    def __reduce__(self) -> tuple[type["Bucket"], tuple[ObjectAddress]]:
+        return Bucket, (self.address,)
+
+    def get(self, key: str) -> bytes | None:
+        """All bytes of an object; None where there is none."""
+        try:
+            with self._errors("read", key):
+                return bytes(obstore.get(self._store, key).bytes())
+        except FileNotFoundError:
+            return None
+
+    def head(self, key: str) -> ObjectFacts | None:
+        """What is known of an object; None where there is none."""
+        try:
+            with self._errors("look at", key):
+                return _facts(obstore.head(self._store, key))
+        except FileNotFoundError:
+            return None
+
+    def tail(self, key: str, length: int) -> tuple[ObjectFacts, bytes] | None:
+        """An object's last bytes, all of it if it is shorter; None where there is none."""
+        try:
+            with self._errors("read", key):
+                try:
+                    found = obstore.get(self._store, key, options={"range": {"suffix": length}})
+                    return _facts(found.meta), bytes(found.bytes())
+                except BaseError:
+                    # No part can be cut from nothing: services refuse it in different ways.
+                    facts = _facts(obstore.head(self._store, key))
+                    if facts.size == 0:
+                        return facts, b""
+                    raise
+        except FileNotFoundError:
+            return None
+
+    def read(self, facts: ObjectFacts, start: int, stop: int) -> bytes:
+        """Bytes start … stop−1 of an object that must still be the one that was looked at.
+
+        Raises:
+            StorageError: it is gone or another one.
+            CorruptDataError: it is shorter.
+        """
+        try:
+            with self._errors("read", facts.key):
+                options: Any = {"range": (start, stop), "if_match": facts.etag or None}
+                data = bytes(obstore.get(self._store, facts.key, options=options).bytes())
+        except (FileNotFoundError, PreconditionError) as error:
+            raise StorageError(
+                f"{self.url(facts.key)}: was deleted or replaced while it was read; open it again"
+            ) from error
+        if len(data) != stop - start:
+            raise CorruptDataError(
+                f"{self.url(facts.key)}: got {len(data)} bytes, expected {stop - start} from byte "
+                f"{start}; the object is truncated, restore it from a copy"
+            )
+        return data
+
+    def put(self, key: str, content: bytes | Path, *, create: bool = False) -> bool:
+        """Write an object; False if `create` is asked for and there is one already."""
+        with self._errors("write", key):
+            try:
+                obstore.put(self._store, key, content, mode="create" if create else "overwrite")
+            except AlreadyExistsError:
+                return False
+            except FileNotFoundError as error:
+                raise StorageError(self._no_bucket(error, key)) from error
+        return True
+
+    def list(self, folder: str) -> Iterator[ObjectFacts]:
+        """All objects below a prefix, in no order that can be relied on."""
+        with self._errors("list", folder):
+            for some in obstore.list(self._store, prefix=folder):
+                for found in some:
+                    yield _facts(found)
+
+    def remove(self, keys: Sequence[str]) -> None:
+        """Delete objects; those that are not there do not matter."""
+        if keys:
+            with self._errors("delete", keys[0]):
+                obstore.delete(self._store, list(keys))
+
+    def url(self, key: str) -> str:
+        """A key as messages name it."""
+        return f"{self.address}/{key}"
+
+    @contextmanager
+    def _errors(self, word: str, key: str) -> Iterator[None]:
+        """Ours for the library's; FileNotFoundError and PreconditionError pass.
+
+        Raises:
+            StorageError: the service refuses: credentials, bucket, rights.
+            UnavailableError: the service does not answer, or not now.
+        """
+        _Runtime.check(self.url(key))
+        try:
+            yield
+        except FileNotFoundError as error:
+            if "NoSuchBucket" in str(error):
+                raise StorageError(self._no_bucket(error, key)) from error
+            raise
+        except PreconditionError:
+            raise
+        except (BaseError, OSError, ValueError) as error:
+            raise self._translated(error, f"{word} {self.url(key)}") from error
+
+    def _translated(self, error: Exception, what: str) -> StorageError | UnavailableError:
+        text = str(error)
+        status, code = _STATUS.search(text), _CODE.search(text)
+        number = int(status[1]) if status else None
+        said = f"{number or ''} {code[1] if code else ''}".strip() or _first_line(error)
+        denied = isinstance(error, PermissionDeniedError | UnauthenticatedError)
+        if _CREDENTIAL_HOST in text:
+            return StorageError(
+                f"{what}: no credentials; set AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or the "
+                "storage options access_key_id and secret_access_key"
+            )
+        if denied or number in {401, 403}:
+            return StorageError(
+                f"{what}: refused ({said}); check the credentials, what they may do, and the region"
+            )
+        if code is not None and code[1] == "NoSuchBucket":
+            return StorageError(self._no_bucket(error, ""))
+        if "builder error" in text and self.address.options.allow_http is None:
+            return StorageError(f"{what}: an endpoint http://… needs the option allow_http=true")
+        if number is None or number >= 500 or number == 429:
+            return UnavailableError(
+                f"{what}: no answer from the storage service ({said}); check endpoint and "
+                "network, then try again"
+            )
+        return StorageError(f"{what}: refused ({said})")
+
+    def _no_bucket(self, error: Exception, key: str) -> str:
+        if "NoSuchBucket" in str(error):
+            return f"{self.address}: bucket {self.address.bucket!r} does not exist; create it first"
+        return f"{self.url(key)}: refused ({_first_line(error)})"
+
+
+def _facts(meta: Any) -> ObjectFacts:  # noqa: ANN401 the library's types exist for checkers only
+    return ObjectFacts(meta["path"], meta["size"], meta["e_tag"] or "", meta["last_modified"])
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0][:300]

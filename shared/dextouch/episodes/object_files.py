@@ -1,0 +1,171 @@
+"""Files of a group in a bucket → their bytes, fetched in blocks that a bounded memory keeps."""
+
+import threading
+from collections import OrderedDict
+
+from dextouch.episodes.object_bucket import Bucket, ObjectFacts
+
+# Small enough for a window of images, large enough that a request is worth its round trip.
+BLOCK_BYTES = 1 << 18
+# One request for the end of a file gives its size, the index of its shard, and all of a small one.
+TAIL_BYTES = 1 << 16
+# Someone who reads on is met with ever larger requests, up to this many blocks.
+MAX_READ_AHEAD = 8
+_TAIL = -1
+
+
+class BlockCache:
+    """The most recently read blocks of all objects, up to a number of bytes.
+
+    Args:
+        capacity: in bytes; 0 keeps nothing.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._guard = threading.Lock()
+        self._blocks: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
+        self._num_bytes = 0
+
+    def get(self, facts: ObjectFacts, number: int) -> bytes | None:
+        """A block of an object as it was when it was looked at."""
+        key = (facts.key, facts.etag, number)
+        with self._guard:
+            block = self._blocks.get(key)
+            if block is not None:
+                self._blocks.move_to_end(key)
+        return block
+
+    def put(self, facts: ObjectFacts, number: int, block: bytes) -> None:
+        """Keep a block; the longest unused go."""
+        key = (facts.key, facts.etag, number)
+        with self._guard:
+            self._num_bytes += len(block) - len(self._blocks.pop(key, b""))
+            self._blocks[key] = block
+            while self._num_bytes > self.capacity:
+                self._num_bytes -= len(self._blocks.popitem(last=False)[1])
+
+
+class CachedBucket:
+    """A bucket and the blocks of its objects that are kept."""
+
+    def __init__(self, bucket: Bucket) -> None:
+        self.bucket = bucket
+        self.cache = BlockCache(bucket.address.options.cache_bytes)
+
+    def __reduce__(self) -> tuple[type["CachedBucket"], tuple[Bucket]]:
+        return CachedBucket, (self.bucket,)
+
+
+class ObjectFile:
+    """One object that is read in parts.
+
+    Args:
+        place: where it lies.
+        key: of the object.
+    """
+
+    def __init__(self, place: CachedBucket, key: str) -> None:
+        self._place, self._key = place, key
+        # Held over a request: a second reader finds in the memory what the first one fetched.
+        self._guard = threading.Lock()
+        self._facts: ObjectFacts | None = None
+        self._next_block, self._ahead = 0, 1
+
+    def __reduce__(self) -> tuple[type["ObjectFile"], tuple[CachedBucket, str]]:
+        return ObjectFile, (self._place, self._key)
+
+    def size(self) -> int | None:
+        """Its length in bytes; None where there is no such object."""
+        with self._guard:
+            facts = self._look()
+        return None if facts is None else facts.size
+
+    def read(self, offset: int, length: int) -> bytes:
+        """Bytes offset … offset + length − 1; fewer where the object ends before.
+
+        Raises:
+            StorageError, UnavailableError: see `Bucket.read`.
+        """
+        with self._guard:
+            facts = self._look()
+            if facts is None:
+                return b""
+            stop = min(offset + length, facts.size)
+            if stop <= offset:
+                return b""
+            if self._place.cache.capacity == 0:
+                return self._place.bucket.read(facts, offset, stop)
+            tail_start = max(0, facts.size - TAIL_BYTES)
+            if offset >= tail_start:
+                return self._tail(facts, tail_start)[offset - tail_start : stop - tail_start]
+            return self._from_blocks(facts, offset, stop)
+
+    def _look(self) -> ObjectFacts | None:
+        if self._facts is None:
+            found = self._place.bucket.tail(self._key, TAIL_BYTES)
+            if found is None:
+                return None
+            self._facts = found[0]
+            self._place.cache.put(self._facts, _TAIL, found[1])
+        return self._facts
+
+    def _tail(self, facts: ObjectFacts, start: int) -> bytes:
+        data = self._place.cache.get(facts, _TAIL)
+        if data is None:
+            data = self._place.bucket.read(facts, start, facts.size)
+            self._place.cache.put(facts, _TAIL, data)
+        return data
+
+    def _from_blocks(self, facts: ObjectFacts, offset: int, stop: int) -> bytes:
+        first, last = offset // BLOCK_BYTES, (stop - 1) // BLOCK_BYTES
+        blocks = {n: self._place.cache.get(facts, n) for n in range(first, last + 1)}
+        missing = [number for number, block in blocks.items() if block is None]
+        if missing:
+            blocks |= self._fetch(facts, missing[0], missing[-1] + 1)
+        data = b"".join(blocks[number] or b"" for number in range(first, last + 1))
+        return data[offset - first * BLOCK_BYTES : stop - first * BLOCK_BYTES]
+
+    def _fetch(self, facts: ObjectFacts, first: int, stop: int) -> dict[int, bytes]:
+        """Blocks first … stop−1 and perhaps some after them, with one request."""
+        self._ahead = min(2 * self._ahead, MAX_READ_AHEAD) if first == self._next_block else 1
+        num_blocks = -(-facts.size // BLOCK_BYTES)
+        stop = min(max(stop, first + self._ahead), num_blocks)
+        self._next_block = stop
+        start = first * BLOCK_BYTES
+        data = self._place.bucket.read(facts, start, min(stop * BLOCK_BYTES, facts.size))
+        blocks = {
+            number: data[number * BLOCK_BYTES - start : (number + 1) * BLOCK_BYTES - start]
+            for number in range(first, stop)
+        }
+        for number, block in blocks.items():
+            self._place.cache.put(facts, number, block)
+        return blocks
+
+
+class ObjectGroup:
+    """The files of a committed group in a bucket.
+
+    Args:
+        place: where it lies.
+        folder: prefix of its keys, `episodes/ID`.
+        known: files whose bytes were read already, by name.
+    """
+
+    def __init__(self, place: CachedBucket, folder: str, known: dict[str, bytes]) -> None:
+        self._place, self._folder, self._known = place, folder, known
+
+    @property
+    def item_id(self) -> str:
+        """The id under which the group is stored."""
+        return self._folder.rpartition("/")[2]
+
+    def get(self, name: str) -> bytes | None:
+        """All bytes of a small file; None where there is no such file."""
+        if name in self._known:
+            return self._known[name]
+        return self._place.bucket.get(f"{self._folder}/{name}")
+
+    def source(self, name: str) -> ObjectFile:
+        """A file that is read in parts."""
+        return ObjectFile(self._place, f"{self._folder}/{name}")
