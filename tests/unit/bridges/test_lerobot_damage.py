@@ -5,6 +5,8 @@ import json
 import shutil
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 
 from dextouch.bridges.lerobot import (
@@ -110,12 +112,18 @@ def _evil_id(folder):
 
 def _ragged(folder):
     """Lists of unequal length whose total is right: rows would shift."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    _reshape(folder, (-1, 1))
 
+
+def _longer(folder):
+    _reshape(folder, (0, 1))
+
+
+def _reshape(folder, more):
     table = pq.read_table(folder / DATA)
     rows = table.column("action").to_pylist()
-    rows[0], rows[1] = rows[0][:-1], [*rows[1], 0.0]
+    for index, count in enumerate(more):
+        rows[index] = [*rows[index], 0.0][: 67 + count]
     place = table.column_names.index("action")
     ragged = pa.array(rows, pa.list_(pa.float32()))
     pq.write_table(table.set_column(place, "action", ragged), folder / DATA)
@@ -187,6 +195,7 @@ DAMAGE = {
     ),
     "empty rows": (_column(DATA, "action", 4, None), CorruptDataError, "action"),
     "ragged rows": (_ragged, CorruptDataError, "action"),
+    "longer rows": (_longer, CorruptDataError, "action"),
     "no measured actions": (
         lambda f: edit_json(f, INFO, lambda i: i["features"].pop("dextouch.action_measured")),
         CorruptDataError,

@@ -105,6 +105,9 @@ def test_units_are_muxed_as_they_are_and_spans_found_again(tmp_path):
     assert read_units(span(path, 6, first=5)) == second
     images = np.array(list(read_images(span(path, 6, first=5))))
     assert np.abs(images.astype(int) - pictures(6)).mean() < 4
+    for read in (read_units, lambda wanted: list(read_images(wanted))):
+        with pytest.raises(CorruptDataError, match="image 11 of 12"):
+            read(span(path, 12))
     # From the middle of a group nothing can be copied, but everything decoded.
     assert read_units(span(path, 3, first=6)) is None
     np.testing.assert_array_equal(list(read_images(span(path, 3, first=6))), images[1:4])

@@ -134,9 +134,8 @@ def _at(
         return np.repeat(actions, len(t_ns), axis=0) if len(actions) != len(t_ns) else actions
     anchor = reader.attributes.anchor.to_poses()
     poses = poses_from_actions(actions, anchor)
-    inside_ns = t_ns.clip(steps_ns[0], steps_ns[-1])
-    widest_ns = int(np.diff(steps_ns).max())
-    left, weight, _ = bracket(steps_ns, inside_ns, max_gap_ns=widest_ns)
+    # A frame may lie up to half a frame outside the steps: it takes the pose of the nearest one.
+    left, weight, _ = bracket(steps_ns, t_ns, max_gap_ns=int(np.diff(steps_ns).max()))
     between = HandTrajectory(
         interpolate_poses(poses.Ts_world_wrist_left, left, weight),
         interpolate_poses(poses.Ts_world_wrist_right, left, weight),
