@@ -140,6 +140,8 @@ def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
         if shard.is_file():
             # The writer died while it committed: the shard becomes a log again.
             shard.rename(part_path(stage, name))
+        # Not only then: a recovery that died after this rename has left the metadata here.
+        if (stage / name).is_dir():
             shutil.rmtree(stage / name)
         part_path(stage, name).touch()
         journal_path(stage, name).touch()
