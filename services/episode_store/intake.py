@@ -1,12 +1,11 @@
 """What stations send in; admitted and kept, or refused before anything is read, out."""
 
 import time
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
 
 import anyio
 import anyio.to_thread
-from fastapi import Request
 
 from dextouch.errors import LimitExceededError, StorageFullError
 from dextouch.schemas.recordings import (
@@ -69,18 +68,31 @@ class Intake:
         return self._ingest.status(recording_id)
 
     async def put_batch(
-        self, recording_id: str, stream: str, number: int, request: Request
+        self,
+        recording_id: str,
+        stream: str,
+        number: int,
+        *,
+        announced: str | None,
+        read: Callable[[], Awaitable[bytes]],
     ) -> BatchReceipt:
         """Take a batch in.
+
+        Args:
+            recording_id: of an upload that was begun.
+            stream: one of its streams.
+            number: of the batch.
+            announced: length of the body, as the request says it.
+            read: gives the body; not called for a batch that is refused.
 
         Raises:
             LimitExceededError: too much at once; the body was not read.
             StorageFullError: the disk or the station's quota is full; the body was not read.
             DexTouchError: as `Ingest.put_batch`.
         """
-        async with self._admitted(recording_id, request):
+        async with self._admitted(recording_id, announced):
             started = time.perf_counter()
-            data = await request.body()
+            data = await read()
             receipt = await anyio.to_thread.run_sync(
                 self._ingest.put_batch, recording_id, stream, number, data, limiter=self._threads
             )
@@ -115,10 +127,9 @@ class Intake:
         return UploadList(uploads=tuple(gone))
 
     @asynccontextmanager
-    async def _admitted(self, recording_id: str, request: Request) -> AsyncIterator[None]:
-        announced = request.headers.get("content-length", "")
+    async def _admitted(self, recording_id: str, announced: str | None) -> AsyncIterator[None]:
         # A body of unknown length may be as long as a batch can be.
-        num_bytes = int(announced) if announced.isdecimal() else MAX_BATCH_BYTES
+        num_bytes = int(announced) if announced and announced.isdecimal() else MAX_BATCH_BYTES
         with self._counting_refusals():
             admission = self._admission.admitted(num_bytes)
             admission.__enter__()

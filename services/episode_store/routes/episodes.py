@@ -7,8 +7,8 @@ from fastapi import APIRouter, Header, Query, Response
 from dextouch.schemas.episodes import EpisodeDetail, EpisodeList
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import EpisodeQuery
-from services.episode_store.media import MSGPACK, WINDOW_MSGPACK, as_response, chosen_type
 from services.episode_store.reading import SpanQuery, StoreReader, WindowQuery
+from services.episode_store.routes.media import MSGPACK, WINDOW_MSGPACK, as_response, chosen_type
 from services.episode_store.routes.pages import page_limit
 from services.episode_store.routes.scopes import MAY_READ
 

@@ -14,8 +14,8 @@ from dextouch.schemas.recordings import (
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import RecordingQuery
 from services.episode_store.intake import Intake
-from services.episode_store.media import MSGPACK, as_response
 from services.episode_store.reading import SpanQuery, StoreReader
+from services.episode_store.routes.media import MSGPACK, as_response
 from services.episode_store.routes.pages import page_limit
 from services.episode_store.routes.scopes import MAY_READ, MAY_WRITE
 
@@ -40,7 +40,10 @@ def recordings_router(
         recording_id: str, stream: str, number: Annotated[int, Path(ge=0)], request: Request
     ) -> BatchReceipt:
         """Take batch n of a stream in (wire format v1), exactly once however often it comes."""
-        return await intake.put_batch(recording_id, stream, number, request)
+        announced = request.headers.get("content-length")
+        return await intake.put_batch(
+            recording_id, stream, number, announced=announced, read=request.body
+        )
 
     @router.post("/{recording_id}/finish", dependencies=[MAY_WRITE])
     def finish(recording_id: str, body: FinishRecording) -> RecordingStatus:
