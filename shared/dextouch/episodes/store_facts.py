@@ -1,0 +1,173 @@
+"""A store's folder → who and what each thing in it names, even where it is damaged or unfinished.
+
+Read leniently, for deletion: an attributes file whose hash does not hold still names its operator.
+"""
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dextouch.episodes.files import disk_errors
+from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
+from dextouch.episodes.inspection import STAGING, UPLOADS
+from dextouch.episodes.spool_reader import RECORDING_FILE
+from dextouch.episodes.stage import STAGE_FILE
+from dextouch.episodes.trash import TRASH
+
+# Where things lie, and the kind of group that lies there.
+PLACES: dict[str, str] = {
+    "episodes": "episode",
+    "recordings": "recording",
+    UPLOADS: "recording",
+    STAGING: "",
+    TRASH: "",
+}
+MAX_BYTES = 16 << 20
+_SAMPLES = (".part", ".journal", ".receipts")
+_WORD = "A-Za-z0-9_-"
+_AROUND_STAGE = re.compile(r"(episode|recording|migrated|old|deleted)-(.+)-[0-9a-f]{32}")
+_AROUND_TRASH = re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+")
+
+
+@dataclass(frozen=True)
+class Facts:
+    """What one folder of a store says of itself.
+
+    `item_id` and `kind` are those of the group that it is or was to become; `lineage` the kinds,
+    ids and hashes that it was made from; `readable` is false where nothing could be learned.
+    """
+
+    folder: Path
+    place: str
+    kind: str
+    item_id: str
+    operator: str | None
+    lineage: tuple[tuple[str, str, str | None], ...]
+    content_sha256: str | None
+    readable: bool
+
+
+def all_facts(root: Path) -> list[Facts]:
+    """Facts of every group, upload, stage and trash entry below a store's folder."""
+    found = []
+    for place in PLACES:
+        folder = root / place
+        with disk_errors(f"list {place}"):
+            paths = sorted(folder.iterdir()) if folder.is_dir() else []
+        found += [_facts(path, place) for path in paths]
+    return found
+
+
+def _facts(folder: Path, place: str) -> Facts:
+    kind, item_id = _named(folder.name, place)
+    attributes: dict[str, Any] = {}
+    for name, keys in (
+        (METADATA_FILE, ("attributes", ATTRIBUTES_KEY)),
+        (STAGE_FILE, ("attributes",)),
+        (RECORDING_FILE, ()),
+    ):
+        value = _json(folder / name)
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        if isinstance(value, dict) and not attributes:
+            attributes = value
+    for known in ("episode", "recording"):
+        if isinstance(attributes.get(f"{known}_id"), str):
+            kind, item_id = known, attributes[f"{known}_id"]
+    commit = _json(folder / COMMIT_FILE)
+    sha256 = commit.get("sha256") if isinstance(commit, dict) else None
+    operator = attributes.get("operator")
+    return Facts(
+        folder=folder,
+        place=place,
+        kind=kind,
+        item_id=item_id,
+        operator=operator if isinstance(operator, str) else None,
+        lineage=tuple(_lineage(attributes.get("lineage"))),
+        content_sha256=sha256 if isinstance(sha256, str) else None,
+        readable=bool(attributes) or not any(small_files(folder)),
+    )
+
+
+def _named(name: str, place: str) -> tuple[str, str]:
+    """Kind and id as the name of a folder says them."""
+    pattern = {STAGING: _AROUND_STAGE, TRASH: _AROUND_TRASH}.get(place)
+    match = pattern.fullmatch(name) if pattern else None
+    if match is None:
+        return PLACES[place], name.removesuffix(".new")
+    if match[1] == "stage":
+        return _named(match[2], STAGING)
+    return {"upload": "recording"}.get(match[1], match[1]), match[2]
+
+
+def _lineage(value: object) -> Iterator[tuple[str, str, str | None]]:
+    for entry in value if isinstance(value, list) else []:
+        if isinstance(entry, dict):
+            sha256 = entry.get("sha256")
+            yield (
+                str(entry.get("kind")),
+                str(entry.get("id")),
+                sha256 if isinstance(sha256, str) else None,
+            )
+
+
+def small_files(folder: Path) -> Iterator[Path]:
+    """Files right in a folder that may say something of what lies there; samples are none."""
+    if folder.is_file():
+        yield folder
+    with disk_errors(f"look through {folder.name}"):
+        for path in sorted(folder.iterdir()) if folder.is_dir() else []:
+            if path.suffix not in _SAMPLES and path.is_file() and path.stat().st_size <= MAX_BYTES:
+                yield path
+
+
+def _json(path: Path) -> object:
+    with disk_errors(f"read {path.name}"):
+        data = path.read_bytes() if path.is_file() else b""
+    try:
+        return json.loads(data)
+    except (ValueError, RecursionError):
+        return None
+
+
+class Wanted:
+    """Words that must not be left: a pseudonym, ids and hashes; each whole, not inside another.
+
+    Args:
+        words: what is looked for.
+    """
+
+    def __init__(self, words: set[str]) -> None:
+        self._words = words
+        # Longest first, so that of two words that begin alike the longer one is named.
+        either = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
+        self._pattern = re.compile(rf"(?<![{_WORD}])(?:{either})(?![{_WORD}])") if words else None
+
+    def found_in(self, data: bytes) -> list[str]:
+        """Which words some bytes hold, as JSON or as text."""
+        try:
+            texts = list(_strings(json.loads(data)))
+        except (ValueError, RecursionError):
+            text = data.decode(errors="replace")
+            escaped = {word for word in self._words if json.dumps(word)[1:-1] in text}
+            return sorted(escaped | set(self.in_text(text)))
+        return sorted({word for text in texts for word in self.in_text(text)})
+
+    def in_text(self, text: str) -> list[str]:
+        """Which words a text holds."""
+        return sorted(set(self._pattern.findall(text))) if self._pattern else []
+
+
+def _strings(value: object) -> Iterator[str]:
+    waiting = [value]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, str):
+            yield item
+        elif isinstance(item, dict):
+            waiting += [*item.keys(), *item.values()]
+        elif isinstance(item, list):
+            waiting += item

@@ -1,0 +1,293 @@
+"""Deleting an operator's data takes all that stems from it, and shows that nothing is left."""
+
+import json
+import struct
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import deletion
+from dextouch.episodes.deletion import DeletionRequest, delete_for_good, plan_deletion
+from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.repair import repair_group
+from dextouch.episodes.write_options import WriteOptions
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+from dextouch.schemas.episodes import LineageEntry
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import SampleBatch
+
+MINE, OTHER = "op-1", "op-10"
+FORCE = StreamDescriptor(
+    name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
+)
+
+
+def recording_attributes(recording_id, operator):
+    return RecordingAttributes(
+        recording_id=recording_id,
+        task="stand_bottle",
+        instruction="",
+        domain="human",
+        station="bench",
+        operator=operator,
+        streams=(FORCE,),
+    )
+
+
+def batch(count=20):
+    numbers = np.arange(count, dtype=np.int64)
+    return SampleBatch(numbers, numbers, numbers, np.ones((count, 2), "f4"))
+
+
+def write_recording(store, recording_id, operator):
+    attributes = recording_attributes(recording_id, operator)
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        writer.append("force", values=batch().values, t_host_ns=batch().t_host_ns)
+    return LineageEntry(
+        kind="recording", id=recording_id, sha256=store.recording(recording_id).content_sha256
+    )
+
+
+def write_episode(store, made, episode_id, *lineage, **changes):
+    attributes = made.attributes.model_copy(
+        update={"episode_id": episode_id, "lineage": lineage} | changes
+    )
+    with store.writer(attributes=attributes) as writer:
+        writer.add_stream(FORCE)
+        writer.append("force", values=batch().values, t_ref_ns=batch().t_host_ns)
+    return LineageEntry(kind="episode", id=episode_id, sha256=store.open(episode_id).content_sha256)
+
+
+@pytest.fixture
+def filled(store, made):
+    """Two operators: recordings, episodes of them, imagined ones, and all that is unfinished."""
+    for prefix, operator in (("a", MINE), ("b", OTHER)):
+        take = write_recording(store, f"{prefix}-take", operator)
+        episode = write_episode(store, made, f"{prefix}-episode", take)
+        by_id = LineageEntry(kind="episode", id=episode.id)
+        write_episode(store, made, f"{prefix}-imagined", by_id, origin="imagined")
+        write_recording(store, f"{prefix}-deleted", operator)
+        store.delete(f"{prefix}-deleted", kind="recording")
+        spool = store.root / ".uploads" / f"{prefix}-upload"
+        with SpoolWriter(spool, recording_attributes(spool.name, operator), sync=False) as writer:
+            writer.append("force", batch())
+        leave_stage(store, f"{prefix}-stage", operator)
+    return store
+
+
+def leave_stage(store, recording_id, operator):
+    """A stage as a killed writer leaves it."""
+    writer = store.writer(
+        kind="recording",
+        attributes=recording_attributes(recording_id, operator),
+        options=WriteOptions(recoverable=True),
+    )
+    writer.append("force", values=batch().values, t_host_ns=batch().t_host_ns)
+    folder = next((store.root / ".staging").glob(f"*{recording_id}*"))
+    folder.rename(store.root / "kept")
+    writer.__exit__(KeyboardInterrupt, None, None)
+    (store.root / "kept").rename(folder)
+
+
+def everything(root):
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def of_other(contents):
+    return {name: data for name, data in contents.items() if "b-" in name}
+
+
+def test_all_of_an_operator_goes_and_nothing_of_another(filled, tmp_path):
+    before = of_other(everything(filled.root))
+    receipt_path = tmp_path / "receipt.json"
+    receipt = delete_for_good(filled.root, DeletionRequest(operator=MINE), receipt_path)
+    assert receipt.complete
+    assert receipt.remaining == ()
+    assert sorted((v.place, v.id, v.reason) for v in receipt.deleted) == [
+        (".staging", "a-stage", "operator"),
+        (".trash", "a-deleted", "operator"),
+        (".uploads", "a-upload", "operator"),
+        ("episodes", "a-episode", "made from recording a-take"),
+        ("episodes", "a-imagined", "made from episode a-episode"),
+        ("recordings", "a-take", "operator"),
+    ]
+    left = everything(filled.root)
+    assert of_other(left) == before == left
+    assert not [name for name, data in left.items() if b"a-take" in data or b'"op-1"' in data]
+    written = json.loads(receipt_path.read_bytes())
+    assert written["request"] == {"operator": MINE, "recording": None, "derived": True}
+    assert written["before"]["episodes"] == ["a-episode", "a-imagined", "b-episode", "b-imagined"]
+    assert written["after"]["episodes"] == ["b-episode", "b-imagined"]
+    assert written["counts"]["episodes"] == 2
+    assert written["num_files_searched"] > 5
+    assert OTHER not in receipt_path.read_text()
+    with pytest.raises(NotFoundError, match="nothing in"):
+        delete_for_good(filled.root, DeletionRequest(operator=MINE), receipt_path)
+
+
+def test_a_recording_with_and_without_what_was_made_of_it(filled, tmp_path):
+    alone = DeletionRequest(recording="a-take", derived=False)
+    assert [v.id for v in plan_deletion(filled.root, alone)] == ["a-take"]
+    receipt = delete_for_good(filled.root, alone, tmp_path / "r.json")
+    assert not receipt.complete
+    assert [(r.where, r.names[-1]) for r in receipt.remaining] == [
+        ("episodes/a-episode/zarr.json", "a-take")
+    ]
+    request = DeletionRequest(recording="b-take")
+    assert sorted(v.id for v in plan_deletion(filled.root, request)) == [
+        "b-episode",
+        "b-imagined",
+        "b-take",
+    ]
+
+
+@pytest.mark.parametrize("num_removed", range(6))
+def test_an_interrupted_deletion_is_completed_by_repeating_it(
+    filled, tmp_path, monkeypatch, num_removed
+):
+    """The recordings go first here, so that only what was written down leads to the episodes."""
+    real, calls = deletion.remove_for_good, []
+
+    def die(folder):
+        if len(calls) == num_removed:
+            next(p for p in folder.rglob("*.json")).unlink()
+            raise KeyboardInterrupt
+        calls.append(folder)
+        real(folder)
+
+    monkeypatch.setattr(deletion, "remove_for_good", die)
+    request, path = DeletionRequest(operator=MINE), tmp_path / "r.json"
+    with pytest.raises(KeyboardInterrupt):
+        delete_for_good(filled.root, request, path)
+    monkeypatch.undo()
+    assert not path.exists()
+    receipt = delete_for_good(filled.root, request, path)
+    assert receipt.complete
+    assert {v.id for v in receipt.deleted} == {
+        "a-take",
+        "a-episode",
+        "a-imagined",
+        "a-deleted",
+        "a-upload",
+        "a-stage",
+    }
+    assert "a-take" in receipt.before["recordings"]
+    left = everything(filled.root)
+    assert left == of_other(left)
+
+
+def test_what_a_writer_holds_is_listed_until_it_lets_go(filled, tmp_path):
+    spool = filled.root / ".uploads" / "a-upload"
+    writer = SpoolWriter.resume(spool, sync=False)
+    request = DeletionRequest(operator=MINE)
+    receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
+    assert not receipt.complete
+    assert {r.where for r in receipt.remaining} == {
+        ".uploads/a-upload",
+        ".uploads/a-upload/recording.json",
+    }
+    assert "a-upload" not in {v.id for v in receipt.deleted}
+    writer.abandon()
+    receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
+    assert receipt.complete
+    assert {"a-upload", "a-take"} <= {v.id for v in receipt.deleted}
+
+
+def test_damaged_things_that_name_the_operator_go_too(filled, tmp_path):
+    folder = filled.root / "recordings" / "a-take"
+    data = (folder / "zarr.json").read_bytes()
+    (folder / "zarr.json").write_bytes(data[:-2] + b"\x00")
+    receipt = delete_for_good(filled.root, DeletionRequest(operator=MINE), tmp_path / "r.json")
+    assert receipt.complete
+    assert "a-imagined" in {v.id for v in receipt.deleted}
+    assert not folder.exists()
+
+
+def test_what_cannot_be_read_is_no_proof(filled, tmp_path):
+    (filled.root / "episodes" / "b-episode" / "zarr.json").write_bytes(b"\x00")
+    receipt = delete_for_good(filled.root, DeletionRequest(operator=MINE), tmp_path / "r.json")
+    assert receipt.remaining == ()
+    assert receipt.unreadable == ("episodes/b-episode",)
+    assert not receipt.complete
+
+
+def test_salvaged_and_damaged_versions_go_together(filled, tmp_path):
+    """The damaged original lies in the trash and may say nothing of itself any more."""
+    folder = filled.root / "recordings" / "a-take"
+    shard = next(p for p in (folder / "force" / "c").rglob("*") if p.is_file())
+    data = bytearray(shard.read_bytes())
+    data[3] ^= 1
+    shard.write_bytes(data)
+    assert repair_group(filled.root, "recording", "a-take").action == "salvaged"
+    (trashed,) = (filled.root / ".trash").glob("recording.a-take.*")
+    for name in ("zarr.json", "commit.json"):
+        (trashed / name).write_bytes(b"\x00")
+    request = DeletionRequest(recording="a-take-salvaged-1")
+    receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
+    assert {v.id for v in receipt.deleted} == {
+        "a-take-salvaged-1",
+        "a-take",
+        "a-episode",
+        "a-imagined",
+    }
+    assert receipt.complete
+
+
+def test_an_id_that_somebody_else_used_again_is_another_thing(filled, tmp_path):
+    filled.delete("a-take", kind="recording")
+    write_recording(filled, "a-take", OTHER)
+    receipt = delete_for_good(filled.root, DeletionRequest(operator=MINE), tmp_path / "r.json")
+    assert filled.list(kind="recording") == ["a-take", "b-take"]
+    # It is named, so that somebody looks at it.
+    assert {r.where for r in receipt.remaining} >= {"recordings/a-take"}
+
+
+def test_checkpoints_are_searched_by_name(filled, tmp_path):
+    header = {"__metadata__": {"notes": json.dumps({"train_episode_ids": ["a-episode"]})}}
+    other = {"__metadata__": {"notes": json.dumps({"train_episode_ids": ["b-episode"]})}}
+    models = tmp_path / "models"
+    models.mkdir()
+    for name, notes in (("mine", header), ("theirs", other)):
+        data = json.dumps(notes).encode()
+        (models / f"{name}.safetensors").write_bytes(struct.pack("<Q", len(data)) + data + b"0" * 9)
+    receipt = delete_for_good(
+        filled.root, DeletionRequest(operator=MINE), tmp_path / "r.json", checkpoints=models
+    )
+    assert [(r.where, r.names) for r in receipt.remaining] == [
+        (str(models / "mine.safetensors"), ("a-episode",))
+    ]
+    assert not receipt.complete
+
+
+@pytest.mark.parametrize("operator", ["Zoë", 'a"b', "x y", "a.b*", "ü\\n"])
+def test_pseudonyms_of_any_letters(store, made, tmp_path, operator):
+    write_recording(store, "take", operator)
+    write_recording(store, "kept", operator + "s")
+    path = store.root / "recordings" / "kept" / "notes.txt"
+    path.write_text(f"like ({operator}), but better")
+    receipt = delete_for_good(store.root, DeletionRequest(operator=operator), tmp_path / "r.json")
+    assert store.list(kind="recording") == ["kept"]
+    assert [r.where for r in receipt.remaining] == ["recordings/kept/notes.txt"]
+
+
+def test_requests_that_ask_for_nothing_or_both(store, tmp_path):
+    for bad in ({}, {"operator": "a", "recording": "b"}, {"operator": ""}):
+        with pytest.raises(InvalidInputError, match="exactly one"):
+            DeletionRequest(**bad)
+    with pytest.raises(InvalidInputError, match="outside"):
+        delete_for_good(store.root, DeletionRequest(operator="a"), store.root / "r.json")
+
+
+def test_a_damaged_plan_is_said(filled, tmp_path):
+    request = DeletionRequest(operator=MINE)
+    path = deletion._intent_path(filled.root, request)
+    path.parent.mkdir()
+    path.write_text("{")
+    with pytest.raises(CorruptDataError, match="remove it and repeat"):
+        delete_for_good(filled.root, request, tmp_path / "r.json")
+    path.unlink()
+    # Another deletion that was not completed names things as well.
+    (path.parent / "other.json").write_text('{"victims": ["a-take"]}')
+    receipt = delete_for_good(filled.root, request, tmp_path / "r.json")
+    assert [r.where for r in receipt.remaining] == [".deletions/other.json"]
