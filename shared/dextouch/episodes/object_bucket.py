@@ -108,7 +108,10 @@ class Bucket:
             with self._errors("look at", key):
                 return _facts(obstore.head(self._store, key))
         except FileNotFoundError:
-            return None
+            # That answer has no body which could say that even the bucket is missing.
+            if self.get(key) is None:
+                return None
+            return self.head(key)
 
     def tail(self, key: str, length: int) -> tuple[ObjectFacts, bytes] | None:
         """An object's last bytes, all of it if it is shorter; None where there is none."""

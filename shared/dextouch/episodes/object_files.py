@@ -70,7 +70,7 @@ class ObjectFile:
         # Held over a request: a second reader finds in the memory what the first one fetched.
         self._guard = threading.Lock()
         self._facts: ObjectFacts | None = None
-        self._next_block, self._ahead = 0, 1
+        self._next_block, self._ahead = -1, 1
 
     def __reduce__(self) -> tuple[type["ObjectFile"], tuple[CachedBucket, str]]:
         return ObjectFile, (self._place, self._key)

@@ -1,0 +1,383 @@
+"""Object storage: addresses, blocks in memory, uploads that die, and services that refuse."""
+
+import os
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.object_address import ObjectOptions, parse_address
+from dextouch.episodes.object_bucket import Bucket, ObjectFacts
+from dextouch.episodes.object_files import (
+    BLOCK_BYTES,
+    MAX_READ_AHEAD,
+    TAIL_BYTES,
+    BlockCache,
+    CachedBucket,
+    ObjectFile,
+)
+from dextouch.episodes.uploads import ORPHAN_AGE, sweep_orphans
+from dextouch.errors import (
+    ConflictError,
+    InvalidInputError,
+    NotFoundError,
+    StorageError,
+    UnavailableError,
+    UnknownNameError,
+)
+from tests.contracts.s3_server import CREDENTIALS, running_s3
+from tests.unit.episodes.conftest import episode_of
+
+EPISODE = "stand-bottle-0003"
+
+
+@pytest.fixture(scope="session")
+def s3_server():
+    with running_s3() as server:
+        yield server
+
+
+@pytest.fixture
+def url(s3_server, tmp_path):
+    return s3_server.url(f"unit/{tmp_path.name}")
+
+
+@pytest.fixture
+def store(url, tmp_path):
+    return EpisodeStore(url, CREDENTIALS, tmp_path / "work")
+
+
+@pytest.fixture
+def bucket(store):
+    return store._storage._bucket
+
+
+class CountedBucket:
+    """Objects in memory with the two requests that reading makes, counted."""
+
+    def __init__(self, data):
+        self.data, self.requests = data, []
+
+    def tail(self, key, length):
+        self.requests.append(("tail", length))
+        facts = ObjectFacts(key, len(self.data), "e", datetime.now(UTC))
+        return facts, self.data[max(0, len(self.data) - length) :]
+
+    def read(self, facts, start, stop):
+        assert 0 <= start < stop <= facts.size
+        self.requests.append((start, stop))
+        return self.data[start:stop]
+
+
+class Place(CachedBucket):
+    def __init__(self, data, capacity):
+        self.bucket, self.cache = CountedBucket(data), BlockCache(capacity)
+
+
+DATA = np.random.default_rng(5).bytes(3 * BLOCK_BYTES + TAIL_BYTES + 12_345)
+NEAR = st.sampled_from([0, BLOCK_BYTES, 2 * BLOCK_BYTES, len(DATA) - TAIL_BYTES, len(DATA)])
+SPANS = st.lists(
+    st.tuples(NEAR, st.integers(-70_000, 70_000), st.integers(0, 600_000)), min_size=1, max_size=8
+)
+
+
+@given(SPANS, st.sampled_from([0, 100_000, BLOCK_BYTES, 1 << 30]))
+def test_parts_of_an_object_are_slices_of_it(spans, capacity):
+    place = Place(DATA, capacity)
+    file = ObjectFile(place, "k")
+    assert file.size() == len(DATA)
+    for near, shift, length in spans:
+        offset = max(0, near + shift)
+        assert file.read(offset, length) == DATA[offset : offset + length]
+        assert sum(map(len, place.cache._blocks.values())) == place.cache._num_bytes <= capacity
+
+
+def test_what_was_read_is_not_asked_for_again():
+    place = Place(DATA, 1 << 30)
+    file = ObjectFile(place, "k")
+    for _ in range(3):
+        file.read(0, 10)
+        file.read(BLOCK_BYTES - 10, 20)
+        file.read(len(DATA) - 10, 10)
+    assert place.bucket.requests[0] == ("tail", TAIL_BYTES)
+    # Two neighbouring blocks at most, each once.
+    assert len(place.bucket.requests) <= 3
+    other = ObjectFile(place, "another key")
+    other.read(0, 10)
+    assert place.bucket.requests[-1][0] == 0
+
+
+def test_small_files_come_whole_with_one_request():
+    place = Place(b"0123456789", 1 << 20)
+    file = ObjectFile(place, "k")
+    assert file.size() == 10
+    assert (file.read(0, 4), file.read(8, 2), file.read(10, 5)) == (b"0123", b"89", b"")
+    assert place.bucket.requests == [("tail", TAIL_BYTES)]
+
+
+def test_reading_on_asks_for_more_at_a_time():
+    data = bytes(64 * BLOCK_BYTES)
+    place = Place(data, 1 << 30)
+    file = ObjectFile(place, "k")
+    for offset in range(0, len(data), 50_000):
+        file.read(offset, 50_000)
+    reads = [stop - start for start, stop in place.bucket.requests[1:]]
+    assert max(reads) == MAX_READ_AHEAD * BLOCK_BYTES
+    assert len(reads) <= 64 / MAX_READ_AHEAD + 4
+    # What is scattered is not met with more than is asked for.
+    place = Place(data, 1 << 30)
+    file = ObjectFile(place, "k")
+    for number in (40, 10, 50, 20):
+        file.read(number * BLOCK_BYTES, 100)
+    assert {stop - start for start, stop in place.bucket.requests[1:]} == {BLOCK_BYTES}
+
+
+def test_addresses():
+    address = parse_address(
+        "s3://takes/a/b%20c/?endpoint=http://h:9000&allow_http=true&work_folder=/w", {}, None
+    )
+    assert (address.bucket, address.prefix, str(address)) == ("takes", "a/b c", "s3://takes/a/b c")
+    assert address.options.endpoint == "http://h:9000"
+    assert str(address.work_folder) == "/w"
+    bare = parse_address("s3://takes", {"secret_access_key": "hush"}, None)
+    assert (bare.prefix, str(bare)) == ("", "s3://takes")
+    assert "hush" not in repr(bare)
+    # Two places never share a work folder that nobody chose.
+    one, other = (parse_address(f"s3://takes/{p}", {}, None).work_folder for p in ("a-b", "a/b"))
+    assert one != other
+
+
+@pytest.mark.parametrize(
+    "url",
+    ["s3://", "s3:///prefix", "s3://b:80/x", "s3://key:hush@b/x", "s3://b/a//c", "s3://b/../c"],
+)
+def test_addresses_that_are_none(url):
+    with pytest.raises(InvalidInputError, match=r"episode store|prefix") as caught:
+        EpisodeStore(url)
+    assert "hush" not in str(caught.value)
+
+
+def test_options_that_do_not_fit():
+    with pytest.raises(InvalidInputError, match="ends up in logs") as caught:
+        EpisodeStore("s3://b/p?secret_access_key=hush")
+    assert "hush" not in str(caught.value)
+    with pytest.raises(UnknownNameError, match=r"valid: .*endpoint"):
+        EpisodeStore("s3://b/p?endpiont=x")
+    with pytest.raises(InvalidInputError, match=r"\['max_retries'\] do not fit"):
+        EpisodeStore("s3://b/p", {"max_retries": "many"})
+    with pytest.raises(InvalidInputError, match="with s3://bucket/prefix only"):
+        EpisodeStore("data/store", {"endpoint": "x"})
+    assert "hush" not in repr(ObjectOptions.model_validate({"session_token": "hush"}))
+
+
+def test_a_work_folder_belongs_to_one_address(made, store, s3_server):
+    made.write(store)
+    elsewhere = EpisodeStore(s3_server.url("unit/elsewhere"), CREDENTIALS, store.root)
+    with pytest.raises(InvalidInputError, match="belongs to another address"):
+        made.write(elsewhere)
+    assert elsewhere.list() == []
+
+
+def test_a_bucket_that_is_not_there(s3_server, made, tmp_path):
+    store = EpisodeStore(s3_server.url("p", bucket="nowhere"), CREDENTIALS, tmp_path)
+    asks = (store.list, lambda: store.open("x"), lambda: store.exists("x"), store.sweep)
+    for ask in (*asks, lambda: made.write(store)):
+        with pytest.raises(StorageError, match="'nowhere' does not exist; create it first"):
+            ask()
+
+
+def test_wrong_credentials_are_said_to_be_wrong(s3_server, store, made):
+    made.write(store)
+    with s3_server.checking_credentials():
+        for ask in (store.list, lambda: store.open(EPISODE), lambda: store.exists("x")):
+            with pytest.raises(StorageError, match=r"refused.*check the credentials") as caught:
+                ask()
+            assert CREDENTIALS["secret_access_key"] not in str(caught.value)
+    assert store.list() == [EPISODE]
+
+
+def test_a_server_that_is_not_there(tmp_path, unused_port):
+    options = CREDENTIALS | {"max_retries": "1", "retry_timeout_s": "1"}
+    url = f"s3://b/p?endpoint=http://127.0.0.1:{unused_port}&region=eu"
+    with pytest.raises(UnavailableError, match=r"no answer.*check endpoint"):
+        EpisodeStore(f"{url}&allow_http=true", options, tmp_path).list()
+    with pytest.raises(StorageError, match="needs the option allow_http=true"):
+        EpisodeStore(url, options, tmp_path).list()
+
+
+@pytest.fixture
+def unused_port():
+    import socket
+
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+DYING_WRITER = """
+import os, signal, sys
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.object_bucket import Bucket
+from tests.contracts.s3_server import CREDENTIALS
+from tests.unit.episodes.conftest import episode_of
+
+url, work, deadly = sys.argv[1:]
+put = Bucket.put
+def put_or_die(self, key, content, *, create=False):
+    if key.endswith(deadly):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return put(self, key, content, create=create)
+Bucket.put = put_or_die
+episode_of().write(EpisodeStore(url, CREDENTIALS, work))
+"""
+
+
+@pytest.mark.parametrize("deadly", ["claim", "action/c/0/0", "/commit.json"])
+def test_a_kill_during_the_upload_loses_nothing(url, store, tmp_path, deadly):
+    work = tmp_path / "work"
+    dead = subprocess.run([sys.executable, "-c", DYING_WRITER, url, str(work), deadly], check=False)
+    assert dead.returncode == -9
+    other = EpisodeStore(url, CREDENTIALS, tmp_path / "another machine")
+    assert other.list() == []
+    with pytest.raises(NotFoundError):
+        other.open(EPISODE)
+    made = episode_of()
+    with pytest.raises(ConflictError, match=r"waits in .* to be uploaded"):
+        made.write(store)
+    (recovered,) = store.recover()
+    assert (recovered.kind, recovered.item_id) == ("episode", EPISODE)
+    assert not any((work / ".outbox" / "episodes").iterdir())
+    reader = other.open(EPISODE)
+    reader.verify()
+    for name, values in made.values.items():
+        np.testing.assert_array_equal(reader.read(name).values, values)
+    assert store.recover() == ()
+
+
+def test_what_could_not_be_uploaded_waits(s3_server, store, made):
+    writer = store.writer(attributes=made.attributes)
+    for descriptor in made.descriptors:
+        writer.add_stream(descriptor)
+        name = descriptor.name
+        writer.append(name, values=made.values[name], t_ref_ns=made.stamps_ns[name])
+    with s3_server.checking_credentials():
+        with pytest.raises(StorageError, match=r"refused.*`recover` uploads it"):
+            writer.__exit__(None, None, None)
+        with pytest.raises(StorageError, match="refused"):
+            store.recover()
+    # A sweep takes nothing that can still be uploaded.
+    assert store.sweep() == 0
+    assert [group.item_id for group in store.recover()] == [EPISODE]
+    assert store.open(EPISODE).verify().num_arrays == 2 * len(made.values)
+
+
+def test_an_upload_under_a_foreign_claim_waits_and_overwrites_nothing(store, bucket, made):
+    bucket.put(f"episodes/{EPISODE}/claim", b"0" * 64)
+    bucket.put(f"episodes/{EPISODE}/action/c/0/0", b"theirs")
+    with pytest.raises(UnavailableError, match="something else is uploaded or deleted"):
+        made.write(store)
+    assert bucket.get(f"episodes/{EPISODE}/action/c/0/0") == b"theirs"
+    assert store.list() == []
+    assert store.sweep() == 0
+    assert sweep_orphans(bucket, now=datetime.now(UTC) + ORPHAN_AGE + timedelta(minutes=1)) == 1
+    assert list(bucket.list("episodes")) == []
+    assert [group.item_id for group in store.recover()] == [EPISODE]
+    store.open(EPISODE).verify()
+
+
+def test_equal_content_of_two_writers_is_no_conflict_in_the_bucket(store, bucket, url, tmp_path):
+    made = episode_of()
+    made.write(store)
+    commit = bucket.get(f"episodes/{EPISODE}/commit.json")
+    bucket.remove([f"episodes/{EPISODE}/commit.json"])
+    # As if the first one had died just before its last request.
+    made.write(EpisodeStore(url, CREDENTIALS, tmp_path / "second"))
+    assert bucket.get(f"episodes/{EPISODE}/commit.json") == commit
+    store.open(EPISODE).verify()
+
+
+def test_sweep_takes_no_committed_group(store, bucket, made):
+    made.write(store)
+    assert sweep_orphans(bucket, now=datetime.now(UTC) + timedelta(days=400)) == 0
+    store.open(EPISODE).verify()
+
+
+def test_an_object_that_is_replaced_while_it_is_read(store, bucket, made):
+    reader = made.write(store)
+    key = f"episodes/{EPISODE}/camera_head/c/0/0"
+    large = np.random.default_rng(1).bytes(3 * BLOCK_BYTES)
+    bucket.put(key, large)
+    file = reader._contents.files.source("camera_head/c/0/0")
+    assert file.read(0, 10) == large[:10]
+    bucket.put(key, large[::-1])
+    with pytest.raises(StorageError, match=f"{key}: was deleted or replaced"):
+        file.read(2 * BLOCK_BYTES, 10)
+    bucket.remove([key])
+    with pytest.raises(StorageError, match="open it again"):
+        file.read(BLOCK_BYTES, 10)
+
+
+def test_windows_need_few_requests_and_none_twice(store, url, tmp_path, monkeypatch, made):
+    made.write(store)
+    reader = EpisodeStore(url, CREDENTIALS, tmp_path / "reader").open(EPISODE)
+    requests = []
+    for name in ("get", "tail", "read", "head"):
+        request = getattr(Bucket, name)
+
+        def counted(self, key, *rest, request=request):
+            requests.append(key)
+            return request(self, key, *rest)
+
+        monkeypatch.setattr(Bucket, name, counted)
+    first = reader.window(2, 9)
+    # Values and stamps of one camera, two tactile streams and the actions; images have blocks.
+    assert len(requests) <= 12
+    requests.clear()
+    np.testing.assert_array_equal(reader.window(2, 9).tactile_kpa, first.tactile_kpa)
+    assert requests == []
+
+
+def test_three_hundred_episodes_are_listed(store, bucket):
+    names = [f"take-{number:04d}" for number in range(300)]
+    files = [
+        f"episodes/{name}/{file}" for name in names for file in ("commit.json", "a/commit.json")
+    ]
+    orphans = [f"episodes/orphan-{number}/zarr.json" for number in range(401)]
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(lambda key: bucket.put(key, b"x"), [*files, *orphans]))
+    # More files than one answer of the service holds.
+    assert len(files) + len(orphans) > 1000
+    assert store.list() == names
+    assert store.list(kind="recording") == []
+
+
+def test_a_forked_process_is_told_how_to_start(store):
+    assert store.list() == []
+    receiver, sender = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            store.list()
+        except UnavailableError as error:
+            os.write(sender, str(error).encode())
+        finally:
+            os._exit(0)
+    os.close(sender)
+    with os.fdopen(receiver, "rb") as answer:
+        assert b"start workers with 'spawn'" in answer.read()
+    os.waitpid(child, 0)
+
+
+def test_without_the_library_the_message_says_what_to_install(monkeypatch):
+    for name in list(sys.modules):
+        if name.startswith(("obstore", "dextouch.episodes.object_", "dextouch.episodes.uploads")):
+            monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "obstore", None)
+    with pytest.raises(UnavailableError, match=r"pip install 'dextouch-wm\[s3\]'"):
+        EpisodeStore("s3://bucket/prefix")
