@@ -35,7 +35,7 @@ def test_no_round_is_refused():
 def test_figures_keep_every_round():
     figure = Figure.of([4.0, 1.0, 3.0])
     assert (figure.median, figure.low, figure.high) == (3, 1, 4)
-    assert figure.text() == "3 (1 … 4)"
+    assert figure.text() == "3 ±1.5"
     assert Figure.of([2.0]).text() == "2"
     assert figure.scaled(2.0).values == (8, 2, 6)
     assert figure.inverse(12.0).values == (3, 12, 4)

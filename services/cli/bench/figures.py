@@ -65,10 +65,10 @@ class Figure:
         return Figure.of([of / value for value in self.values])
 
     def text(self) -> str:
-        """Median, with the spread where there were several rounds."""
+        """Median, with half the range of the rounds where there were several."""
         if len(self.values) == 1:
             return f"{self.median:.3g}"
-        return f"{self.median:.3g} ({self.low:.3g} … {self.high:.3g})"
+        return f"{self.median:.3g} ±{(self.high - self.low) / 2:.2g}"
 
 
 @dataclass(frozen=True)

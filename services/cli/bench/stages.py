@@ -54,6 +54,14 @@ STAGES = {
         "with what the store promises and whether it holds. Close other programs first: timings "
         "on a busy machine say little.",
     ),
+    "loader": StageEntry(
+        "services.cli.bench.loader",
+        "read training windows from the disk as fast as training needs them",
+        "Makes twin episodes (or reads --store) and times, in turns and with one thread: training "
+        "steps of the world model on windows that are in memory, the loader of "
+        "`dextouch train world-model --streaming` alone, and both together. Ends with how many "
+        "times faster windows are read than learned from.",
+    ),
 }
 
 
