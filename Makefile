@@ -45,7 +45,7 @@ $(LEROBOT_VENV)/.complete: $(LEROBOT)/make_venv.sh $(LEROBOT)/requirements.txt $
 	PYTHON=$(PYTHON) $(LEROBOT)/make_venv.sh $(LEROBOT_VENV)
 
 bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: our store beside LeRobotDataset v3; ARGS="--rounds 5"
-	$(LEROBOT_VENV)/bin/python $(LEROBOT)/bench.py $(ARGS)
+	$(LEROBOT_VENV)/bin/python $(LEROBOT)/bench.py --out runs/bench_lerobot $(ARGS)
 
 check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: our exports open in lerobot itself
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py

@@ -210,12 +210,12 @@ def _row(workload: Workload, index: int) -> dict[str, object]:
     return {**row, "task": "bench"}
 
 
-STREAMING, TUNED = "lerobot-streaming", "lerobot-h264"
+STREAMING, TUNED, DIRECT = "lerobot-streaming", "lerobot-h264", "-direct"
 _DESIGNS = (
     LeRobotDesign(STREAMING),
-    LeRobotDesign(f"{STREAMING}-direct", direct=True, reads=STREAMING),
+    LeRobotDesign(f"{STREAMING}{DIRECT}", direct=True, reads=STREAMING),
     LeRobotDesign(TUNED, encoder={"vcodec": "h264", "preset": "ultrafast", "crf": 25, "g": 8}),
-    LeRobotDesign(f"{TUNED}-direct", direct=True, reads=TUNED),
+    LeRobotDesign(f"{TUNED}{DIRECT}", direct=True, reads=TUNED),
     LeRobotDesign("lerobot-default", streaming=False),
 )
 
