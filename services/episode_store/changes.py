@@ -9,6 +9,8 @@ from dextouch.episodes.format import COMMIT_FILE, Kind
 
 # Stamps of a file system can be this coarse: a change as young may have a twin with its stamp.
 SETTLED_NS = 2_000_000_000
+# Listing a bucket takes a request for every thousand files in it.
+BUCKET_PERIOD_NS = 5_000_000_000
 
 Revision = tuple[int, int]
 
@@ -18,10 +20,15 @@ class FolderChanges:
 
     Committing and deleting rename folders in and out, which sets the stamp of the folder above.
     What was changed in place behind the store's back shows at the next coming or going only.
+
+    A store that is no folder is listed, at most once in BUCKET_PERIOD_NS, and by ids alone: one
+    that is deleted and written again between two looks goes unnoticed there.
     """
 
     def __init__(self, store: EpisodeStore, kind: Kind) -> None:
+        self._store, self._kind = store, kind
         self._folder = store.root / f"{kind}s"
+        self._listed_ns: int | None = None
         self._stamp_ns: int | None = None
         self._is_settled = False
 
@@ -32,12 +39,21 @@ class FolderChanges:
                 stamp_ns = self._folder.stat().st_mtime_ns
             except FileNotFoundError:
                 self._stamp_ns = None
-                return {}
+                return self._list()
             if self._is_settled and stamp_ns == self._stamp_ns:
                 return None
             now_ns = time.time_ns()
             found = self._scan()
         self._stamp_ns, self._is_settled = stamp_ns, now_ns - stamp_ns > SETTLED_NS
+        return found
+
+    def _list(self) -> dict[str, Revision] | None:
+        # An empty folder's list costs nothing; a bucket's is not asked for again at once.
+        now_ns = time.monotonic_ns()
+        if self._listed_ns is not None and now_ns - self._listed_ns < BUCKET_PERIOD_NS:
+            return None
+        found = dict.fromkeys(self._store.list(kind=self._kind), (0, 0))
+        self._listed_ns = now_ns if found else None
         return found
 
     def _scan(self) -> dict[str, Revision]:

@@ -129,6 +129,24 @@ def test_a_young_stamp_is_not_believed(store):
     assert ids(catalog) == "bcd"
 
 
+def test_a_bucket_is_listed_now_and_then(store, monkeypatch, tmp_path):
+    """A store whose groups lie elsewhere: its root is only the folder of unfinished things."""
+    work_folder, asked, now_ns = tmp_path / "work", [], [0]
+    monkeypatch.setattr(changes_module.time, "monotonic_ns", lambda: now_ns[0])
+    whole = store.list
+    monkeypatch.setattr(store, "list", lambda kind: asked.append(kind) or whole(kind=kind))
+    root, store.root = store.root, work_folder
+    catalog = Catalog(store)
+    store.root = root
+    assert ids(catalog, origin="twin") == "ab"
+    write_episode(store, "e")
+    assert ids(catalog) == "abcd"
+    assert asked == ["episode"]
+    now_ns[0] += changes_module.BUCKET_PERIOD_NS
+    assert ids(catalog) == "abcde"
+    assert asked == ["episode", "episode"]
+
+
 def test_recordings_are_filtered_too(start, attributes, batch_of, store):
     client = start()
     for number, changes in enumerate(
