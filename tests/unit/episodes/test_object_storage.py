@@ -8,8 +8,11 @@ from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
+import zarr
 from hypothesis import given
 from hypothesis import strategies as st
+from obstore.store import S3Store
+from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.object_address import ObjectOptions, parse_address
@@ -341,6 +344,22 @@ def test_windows_need_few_requests_and_none_twice(store, url, tmp_path, monkeypa
     requests.clear()
     np.testing.assert_array_equal(reader.window(2, 9).tactile_kpa, first.tactile_kpa)
     assert requests == []
+
+
+def test_zarr_python_opens_it_in_the_bucket_as_it_stands(store, bucket, made):
+    made.write(store)
+    address, place = bucket.address, f"{bucket.address.prefix}/episodes/{EPISODE}"
+    keys = S3Store(
+        address.bucket,
+        prefix=place,
+        config=CREDENTIALS | {"endpoint": address.options.endpoint, "region": "us-east-1"},
+        client_options={"allow_http": True},
+    )
+    group = zarr.open_group(ObjectStore(keys, read_only=True), mode="r")
+    assert group.attrs["dextouch"]["task"] == made.attributes.task
+    for name, values in made.values.items():
+        np.testing.assert_array_equal(group[name][:], values)
+        np.testing.assert_array_equal(group[f"{name}_t_ref_ns"][:], made.stamps_ns[name])
 
 
 def test_three_hundred_episodes_are_listed(store, bucket):
