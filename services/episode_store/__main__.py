@@ -5,28 +5,25 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
-from dextouch.errors import CorruptDataError, DexTouchError, StorageError
-from dextouch.schemas.episodes import json_ready
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.trash import TRASH_KINDS
+from dextouch.errors import DexTouchError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
 from services.episode_store.app import create_app
-from services.episode_store.catalog import Catalog, EpisodeFilter
 from services.episode_store.settings import EpisodeStoreSettings
+from services.episode_store.words import look, mend, remove
+from services.episode_store.words.context import Context, Outcome, seconds_of
 
-EXIT_DAMAGED = 1
 EXIT_REFUSED = 3
-
-Outcome = tuple[dict[str, Any], int]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run one word of the store's command line; without a word, serve.
 
     Returns:
-        0, 1 when `verify` found damage, 3 for a refusal.
+        0, 1 when something is damaged, left or not provably gone, 3 for a refusal.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -38,11 +35,16 @@ def main(argv: Sequence[str] | None = None) -> int:
         # What the catalog leaves out is told on stderr, beside the list.
         configure_logging(service="episode_store", log_format="auto", level="warning")
         url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-        result, status = _WORDS[options.word](EpisodeStore(url), options)
+        # With the result itself on stdout, what is said goes beside it.
+        out = sys.stderr if options.json == "-" else sys.stdout
+        context = Context(EpisodeStore(url), url, options, lambda line: print(line, file=out))
+        result, status = _WORDS[options.word](context)
     except DexTouchError as error:
         print(f"dextouch store: {error.message}", file=sys.stderr)
         return EXIT_REFUSED
-    if options.json is not None:
+    if options.json == "-":
+        print(json.dumps(result, indent=2))
+    elif options.json is not None:
         Path(options.json).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     return status
 
@@ -56,92 +58,68 @@ def _serve(arguments: list[str]) -> int:
     return 0
 
 
-def _list(store: EpisodeStore, options: argparse.Namespace) -> Outcome:
-    catalog = Catalog(store)
-    if options.kind == "recording":
-        recordings = catalog.recordings(limit=sys.maxsize)
-        for take in recordings.recordings:
-            num_samples = sum(take.num_samples.values())
-            print(f"{take.recording_id}  {take.task}  {take.domain}  {num_samples} samples")
-        return json_ready(recordings), 0
-    wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
-    episodes = catalog.episodes(wanted, limit=sys.maxsize)
-    outcomes = {True: "success", False: "failure", None: "not judged"}
-    for episode in episodes.episodes:
-        print(
-            f"{episode.episode_id}  {episode.task}  {episode.domain}  {episode.origin}  "
-            f"{episode.num_steps} steps  {outcomes[episode.success]}"
-        )
-    return json_ready(episodes), 0
-
-
-def _show(store: EpisodeStore, options: argparse.Namespace) -> Outcome:
-    reader = _reader(store, options.kind, options.id)
-    counts = {name: reader.num_samples(name) for name in reader.streams}
-    result = {
-        "attributes": json_ready(reader.attributes),
-        "num_samples": counts,
-        "content_sha256": reader.content_sha256,
-    }
-    print(json.dumps(result, indent=2))
-    return result, 0
-
-
-def _verify(store: EpisodeStore, options: argparse.Namespace) -> Outcome:
-    damaged: dict[str, str] = {}
-    ids = options.ids or store.list(kind=options.kind)
-    for item_id in ids:
-        try:
-            found = _reader(store, options.kind, item_id).verify()
-        except (CorruptDataError, StorageError) as error:
-            damaged[item_id] = error.message
-            print(f"{item_id}  DAMAGED  {error.message}")
-        else:
-            print(f"{item_id}  whole  {found.num_arrays} arrays, {found.num_bytes} bytes")
-    return {"verified": len(ids), "damaged": damaged}, EXIT_DAMAGED if damaged else 0
-
-
-def _delete(store: EpisodeStore, options: argparse.Namespace) -> Outcome:
-    for item_id in options.ids:
-        store.delete(item_id, kind=options.kind)
-        print(f"{item_id}  deleted")
-    return {"deleted": options.ids}, 0
-
-
-def _reader(store: EpisodeStore, kind: str, item_id: str) -> EpisodeReader | RecordingReader:
-    return store.recording(item_id) if kind == "recording" else store.open(item_id)
-
-
-_WORDS: dict[str, Callable[[EpisodeStore, argparse.Namespace], Outcome]] = {
-    "list": _list,
-    "show": _show,
-    "verify": _verify,
-    "delete": _delete,
+_WORDS: dict[str, Callable[[Context], Outcome]] = {
+    "list": look.list_items,
+    "show": look.show,
+    "verify": look.verify,
+    "delete": remove.delete,
+    "restore": remove.restore,
+    "purge": remove.purge,
+    "repair": mend.repair,
+    "migrate": mend.migrate,
 }
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dextouch store",
-        description="Look into a store, or serve it ('serve --help' lists the settings).",
+        description="Look into a store, mend it, or serve it ('serve --help' lists the settings).",
     )
     shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("--store", metavar="URL", help="local folder or file:///…")
-    shared.add_argument("--kind", choices=("episode", "recording"), default="episode")
-    shared.add_argument("--json", metavar="PATH", help="write the result there as well")
+    shared.add_argument("--store", metavar="URL", help="local folder, file:///… or s3://…")
+    shared.add_argument("--json", metavar="PATH", help="write the result there too; - for stdout")
+    kind = argparse.ArgumentParser(add_help=False, parents=[shared])
+    kind.add_argument("--kind", choices=("episode", "recording"), help="both when not given")
     words = parser.add_subparsers(dest="word", required=True)
     words.add_parser("serve", help="answer over HTTP", add_help=False)
-    listing = words.add_parser("list", parents=[shared], help="what is in the store")
+    listing = words.add_parser("list", parents=[kind], help="what is in the store")
     listing.add_argument("--task")
     listing.add_argument("--domain", choices=("human", "robot"))
     listing.add_argument("--origin", choices=("recorded", "twin", "imagined"))
-    show = words.add_parser("show", parents=[shared], help="attributes and sizes of one")
+    listing.add_argument("--trash", action="store_true", help="what was deleted instead")
+    show = words.add_parser("show", parents=[kind], help="attributes and streams of one")
     show.add_argument("id")
-    verify = words.add_parser("verify", parents=[shared], help="read everything, compare hashes")
-    verify.add_argument("ids", nargs="*", help="all when none is named")
-    delete = words.add_parser("delete", parents=[shared], help="remove for good")
-    delete.add_argument("ids", nargs="+")
+    _add_ids(words.add_parser("verify", parents=[kind], help="read everything, name all damage"))
+    repair = words.add_parser(
+        "repair", parents=[kind], help="complete what was interrupted, mend or salvage damage"
+    )
+    _add_ids(repair)
+    repair.add_argument("--from", dest="source", metavar="URL", help="another copy of the store")
+    _add_ids(words.add_parser("migrate", parents=[kind], help="bring older versions over"))
+    _add_delete(words.add_parser("delete", parents=[kind], help="into the trash, or for good"))
+    restore = words.add_parser("restore", parents=[shared], help="out of the trash again")
+    restore.add_argument("--kind", choices=TRASH_KINDS, help="needed where an id has several")
+    restore.add_argument("ids", nargs="+")
+    purge = words.add_parser("purge", parents=[shared], help="empty the trash for good")
+    purge.add_argument(
+        "--older-than", type=seconds_of, default=0.0, metavar="AGE", help="such as 30d or 12h"
+    )
     return parser
+
+
+def _add_ids(word: argparse.ArgumentParser) -> None:
+    word.add_argument("ids", nargs="*", help="all when none is named")
+
+
+def _add_delete(word: argparse.ArgumentParser) -> None:
+    word.add_argument("ids", nargs="*")
+    word.add_argument("--for-good", action="store_true", help="not into the trash")
+    word.add_argument("--operator", metavar="P", help="all that stems from this pseudonym")
+    word.add_argument("--recording", metavar="ID", help="this recording")
+    word.add_argument("--derived", action="store_true", help="and all that was made from it")
+    word.add_argument("--yes", action="store_true", help="do not ask")
+    word.add_argument("--receipt", metavar="PATH", help="where the proof goes")
+    word.add_argument("--checkpoints", metavar="FOLDER", help="models to search as well")
 
 
 if __name__ == "__main__":

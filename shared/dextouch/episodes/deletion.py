@@ -105,6 +105,9 @@ def plan_deletion(
     spreads = request.derived or request.operator is not None
     names = {(victim.kind, victim.id) for victim in known if spreads}
     hashes = {victim.sha256 for victim in known if spreads} - {None}
+    if spreads and request.recording is not None:
+        # What was made of it may outlive it.
+        names.add(("recording", request.recording))
     found: list[Victim] = []
     grown = True
     while grown:

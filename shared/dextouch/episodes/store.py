@@ -7,6 +7,7 @@ from dextouch.episodes.format import KINDS, Kind, check_id
 from dextouch.episodes.group_contents import read_group, read_live
 from dextouch.episodes.local_storage import LocalStorage, local_folder
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
+from dextouch.episodes.sources import GroupFiles
 from dextouch.episodes.stage import Attributes, attributes_id
 from dextouch.episodes.stage_recovery import RecoveredGroup
 from dextouch.episodes.staging import stages_of
@@ -120,6 +121,14 @@ class EpisodeStore:
         """The reader of a finished recording; raises as `open`."""
         group = self._storage.group(*_check("recording", recording_id))
         return RecordingReader(read_group(group, "recording", RecordingAttributes))
+
+    def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
+        """The files of a committed group as they lie there, for inspection and repair.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        return self._storage.group(*_check(kind, item_id))
 
     def live(self, recording_id: str) -> RecordingReader:
         """A reader of what an unfinished recording holds at this moment; ask again for more.

@@ -1,0 +1,1 @@
+"""The words of `dextouch store`, by what they do: look, remove, mend."""

@@ -1,0 +1,127 @@
+"""What every word of the command line is given: the store, its flags, and ways to speak."""
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.format import KINDS, Kind, check_id
+from dextouch.episodes.local_storage import local_folder
+from dextouch.errors import InvalidInputError, NotFoundError
+
+EXIT_DAMAGED = 1
+_UNITS = {"s": 1.0, "m": 60.0, "h": 3600.0, "d": 86_400.0}
+_SIZES = ("bytes", "kB", "MB", "GB", "TB")
+
+Outcome = tuple[dict[str, Any], int]
+
+
+def _ask(question: str) -> str:
+    sys.stderr.write(question)
+    sys.stderr.flush()
+    return sys.stdin.readline().strip()
+
+
+@dataclass(frozen=True)
+class Context:
+    """A store, what was asked of it, where lines go and where answers come from."""
+
+    store: EpisodeStore
+    url: str
+    options: argparse.Namespace
+    say: Callable[[str], None]
+    ask: Callable[[str], str] = field(default=_ask)
+
+    def kind_of(self, item_id: str) -> Kind:
+        """The kind of an id: the one named with --kind, else the one under which it exists.
+
+        Raises:
+            NotFoundError: there is none.
+            InvalidInputError: there are both.
+        """
+        check_id(item_id)
+        if self.options.kind:
+            return self.options.kind
+        found = [kind for kind in KINDS if self._is_there(kind, item_id)]
+        if not found:
+            raise NotFoundError(
+                f"{item_id!r}: not in the store {self.url}, neither episode nor recording"
+            )
+        if len(found) > 1:
+            raise InvalidInputError(
+                f"{item_id!r} is an episode and a recording; name one with --kind"
+            )
+        return found[0]
+
+    def _is_there(self, kind: Kind, item_id: str) -> bool:
+        if self.store.exists(item_id, kind=kind):
+            return True
+        root = self.local_root()
+        return root is not None and (root / f"{kind}s" / item_id).is_dir()
+
+    def items(self) -> list[tuple[Kind, str]]:
+        """What is meant: the ids that were named, else all of the kinds that were named.
+
+        A folder in a group's place counts even without a commit record.
+        """
+        if self.options.ids:
+            return [(self.kind_of(item_id), item_id) for item_id in self.options.ids]
+        root = self.local_root()
+        found: list[tuple[Kind, str]] = []
+        for kind in KINDS if self.options.kind is None else (self.options.kind,):
+            names = set(self.store.list(kind=kind))
+            folder = None if root is None else root / f"{kind}s"
+            if folder is not None and folder.is_dir():
+                names |= {path.name for path in folder.iterdir()}
+            found += [(kind, name) for name in sorted(names)]
+        return found
+
+    def local_root(self) -> Path | None:
+        """The store's folder; None for one in a bucket."""
+        return None if self.url.startswith("s3://") else local_folder(self.url)
+
+    def need_local_root(self) -> Path:
+        """The store's folder.
+
+        Raises:
+            InvalidInputError: a store in a bucket.
+        """
+        root = self.local_root()
+        if root is None:
+            raise InvalidInputError(
+                f"{self.options.word}: got the store {self.url}, expected one in a folder; copy "
+                "it to a folder first, or use the versions of the bucket"
+            )
+        return root
+
+
+def seconds_of(text: str) -> float:
+    """Seconds of `30d`, `12h`, `90m` or `10s`.
+
+    Raises:
+        ValueError: anything else.
+    """
+    factor = _UNITS.get(text[-1:])
+    if factor is None or not text[:-1].isdecimal():
+        raise ValueError(f"got {text!r}, expected a number and one of s m h d, such as 30d")
+    return int(text[:-1]) * factor
+
+
+def readable_size(num_bytes: int) -> str:
+    """A size with three digits and a unit."""
+    size, unit = float(num_bytes), 0
+    while size >= 999.5 and unit < len(_SIZES) - 1:
+        size, unit = size / 1000, unit + 1
+    return f"{num_bytes} bytes" if unit == 0 else f"{size:.3g} {_SIZES[unit]}"
+
+
+def table(rows: list[tuple[str, ...]]) -> list[str]:
+    """Rows of words as lines with columns below each other."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
+    return [
+        "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()
+        for row in rows
+    ]

@@ -1,0 +1,205 @@
+"""`list`, `show` and `verify`: a store in, lines and verdicts out."""
+
+import importlib.util
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.episodes import EpisodeReader, RecordingReader
+from dextouch.episodes.format import KINDS, Kind, shard_path, stream_arrays
+from dextouch.episodes.inspection import (
+    Finding,
+    ItemReport,
+    Progress,
+    inspect_group,
+    inspect_stage,
+    inspect_upload,
+    open_contents,
+    unfinished,
+)
+from dextouch.episodes.sources import GroupFiles, LocalGroup
+from dextouch.errors import StorageError
+from dextouch.schemas.episodes import json_ready
+from services.episode_store.catalog import Catalog, EpisodeFilter
+from services.episode_store.words.context import (
+    EXIT_DAMAGED,
+    Context,
+    Outcome,
+    readable_size,
+    table,
+)
+
+_OUTCOMES = {True: "success", False: "failure", None: "not judged"}
+
+
+def list_items(context: Context) -> Outcome:
+    """What is in the store, or in its trash."""
+    options, say = context.options, context.say
+    if options.trash:
+        return _list_trash(context)
+    catalog = Catalog(context.store)
+    if options.kind == "recording":
+        recordings = catalog.recordings(limit=sys.maxsize)
+        for take in recordings.recordings:
+            num_samples = sum(take.num_samples.values())
+            say(f"{take.recording_id}  {take.task}  {take.domain}  {num_samples} samples")
+        return json_ready(recordings), 0
+    wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
+    episodes = catalog.episodes(wanted, limit=sys.maxsize)
+    for episode in episodes.episodes:
+        say(
+            f"{episode.episode_id}  {episode.task}  {episode.domain}  {episode.origin}  "
+            f"{episode.num_steps} steps  {_OUTCOMES[episode.success]}"
+        )
+    return json_ready(episodes), 0
+
+
+def _list_trash(context: Context) -> Outcome:
+    entries = context.store.trash_list()
+    for entry in entries:
+        size = readable_size(entry.num_bytes)
+        context.say(f"{entry.item_id}  {entry.kind}  deleted {_date(entry.deleted_at_ns)}  {size}")
+    rows = [
+        {
+            "kind": entry.kind,
+            "id": entry.item_id,
+            "deleted_at": _date(entry.deleted_at_ns),
+            "num_bytes": entry.num_bytes,
+        }
+        for entry in entries
+    ]
+    return {"trash": rows}, 0
+
+
+def _date(time_ns: int) -> str:
+    return datetime.fromtimestamp(time_ns / 1e9, UTC).isoformat(timespec="seconds")
+
+
+def show(context: Context) -> Outcome:
+    """Attributes of one group and a table of its streams."""
+    item_id = context.options.id
+    kind = context.kind_of(item_id)
+    store = context.store
+    reader = store.recording(item_id) if kind == "recording" else store.open(item_id)
+    files = store.files(item_id, kind=kind)
+    contents = open_contents(files, kind)
+    streams = {}
+    rows: list[tuple[str, ...]] = [("stream", "Hz", "samples", "gaps", "size", "codec", "encoder")]
+    for name, descriptor in reader.streams.items():
+        entry, num_gaps = contents.entries[name], _num_gaps(reader, name)
+        arrays = stream_arrays(descriptor, kind)
+        num_bytes = sum(_shard_bytes(files, a, contents.entries[a].shape) for a in arrays)
+        num_samples, rate_hz = reader.num_samples(name), descriptor.nominal_rate_hz
+        streams[name] = {
+            "rate_hz": rate_hz,
+            "num_samples": num_samples,
+            "num_gaps": num_gaps,
+            "num_bytes": num_bytes,
+            "codec": entry.codec,
+            "encoder": entry.encoder,
+        }
+        numbers = (f"{rate_hz:g}", str(num_samples), str(num_gaps), readable_size(num_bytes))
+        rows.append((name, *numbers, entry.codec, entry.encoder or ""))
+    result = {
+        "attributes": json_ready(reader.attributes),
+        "num_samples": {name: reader.num_samples(name) for name in reader.streams},
+        "streams": streams,
+        "content_sha256": reader.content_sha256,
+    }
+    attributes = reader.attributes
+    context.say(f"{kind} {item_id}  {attributes.task}  {attributes.domain}")
+    context.say(f"{_OUTCOMES[attributes.success]}{'  recovered' * attributes.recovered}")
+    for source in attributes.lineage:
+        context.say(f"made from {source.kind} {source.id}")
+    for line in table(rows):
+        context.say(line)
+    context.say(f"content {reader.content_sha256}")
+    return result, 0
+
+
+def _num_gaps(reader: EpisodeReader | RecordingReader, name: str) -> int:
+    """Steps between samples of more than one and a half nominal periods."""
+    steps = np.diff(reader.stamps_ns(name))
+    return int((steps > 1.5 * reader.streams[name].period_ns()).sum())
+
+
+def _shard_bytes(files: GroupFiles, array: str, shape: tuple[int, ...]) -> int:
+    return files.source(f"{array}/{shard_path(len(shape))}").size() or 0
+
+
+def verify(context: Context) -> Outcome:
+    """Read everything and name all that does not hold."""
+    items, root = context.items(), context.local_root()
+    reports: list[ItemReport] = []
+    with _progress_bar(context, items) as progress:
+        for kind, item_id in items:
+            files = _files(context, kind, item_id)
+            reports.append(inspect_group(files, kind, progress=progress))
+    if not context.options.ids and root is not None:
+        for what, folder in unfinished(root):
+            reports.append(_inspect_unfinished(what, folder))
+    for report in reports:
+        _say_report(context, report)
+    damaged = {r.item_id: "; ".join(f.message for f in r.findings) for r in reports if r.damaged}
+    result = {
+        "verified": len(items),
+        "damaged": damaged,
+        "reports": [asdict(report) for report in reports],
+    }
+    return result, EXIT_DAMAGED if damaged else 0
+
+
+def _files(context: Context, kind: Kind, item_id: str) -> GroupFiles:
+    root = context.local_root()
+    # Not by the store, which does not know what lost its commit record.
+    return (
+        context.store.files(item_id, kind=kind)
+        if root is None
+        else LocalGroup(root / f"{kind}s" / item_id)
+    )
+
+
+def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
+    if not folder.is_dir() or folder.is_symlink():
+        finding = Finding(f"{kind} {folder.name}: is no folder; move it away", foreign=True)
+        return ItemReport(kind, folder.name, findings=(finding,))
+    return inspect_upload(folder) if kind == "upload" else inspect_stage(folder)
+
+
+def _say_report(context: Context, report: ItemReport) -> None:
+    size = f"{report.num_arrays} arrays, {report.num_bytes} bytes"
+    if report.damaged:
+        for finding in report.findings:
+            context.say(f"{report.item_id}  DAMAGED  {finding.message}")
+    elif report.kind in KINDS:
+        context.say(f"{report.item_id}  whole  {report.kind}, {size}")
+    else:
+        state = "being written" if report.busy else "unfinished"
+        context.say(f"{report.item_id}  {state}  {report.kind}, {size}")
+
+
+@contextmanager
+def _progress_bar(context: Context, items: list[tuple[Kind, str]]) -> Iterator[Progress]:
+    """A bar of bytes at a terminal; nothing where there is none, or no rich."""
+    if not sys.stderr.isatty() or importlib.util.find_spec("rich") is None:
+        yield lambda _: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress as Bar
+
+    total = 0
+    for kind, item_id in items:
+        try:
+            files = _files(context, kind, item_id)
+            entries = open_contents(files, kind).entries
+            total += sum(_shard_bytes(files, name, e.shape) for name, e in entries.items())
+        except StorageError:
+            continue
+    with Bar(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("verify", total=total)
+        yield lambda num_bytes: bar.advance(task, num_bytes)

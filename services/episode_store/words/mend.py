@@ -1,0 +1,57 @@
+"""`repair` and `migrate`: a damaged or old store in, a whole or current one out."""
+
+from dataclasses import asdict
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.format import Kind
+from dextouch.episodes.repair import LEFT, RepairReport, repair_group, repair_unfinished
+from dextouch.episodes.sources import GroupFiles
+from dextouch.errors import InvalidInputError, NotFoundError, StorageError
+from services.episode_store.words.context import EXIT_DAMAGED, Context, Outcome
+
+
+def repair(context: Context) -> Outcome:
+    """Complete what was interrupted, mend what a copy holds, salvage the rest."""
+    root, options = context.need_local_root(), context.options
+    copies = EpisodeStore(options.source) if options.source else None
+    reports = [] if options.ids else repair_unfinished(root)
+    for kind, item_id in context.items():
+        reports.append(repair_group(root, kind, item_id, copy=_copy(copies, kind, item_id)))
+    for report in reports:
+        _say_report(context, report)
+    left = any(report.action == LEFT for report in reports)
+    return {"reports": [asdict(r) for r in reports]}, EXIT_DAMAGED if left else 0
+
+
+def _copy(copies: EpisodeStore | None, kind: Kind, item_id: str) -> GroupFiles | None:
+    if copies is None:
+        return None
+    try:
+        return copies.files(item_id, kind=kind)
+    except NotFoundError:
+        return None
+
+
+def _say_report(context: Context, report: RepairReport) -> None:
+    context.say(
+        f"{report.item_id}  {report.action}" + f"  as {report.new_id}" * bool(report.new_id)
+    )
+    for name, count in report.lost.items():
+        context.say(f"  {name}: {count} samples lost")
+    for note in report.notes:
+        context.say(f"  {note}")
+
+
+def migrate(context: Context) -> Outcome:
+    """Bring groups of older format versions over; what fails stays as it is and is named."""
+    migrated, failed = [], {}
+    for kind, item_id in context.items():
+        try:
+            if context.store.migrate(item_id, kind=kind):
+                migrated.append(item_id)
+                context.say(f"{item_id}  migrated")
+        except (StorageError, NotFoundError, InvalidInputError) as error:
+            failed[item_id] = error.message
+            context.say(f"{item_id}  FAILED  {error.message}")
+    context.say(f"{len(migrated)} migrated, {len(failed)} failed")
+    return {"migrated": migrated, "failed": failed}, EXIT_DAMAGED if failed else 0

@@ -1,0 +1,88 @@
+"""`delete`, `restore` and `purge`: ids or an operator in, a trash or a deletion receipt out."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+from dextouch.episodes.deletion import DeletionRequest, delete_for_good, plan_deletion
+from dextouch.episodes.trash import TrashKind
+from dextouch.errors import InvalidInputError
+from services.episode_store.words.context import EXIT_DAMAGED, Context, Outcome, readable_size
+
+
+def delete(context: Context) -> Outcome:
+    """Put ids into the trash, remove them for good, or remove all of an operator or recording."""
+    options = context.options
+    if options.operator is not None or options.recording is not None:
+        return _delete_all_of(context)
+    if not options.ids:
+        raise InvalidInputError(
+            "delete: got nothing to delete, expected ids, --operator or --recording"
+        )
+    if options.derived or options.receipt or options.checkpoints:
+        raise InvalidInputError(
+            "delete: --derived, --receipt and --checkpoints go with --operator or --recording"
+        )
+    for item_id, kind in [(item_id, context.kind_of(item_id)) for item_id in options.ids]:
+        context.store.delete(item_id, kind=kind, for_good=options.for_good)
+        context.say(f"{item_id}  {'deleted for good' if options.for_good else 'in the trash'}")
+    return {"deleted": options.ids, "for_good": options.for_good}, 0
+
+
+def _delete_all_of(context: Context) -> Outcome:
+    options, root = context.options, context.need_local_root()
+    if not options.for_good or options.ids:
+        raise InvalidInputError(
+            "delete: --operator and --recording remove all that stems from them; got "
+            f"{'ids as well' if options.ids else 'no --for-good'}, expected --for-good alone"
+        )
+    # All that stems from an operator always goes; of a recording, if that is asked for.
+    derived = options.derived or options.operator is not None
+    request = DeletionRequest(
+        operator=options.operator, recording=options.recording, derived=derived
+    )
+    asked = options.operator or options.recording
+    for victim in plan_deletion(root, request):
+        context.say(f"{victim.place}/{victim.folder}  {victim.reason}")
+    if not options.yes and context.ask(f"Type {asked} to remove all this for good: ") != asked:
+        raise InvalidInputError("delete: not confirmed; nothing was removed")
+    path = Path(options.receipt or f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
+    checkpoints = Path(options.checkpoints) if options.checkpoints else None
+    receipt = delete_for_good(root, request, path, checkpoints=checkpoints)
+    for reference in receipt.remaining:
+        context.say(f"{reference.where}  still names {', '.join(reference.names)}")
+    for place in receipt.unreadable:
+        context.say(f"{place}  cannot be read; repair or delete it, then repeat")
+    context.say(
+        f"{len(receipt.deleted)} removed, {len(receipt.remaining)} references left, "
+        f"{len(receipt.unreadable)} unreadable of {receipt.num_files_searched} files searched; "
+        f"receipt {path}"
+    )
+    return json.loads(json.dumps(asdict(receipt))), 0 if receipt.complete else EXIT_DAMAGED
+
+
+def restore(context: Context) -> Outcome:
+    """Put what was deleted last under each id back."""
+    options = context.options
+    for item_id in options.ids:
+        kinds = {entry.kind for entry in context.store.trash_list() if entry.item_id == item_id}
+        if options.kind is None and len(kinds) > 1:
+            raise InvalidInputError(
+                f"{item_id!r} is in the trash as {', '.join(sorted(kinds))}; name one with --kind"
+            )
+        found: TrashKind = next(iter(kinds), "episode")
+        kind: TrashKind = options.kind or found
+        context.store.restore(item_id, kind=kind)
+        context.say(f"{item_id}  restored")
+    return {"restored": options.ids}, 0
+
+
+def purge(context: Context) -> Outcome:
+    """Remove for good what is old enough."""
+    gone = context.store.purge(older_than_s=context.options.older_than)
+    for entry in gone:
+        context.say(f"{entry.item_id}  {entry.kind}  {readable_size(entry.num_bytes)} freed")
+    num_bytes = sum(entry.num_bytes for entry in gone)
+    context.say(f"{len(gone)} purged, {readable_size(num_bytes)} freed")
+    return {"purged": [entry.item_id for entry in gone], "num_bytes": num_bytes}, 0
