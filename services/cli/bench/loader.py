@@ -97,17 +97,20 @@ def requirement(rates: Mapping[str, Figure]) -> Requirement:
 def _subjects(
     pace: "TrainingPace", workers: list[int], num_batches: int
 ) -> dict[str, Callable[[int], float]]:
-    def called(work: Callable[[], float], _round_index: int) -> float:
-        return work()
-
-    subjects = {LEARNING: partial(called, partial(pace.learning, num_batches))}
+    subjects: dict[str, Callable[[int], float]] = {LEARNING: lambda _: pace.learning(num_batches)}
     for count in workers:
-        load = partial(pace.loading, num_batches, num_workers=count)
-        subjects[loading(count)] = partial(called, load)
+        subjects[loading(count)] = _ignoring_round(
+            partial(pace.loading, num_batches, num_workers=count)
+        )
     for count in workers:
-        both = partial(pace.both, num_batches, num_workers=count)
-        subjects[f"training from the disk, {count} worker processes"] = partial(called, both)
+        subjects[f"training from the disk, {count} worker processes"] = _ignoring_round(
+            partial(pace.both, num_batches, num_workers=count)
+        )
     return subjects
+
+
+def _ignoring_round(work: Callable[[], float]) -> Callable[[int], float]:
+    return lambda _: work()
 
 
 def _make_episodes(folder: Path, num_episodes: int) -> str:

@@ -259,10 +259,11 @@ class TrainingRun:
         """The windows of each step, for ever."""
         if self.settings.streaming:
             workers = self.settings.loader_workers
-            return read_batches(self._episodes, self._places(), num_workers=workers)
-        return map(self._sampler.cut, self._places())
+            return read_batches(self._episodes, self.places(), num_workers=workers)
+        return map(self._sampler.cut, self.places())
 
-    def _places(self) -> Iterator[list[Place]]:
+    def places(self) -> Iterator[list[Place]]:
+        """Where the windows of each step lie, for ever."""
         while True:
             yield self._sampler.places(self.settings.optimizer.batch, self._num_steps())
 

@@ -1,0 +1,79 @@
+"""An episode store in; how many windows a second are read, and how many are learned from, out."""
+
+import time
+from collections.abc import Generator, Iterator
+from itertools import islice
+
+import torch
+
+from services.world_model.settings import TrainSettings
+from services.world_model.training.dataset import WindowBatch
+from services.world_model.training.streaming import index_episodes, read_batches
+from services.world_model.training.trainer import TrainingRun
+
+
+class TrainingPace:
+    """Windows a second of the loader and of the training step, each by itself and together.
+
+    All use the same network, the same sampling of windows and one thread, and leave out what
+    happens once: codecs are fitted and worker processes started before the clock starts.
+
+    Args:
+        url: of an episode store.
+        fit_windows: windows the codecs are fitted on.
+    """
+
+    def __init__(self, url: str, *, fit_windows: int = 256) -> None:
+        torch.set_num_threads(1)
+        plain = TrainSettings(episodes=url, streaming=True, loader_workers=0)
+        windows = plain.windows.model_copy(update={"fit_windows": fit_windows})
+        self._settings = plain.model_copy(update={"windows": windows})
+        self._episodes = index_episodes(url)
+        self._run = TrainingRun(self._episodes, self._settings)
+        self._run.fit_codecs()
+        self._run.model.train()
+
+    @property
+    def num_episodes(self) -> int:
+        """Episodes in the store."""
+        return len(self._episodes)
+
+    @property
+    def batch(self) -> int:
+        """Windows a step."""
+        return self._settings.optimizer.batch
+
+    def loading(self, num_batches: int, *, num_workers: int) -> float:
+        """Windows a second that the loader gives when nobody else needs the processor."""
+        batches = self._batches(num_workers)
+        start_s = time.perf_counter()
+        for _ in islice(batches, num_batches):
+            pass
+        elapsed_s = time.perf_counter() - start_s
+        batches.close()
+        return num_batches * self.batch / elapsed_s
+
+    def learning(self, num_batches: int) -> float:
+        """Windows a second that training consumes when they are in memory already."""
+        ready = list(islice(self._batches(0), num_batches))
+        return self._learn(iter(ready), num_batches)
+
+    def both(self, num_batches: int, *, num_workers: int) -> float:
+        """Windows a second of training that reads its windows from the disk."""
+        batches = self._batches(num_workers)
+        rate = self._learn(batches, num_batches)
+        batches.close()
+        return rate
+
+    def _batches(self, num_workers: int) -> Generator[WindowBatch, None, None]:
+        batches = read_batches(self._episodes, self._run.places(), num_workers=num_workers)
+        # What was read ahead while the processes started must not count: two batches a process.
+        for _ in islice(batches, 2 * num_workers + 1):
+            pass
+        return batches
+
+    def _learn(self, batches: Iterator[WindowBatch], num_batches: int) -> float:
+        start_s = time.perf_counter()
+        for batch in islice(batches, num_batches):
+            self._run.learn(batch)
+        return num_batches * self.batch / (time.perf_counter() - start_s)
