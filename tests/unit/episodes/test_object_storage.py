@@ -1,4 +1,4 @@
-"""Object storage: addresses, blocks in memory, uploads that die, and services that refuse."""
+"""Object storage: addresses, uploads that die, deletions, and services that refuse."""
 
 import os
 import subprocess
@@ -9,22 +9,13 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 import pytest
 import zarr
-from hypothesis import given
-from hypothesis import strategies as st
 from obstore.store import S3Store
 from zarr.storage import ObjectStore
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.object_address import ObjectOptions, parse_address
-from dextouch.episodes.object_bucket import Bucket, ObjectFacts
-from dextouch.episodes.object_files import (
-    BLOCK_BYTES,
-    MAX_READ_AHEAD,
-    TAIL_BYTES,
-    BlockCache,
-    CachedBucket,
-    ObjectFile,
-)
+from dextouch.episodes.object_bucket import Bucket
+from dextouch.episodes.object_files import BLOCK_BYTES
 from dextouch.episodes.uploads import ORPHAN_AGE, sweep_orphans
 from dextouch.errors import (
     ConflictError,
@@ -59,86 +50,6 @@ def store(url, tmp_path):
 @pytest.fixture
 def bucket(store):
     return store._storage._bucket
-
-
-class CountedBucket:
-    """Objects in memory with the two requests that reading makes, counted."""
-
-    def __init__(self, data):
-        self.data, self.requests = data, []
-
-    def tail(self, key, length):
-        self.requests.append(("tail", length))
-        facts = ObjectFacts(key, len(self.data), "e", datetime.now(UTC))
-        return facts, self.data[max(0, len(self.data) - length) :]
-
-    def read(self, facts, start, stop):
-        assert 0 <= start < stop <= facts.size
-        self.requests.append((start, stop))
-        return self.data[start:stop]
-
-
-class Place(CachedBucket):
-    def __init__(self, data, capacity):
-        self.bucket, self.cache = CountedBucket(data), BlockCache(capacity)
-
-
-DATA = np.random.default_rng(5).bytes(3 * BLOCK_BYTES + TAIL_BYTES + 12_345)
-NEAR = st.sampled_from([0, BLOCK_BYTES, 2 * BLOCK_BYTES, len(DATA) - TAIL_BYTES, len(DATA)])
-SPANS = st.lists(
-    st.tuples(NEAR, st.integers(-70_000, 70_000), st.integers(0, 600_000)), min_size=1, max_size=8
-)
-
-
-@given(SPANS, st.sampled_from([0, 100_000, BLOCK_BYTES, 1 << 30]))
-def test_parts_of_an_object_are_slices_of_it(spans, capacity):
-    place = Place(DATA, capacity)
-    file = ObjectFile(place, "k")
-    assert file.size() == len(DATA)
-    for near, shift, length in spans:
-        offset = max(0, near + shift)
-        assert file.read(offset, length) == DATA[offset : offset + length]
-        assert sum(map(len, place.cache._blocks.values())) == place.cache._num_bytes <= capacity
-
-
-def test_what_was_read_is_not_asked_for_again():
-    place = Place(DATA, 1 << 30)
-    file = ObjectFile(place, "k")
-    for _ in range(3):
-        file.read(0, 10)
-        file.read(BLOCK_BYTES - 10, 20)
-        file.read(len(DATA) - 10, 10)
-    assert place.bucket.requests[0] == ("tail", TAIL_BYTES)
-    # Two neighbouring blocks at most, each once.
-    assert len(place.bucket.requests) <= 3
-    other = ObjectFile(place, "another key")
-    other.read(0, 10)
-    assert place.bucket.requests[-1][0] == 0
-
-
-def test_small_files_come_whole_with_one_request():
-    place = Place(b"0123456789", 1 << 20)
-    file = ObjectFile(place, "k")
-    assert file.size() == 10
-    assert (file.read(0, 4), file.read(8, 2), file.read(10, 5)) == (b"0123", b"89", b"")
-    assert place.bucket.requests == [("tail", TAIL_BYTES)]
-
-
-def test_reading_on_asks_for_more_at_a_time():
-    data = bytes(64 * BLOCK_BYTES)
-    place = Place(data, 1 << 30)
-    file = ObjectFile(place, "k")
-    for offset in range(0, len(data), 50_000):
-        file.read(offset, 50_000)
-    reads = [stop - start for start, stop in place.bucket.requests[1:]]
-    assert max(reads) == MAX_READ_AHEAD * BLOCK_BYTES
-    assert len(reads) <= 64 / MAX_READ_AHEAD + 4
-    # What is scattered is not met with more than is asked for.
-    place = Place(data, 1 << 30)
-    file = ObjectFile(place, "k")
-    for number in (40, 10, 50, 20):
-        file.read(number * BLOCK_BYTES, 100)
-    assert {stop - start for start, stop in place.bucket.requests[1:]} == {BLOCK_BYTES}
 
 
 def test_addresses():
@@ -261,6 +172,42 @@ def test_a_kill_during_the_upload_loses_nothing(url, store, tmp_path, deadly):
     for name, values in made.values.items():
         np.testing.assert_array_equal(reader.read(name).values, values)
     assert store.recover() == ()
+
+
+def test_the_claim_comes_first_and_the_commit_record_last(store, monkeypatch, made):
+    puts = []
+    put = Bucket.put
+
+    def noted(self, key, content, *, create=False):
+        answer = put(self, key, content, create=create)
+        puts.append((key.removeprefix(f"episodes/{EPISODE}/"), create))
+        return answer
+
+    monkeypatch.setattr(Bucket, "put", noted)
+    made.write(store)
+    assert puts[0] == ("claim", True)
+    assert puts[-1] == ("commit.json", True)
+    assert [name for name, _ in puts].count("commit.json") == 1
+    # Claimed once more before the commit, in case a sweep took the upload for dead.
+    assert puts[-2] == ("claim", True)
+    assert len(puts) == 3 + 1 + 2 * 2 * len(made.values)
+
+
+def test_deleting_takes_the_commit_record_first_and_the_claim_last(store, monkeypatch, made):
+    made.write(store)
+    removed = []
+    remove = Bucket.remove
+
+    def noted(self, keys):
+        removed.append([key.removeprefix(f"episodes/{EPISODE}/") for key in keys])
+        remove(self, keys)
+
+    monkeypatch.setattr(Bucket, "remove", noted)
+    store.delete(EPISODE)
+    assert removed[0] == ["commit.json"]
+    assert removed[-1] == ["claim"]
+    assert len(removed) == 3
+    assert store.list() == []
 
 
 def test_what_could_not_be_uploaded_waits(s3_server, store, made):
