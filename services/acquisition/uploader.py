@@ -205,7 +205,7 @@ def _recover(path: Path) -> bool:
         return False
     marks = tuple(LedgerEntry(stream=name, event="interrupted", count=1) for name in names)
     ledger = (*spool.attributes.ledger, *marks)
-    spool.set_attributes(spool.attributes.model_copy(update={"ledger": ledger}))
+    spool.set_attributes(spool.attributes.model_copy(update={"ledger": ledger, "recovered": True}))
     spool.close()
     logger.warning("recover_take", recording_id=path.name)
     return True

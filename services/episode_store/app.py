@@ -31,7 +31,7 @@ logger = structlog.get_logger(__name__)
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
-    """The routes over one store folder; what crashed writers left there is removed at the start.
+    """The routes over one store folder; what crashed writers left is mended at the start.
 
     Args:
         settings: where the store is and what it allows.
@@ -54,9 +54,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        removed = store.sweep()
-        if removed:
-            logger.info("removed_unfinished_writes", count=removed)
+        _mend(store)
         # The first list of a large store takes seconds; it is read while nobody waits for it.
         threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
         try:
@@ -82,6 +80,19 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     )
     metrics.register(app.state.registry)
     return app
+
+
+def _mend(store: EpisodeStore) -> None:
+    """Complete what killed writers left, remove what is worth nothing."""
+    try:
+        for group in store.recover():
+            logger.warning("recover_recording", kind=group.kind, id=group.item_id)
+    except StorageError as error:
+        # The service still serves all the rest; `dextouch store repair` says more.
+        logger.error("fail_recovery", error=error.message)  # noqa: TRY400
+    removed = store.sweep()
+    if removed:
+        logger.info("remove_unfinished_writes", count=removed)
 
 
 def _intake(

@@ -30,7 +30,7 @@ class VideoSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    crf: int = Field(default=26, ge=1, le=51)
+    crf: int = Field(default=25, ge=1, le=51)
     preset: str = Field(default="ultrafast", pattern="^[a-z]+$")
 
 
@@ -116,7 +116,8 @@ class GopEncoder:
         self._context.gop_size = GOP_IMAGES
         x264 = (
             f"keyint={GOP_IMAGES}:min-keyint={GOP_IMAGES}:scenecut=0:open-gop=0:bframes=0"
-            ":threads=1:sliced-threads=0"
+            # Half-pixel motion: a seventh fewer bytes for a tenth more time, and decoding gains.
+            ":threads=1:sliced-threads=0:subme=1"
         )
         self._context.options = {
             "crf": str(settings.crf),

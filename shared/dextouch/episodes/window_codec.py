@@ -72,8 +72,10 @@ def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
         "K_head": ("float64", (3, 3)),
     }
     for camera in cameras:
-        # Height and width are the camera's own.
-        expected[_IMAGES + camera] = ("uint8", (n, *arrays[_IMAGES + camera].shape[1:3], 3))
+        # Height and width are the camera's own; gray images have one channel.
+        shape = arrays[_IMAGES + camera].shape
+        channels = 1 if shape[3:] == (1,) else 3
+        expected[_IMAGES + camera] = ("uint8", (n, *shape[1:3], channels))
         expected[_IMAGE_DT + camera] = ("int64", (n,))
     got = {name: (array.dtype.name, array.shape) for name, array in arrays.items()}
     for name in sorted(expected.keys() | got.keys()):
