@@ -74,7 +74,8 @@ class Bucket:
         config: Any = {
             name: value for name in _PASSED_ON if (value := getattr(options, name)) is not None
         }
-        client: Any = {} if options.allow_http is None else {"allow_http": options.allow_http}
+        given = options.allow_http
+        client: Any = None if given is None else {"allow_http": given}
         try:
             self._store = S3Store(
                 address.bucket,

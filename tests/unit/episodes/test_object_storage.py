@@ -116,6 +116,21 @@ def test_wrong_credentials_are_said_to_be_wrong(s3_server, store, made):
     assert store.list() == [EPISODE]
 
 
+def test_what_is_not_given_comes_from_the_usual_environment(s3_server, monkeypatch, made, tmp_path):
+    for name, value in {
+        "AWS_ACCESS_KEY_ID": "tester",
+        "AWS_SECRET_ACCESS_KEY": "x",
+        "AWS_REGION": "us-east-1",
+        "AWS_ENDPOINT_URL": f"http://127.0.0.1:{s3_server.port}",
+        "AWS_ALLOW_HTTP": "true",
+    }.items():
+        monkeypatch.setenv(name, value)
+    store = EpisodeStore(f"s3://takes/environment?work_folder={tmp_path}")
+    assert made.write(store).content_sha256
+    assert store.root == tmp_path
+    assert store.list() == [EPISODE]
+
+
 def test_a_server_that_is_not_there(tmp_path, unused_port):
     options = CREDENTIALS | {"max_retries": "1", "retry_timeout_s": "1"}
     url = f"s3://b/p?endpoint=http://127.0.0.1:{unused_port}&region=eu"
