@@ -4,7 +4,7 @@ import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.errors import StorageError
 from dextouch.schemas.episodes import json_ready
 from services.episode_store.catalog import Catalog, EpisodeFilter
+from services.episode_store.receipts import Receipts
 from services.episode_store.words.context import (
     EXIT_DAMAGED,
     Context,
@@ -168,7 +169,16 @@ def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
     if not folder.is_dir() or folder.is_symlink():
         finding = Finding(f"{kind} {folder.name}: is no folder; move it away", foreign=True)
         return ItemReport(kind, folder.name, findings=(finding,))
-    return inspect_upload(folder) if kind == "upload" else inspect_stage(folder)
+    if kind == "stage":
+        return inspect_stage(folder)
+    report = inspect_upload(folder)
+    found = []
+    for path in sorted(folder.glob("*.receipts")):
+        try:
+            Receipts(path)
+        except StorageError as error:
+            found.append(Finding(f"upload {folder.name}: {error.message}", path.stem))
+    return replace(report, findings=(*report.findings, *found))
 
 
 def _say_report(context: Context, report: ItemReport) -> None:
