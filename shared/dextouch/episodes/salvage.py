@@ -222,8 +222,6 @@ def _streams(
         kept = values.rows_hold[:count].copy()
         for part in stamps.values():
             kept &= part.rows_hold[:count]
-        if values.entry.codec == "h264":
-            kept = _whole_groups(kept, values.entry.chunk_rows)
         columns = {stamp: part.column()[:count] for stamp, part in stamps.items()}
         read = _array_reader(values, columns)
         found.append(SalvagedStream(stream, kept, read, values.entry.chunk_rows))

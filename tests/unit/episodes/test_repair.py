@@ -11,8 +11,10 @@ from dextouch.episodes.inspection import inspect_group, inspect_stage, inspect_u
 from dextouch.episodes.log import SpoolWriter
 from dextouch.episodes.repair import repair_group, repair_unfinished
 from dextouch.episodes.sources import LocalGroup
+from dextouch.episodes.video import GopEncoder, VideoSettings
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import ConflictError, CorruptDataError
+from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
@@ -308,6 +310,38 @@ def test_a_damaged_upload_is_salvaged(store, spool, file, place):
     assert not store.exists("take-1", kind="recording")
     store.restore("take-1", kind="upload")
     assert (spool / file).is_file()
+
+
+@pytest.mark.parametrize(("number", "lost"), [(0, 8), (10, 8), (15, 8), (17, 4), (19, 1)])
+def test_of_video_in_an_upload_whole_groups_are_kept(store, number, lost):
+    """An image of H.264 cannot do without those before it; what is torn off last is no damage."""
+    camera = StreamDescriptor(
+        name="camera",
+        kind="image",
+        shape=(32, 32, 3),
+        dtype="uint8",
+        unit="h264",
+        nominal_rate_hz=30,
+    )
+    encoder = GopEncoder(32, 32, rate_hz=30.0, settings=VideoSettings())
+    units = [encoder.encode(np.full((32, 32, 3), 9 * i, np.uint8)) for i in range(20)]
+    attributes = recording_attributes().model_copy(update={"streams": (camera, FORCE)})
+    spool = store.root / ".uploads" / "take-1"
+    numbers = np.arange(20)
+    with SpoolWriter(spool, attributes, sync=False) as writer:
+        writer.append("camera", SampleBatch(numbers, numbers, numbers, jpeg_values(units)))
+        writer.append("force", batch(0, 9))
+    flip(spool / "force.part", 3)
+    flip(spool / "camera.part", sum(map(len, units[:number])) + 6)
+    (result,) = repair_unfinished(store.root)
+    torn = number == 19
+    assert result.lost == {"force": 1} | ({} if torn else {"camera": lost})
+    reader = store.recording("take-1-salvaged-1")
+    first = number // 8 * 8
+    kept = [i for i in range(20) if not first <= i < first + 8] if not torn else list(range(19))
+    assert reader.read("camera").sequence.tolist() == kept
+    assert reader.encoded_images("camera", 0, len(kept)) == [units[i] for i in kept]
+    assert len(reader.images("camera")) == len(kept)
 
 
 def test_whole_and_torn_uploads_are_left_to_their_station(store, spool):
