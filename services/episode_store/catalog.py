@@ -1,19 +1,16 @@
 """Filters in, the matching episodes, recordings and hours out; what is committed is read once."""
 
-import os
 import threading
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
 from typing import Generic, TypeVar
 
 import structlog
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
-from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import Kind
 from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas.episodes import CatalogHours, EpisodeList, EpisodeSummary, HoursRow
@@ -172,24 +169,11 @@ class Catalog:
             recovered=attributes.recovered,
             num_samples={name: reader.num_samples(name) for name in reader.streams},
             duration_s=_nominal_duration_s(reader),
-            num_bytes=folder_bytes(self._store.root / "recordings" / recording_id),
+            num_bytes=self._store.num_bytes(recording_id, kind="recording"),
             started_at=attributes.started_at,
             content_sha256=reader.content_sha256,
         )
         return Entry(summary, dict(attributes.quality), attributes.started_at)
-
-
-def folder_bytes(folder: Path) -> int:
-    """Bytes of all files below a folder; what vanishes meanwhile counts nothing."""
-    total = 0
-    with disk_errors(f"measure {folder.name}"):
-        for here, _, names in os.walk(folder):
-            for name in names:
-                try:
-                    total += Path(here, name).stat().st_size
-                except FileNotFoundError:
-                    continue
-    return total
 
 
 def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[str, S]:

@@ -8,12 +8,11 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes.files import disk_errors, folder_bytes
 from dextouch.episodes.log import read_attributes
 from dextouch.errors import NotFoundError, StorageError, StorageFullError
 from dextouch.schemas.recordings import RecordingAttributes, UploadList, UploadSummary
 from services.episode_store.admission import FULL_RETRY_S
-from services.episode_store.catalog import folder_bytes
 
 logger = structlog.get_logger(__name__)
 

@@ -294,3 +294,13 @@ def test_readers_are_shared_by_threads_and_pickled(made, place, reference):
         expected = reference.window(number % 5, 9)
         np.testing.assert_array_equal(window.images["camera_head"], expected.images["camera_head"])
         np.testing.assert_array_equal(window.tactile_kpa, expected.tactile_kpa)
+
+
+def test_a_groups_size_is_that_of_its_files(place, made):
+    made.write(place.store)
+    sizes = []
+    for key in place.keys(f"episodes/{EPISODE}"):
+        place.change(key, lambda data: sizes.append(len(data)) or data)
+    assert place.again().num_bytes(EPISODE) == sum(sizes) > 0
+    with pytest.raises(NotFoundError):
+        place.store.num_bytes("nobody")

@@ -85,3 +85,16 @@ def replace_file(path: Path, data: bytes) -> None:
     write_file(partial, data)
     partial.replace(path)
     sync_folder(path.parent)
+
+
+def folder_bytes(folder: Path) -> int:
+    """Bytes of all files below a folder; what vanishes meanwhile counts nothing."""
+    total = 0
+    with disk_errors(f"measure {folder.name}"):
+        for here, _, names in os.walk(folder):
+            for name in names:
+                try:
+                    total += Path(here, name).stat().st_size
+                except FileNotFoundError:
+                    continue
+    return total

@@ -6,7 +6,7 @@ import uuid
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
-from dextouch.episodes.files import disk_errors, sync_folder
+from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
 from dextouch.episodes.format import COMMIT_FILE, Kind
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.sources import LocalGroup
@@ -86,6 +86,14 @@ class LocalStorage:
         """
         with disk_errors(f"look at {kind} {item_id}"):
             return (self._existing(kind, item_id) / COMMIT_FILE).stat().st_mtime_ns
+
+    def num_bytes(self, kind: Kind, item_id: str) -> int:
+        """What a committed group takes on the disk.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        return folder_bytes(self._existing(kind, item_id))
 
     def list(self, kind: Kind) -> list[str]:
         """Committed ids in order."""

@@ -128,6 +128,16 @@ class ObjectStorage:
         text = f"{facts.etag} {facts.modified.isoformat()}"
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
+    def num_bytes(self, kind: Kind, item_id: str) -> int:
+        """What a committed group takes in the bucket.
+
+        Raises:
+            NotFoundError: no such id.
+        """
+        if not self.exists(kind, item_id):
+            raise self._missing(kind, item_id)
+        return sum(facts.size for facts in self._bucket.list(group_key(kind, item_id)))
+
     def list(self, kind: Kind) -> list[str]:
         """Committed ids in order; one request for every thousand files in the bucket."""
         keys = (facts.key.split("/") for facts in self._bucket.list(f"{kind}s"))

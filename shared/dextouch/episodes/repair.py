@@ -113,7 +113,9 @@ def repair_group(
         streams = group_streams(folder, attributes, entries)
         new_id, lost = _write_once(root, attributes, streams, source)
     except (StorageError, InvalidInputError) as error:
-        return RepairReport(kind, item_id, LEFT, notes=(*notes, error.message))
+        # Often what the inspection had found already.
+        notes = tuple(dict.fromkeys((*notes, error.message)))
+        return RepairReport(kind, item_id, LEFT, notes=notes)
     put_into_trash(root, kind, item_id)
     return RepairReport(kind, item_id, SALVAGED, new_id, lost, notes)
 

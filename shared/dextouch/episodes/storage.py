@@ -40,6 +40,10 @@ class Storage(Protocol):
         """A number that changes when an id is deleted and written again."""
         ...
 
+    def num_bytes(self, kind: Kind, item_id: str) -> int:
+        """What a committed group takes there; NotFoundError if there is none."""
+        ...
+
     def list(self, kind: Kind) -> list[str]:
         """Committed ids in order."""
         ...

@@ -153,6 +153,10 @@ class EpisodeStore:
         """
         return self._storage.revision(*_check(kind, item_id))
 
+    def num_bytes(self, item_id: str, *, kind: Kind = "episode") -> int:
+        """What a committed group takes where it lies; raises as `revision`."""
+        return self._storage.num_bytes(*_check(kind, item_id))
+
     def list(self, *, kind: Kind = "episode") -> list[str]:
         """Committed ids in order."""
         if kind not in KINDS:
