@@ -102,9 +102,16 @@ def _parser() -> argparse.ArgumentParser:
     restore.add_argument("ids", nargs="+")
     purge = words.add_parser("purge", parents=[shared], help="empty the trash for good")
     purge.add_argument(
-        "--older-than", type=seconds_of, default=0.0, metavar="AGE", help="such as 30d or 12h"
+        "--older-than", type=_age, default=0.0, metavar="AGE", help="such as 30d or 12h"
     )
     return parser
+
+
+def _age(text: str) -> float:
+    try:
+        return seconds_of(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
 
 
 def _add_ids(word: argparse.ArgumentParser) -> None:

@@ -140,6 +140,12 @@ def test_delete_list_restore_purge(store, word, tmp_path):
     assert store.trash_list() == []
 
 
+def test_an_age_that_is_none_is_explained(word, capsys):
+    with pytest.raises(SystemExit):
+        word("purge", "--older-than", "3x")
+    assert "expected a number and one of s m h d" in capsys.readouterr().err
+
+
 def test_kinds_are_found_or_asked_for(store, word):
     write_recording(store, "e-1")
     status, _, err = word("delete", "e-1")
