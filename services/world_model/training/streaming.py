@@ -101,10 +101,10 @@ def index_episodes(url: str) -> list[StoredEpisode]:
     """
     # An id may hold something else than when it was last read.
     _reader.cache_clear()
-    store = EpisodeStore(url)
     episodes, rates_hz = [], set()
-    for episode_id in store.list():
-        arrays = read_episode(store.open(episode_id))
+    for episode_id in EpisodeStore(url).list():
+        # Through the readers that are kept: processes that are forked later find them open.
+        arrays = read_episode(_reader(url, episode_id))
         rates_hz.add(arrays.model_rate_hz)
         episodes.append(
             StoredEpisode(
