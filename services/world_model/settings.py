@@ -58,7 +58,7 @@ class TrainSettings(BaseModel):
         default=False, description="leave episodes on the disk: for more of them than memory holds"
     )
     loader_workers: int = Field(
-        default=1, ge=0, le=64, description="processes that read windows, with --streaming"
+        default=0, ge=0, le=64, description="processes that read for --streaming; 0: none besides"
     )
     network: NetworkConfig = NetworkConfig()
     optimizer: OptimizerSettings = OptimizerSettings()

@@ -40,12 +40,13 @@ def test_a_quick_run_measures_everything(run):
     assert figures["options"]["episodes"] == 2
     assert figures["options"]["batch"] == 8
     assert figures["requirements"][0]["verdict"] in text
-    ratio = rates[loader.loading(1)][0] / rates[loader.LEARNING][0]
+    ratio = rates[loader.loading(loader.USUAL_WORKERS)][0] / rates[loader.LEARNING][0]
     assert figures["requirements"][0]["figure"] == pytest.approx(ratio)
 
 
 def rates(*, loading, learning):
-    return {loader.LEARNING: Figure.of(learning), loader.loading(1): Figure.of(loading)}
+    usual = loader.loading(loader.USUAL_WORKERS)
+    return {loader.LEARNING: Figure.of(learning), usual: Figure.of(loading)}
 
 
 def test_the_verdict_is_of_the_rounds_ratios():
@@ -62,7 +63,7 @@ def test_the_verdict_is_of_the_rounds_ratios():
 def test_the_table_says_how_often_training_fits():
     table = loader.rate_table(rates(loading=[40.0], learning=[10.0]), 200)
     assert "200 episodes" in table.title
-    assert table.rows == [(loader.LEARNING, "10", "1"), (loader.loading(1), "40", "4")]
+    assert table.rows == [(loader.LEARNING, "10", "1"), (loader.loading(0), "40", "4")]
 
 
 @pytest.mark.parametrize("words", [["--workers", "many"], ["--rounds", "0"], ["--batches", "0"]])

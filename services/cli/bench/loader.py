@@ -18,10 +18,10 @@ from services.twin.tasks import TASK_NAMES
 if TYPE_CHECKING:
     from services.world_model.training.pace import TrainingPace
 
-PACKAGES = ("numpy", "torch", "numcodecs")
+PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
 # What `dextouch train world-model --streaming` does unless told otherwise.
-USUAL_WORKERS = 1
+USUAL_WORKERS = 0
 _QUICK = {"episodes": 4, "rounds": 1, "batches": 2, "fit_windows": 8}
 _USUAL = {"episodes": 200, "rounds": 5, "batches": 40, "fit_windows": 256}
 LEARNING = "training, windows in memory"
