@@ -22,7 +22,7 @@ class Finding:
 
 
 _PACKAGES = {
-    "numcodecs": ("episodes", "store"),
+    "zstandard": ("episodes", "store"),
     "serial": ("gloves over serial", "station"),
     "hid": ("trackers over HID", "station"),
     "cv2": ("cameras and calibration", "station"),

@@ -100,7 +100,6 @@ class GroupReader(Generic[A]):
             raise InvalidInputError(f"{self._what}: {name!r} has no images {start} … {stop}")
         chunks, shard = self._image_chunks(descriptor), self._contents.shard(name)
         first = start // chunks.rows
-        shard.check_index()
         images: list[bytes] = []
         for number in range(first, -(-stop // chunks.rows) if stop > start else first):
             group = chunks.unpack(shard.payload(number), number)

@@ -7,8 +7,9 @@ import google_crc32c
 import numpy as np
 
 from dextouch.episodes.format import ArrayEntry
-from dextouch.episodes.shard_reader import CRC_BYTES, INDEX_ENTRY_BYTES, zstd_frame_bytes
+from dextouch.episodes.shard_reader import CRC_BYTES, INDEX_ENTRY_BYTES
 from dextouch.episodes.sources import ByteSource
+from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError
 
 # A day of 30 images a second, each a storage chunk.
@@ -93,7 +94,7 @@ def _encoded_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
     if entry.codec == "zstd":
         # Far less is looked at than copied: the headers of its blocks.
         longest = entry.chunk_rows * math.prod(entry.shape[1:]) * np.dtype(entry.dtype).itemsize
-        return zstd_frame_bytes(data[start : start + longest + longest // 8 + 1024]) or 0
+        return frame_bytes(data[start : start + longest + longest // 8 + 1024]) or 0
     count = int.from_bytes(data[start : start + 4], "little")
     head = 4 * (1 + count)
     if not 1 <= count <= entry.chunk_rows or len(data) < start + head:

@@ -10,19 +10,16 @@ import math
 import google_crc32c
 import numpy as np
 from jaxtyping import Shaped
-from numcodecs.zstd import Zstd
 
 from dextouch.episodes.format import ArrayEntry
 from dextouch.episodes.sources import ByteSource
+from dextouch.episodes.zstd import decompress
 from dextouch.errors import CorruptDataError, InvalidInputError
 
 CRC_BYTES = 4
 INDEX_ENTRY_BYTES = 16
-_ZSTD = Zstd()
-_ZSTD_MAGIC = bytes.fromhex("28b52ffd")
 # The four bytes of a block that repeats one byte unpack to 128 KiB (RFC 8878, 3.1.1.2).
 _ZSTD_MAX_RATIO = 1 << 15
-_ZSTD_REPEATED = 1
 # The length of an access unit, a start code and the header of its first unit.
 _H264_MIN_BYTES = 4 + 3 + 1
 
@@ -168,48 +165,5 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
     dtype = np.dtype(entry.dtype).newbyteorder("<")
     shape = (entry.chunk_rows, *entry.shape[1:])
     expected = math.prod(shape) * dtype.itemsize
-    # Asked before anything is unpacked: a bomb says a size that we never allocate.
-    if (size := zstd_content_size(payload)) != expected:
-        raise CorruptDataError(f"{what}: holds {size} bytes, expected {expected}")
-    # A second frame would be unpacked as well, whatever size it has.
-    if (end := zstd_frame_bytes(payload)) != len(payload):
-        raise CorruptDataError(f"{what}: zstd frame ends at byte {end} of {len(payload)}")
-    try:
-        data = _ZSTD.decode(payload)
-    except (RuntimeError, ValueError) as error:
-        raise CorruptDataError(f"{what}: no zstd data ({error})") from error
+    data = decompress(payload, size=expected, what=what)
     return np.frombuffer(data, dtype=dtype).reshape(shape)
-
-
-def zstd_content_size(frame: bytes) -> int | None:
-    """How many bytes a zstd frame says it unpacks to (RFC 8878, 3.1.1); None if it does not say."""
-    start, length = _zstd_size_field(frame)
-    if length == 0 or len(frame) < start + length:
-        return None
-    size = int.from_bytes(frame[start : start + length], "little")
-    return size + 256 if length == 2 else size
-
-
-def zstd_frame_bytes(frame: bytes) -> int | None:
-    """Where the first zstd frame of some bytes ends, going from block to block; None if nowhere."""
-    place, length = _zstd_size_field(frame)
-    place += length
-    last = False
-    while place > 0 and not last:
-        header = int.from_bytes(frame[place : place + 3], "little")
-        last, kind, size = bool(header & 1), header >> 1 & 3, header >> 3
-        place += 3 + (1 if kind == _ZSTD_REPEATED else size)
-        if place > len(frame):
-            return None
-    place += 4 * bool(last and frame[4] & 0x04)
-    return place if 0 < place <= len(frame) else None
-
-
-def _zstd_size_field(frame: bytes) -> tuple[int, int]:
-    """Where a zstd frame says its size, and in how many bytes; (0, 0) if it is none."""
-    if len(frame) < 6 or frame[:4] != _ZSTD_MAGIC:
-        return 0, 0
-    descriptor = frame[4]
-    single_segment = bool(descriptor & 0x20)
-    start = 5 + (not single_segment) + (0, 1, 2, 4)[descriptor & 0x03]
-    return start, (int(single_segment), 2, 4, 8)[descriptor >> 6]

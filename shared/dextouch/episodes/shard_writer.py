@@ -5,14 +5,12 @@ from pathlib import Path
 
 import google_crc32c
 import numpy as np
-from numcodecs.zstd import Zstd
 
 from dextouch.episodes.files import disk_errors
-from dextouch.episodes.format import ZSTD_LEVEL, ArrayEntry, shard_path, with_rows
+from dextouch.episodes.format import ArrayEntry, shard_path, with_rows
 from dextouch.episodes.journal import CHUNK_JOURNAL, JournalWriter, journal_path, part_path
 from dextouch.episodes.shard_reader import with_crc
-
-_ZSTD = Zstd(level=ZSTD_LEVEL)
+from dextouch.episodes.zstd import compress
 
 
 class ShardWriter:
@@ -79,7 +77,7 @@ class ShardWriter:
         num_rows = self._num_pending
         self._sha256.update(memoryview(data)[: num_rows * (len(data) // len(self._chunk))])
         self._num_pending = 0
-        self._log_chunk(_ZSTD.encode(data), num_rows)
+        self._log_chunk(compress(data), num_rows)
 
     def _log_chunk(self, payload: bytes, num_rows: int) -> None:
         encoded = with_crc(payload)

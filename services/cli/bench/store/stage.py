@@ -30,7 +30,7 @@ DESIGNS: tuple[Design, ...] = (
     ZarrDesign("raw"),
     McapDesign(),
 )
-PACKAGES = ("numpy", "simplejpeg", "av", "zarr", "numcodecs", "mcap")
+PACKAGES = ("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap")
 _QUICK = {"seconds": 2.0, "rounds": 1, "windows": 4}
 _USUAL = {"seconds": 10.0, "rounds": 5, "windows": 40}
 _MIN_SECONDS = 1.0

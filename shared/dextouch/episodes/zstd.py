@@ -1,0 +1,69 @@
+"""Bytes ↔ one zstd frame that says its size; each thread keeps its contexts.
+
+Making a context costs as much as unpacking a storage chunk.
+"""
+
+import threading
+
+import zstandard
+
+from dextouch.episodes.format import ZSTD_LEVEL
+from dextouch.errors import CorruptDataError
+
+_MAGIC = bytes.fromhex("28b52ffd")
+_REPEATED = 1
+
+
+class _Contexts(threading.local):
+    def __init__(self) -> None:
+        self.compressor = zstandard.ZstdCompressor(level=ZSTD_LEVEL)
+        self.decompressor = zstandard.ZstdDecompressor()
+
+
+_CONTEXTS = _Contexts()
+
+
+def compress(data: bytes) -> bytes:
+    """One frame with these bytes."""
+    return _CONTEXTS.compressor.compress(data)
+
+
+def decompress(frame: bytes, *, size: int, what: str) -> bytes:
+    """The bytes of one frame that must hold `size` of them and be followed by nothing.
+
+    Raises:
+        CorruptDataError: anything else; `what` names it.
+    """
+    try:
+        # Asked before anything is unpacked: a bomb says a size that we never allocate.
+        said = zstandard.get_frame_parameters(frame).content_size
+        if said != size:
+            raise CorruptDataError(f"{what}: holds {said} bytes, expected {size}")
+        return _CONTEXTS.decompressor.decompress(frame, allow_extra_data=False)
+    except zstandard.ZstdError as error:
+        raise CorruptDataError(f"{what}: no zstd frame of {size} bytes ({error})") from error
+
+
+def frame_bytes(frame: bytes) -> int | None:
+    """Where the first zstd frame of some bytes ends, going from block to block; None if nowhere."""
+    place, length = _size_field(frame)
+    place += length
+    last = False
+    while place > 0 and not last:
+        header = int.from_bytes(frame[place : place + 3], "little")
+        last, kind, size = bool(header & 1), header >> 1 & 3, header >> 3
+        place += 3 + (1 if kind == _REPEATED else size)
+        if place > len(frame):
+            return None
+    place += 4 * bool(last and frame[4] & 0x04)
+    return place if 0 < place <= len(frame) else None
+
+
+def _size_field(frame: bytes) -> tuple[int, int]:
+    """Where a zstd frame says its size, and in how many bytes; (0, 0) if it is none."""
+    if len(frame) < 6 or frame[:4] != _MAGIC:
+        return 0, 0
+    descriptor = frame[4]
+    single_segment = bool(descriptor & 0x20)
+    start = 5 + (not single_segment) + (0, 1, 2, 4)[descriptor & 0x03]
+    return start, (int(single_segment), 2, 4, 8)[descriptor >> 6]
