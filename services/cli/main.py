@@ -29,7 +29,8 @@ COMMANDS = {
     ),
     "station": Command("services.acquisition.__main__", "record gloves, trackers and cameras"),
     "store": Command(
-        "services.episode_store.__main__", "list, show, verify, repair, delete, serve episodes"
+        "services.episode_store.__main__",
+        "list, show, verify, repair, migrate, delete, restore, purge, serve",
     ),
     "export": Command(
         "services.cli.exports", "write LeRobot, MCAP, Rerun or UMI files from a store", ("export",)

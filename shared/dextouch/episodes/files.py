@@ -1,6 +1,7 @@
 """Bytes to files that survive a crash: whole writes, atomic replacement, and honest disk errors."""
 
 import errno
+import fcntl
 import os
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -47,6 +48,27 @@ def sync_folder(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def make_held_folder(path: Path) -> int:
+    """Make a new folder and lock it; a descriptor that holds the lock until it is closed."""
+    while True:
+        path.mkdir(parents=True)
+        descriptor = os.open(path, os.O_RDONLY)
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        if is_folder_at(descriptor, path):
+            return descriptor
+        # A sweep found it before it was locked, and removed it.
+        os.close(descriptor)
+
+
+def is_folder_at(descriptor: int, path: Path) -> bool:
+    """Whether an open folder is still the one at a path."""
+    try:
+        there = path.stat()
+    except FileNotFoundError:
+        return False
+    return there.st_ino == os.fstat(descriptor).st_ino
 
 
 def write_file(path: Path, data: bytes, *, sync: bool = True) -> None:

@@ -93,6 +93,21 @@ class CommittedGroup(Generic[A]):
         return num_bytes
 
 
+class _GrowingFile(LocalFile):
+    """The part file of an array that is being written."""
+
+    def read(self, offset: int, length: int) -> memoryview:
+        """Bytes offset … offset + length − 1.
+
+        Raises:
+            NotFoundError: its writer finished meanwhile.
+        """
+        data = super().read(offset, length)
+        if not data and self.size() is None:
+            raise NotFoundError(f"{self.path}: was finished meanwhile; open what was committed")
+        return data
+
+
 @dataclass
 class LiveGroup(Generic[A]):
     """A group that is being written, as far as its journals vouched for it when this was made."""
@@ -108,7 +123,7 @@ class LiveGroup(Generic[A]):
     def shard(self, name: str) -> ShardReader:
         """One array."""
         return ShardReader(
-            LocalFile(part_path(self.stage, name)),
+            _GrowingFile(part_path(self.stage, name)),
             self.entries[name],
             what=f"{self.what}: array {name!r}",
             index=self.indexes[name],
@@ -229,6 +244,8 @@ def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
         raise NotFoundError(f"{stage.name}: is being written in a way that cannot be followed")
     entries: dict[str, ArrayEntry] = {}
     indexes: dict[str, np.ndarray] = {}
+    if any((stage / name).is_dir() for s in attributes.streams for name in stream_arrays(s, kind)):
+        raise NotFoundError(f"{stage.name}: is being finished; open what is committed in a moment")
     for stream in attributes.streams:
         arrays = stream_arrays(stream, kind)
         rows = {

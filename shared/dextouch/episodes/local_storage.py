@@ -13,6 +13,7 @@ from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.stage import Attributes, attributes_id
 from dextouch.episodes.stage_recovery import RecoveredGroup, recover_stage
 from dextouch.episodes.staging import STAGING, abandoned_stages, new_stage, sweep_stages
+from dextouch.episodes.trash import put_into_trash, remove_for_good
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
@@ -104,17 +105,13 @@ class LocalStorage:
             return sorted(path.name for path in folder.iterdir() if (path / COMMIT_FILE).is_file())
 
     def delete(self, kind: Kind, item_id: str) -> None:
-        """Remove a group; it vanishes at once, its bytes a moment later.
+        """Remove a group for good; it vanishes at once, its bytes a moment later.
 
         Raises:
             NotFoundError: no such id.
         """
-        folder = self._existing(kind, item_id)
-        trash = self.root / STAGING / f"deleted-{item_id}-{uuid.uuid4().hex}"
-        with disk_errors(f"delete {kind} {item_id}"):
-            trash.parent.mkdir(parents=True, exist_ok=True)
-            folder.rename(trash)
-            shutil.rmtree(trash)
+        self._existing(kind, item_id)
+        remove_for_good(put_into_trash(self.root, kind, item_id))
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
         """Bring a group of an older format version over; False if it is of the current one.

@@ -97,18 +97,18 @@ class LocalFile:
     """A file on this machine, mapped into memory when it is first read."""
 
     def __init__(self, path: Path) -> None:
-        self._path = path
+        self.path = path
 
     def size(self) -> int | None:
         """Its length in bytes; None where there is no such file."""
-        with disk_errors(f"read {self._path}"):
-            data = _MAPPED.get(self._path)
+        with disk_errors(f"read {self.path}"):
+            data = _MAPPED.get(self.path)
         return None if data is None else len(data)
 
     def read(self, offset: int, length: int) -> memoryview:
         """Bytes offset … offset + length − 1."""
-        with disk_errors(f"read {self._path}"):
-            data = _MAPPED.get(self._path)
+        with disk_errors(f"read {self.path}"):
+            data = _MAPPED.get(self.path)
         return memoryview(b"") if data is None else data[offset : offset + length]
 
 

@@ -67,7 +67,7 @@ def read_stage(stage: Path) -> Attributes | None:
         known = json.loads(data)
         model = EpisodeAttributes if known["kind"] == "episode" else RecordingAttributes
         return model.model_validate_json(json.dumps(known["attributes"]))
-    except (ValueError, KeyError, TypeError, ValidationError) as error:
+    except (ValueError, KeyError, TypeError, RecursionError, ValidationError) as error:
         raise CorruptDataError(f"{stage.name}: {STAGE_FILE} is damaged ({error})") from error
 
 

@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Iterator
 from pathlib import Path
 
+from dextouch.episodes.files import is_folder_at
 from dextouch.episodes.format import Kind
 from dextouch.episodes.stage_recovery import is_recoverable
 
@@ -28,13 +29,18 @@ def stages_of(root: Path, kind: Kind, item_id: str) -> list[Path]:
 def unheld_folders(parent: Path) -> Iterator[Path]:
     """Folders that no writer holds, each held while the caller looks at it."""
     for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
-        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            descriptor = os.open(folder, os.O_RDONLY)
+        except FileNotFoundError:
+            continue  # committed since we listed
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             continue
         else:
-            yield folder
+            # Its writer may have committed it, and let go, between the two calls above.
+            if is_folder_at(descriptor, folder):
+                yield folder
         finally:
             os.close(descriptor)
 

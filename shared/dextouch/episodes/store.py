@@ -18,7 +18,6 @@ from dextouch.episodes.trash import (
     list_trash,
     purge_trash,
     put_into_trash,
-    remove_for_good,
     restore_from_trash,
 )
 from dextouch.episodes.write_options import WriteOptions
@@ -175,14 +174,12 @@ class EpisodeStore:
             NotFoundError: no such id.
         """
         kind, item_id = _check(kind, item_id)
-        if not isinstance(self._storage, LocalStorage):
+        if for_good or not isinstance(self._storage, LocalStorage):
             self._storage.delete(kind, item_id)
             return
         if not self.exists(item_id, kind=kind):
             raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
-        entry = put_into_trash(self.root, kind, item_id)
-        if for_good:
-            remove_for_good(entry)
+        put_into_trash(self.root, kind, item_id)
 
     def restore(self, item_id: str, *, kind: TrashKind = "episode") -> None:
         """Put what was deleted last under an id back; raises as `restore_from_trash`."""

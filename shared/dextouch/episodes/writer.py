@@ -1,6 +1,5 @@
 """Blocks of samples → a new episode or recording that appears whole or not at all."""
 
-import fcntl
 import os
 import shutil
 from pathlib import Path
@@ -8,7 +7,7 @@ from types import TracebackType
 
 import numpy as np
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes.files import disk_errors, make_held_folder
 from dextouch.episodes.format import STAMPS, stream_arrays
 from dextouch.episodes.stage import (
     Attributes,
@@ -52,10 +51,8 @@ class EpisodeWriter:
         # Whether `stage.json` must be written before the next sample.
         self._unannounced, self._recoverable = keep, keep
         with disk_errors(f"create {stage}"):
-            stage.mkdir(parents=True)
             # Held as long as the writer lives: tells a sweep that this stage is not abandoned.
-            self._lock = os.open(stage, os.O_RDONLY)
-            fcntl.flock(self._lock, fcntl.LOCK_EX)
+            self._lock = make_held_folder(stage)
         for descriptor in attributes.streams:
             self.add_stream(descriptor)
 

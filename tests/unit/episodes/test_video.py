@@ -1,17 +1,21 @@
 """H.264 groups: what goes in comes out near, only what is asked is decoded, nothing is mixed up."""
 
+import fcntl
+import os
 import threading
 
 import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore, ImageForm, VideoSettings, WriteOptions
+from dextouch.episodes.files import make_held_folder
 from dextouch.episodes.format import GOP_IMAGES
 from dextouch.episodes.image_codecs import ImageChunks, pack_chunk, transform_pixels
 from dextouch.episodes.video import GopDecoder, GopEncoder, is_keyframe
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,
+    NotFoundError,
     ShapeError,
     StorageFullError,
     UnknownNameError,
@@ -281,3 +285,34 @@ def test_encoded_images_are_asked_of_encoded_streams_only(store):
     reader = write(EpisodeStore(store.root), moving_images(3), unit="rgb8")
     with pytest.raises(InvalidInputError, match="rgb8"):
         reader.encoded_images("camera_head", 0, 1)
+
+
+def test_a_live_view_of_a_take_that_was_finished_says_so(store):
+    writer = store.writer(
+        kind="recording",
+        attributes=attributes(camera()),
+        options=WriteOptions(threads=False),
+    )
+    with writer:
+        writer.append("camera_head", values=moving_images(16), t_host_ns=stamps(16))
+        live = store.live("take-1")
+        before = live.images("camera_head", 0, 8)
+    with pytest.raises(NotFoundError, match="finished meanwhile"):
+        live.images("camera_head", 8, 16)
+    with pytest.raises(NotFoundError, match="not being written"):
+        store.live("take-1")
+    np.testing.assert_array_equal(before, store.recording("take-1").images("camera_head", 0, 8))
+
+
+def test_a_stage_that_was_swept_before_it_was_held_is_made_again(tmp_path, monkeypatch):
+    stage, real = tmp_path / "stage", fcntl.flock
+    swept = []
+
+    def sweep_first(descriptor, how):
+        if not swept:
+            swept.append(stage.rmdir())
+        return real(descriptor, how)
+
+    monkeypatch.setattr(fcntl, "flock", sweep_first)
+    os.close(make_held_folder(stage))
+    assert stage.is_dir()
