@@ -23,7 +23,7 @@ demo: $(VENV)/.runtime   ## record, align, imagine and score, on this machine
 	$(BIN)/dextouch demo
 
 test: $(VENV)/.dev       ## the default test run (under ten minutes on two cores)
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n logical --dist loadfile
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow
