@@ -25,11 +25,12 @@ class ImageQueue:
         self.num_dropped = 0
         self._work, self._when_full = work, when_full
         self._waiting: deque[tuple[Future[None], int]] = deque()
+        self._spare: deque[np.ndarray] = deque(maxlen=MAX_WAITING_IMAGES)
         self._num_images = 0
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"encode-{name}")
 
     def put(self, values: np.ndarray, stamps: Mapping[str, np.ndarray]) -> None:
-        """Queue a block, which must not change any more; raises what an earlier block raised."""
+        """Queue a copy of a block; raises what an earlier block raised."""
         while self._waiting and self._waiting[0][0].done():
             self._take_oldest()
         # A block larger than the queue goes in when nothing waits.
@@ -38,7 +39,9 @@ class ImageQueue:
                 self.num_dropped += len(values)
                 return
             self._take_oldest()
-        self._waiting.append((self._thread.submit(self._work, values, stamps), len(values)))
+        kept = {name: column.copy() for name, column in stamps.items()}
+        work = self._thread.submit(self._hand_on, self._copy(values), kept)
+        self._waiting.append((work, len(values)))
         self._num_images += len(values)
 
     def drain(self) -> None:
@@ -49,6 +52,22 @@ class ImageQueue:
     def stop(self) -> None:
         """End the thread; what still waits is left out."""
         self._thread.shutdown(cancel_futures=True)
+
+    def _copy(self, values: np.ndarray) -> np.ndarray:
+        if values.dtype == object:
+            return values.copy()
+        # The memory of blocks that are done: fresh memory for an image costs more than the image.
+        while self._spare:
+            spare = self._spare.pop()
+            if spare.shape == values.shape:
+                np.copyto(spare, values)
+                return spare
+        return values.copy()
+
+    def _hand_on(self, values: np.ndarray, stamps: Mapping[str, np.ndarray]) -> None:
+        self._work(values, stamps)
+        if values.dtype != object:
+            self._spare.append(values)
 
     def _take_oldest(self) -> None:
         done, num_images = self._waiting.popleft()

@@ -89,8 +89,7 @@ class StreamWriter:
         if self._queue is None:
             name, when_full = self.descriptor.name, self._options.when_full
             self._queue = ImageQueue(self._append_images, name=name, when_full=when_full)
-        kept = values if values.dtype == object else values.copy()
-        self._queue.put(kept, {stamp: column.copy() for stamp, column in stamps.items()})
+        self._queue.put(values, stamps)
 
     def _check_order(self, stamps_ns: np.ndarray) -> None:
         # Arrival stamps may repeat: a device can hand over several samples at once.
