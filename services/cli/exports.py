@@ -120,11 +120,13 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
         raise ConflictError(f"{folder}: is no LeRobot data set, so --force does not remove it")
     aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.old")
     folder.rename(aside)
+    written = False
     try:
         yield
-    except BaseException:
-        aside.rename(folder)
-        raise
+        written = True
+    finally:
+        if not written:
+            aside.rename(folder)
     shutil.rmtree(aside)
 
 

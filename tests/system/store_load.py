@@ -13,10 +13,10 @@ import numpy as np
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from dextouch.errors import LimitExceededError, StorageFullError, UnavailableError
-from dextouch.images.jpeg import encode_jpeg, jpeg_values
+from dextouch.images.jpeg import encode_jpeg
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 from services.acquisition.uploader import batch_samples
 
 NUM_IMAGES = 16
@@ -66,7 +66,7 @@ def batch_of(descriptor, first, count, pictures):
     k = np.arange(first, first + count, dtype=np.int64)
     t_host_ns = np.round(k * 1e9 / descriptor.nominal_rate_hz).astype(np.int64)
     if descriptor.unit == "jpeg":
-        values = jpeg_values([pictures[i % NUM_IMAGES] for i in k.tolist()])
+        values = encoded_values([pictures[i % NUM_IMAGES] for i in k.tolist()])
     else:
         flat = np.ones((count, int(np.prod(descriptor.shape))), dtype=descriptor.dtype)
         flat *= (k % 60_000).astype(descriptor.dtype)[:, None]

@@ -11,10 +11,10 @@ from itertools import count
 import numpy as np
 
 from dextouch.episodes.video import GopEncoder, VideoSettings
-from dextouch.images.jpeg import encode_jpeg, jpeg_values
+from dextouch.images.jpeg import encode_jpeg
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 HEIGHT, WIDTH, NUM_IMAGES = 240, 320, 96
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
@@ -100,7 +100,7 @@ def block(name, seed, first, num_samples, images):
 def spool_batch(name, seed, first, num_samples, jpegs):
     """The same samples as a batch for a spool, whose cameras speak JPEG."""
     made = block(name, seed, first, num_samples, jpegs)
-    what = jpeg_values(list(made["values"])) if name in CAMERAS else made["values"]
+    what = encoded_values(list(made["values"])) if name in CAMERAS else made["values"]
     return SampleBatch(made["t_host_ns"], made["t_device_ns"], made["sequence"], what)
 
 

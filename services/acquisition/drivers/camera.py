@@ -6,9 +6,9 @@ from typing import Literal
 import numpy as np
 
 from dextouch.errors import CorruptDataError, DeviceError
-from dextouch.images.jpeg import jpeg_size, jpeg_values
+from dextouch.images.jpeg import jpeg_size
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams.samples import Sample, encoded_values
 from services.acquisition.drivers.base import Readings, check_packet
 from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
 
@@ -111,4 +111,4 @@ class CameraDecoder:
                 return None
         except CorruptDataError:
             return None
-        return jpeg_values([body]).reshape(())
+        return encoded_values([body]).reshape(())

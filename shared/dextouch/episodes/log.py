@@ -95,7 +95,7 @@ class SpoolWriter:
             stream_name: one of the recording's streams.
             batch: of the stream's dtype and shape; `t_host_ns` never decreases. Values of `jpeg`
                 and `h264` streams are an object array of bytes, one an image
-                (`dextouch.images.jpeg.jpeg_values`).
+                (`dextouch.streams.samples.encoded_values`).
 
         Raises:
             UnknownNameError: no such stream.

@@ -26,11 +26,11 @@ from dextouch.episodes.format import (
 from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles
 from dextouch.errors import CorruptDataError, StorageError
-from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.checks import JPEG_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import encoded_values
 
 OLD_VERSION = 1
 BLOCK_SAMPLES = 256
@@ -102,7 +102,7 @@ class OldGroup:
         first, last = int(bounds[start]), int(bounds[stop])
         data = self._shard(stream.name).read(first, last).tobytes()
         ends = [int(end) - first for end in bounds[start : stop + 1]]
-        return jpeg_values([data[low:high] for low, high in pairwise(ends)])
+        return encoded_values([data[low:high] for low, high in pairwise(ends)])
 
     def _shard(self, name: str) -> ShardReader:
         if name not in self._entries:

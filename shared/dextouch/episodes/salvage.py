@@ -39,11 +39,11 @@ from dextouch.episodes.stage import Attributes, attributes_id, kind_of
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError
-from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
 from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.checks import ENCODED_UNITS, check_encoded_image
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import encoded_values
 
 LOST = "lost_to_damage"
 # Rows of these belong to each other by their number: the steps of the model grid.
@@ -102,7 +102,7 @@ class _SalvagedArray:
             return decode_rows(payload, self.entry, what=self._what)
         shape = self.entry.shape[1:]
         chunks = ImageChunks(self.entry.codec, shape, self.entry.chunk_rows, self._what)
-        return jpeg_values(chunks.unpack(payload, number))
+        return encoded_values(chunks.unpack(payload, number))
 
     def column(self) -> np.ndarray:
         """All rows; those that do not hold are of no meaning."""
@@ -308,7 +308,7 @@ def _spooled(spool: Path, descriptor: StreamDescriptor) -> SalvagedStream:
         mine = [payload for payload, want in zip(payloads[start:stop], wanted, strict=True) if want]
         stamps = {stamp: chosen[stamp].astype(np.int64) for stamp in STAMPS["recording"]}
         if descriptor.unit in ENCODED_UNITS:
-            return jpeg_values(mine), stamps
+            return encoded_values(mine), stamps
         values = np.frombuffer(b"".join(mine), dtype=descriptor.numpy_dtype())
         return values.reshape(len(mine), *descriptor.shape), stamps
 

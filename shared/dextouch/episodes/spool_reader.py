@@ -9,11 +9,10 @@ from pydantic import ValidationError
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.journal import SAMPLE_JOURNAL, journal_path, read_payloads, read_rows
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.checks import ENCODED_UNITS
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 RECORDING_FILE = "recording.json"
 CLOSED_FILE = "closed"
@@ -113,6 +112,6 @@ def read_attributes(path: Path) -> RecordingAttributes:
 
 def _values(descriptor: StreamDescriptor, payloads: list[bytes]) -> np.ndarray:
     if descriptor.unit in ENCODED_UNITS:
-        return jpeg_values(payloads)
+        return encoded_values(payloads)
     values = np.frombuffer(b"".join(payloads), dtype=descriptor.numpy_dtype())
     return values.reshape(len(payloads), *descriptor.shape)

@@ -1,10 +1,8 @@
 """Images [h, w, 3] uint8 RGB ↔ JPEG bytes: the one still-image codec."""
 
-from collections.abc import Sequence
-
 import numpy as np
 import simplejpeg
-from jaxtyping import Shaped, UInt8
+from jaxtyping import UInt8
 
 from dextouch.errors import CorruptDataError, ShapeError
 
@@ -45,10 +43,3 @@ def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
     except ValueError as error:
         raise CorruptDataError(f"{where}: {len(data)} bytes are no JPEG image ({error})") from error
     return height_px, width_px
-
-
-def jpeg_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
-    """JPEG images as the `values` of a batch of a `jpeg` stream: an object array of bytes."""
-    values = np.empty(len(images), dtype=object)
-    values[:] = images
-    return values

@@ -64,7 +64,7 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
     if values.dtype != object or values.ndim != 1:
         raise ShapeError(
             f"{name}: got values {values.dtype} {values.shape}, expected an object array of "
-            "bytes, one an image (see dextouch.images.jpeg.jpeg_values)"
+            "bytes, one an image (see dextouch.streams.samples.encoded_values)"
         )
     for index, data in enumerate(values):
         check_encoded_image(descriptor, data, where=f"{name}: image {index} of the batch")

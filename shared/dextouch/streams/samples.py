@@ -58,3 +58,10 @@ class SampleBatch:
                 self.t_host_ns, self.t_device_ns, self.sequence, self.values, strict=True
             )
         ]
+
+
+def encoded_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
+    """Encoded images, bytes each, as the `values` of a batch of a `jpeg` or `h264` stream."""
+    values = np.empty(len(images), dtype=object)
+    values[:] = images
+    return values

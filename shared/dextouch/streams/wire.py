@@ -11,11 +11,10 @@ import google_crc32c
 import numpy as np
 
 from dextouch.errors import InvalidInputError, LimitExceededError, PacketError
-from dextouch.images.jpeg import jpeg_values
 from dextouch.streams.checks import ENCODED_UNITS, check_batch
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.packing import pack, unpack
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 MAGIC = b"DXTB"
 VERSION = 1
@@ -147,4 +146,4 @@ def _images(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
             f"{where}: image_end must rise and end at {len(data)}, the number of bytes"
         )
     whole = data.tobytes()
-    return jpeg_values([whole[start:end] for start, end in pairwise(bounds)])
+    return encoded_values([whole[start:end] for start, end in pairwise(bounds)])

@@ -7,10 +7,11 @@ import numpy as np
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import pose_from_transform, transform
 from dextouch.hands import actions as act
-from dextouch.images.jpeg import encode_jpeg, jpeg_values
+from dextouch.images.jpeg import encode_jpeg
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.schemas.recordings import LedgerEntry, RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import encoded_values
 
 K_HEAD = np.array([[60.0, 0, 32], [0, 61, 31.5], [0, 0, 1]])
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
@@ -127,7 +128,7 @@ def write_recording(store, recording_id="take-0001", *, count=70):
     sequence[4] = -1
     poses = rng.normal(size=(count, 7))
     poses[2] = np.nan
-    jpegs = jpeg_values([encode_jpeg(image) for image in images_of(count, 32)])
+    jpegs = encoded_values([encode_jpeg(image) for image in images_of(count, 32)])
     values = {
         "tactile_left": rng.integers(0, 65536, (count, 360)).astype("u2"),
         "keypoints_left": rng.normal(size=(count, 25, 3)).astype("f4"),

@@ -10,10 +10,10 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.hands.actions import IDENTITY_POSE_9D
-from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import encoded_values
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 FORCE = StreamDescriptor(
@@ -78,7 +78,9 @@ def write_episode(store):
     image = (GOLDEN / "image.jpg").read_bytes()
     with store.writer(attributes=attributes) as writer:
         writer.append("force", values=FORCE_VALUES, t_ref_ns=np.arange(5) * 250_000_000)
-        writer.append("camera_head", values=jpeg_values([image] * 2), t_ref_ns=np.array([0, 10**9]))
+        writer.append(
+            "camera_head", values=encoded_values([image] * 2), t_ref_ns=np.array([0, 10**9])
+        )
         writer.append("action", values=ACTIONS, t_ref_ns=np.arange(3) * 500_000_000)
 
 

@@ -19,10 +19,10 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.images.jpeg import encode_jpeg, jpeg_values
+from dextouch.images.jpeg import encode_jpeg
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 GLOVE = StreamDescriptor(
     name="glove_left",
@@ -60,7 +60,7 @@ def camera_batch(first, count=1):
     images = [np.full((8, 8, 3), 10 * (first + k), np.uint8) for k in range(count)]
     numbers = np.arange(first, first + count, dtype=np.int64)
     return SampleBatch(
-        numbers, np.full(count, -1), numbers, jpeg_values([encode_jpeg(i) for i in images])
+        numbers, np.full(count, -1), numbers, encoded_values([encode_jpeg(i) for i in images])
     )
 
 

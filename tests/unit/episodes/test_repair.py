@@ -14,10 +14,9 @@ from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.video import GopEncoder, VideoSettings
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import ConflictError, CorruptDataError
-from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 ID = "stand-bottle-0003"
 NEW = f"{ID}-salvaged-1"
@@ -329,7 +328,7 @@ def test_of_video_in_an_upload_whole_groups_are_kept(store, number, lost):
     spool = store.root / ".uploads" / "take-1"
     numbers = np.arange(20)
     with SpoolWriter(spool, attributes, sync=False) as writer:
-        writer.append("camera", SampleBatch(numbers, numbers, numbers, jpeg_values(units)))
+        writer.append("camera", SampleBatch(numbers, numbers, numbers, encoded_values(units)))
         writer.append("force", batch(0, 9))
     flip(spool / "force.part", 3)
     flip(spool / "camera.part", sum(map(len, units[:number])) + 6)

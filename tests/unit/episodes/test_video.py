@@ -20,9 +20,10 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.images.jpeg import encode_jpeg, jpeg_values
+from dextouch.images.jpeg import encode_jpeg
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import encoded_values
 
 HEIGHT, WIDTH, COUNT = 48, 64, 21
 FULL = ImageForm()
@@ -158,7 +159,7 @@ def test_the_writer_keeps_its_own_copy(store):
 def test_access_units_are_kept_as_they_come(store, encoder):
     images = moving_images()
     units = [encoder.encode(image) for image in images]
-    reader = write(store, jpeg_values(units), block=5)
+    reader = write(store, encoded_values(units), block=5)
     for start, stop in [(0, COUNT), (0, 0), (7, 9), (20, 21)]:
         assert reader.encoded_images("camera_head", start, stop) == units[start:stop]
     assert psnr_db(reader.images("camera_head"), images) > 30
@@ -168,22 +169,22 @@ def test_groups_of_another_length_are_refused(store, encoder):
     units = [encoder.encode(image) for image in moving_images(9)]
     with store.writer(kind="recording", attributes=attributes(camera())) as writer:
         with pytest.raises(InvalidInputError, match="image 0: is no key frame"):
-            writer.append("camera_head", values=jpeg_values(units[1:2]), t_host_ns=stamps(1))
-        writer.append("camera_head", values=jpeg_values(units[:3]), t_host_ns=stamps(3))
+            writer.append("camera_head", values=encoded_values(units[1:2]), t_host_ns=stamps(1))
+        writer.append("camera_head", values=encoded_values(units[:3]), t_host_ns=stamps(3))
         with pytest.raises(InvalidInputError, match="image 3: is a key frame"):
-            writer.append("camera_head", values=jpeg_values(units[:1]), t_host_ns=stamps(1, 3))
+            writer.append("camera_head", values=encoded_values(units[:1]), t_host_ns=stamps(1, 3))
         with pytest.raises(InvalidInputError, match="start code"):
-            writer.append("camera_head", values=jpeg_values([b"abc"]), t_host_ns=stamps(1, 3))
+            writer.append("camera_head", values=encoded_values([b"abc"]), t_host_ns=stamps(1, 3))
         bad = np.array([None], dtype=object)
         with pytest.raises(ShapeError, match="expected bytes"):
             writer.append("camera_head", values=bad, t_host_ns=stamps(1, 3))
-        writer.append("camera_head", values=jpeg_values(units[3:]), t_host_ns=stamps(6, 3))
+        writer.append("camera_head", values=encoded_values(units[3:]), t_host_ns=stamps(6, 3))
     assert store.recording("take-1").encoded_images("camera_head", 0, 9) == units
 
 
 def test_plain_and_encoded_images_are_not_mixed(store, encoder):
     images = moving_images(8)
-    unit = jpeg_values([encoder.encode(images[0])])
+    unit = encoded_values([encoder.encode(images[0])])
     with store.writer(kind="recording", attributes=attributes(camera())) as writer:
         writer.append("camera_head", values=images, t_host_ns=stamps(8))
         with pytest.raises(InvalidInputError, match="got encoded images after plain ones"):

@@ -8,11 +8,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, LimitExceededError, PacketError
-from dextouch.images.jpeg import jpeg_values
 from dextouch.streams import wire
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.packing import pack
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 POSE = StreamDescriptor(
@@ -40,7 +39,7 @@ def pose_batch(count=3):
 
 def camera_batch():
     k = np.arange(2, dtype=np.int64)
-    return SampleBatch(k, k - 1, k, jpeg_values([(GOLDEN / "image.jpg").read_bytes()] * 2))
+    return SampleBatch(k, k - 1, k, encoded_values([(GOLDEN / "image.jpg").read_bytes()] * 2))
 
 
 CASES = {"batch_v1": (POSE, pose_batch()), "batch_jpeg_v1": (CAMERA, camera_batch())}

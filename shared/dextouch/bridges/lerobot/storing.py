@@ -13,9 +13,9 @@ from dextouch.bridges.lerobot.h264 import holds_idr
 from dextouch.bridges.lerobot.video_reader import read_images, read_units
 from dextouch.episodes import EpisodeStore, EpisodeWriter
 from dextouch.episodes.format import GOP_IMAGES
-from dextouch.images.jpeg import jpeg_values
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.streams.samples import encoded_values
 from dextouch.tactile.layout import SIDES
 
 ImageUnit = Literal["h264", "jpeg", "rgb8"]
@@ -95,7 +95,7 @@ def _store_images(
     fresh = np.diff(found.t_ref_ns, prepend=found.t_ref_ns[0] - 1) > 0
     units = read_units(found.span) if unit == "h264" and fresh.all() else None
     if units is not None and _in_groups(units):
-        writer.append(camera, values=jpeg_values(units), t_ref_ns=found.t_ref_ns)
+        writer.append(camera, values=encoded_values(units), t_ref_ns=found.t_ref_ns)
         return
     images = _kept(read_images(found.span), fresh)
     stamps = found.t_ref_ns[fresh]

@@ -13,7 +13,7 @@ from dextouch.bridges.blocks import is_encoded, objects
 from dextouch.bridges.mcap.messages import MessageCodec, Sent
 from dextouch.bridges.mcap.records import records
 from dextouch.bridges.mcap.writing import ABOUT, ATTRIBUTES_FILE, BRIDGE_VERSION, COUNTS
-from dextouch.episodes import EpisodeStore, EpisodeWriter
+from dextouch.episodes import EpisodeStore, EpisodeWriter, WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.schemas.recordings import RecordingAttributes
@@ -59,7 +59,9 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
             f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
             "`dextouch export --format mcap` wrote can be imported"
         )
-    with store.writer(kind="recording", attributes=attributes) as writer:
+    # A killed import is done again from its file; half of one must not pass for a recovered take.
+    options = WriteOptions(recoverable=False)
+    with store.writer(kind="recording", attributes=attributes, options=options) as writer:
         _Import(path, about, writer).run()
     return attributes.recording_id
 
