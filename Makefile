@@ -6,7 +6,7 @@ LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow fix clean bench bench-lerobot check-lerobot-export
+.PHONY: demo test check slow vm fuzz fix clean bench bench-lerobot check-lerobot-export
 .DEFAULT_GOAL := demo
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
@@ -27,6 +27,12 @@ test: $(VENV)/.dev       ## the default test run (under ten minutes on two cores
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow
+
+vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get install qemu-system-x86 busybox-static cpio kmod
+	$(BIN)/python -m pytest -q -s -m vm tests/vm
+
+fuzz: $(VENV)/.dev       ## mutate packets of all gloves, guided by coverage; ARGS="--seconds 600"
+	PYTHONPATH=.:shared $(BIN)/python -m tests.fuzz.mutate $(ARGS)
 
 check: $(VENV)/.dev      ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

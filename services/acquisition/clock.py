@@ -2,9 +2,13 @@
 
 import threading
 import time
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from dextouch.errors import InvalidInputError
+
+# Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
+MIN_NOTICED_NS = 100_000_000
 
 
 @runtime_checkable
@@ -37,21 +41,37 @@ class StationClock(Protocol):
         ...
 
 
+@runtime_checkable
+class HostTimes(Protocol):
+    """What a clock can tell of its host besides the time."""
+
+    def suspended_ns(self) -> int:
+        """How long the host has slept since the clock was made."""
+        ...
+
+    def wall_offset_ns(self) -> int:
+        """Wall clock minus a clock that nobody sets; a jump means that the wall clock was set."""
+        ...
+
+
 class RealClock:
     """The host's monotonic clock, if wanted `speed` times as fast (for replays in less time).
 
-    A faster clock also magnifies what the operating system adds to each stamp.
+    It goes on while the host is suspended (`time.monotonic_ns` stands still then, and the time
+    asleep would vanish from a take), and nobody can set it. A faster clock also magnifies what
+    the operating system adds to each stamp.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
         if not 0.01 <= speed <= 100:
             raise InvalidInputError(f"clock speed: got {speed}, expected 0.01 … 100")
         self._speed = speed
-        self._origin_ns = time.monotonic_ns()
+        self._suspended_before_ns = _suspended_ns()
+        self._origin_ns = self._host_ns()
 
     def now_ns(self) -> int:
-        """Nanoseconds of `time.monotonic_ns`, counted `speed` times as fast from the start on."""
-        t_ns = time.monotonic_ns()
+        """Nanoseconds of `time.monotonic_ns` as it was at the start, counted on through sleep."""
+        t_ns = self._host_ns()
         if self._speed == 1.0:
             return t_ns
         return self._origin_ns + int((t_ns - self._origin_ns) * self._speed)
@@ -60,6 +80,23 @@ class RealClock:
         """A waiter that sleeps."""
         del drives_time
         return _RealWaiter(self, self._speed)
+
+    def suspended_ns(self) -> int:
+        """How long the host has slept since the clock was made."""
+        return _suspended_ns() - self._suspended_before_ns
+
+    def wall_offset_ns(self) -> int:
+        """Wall clock minus the time since boot."""
+        return time.time_ns() - time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+
+    def _host_ns(self) -> int:
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._suspended_before_ns
+
+
+def _suspended_ns() -> int:
+    """How long this host has slept since it was booted; less than a millisecond is noise."""
+    asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+    return asleep_ns if asleep_ns >= 1_000_000 else 0
 
 
 class _RealWaiter:
@@ -91,6 +128,8 @@ class VirtualClock:
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
+        self._suspended_ns = 0
+        self._wall_offset_ns = 0
         self._lock = threading.Lock()
         self._open: set[_VirtualWaiter] = set()
 
@@ -104,6 +143,25 @@ class VirtualClock:
         with self._lock:
             self._open.add(waiter)
         return waiter
+
+    def suspend(self, duration_ns: int) -> None:
+        """Let the host sleep: time passes and nobody does anything meanwhile."""
+        with self._lock:
+            self._now_ns += duration_ns
+            self._suspended_ns += duration_ns
+            self._advance()
+
+    def set_wall(self, step_ns: int) -> None:
+        """Step the wall clock, which the time of this clock does not follow."""
+        self._wall_offset_ns += step_ns
+
+    def suspended_ns(self) -> int:
+        """How long the simulated host has slept."""
+        return self._suspended_ns
+
+    def wall_offset_ns(self) -> int:
+        """How far the simulated wall clock was set."""
+        return self._wall_offset_ns
 
     def _wait(self, waiter: "_VirtualWaiter", t_ns: int) -> bool:
         with self._lock:
@@ -153,3 +211,60 @@ class _VirtualWaiter:
 
     def close(self) -> None:
         self._clock._leave(self)  # noqa: SLF001
+
+
+@dataclass
+class HostEvent:
+    """How often something happened to the host, when first and for how long altogether."""
+
+    count: int = 0
+    first_t_host_ns: int = 0
+    total_ns: int = 0
+
+    def add(self, t_host_ns: int, duration_ns: int) -> None:
+        """Once more."""
+        if not self.count:
+            self.first_t_host_ns = t_host_ns
+        self.count += 1
+        self.total_ns += duration_ns
+
+
+class HostWatch:
+    """Finds out, at every `look`, whether the host slept or its wall clock was set meanwhile.
+
+    Neither touches the stamps: the station's clock counts on through sleep and nobody sets it. But
+    both explain things (a gap in all streams; a `started_at` that does not fit), so they are told.
+    """
+
+    def __init__(self, clock: StationClock) -> None:
+        self._clock = clock
+        self._times = clock if isinstance(clock, HostTimes) else None
+        self.events = {"host_suspended": HostEvent(), "wall_clock_set": HostEvent()}
+        self._suspended_ns = self._times.suspended_ns() if self._times else 0
+        self._wall_offset_ns = self._times.wall_offset_ns() if self._times else 0
+
+    def look(self) -> None:
+        """Compare with the last look."""
+        if self._times is None:
+            return
+        suspended_ns, wall_offset_ns = self._times.suspended_ns(), self._times.wall_offset_ns()
+        asleep_ns = suspended_ns - self._suspended_ns
+        if asleep_ns > MIN_NOTICED_NS:
+            self.events["host_suspended"].add(self._clock.now_ns(), asleep_ns)
+        set_ns = wall_offset_ns - self._wall_offset_ns
+        if abs(set_ns) > MIN_NOTICED_NS:
+            self.events["wall_clock_set"].add(self._clock.now_ns(), abs(set_ns))
+        self._suspended_ns, self._wall_offset_ns = suspended_ns, wall_offset_ns
+
+    def problems(self) -> tuple[str, ...]:
+        """What happened, in words."""
+        texts = {
+            "host_suspended": "the host slept for {s:.1f} s during the take: a gap in all streams",
+            "wall_clock_set": "the wall clock was set by {s:.1f} s during the take: stamps are not "
+            "touched, but started_at may not fit",
+        }
+        return tuple(
+            texts[name].format(s=event.total_ns / 1e9)
+            for name, event in self.events.items()
+            if event.count
+        )

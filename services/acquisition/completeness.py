@@ -7,6 +7,7 @@ from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.health_taxels import TaxelCounts, count_taxels
 from services.acquisition.schemas import StreamTake, TakeCheck, TakeProblem
 
 RATE_WARN = 0.02
@@ -15,6 +16,8 @@ LOSS_WARN = 0.001
 LOSS_ERROR = 0.05
 # Shorter takes say nothing about rates and loss ratios.
 MIN_JUDGED_S = 1.0
+# Any taxel that is out is worth a word; with 5 % of them a take is not worth keeping.
+TAXELS_ERROR = 16
 MAX_GAP_S = {"image": 0.5}
 MAX_GAP_OTHERS_S = 0.2
 
@@ -55,6 +58,13 @@ class StreamFacts:
         edges = (first_ns - span.start_t_host_ns, span.stop_t_host_ns - last_ns)
         return max(self.counters.largest_gap_ns, *edges) / 1e9
 
+    def taxels(self) -> TaxelCounts | None:
+        """Dead, stuck and saturated taxels of the take; None of streams that have none."""
+        side, extremes = self.descriptor.side, self.counters.extremes
+        if side is None or extremes is None or self.descriptor.kind != "tactile":
+            return None
+        return count_taxels(extremes.low_counts, extremes.high_counts, side=side)
+
 
 def check_take(facts: Sequence[StreamFacts], span: TakeSpan) -> TakeCheck:
     """Judge a take: complete means no problem of level ERROR."""
@@ -88,10 +98,40 @@ def take_ledger(facts: Sequence[StreamFacts]) -> tuple[LedgerEntry, ...]:
             "length_errors": fact.decoder.length_errors,
             "resync_bytes": fact.decoder.resync_bytes,
             "refused": fact.decoder.refused,
+            "repeated": fact.decoder.repeated,
+            "restarts": fact.decoder.restarts,
+            **_taxel_events(fact),
         }
         name = fact.descriptor.name
         entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
     return tuple(entries)
+
+
+def take_quality(facts: Sequence[StreamFacts], span: TakeSpan) -> dict[str, float]:
+    """Figures of a take by stream, for the recording's `quality`; the episode takes them over."""
+    quality: dict[str, float] = {}
+    for fact in facts:
+        name, rate_hz = fact.descriptor.name, fact.rate_hz()
+        quality[f"{name}_largest_gap_s"] = fact.largest_gap_s(span)
+        if rate_hz is not None:
+            quality[f"{name}_rate_hz"] = rate_hz
+        if fact.descriptor.capabilities.sequence:
+            lost = fact.decoder.lost
+            quality[f"{name}_loss_ratio"] = lost / max(1, lost + fact.decoder.packets)
+        for event, count in _taxel_events(fact).items():
+            quality[f"{name}_num_{event}"] = float(count)
+    return quality
+
+
+def _taxel_events(fact: StreamFacts) -> dict[str, int]:
+    taxels = fact.taxels()
+    if taxels is None:
+        return {}
+    return {
+        "dead_taxels": taxels.dead,
+        "stuck_taxels": taxels.stuck,
+        "saturated_taxels": taxels.saturated,
+    }
 
 
 def _problems(fact: StreamFacts, span: TakeSpan) -> list[TakeProblem]:
@@ -114,6 +154,11 @@ def _problems(fact: StreamFacts, span: TakeSpan) -> list[TakeProblem]:
     if loss > LOSS_WARN:
         text = f"{fact.decoder.lost} packets lost ({loss:.1%}), {fact.decoder.crc_errors} bad sums"
         found.append(_problem(fact, "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text))
+    for event, count in _taxel_events(fact).items():
+        if count:
+            text = f"{count} {event.replace('_', ' ')} during the whole take"
+            level = "ERROR" if count >= TAXELS_ERROR else "WARN"
+            found.append(_problem(fact, event, level, text))
     return found
 
 

@@ -1,87 +1,68 @@
-"""Counters of the readers come in; a level with reasons for every stream goes out."""
+"""Counters and blocks of the readers come in; levels, findings and events by stream go out."""
 
 import threading
-from collections import deque
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import Literal
-
-import numpy as np
+from pathlib import Path
+from typing import Protocol, runtime_checkable
 
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.drivers.tactile_glove import FULL_SCALE_COUNTS
+from services.acquisition.health_blocks import Block
+from services.acquisition.health_camera import CameraJudge
+from services.acquisition.health_clock import ClockJudge
+from services.acquisition.health_levels import Board, EventLog, Verdict, worst
+from services.acquisition.health_link import LinkJudge
+from services.acquisition.health_report import device_health, stale_code, stream_health
+from services.acquisition.health_station import CalibrationJudge, DiskJudge
+from services.acquisition.health_taxels import TaxelJudge
+from services.acquisition.health_tracking import (
+    FiniteJudge,
+    PoseJudge,
+    TellsTracking,
+    TrackingJudge,
+)
 from services.acquisition.live import LiveView
-from services.acquisition.schemas import DeviceHealth, Level, StationHealth, StreamHealth
+from services.acquisition.schemas import HealthEvent, HealthEvents, StationHealth, StreamHealth
 from services.acquisition.supervisor import DeviceSupervisor
 
+TICK_NS = 100_000_000
 PERIOD_NS = 1_000_000_000
-WINDOW_EVALUATIONS = 10
-TAXEL_WINDOW_EVALUATIONS = 5
-RAISE_AFTER = 2
-CLEAR_AFTER = 5
-RATE_LIMITS = (0.02, 0.10)
-DROP_LIMITS = (0.001, 0.01)
-DEAD_LIMITS = (1.0, 18.0)  # taxels of 360: any, 5 %
-STALE_AFTER_NS = {"image": 500_000_000}
-STALE_AFTER_OTHERS_NS = 200_000_000
-LATE_PERIODS = 3
-SEVERITY: tuple[Level, ...] = ("OK", "WARN", "ERROR", "STALE")
-
-Judgement = Literal["OK", "WARN", "ERROR"]
+CONFIRM_NS = 200_000_000
+# A device may take this long after the start before its silence is an event.
+START_NS = 1_000_000_000
+STATION = "station"
 
 
-@dataclass
-class Hysteresis:
-    """A level that rises after 2 and falls after 5 evaluations that agree."""
+@runtime_checkable
+class Judge(Protocol):
+    """Judges one aspect of one stream at every evaluation."""
 
-    level: Judgement = "OK"
-    _candidate: Judgement = "OK"
-    _count: int = 0
-
-    def update(self, judgement: Judgement) -> Judgement:
-        """One evaluation."""
-        if judgement == self.level:
-            self._count = 0
-            return self.level
-        self._count = self._count + 1 if judgement == self._candidate else 1
-        self._candidate = judgement
-        rises = SEVERITY.index(judgement) > SEVERITY.index(self.level)
-        if self._count >= (RAISE_AFTER if rises else CLEAR_AFTER):
-            self.level, self._count = judgement, 0
-        return self.level
-
-
-@dataclass(frozen=True)
-class _Snapshot:
-    """Counts of one stream and its device at one evaluation."""
-
-    t_host_ns: int
-    num_samples: int
-    packets: int
-    lost: int
-    damaged: int
-    reconnects: int
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation of what came since the last one."""
+        ...
 
 
 @dataclass
-class _StreamState:
-    snapshots: deque[_Snapshot] = field(
-        default_factory=lambda: deque(maxlen=WINDOW_EVALUATIONS + 1)
-    )
-    pinned: deque[np.ndarray] = field(
-        default_factory=lambda: deque(maxlen=TAXEL_WINDOW_EVALUATIONS)
-    )
-    hysteresis: Hysteresis = field(default_factory=Hysteresis)
-    reasons: tuple[str, ...] = ()
-    rate_hz: float | None = None
+class _Watched:
+    """One stream with its judges and what they said."""
+
+    supervisor: DeviceSupervisor
+    descriptor: StreamDescriptor
+    judges: list[Judge]
+    board: Board = field(default_factory=Board)
+    figures: dict[str, float] = field(default_factory=dict)
+    evaluated_ns: int = 0
+    is_suspicious: bool = False
+    stale: str | None = None
 
 
 class HealthMonitor:
     """Evaluates all streams once a second, in its own thread; readers never wait for it.
 
-    Staleness is judged whenever someone asks, since it must show within 0.3 s.
+    What was seen once is looked at again after 0.2 s, so that a fault is confirmed soon. Silence
+    is noticed every 0.1 s for the event log, and at once by whoever asks.
     """
 
     def __init__(
@@ -96,16 +77,32 @@ class HealthMonitor:
         self._live = live
         self._clock = clock
         self._station = station
-        self._states = {
-            d.name: _StreamState() for s in self._supervisors for d in s.driver.descriptors
-        }
+        self._log = EventLog()
+        self._streams = [watched for s in self._supervisors for watched in watch(s, live)]
+        self._board = Board()
+        self._figures: dict[str, float] = {}
+        self._disk: DiskJudge | None = None
+        self._calibration = CalibrationJudge(
+            [watched.descriptor for watched in self._streams], live.calibration
+        )
+        live.blocks.time_by(clock)
+        self._started_ns = clock.now_ns()
+        self._due_ns = self._started_ns + PERIOD_NS
+        # One evaluates at a time; the other lock guards what a report reads.
+        self._evaluating = threading.Lock()
         self._lock = threading.Lock()
         self._waiter: Waiter | None = None
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
 
+    def watch_disk(self, spool_root: Path) -> None:
+        """Judge from now on how long the disk of the takes lasts."""
+        self._disk = DiskJudge(spool_root, self._supervisors)
+
     def start(self) -> None:
         """Start evaluating."""
         self._waiter = self._clock.waiter()
+        self._started_ns = self._clock.now_ns()
+        self._due_ns = self._started_ns + PERIOD_NS
         self._thread.start()
 
     def stop(self) -> None:
@@ -115,150 +112,157 @@ class HealthMonitor:
             self._thread.join()
 
     def evaluate(self) -> None:
-        """One evaluation now."""
+        """One regular evaluation now."""
         now_ns = self._clock.now_ns()
-        with self._lock:
-            for supervisor in self._supervisors:
-                for descriptor in supervisor.driver.descriptors:
-                    self._evaluate(supervisor, descriptor, now_ns)
+        with self._evaluating:
+            for watched in self._streams:
+                self._evaluate(watched, now_ns, confirming=False)
+            self._evaluate_station(now_ns)
+
+    def tick(self) -> None:
+        """What is due now: silences, confirmations, and each second a regular evaluation."""
+        now_ns = self._clock.now_ns()
+        self._notice_silence(now_ns)
+        if now_ns >= self._due_ns:
+            # After a long stop of the process one evaluation is enough.
+            self._due_ns = now_ns + PERIOD_NS
+            self.evaluate()
+            return
+        with self._evaluating:
+            for watched in self._streams:
+                waits = watched.board.is_rising or watched.is_suspicious
+                if waits and now_ns >= watched.evaluated_ns + CONFIRM_NS:
+                    self._evaluate(watched, now_ns, confirming=True)
 
     def report(self) -> StationHealth:
         """Every stream and device at this moment."""
         now_ns = self._clock.now_ns()
         with self._lock:
-            streams = [
-                self._stream_health(supervisor, descriptor, now_ns)
-                for supervisor in self._supervisors
-                for descriptor in supervisor.driver.descriptors
-            ]
-        worst: Level = max((s.level for s in streams), key=SEVERITY.index, default="STALE")
+            streams = tuple(self._stream_health(watched, now_ns) for watched in self._streams)
+            findings, figures = self._board.active(), dict(self._figures)
+        levels = [stream.level for stream in streams] + [finding.level for finding in findings]
         return StationHealth(
             station=self._station,
-            level=worst,
-            streams=tuple(streams),
+            level=worst(levels, default="STALE"),
+            findings=findings,
+            figures=figures,
+            streams=streams,
             devices=tuple(device_health(s) for s in self._supervisors),
         )
+
+    def events(self, since_ns: int = 0) -> HealthEvents:
+        """Changes of levels from a moment on the station's clock, oldest first."""
+        found: tuple[HealthEvent, ...] = self._log.events(since_ns)
+        return HealthEvents(now_ns=self._clock.now_ns(), events=found)
+
+    def raised(self) -> dict[tuple[str, str], int]:
+        """How often each (stream, code) was raised since the station's start."""
+        return self._log.raised()
+
+    @property
+    def num_unjudged(self) -> int:
+        """Samples that no judge saw because the evaluation did not keep up."""
+        return self._live.blocks.dropped
 
     def _run(self) -> None:
         if self._waiter is None:
             return
         with closing(self._waiter) as waiter:
-            due_ns = self._clock.now_ns() + PERIOD_NS
-            while waiter.wait_until(due_ns):
-                self.evaluate()
-                # After a long stop of the process one evaluation is enough.
-                due_ns = max(due_ns, self._clock.now_ns()) + PERIOD_NS
+            while waiter.wait_until(self._clock.now_ns() + TICK_NS):
+                self.tick()
 
-    def _evaluate(
-        self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor, now_ns: int
-    ) -> None:
-        state = self._states[descriptor.name]
-        statistics = supervisor.driver.statistics
-        state.snapshots.append(
-            _Snapshot(
-                now_ns,
-                supervisor.counters.streams[descriptor.name].num_samples,
-                statistics.packets,
-                statistics.lost,
-                statistics.crc_errors + statistics.length_errors + statistics.refused,
-                supervisor.counters.reconnects,
-            )
+    def _evaluate(self, watched: _Watched, now_ns: int, *, confirming: bool) -> None:
+        block = self._live.blocks.take(watched.descriptor.name)
+        verdicts = [judge.judge(block, now_ns) for judge in watched.judges]
+        findings = [finding for verdict in verdicts for finding in verdict.findings]
+        with self._lock:
+            changes = watched.board.update(findings, confirming=confirming)
+            watched.figures = {k: v for verdict in verdicts for k, v in verdict.figures.items()}
+            watched.is_suspicious = any(verdict.suspicious for verdict in verdicts)
+            watched.evaluated_ns = now_ns
+        for code, level in changes:
+            self._log.add(now_ns, watched.descriptor.name, code, level)
+
+    def _evaluate_station(self, now_ns: int) -> None:
+        verdicts = [self._calibration.judge(now_ns)]
+        if self._disk is not None:
+            verdicts.append(self._disk.judge(now_ns))
+        findings = [finding for verdict in verdicts for finding in verdict.findings]
+        with self._lock:
+            changes = self._board.update(findings)
+            self._figures = {k: v for verdict in verdicts for k, v in verdict.figures.items()}
+            self._figures["unjudged_samples"] = float(self.num_unjudged)
+        for code, level in changes:
+            self._log.add(now_ns, STATION, code, level)
+
+    def _notice_silence(self, now_ns: int) -> None:
+        for watched in self._streams:
+            name, stale = watched.descriptor.name, watched.stale
+            code = stale_code(watched.supervisor, watched.descriptor, now_ns)
+            never = watched.supervisor.counters.streams[name].last_t_host_ns is None
+            if code == stale or (never and now_ns < self._started_ns + START_NS):
+                continue
+            if stale is not None:
+                self._log.add(now_ns, name, stale, "OK")
+            if code is not None:
+                self._log.add(now_ns, name, code, "STALE")
+            watched.stale = code
+
+    def _stream_health(self, watched: _Watched, now_ns: int) -> StreamHealth:
+        return stream_health(
+            watched.supervisor,
+            watched.descriptor,
+            now_ns,
+            findings=watched.board.active(),
+            figures=watched.figures,
         )
-        if len(state.snapshots) < 2:
-            return
-        first, last = state.snapshots[0], state.snapshots[-1]
-        elapsed_s = max(1, last.t_host_ns - first.t_host_ns) / 1e9
-        state.rate_hz = (last.num_samples - first.num_samples) / elapsed_s
-        findings = judge_window(first, last, rate_hz=state.rate_hz, descriptor=descriptor)
+
+
+class _SameAs:
+    """The newest verdict of another stream's judge, for streams that share their stamps."""
+
+    def __init__(self, first: "_Remembering") -> None:
+        self._first = first
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        del block, now_ns
+        return self._first.verdict
+
+
+class _Remembering:
+    def __init__(self, judge: Judge) -> None:
+        self._judge = judge
+        self.verdict = Verdict()
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        self.verdict = self._judge.judge(block, now_ns)
+        return self.verdict
+
+
+def watch(supervisor: DeviceSupervisor, live: LiveView) -> list[_Watched]:
+    """The streams of one device, each with the judges that its kind needs and no others."""
+    watched = []
+    clock: _Remembering | None = None
+    driver = supervisor.driver
+    for descriptor in driver.descriptors:
+        judges: list[Judge] = [LinkJudge(supervisor, descriptor)]
+        if descriptor.capabilities.device_time and clock is None:
+            clock = _Remembering(ClockJudge(descriptor))
+            judges.append(clock)
+        elif descriptor.capabilities.device_time and clock is not None:
+            judges.append(_SameAs(clock))
+        glove = live.glove(descriptor.name)
+        if descriptor.kind == "tactile" and glove is not None:
+            judges.append(TaxelJudge(descriptor, glove))
         if descriptor.kind == "tactile":
-            findings += self._judge_taxels(descriptor.name, state)
-        worst: Judgement = "OK"
-        for judgement, _ in findings:
-            worst = max(worst, judgement, key=SEVERITY.index)
-        state.hysteresis.update(worst)
-        state.reasons = tuple(reason for _, reason in findings)
-
-    def _judge_taxels(self, stream: str, state: _StreamState) -> list[tuple[Judgement, str]]:
-        counts = self._live.take_counts(stream)
-        if len(counts):
-            pinned = np.all(counts == 0, axis=0) | np.all(counts == FULL_SCALE_COUNTS, axis=0)
-            state.pinned.append(pinned)
-        if len(state.pinned) < TAXEL_WINDOW_EVALUATIONS:
-            return []
-        num_dead = int(np.logical_and.reduce(list(state.pinned)).sum())
-        if num_dead < DEAD_LIMITS[0]:
-            return []
-        return [_finding(float(num_dead), DEAD_LIMITS, f"{num_dead} taxels dead or saturated")]
-
-    def _stream_health(
-        self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor, now_ns: int
-    ) -> StreamHealth:
-        state = self._states[descriptor.name]
-        counters = supervisor.counters.streams[descriptor.name]
-        level: Level = state.hysteresis.level
-        reasons = state.reasons if level != "OK" else ()
-        age_ns = None
-        if counters.last_t_host_ns is not None:
-            age_ns = max(0, now_ns - counters.last_t_host_ns)
-        stale_ns = STALE_AFTER_NS.get(descriptor.kind, STALE_AFTER_OTHERS_NS)
-        if age_ns is None or age_ns > stale_ns:
-            level = "STALE"
-            reasons = (supervisor.counters.last_error or "no data", *reasons)
-        elif age_ns > LATE_PERIODS * descriptor.period_ns() and level == "OK":
-            level, reasons = "WARN", ("late",)
-        statistics = supervisor.driver.statistics
-        return StreamHealth(
-            stream=descriptor.name,
-            device=supervisor.driver.name,
-            level=level,
-            reasons=reasons,
-            rate_hz=state.rate_hz,
-            nominal_rate_hz=descriptor.nominal_rate_hz,
-            age_s=None if age_ns is None else age_ns / 1e9,
-            received=statistics.packets,
-            lost=statistics.lost,
-        )
-
-
-def judge_window(
-    first: _Snapshot, last: _Snapshot, *, rate_hz: float, descriptor: StreamDescriptor
-) -> list[tuple[Judgement, str]]:
-    """What two snapshots of a stream say about the time between them."""
-    findings: list[tuple[Judgement, str]] = []
-    off = abs(rate_hz / descriptor.nominal_rate_hz - 1.0)
-    if off > RATE_LIMITS[0]:
-        text = f"{rate_hz:.1f} Hz, expected {descriptor.nominal_rate_hz:g} Hz"
-        findings.append(_finding(off, RATE_LIMITS, text))
-    lost, packets = last.lost - first.lost, last.packets - first.packets
-    ratio = lost / max(1, lost + packets)
-    if ratio > DROP_LIMITS[0]:
-        findings.append(_finding(ratio, DROP_LIMITS, f"{ratio:.1%} of packets lost"))
-    damaged = last.damaged - first.damaged
-    ratio = damaged / max(1, damaged + packets)
-    if ratio > DROP_LIMITS[0]:
-        findings.append(_finding(ratio, DROP_LIMITS, f"{damaged} packets damaged"))
-    if last.reconnects > first.reconnects:
-        findings.append(("WARN", f"{last.reconnects - first.reconnects} reconnects"))
-    return findings
-
-
-def device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
-    """A device's counters."""
-    statistics, counters = supervisor.driver.statistics, supervisor.counters
-    return DeviceHealth(
-        device=supervisor.driver.name,
-        connected=counters.is_connected,
-        address=str(supervisor.driver.info),
-        packets=statistics.packets,
-        lost=statistics.lost,
-        crc_errors=statistics.crc_errors,
-        length_errors=statistics.length_errors,
-        resync_bytes=statistics.resync_bytes,
-        refused=statistics.refused,
-        reconnects=counters.reconnects,
-        last_error=counters.last_error,
-    )
-
-
-def _finding(value: float, limits: tuple[float, float], text: str) -> tuple[Judgement, str]:
-    return ("ERROR" if value >= limits[1] else "WARN"), text
+            judges.append(FiniteJudge("nan", "taxels are no numbers"))
+        elif descriptor.kind == "keypoints":
+            judges.append(FiniteJudge("tracking", "nodes are not seen"))
+        elif descriptor.kind == "pose":
+            judges.append(PoseJudge(descriptor))
+        elif descriptor.kind == "image":
+            judges.append(CameraJudge(driver))
+        if isinstance(driver.decoder, TellsTracking):
+            judges.append(TrackingJudge(driver))
+        watched.append(_Watched(supervisor, descriptor, judges))
+    return watched

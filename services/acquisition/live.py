@@ -1,21 +1,23 @@
-"""Readings come in; the newest pressures and images go out, for viewers."""
+"""Readings come in; the newest pressures and images go out for viewers, blocks for the health."""
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Float32, UInt16
+from jaxtyping import Float32
 
 from dextouch.errors import NotFoundError, StaleDataError
 from dextouch.schemas.episodes import Matrix
+from dextouch.streams.checks import H264_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side, select_taxels
 from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.image_encoding import GroupPreview
+from services.acquisition.health_blocks import SampleBlocks
+from services.acquisition.health_taxels import GloveRecord
 from services.acquisition.schemas import CameraLive
 
-BLOCK_SAMPLES = 120
 MAX_AGE_NS = 500_000_000
 
 
@@ -27,38 +29,52 @@ class LiveView:
             d.name: d for driver in drivers for d in driver.descriptors
         }
         self._newest: dict[str, Sample] = {}
-        self._counts: dict[str, deque[np.ndarray]] = {
-            name: deque(maxlen=BLOCK_SAMPLES)
+        self._num_images: dict[str, int] = {}
+        self._previews = {
+            name: GroupPreview((d.shape[0], d.shape[1]))
             for name, d in self._descriptors.items()
-            if d.kind == "tactile"
+            if d.unit == H264_UNIT
         }
+        self.blocks = SampleBlocks(self._descriptors)
+        self.calibration = dict(calibration)
         self._gloves = {
             name: (
                 calibration_row(calibration, f"{name}_tare_counts"),
                 calibration_row(calibration, f"{name}_gain_counts_per_kpa"),
             )
-            for name in self._counts
+            for name, d in self._descriptors.items()
+            if d.kind == "tactile" and d.shape == (NUM_RAW_TAXELS,)
         }
 
     def accept(self, device: str, readings: Readings) -> None:
         """Remember (called by the reader threads)."""
         del device
         for name, samples in readings.items():
+            if name in self._previews:
+                for sample in samples:
+                    self._previews[name].add(bytes(sample.values.item()))
             self._newest[name] = samples[-1]
-            if name in self._counts:
-                self._counts[name].extend(sample.values for sample in samples)
+            self._num_images[name] = self._num_images.get(name, 0) + len(samples)
+            self.blocks.add(name, samples)
 
-    def take_counts(self, stream: str) -> UInt16[np.ndarray, "n 360"]:
-        """Counts that came since the last call (the newest 2 s of them)."""
-        queue = self._counts[stream]
-        block = [queue.popleft() for _ in range(len(queue))]
-        if not block:
-            return np.empty((0, NUM_RAW_TAXELS), dtype=np.uint16)
-        return np.stack(block).astype(np.uint16)
+    def glove(self, stream: str) -> GloveRecord | None:
+        """Tare and gain of a glove's 320 taxels; None for other streams."""
+        if stream not in self._gloves:
+            return None
+        side = _side(self._descriptors[stream])
+        tare_counts, gain_counts_per_kpa = self._gloves[stream]
+        sigma = np.array(self.calibration.get(f"{stream}_tare_sigma_counts", ()))
+        sigma_counts = sigma.ravel() if sigma.size else np.zeros(NUM_RAW_TAXELS)
+        return GloveRecord(
+            side,
+            select_taxels(tare_counts, side=side),
+            select_taxels(gain_counts_per_kpa, side=side),
+            select_taxels(sigma_counts.astype(np.float64), side=side),
+        )
 
     def tactile_streams(self) -> list[str]:
         """Names of the glove streams."""
-        return sorted(self._counts)
+        return sorted(self._gloves)
 
     def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, "320"]]:
         """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones."""
@@ -81,7 +97,7 @@ class LiveView:
                 found.append(
                     CameraLive(
                         name=name,
-                        image_index=sample.sequence,
+                        image_index=self._num_images[name],
                         age_s=(now_ns - sample.t_host_ns) / 1e9,
                         height_px=descriptor.shape[0],
                         width_px=descriptor.shape[1],
@@ -93,7 +109,7 @@ class LiveView:
         """Newest image of a camera as JPEG.
 
         Raises:
-            NotFoundError: no such camera, or no image yet.
+            NotFoundError: no such camera, or no image yet (of H.264: no key frame yet).
             StaleDataError: the newest image is older than 0.5 s.
         """
         from dextouch.images.jpeg import encode_jpeg
@@ -107,6 +123,8 @@ class LiveView:
             raise StaleDataError(f"camera {camera!r}: the newest image is {age_s:.1f} s old")
         if descriptor.unit == "jpeg":
             return bytes(sample.values.item())
+        if camera in self._previews:
+            return encode_jpeg(self._previews[camera].image())
         return encode_jpeg(sample.values)
 
 

@@ -3,29 +3,21 @@
 import shutil
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import fields
 from datetime import UTC, datetime
 from pathlib import Path
 from secrets import token_hex
 
 import structlog
 
+from dextouch.episodes.files import disk_errors
 from dextouch.episodes.log import SpoolWriter
-from dextouch.errors import ConflictError, StorageError
+from dextouch.errors import ConflictError
 from dextouch.schemas.episodes import Matrix
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
 from services.acquisition.clock import StationClock
-from services.acquisition.completeness import (
-    StreamFacts,
-    TakeSpan,
-    check_take,
-    take_ledger,
-)
-from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.drivers.image_encoding import begin_take
 from services.acquisition.schemas import (
     Action,
     RecorderStatus,
@@ -34,14 +26,16 @@ from services.acquisition.schemas import (
     TakeCheck,
     TakePrompt,
 )
+from services.acquisition.supervisor import check_free_space
+from services.acquisition.take import Take, TakeOptions
 
 logger = structlog.get_logger(__name__)
 
 ACTIONS: Mapping[State, tuple[Action, ...]] = {
     "idle": ("arm",),
     "armed": ("arm", "record", "discard"),
-    "recording": ("stop", "discard"),
-    "checking": ("save", "discard"),
+    "recording": ("stop", "discard", "rerecord"),
+    "checking": ("save", "discard", "rerecord"),
     "saved": ("arm",),
     "discarded": ("arm",),
 }
@@ -51,7 +45,8 @@ class Recorder:
     """idle → armed → recording → checking → saved or discarded, one take at a time.
 
     Everything goes to the spool first. A full disk ends the take; what is there stays and can be
-    saved or discarded.
+    saved or discarded. An action that names its recording may be repeated: what was done is not
+    done again, and an action meant for another take is refused.
 
     Args:
         station: name of the station.
@@ -59,6 +54,7 @@ class Recorder:
         drivers: whose streams are recorded.
         clock: of the station.
         calibration: matrices that travel with every recording.
+        options: how takes are kept.
     """
 
     def __init__(
@@ -69,42 +65,38 @@ class Recorder:
         drivers: Sequence[Driver],
         clock: StationClock,
         calibration: Mapping[str, Matrix],
+        options: TakeOptions | None = None,
     ) -> None:
         self.spool_root = spool_root
         self._station = station
         self._drivers = {driver.name: driver for driver in drivers}
         self._clock = clock
         self._calibration = dict(calibration)
+        self._options = options or TakeOptions()
+        # Held for a whole action, disk included; readers never take it.
         self._lock = threading.RLock()
         self._state: State = "idle"
+        self._discarded_id: str | None = None
         self._forget()
 
     def _forget(self) -> None:
         self._prompt: TakePrompt | None = None
-        self._spool: SpoolWriter | None = None
-        self._span: TakeSpan | None = None
-        self._started_ns = 0
-        self._streams: dict[str, StreamCounters] = {}
-        self._before: dict[str, DecoderStatistics] = {}
-        self._facts: list[StreamFacts] = []
+        self._take: Take | None = None
         self._check: TakeCheck | None = None
-        self._failure: str | None = None
+        self._done: dict[Action, SaveTake | None] = {}
 
     def status(self) -> RecorderStatus:
         """Where it stands."""
         with self._lock:
-            duration_s = None
-            if self._state == "recording":
-                duration_s = (self._clock.now_ns() - self._started_ns) / 1e9
-            elif self._span is not None:
-                duration_s = self._span.duration_s
+            self._settle()
+            take = self._take
             return RecorderStatus(
                 state=self._state,
                 actions=ACTIONS[self._state],
-                recording_id=self._spool.attributes.recording_id if self._spool else None,
+                recording_id=self._recording_id(),
                 prompt=self._prompt,
-                duration_s=duration_s,
-                num_samples={name: c.num_samples for name, c in self._streams.items()},
+                duration_s=take.duration_s if take else None,
+                num_samples={n: c.num_samples for n, c in take.streams.items()} if take else {},
                 problems=self._problems(),
                 check=self._check,
             )
@@ -112,17 +104,9 @@ class Recorder:
     def accept(self, device: str, readings: Readings) -> None:
         """Spool new readings while recording (called by the reader threads)."""
         del device
-        with self._lock:
-            if self._state != "recording" or self._spool is None:
-                return
-            try:
-                for name, samples in readings.items():
-                    self._spool.append(name, SampleBatch.from_samples(samples))
-                    self._streams[name].add(samples)
-            except StorageError as error:
-                self._failure = error.message
-                logger.error("stop_take_by_disk", error=error.message)  # noqa: TRY400 - one line
-                self._finish()
+        take = self._take
+        if take is not None:
+            take.accept(readings)
 
     def arm(self, prompt: TakePrompt) -> RecorderStatus:
         """Announce what is going to be recorded."""
@@ -137,23 +121,32 @@ class Recorder:
         """Start the take.
 
         Raises:
-            ConflictError: not armed.
-            StorageError: the spool cannot be created.
+            ConflictError: not armed, or the id is that of another take.
+            StorageError: the spool cannot be created, or the disk is nearly full.
         """
         with self._lock:
+            if self._is_done("record", recording_id):
+                return self.status()
             self._expect("record")
             attributes = self._attributes(recording_id)
-            self._spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
-            self._started_ns = attributes.started_t_host_ns or 0
-            self._streams = {d.name: StreamCounters() for d in attributes.streams}
-            self._before = {name: _copy(d.statistics) for name, d in self._drivers.items()}
+            with disk_errors(f"make the spool folder {self.spool_root}"):
+                self.spool_root.mkdir(parents=True, exist_ok=True)
+            check_free_space(self.spool_root, self._options.safety)
+            spool = SpoolWriter(self.spool_root / attributes.recording_id, attributes)
+            self._take = Take(
+                spool, drivers=self._drivers, clock=self._clock, options=self._options
+            )
             self._state = "recording"
+            self._done["record"] = None
             logger.info("start_take", recording_id=attributes.recording_id)
             return self.status()
 
-    def stop(self) -> RecorderStatus:
+    def stop(self, recording_id: str | None = None) -> RecorderStatus:
         """End the take and check it."""
         with self._lock:
+            self._settle()
+            if self._is_done("stop", recording_id):
+                return self.status()
             self._expect("stop")
             self._finish()
             return self.status()
@@ -162,57 +155,91 @@ class Recorder:
         """Keep the take: its spool is closed and waits for the upload.
 
         Raises:
-            ConflictError: nothing to save, or an incomplete take without `accept_incomplete`.
+            ConflictError: nothing to save, an incomplete take without `accept_incomplete`, or
+                saved already in another way.
         """
         with self._lock:
+            self._settle()
+            if self._is_done("save", how.recording_id):
+                before = self._done["save"]
+                if before is not None and before.success != how.success:
+                    raise ConflictError(
+                        f"take {how.recording_id!r} was saved with success={before.success}, got "
+                        f"{how.success}; what is saved is not changed"
+                    )
+                return self.status()
             self._expect("save")
-            spool, check = self._taken()
+            take, check = self._take, self._check
+            if take is None or check is None:
+                raise ConflictError("recorder: there is no take; record one first")
             if not check.complete and not how.accept_incomplete:
                 reasons = "; ".join(p.message for p in check.problems if p.level == "ERROR")
                 raise ConflictError(f"the take is incomplete: {reasons}. Accept or discard it")
-            changed = {"success": how.success, "ledger": take_ledger(self._facts)}
+            changed = {
+                "success": how.success,
+                "ledger": take.ledger(),
+                "quality": take.quality(),
+            }
+            spool = take.spool
             spool.set_attributes(spool.attributes.model_copy(update=changed))
             spool.close()
             self._state = "saved"
+            self._done["save"] = how
             logger.info("save_take", recording_id=spool.attributes.recording_id)
             return self.status()
 
-    def discard(self) -> RecorderStatus:
+    def discard(self, recording_id: str | None = None) -> RecorderStatus:
         """Throw the take away, spool included."""
         with self._lock:
+            if self._is_done("discard", recording_id):
+                return self.status()
             self._expect("discard")
-            if self._spool is not None:
-                self._spool.abandon()
-                shutil.rmtree(self._spool.path)
-                logger.info("discard_take", recording_id=self._spool.attributes.recording_id)
+            self._throw_away()
             self._state = "discarded"
+            self._done["discard"] = None
+            return self.status()
+
+    def rerecord(self, recording_id: str | None = None) -> RecorderStatus:
+        """Throw the take away and arm its prompt again."""
+        with self._lock:
+            again = recording_id is not None and recording_id == self._discarded_id
+            if again and self._state == "armed":
+                return self.status()
+            self._is_done("rerecord", recording_id)
+            self._expect("rerecord")
+            prompt = self._prompt
+            self._throw_away()
+            self._forget()
+            self._prompt = prompt
+            self._state = "armed"
             return self.status()
 
     def close(self) -> None:
         """Give the files back; an unsaved take stays in the spool for the next start."""
         with self._lock:
-            if self._spool is not None:
-                self._spool.abandon()
+            if self._take is not None:
+                self._take.release()
+
+    def _throw_away(self) -> None:
+        take = self._take
+        if take is None:
+            return
+        self._discarded_id = take.spool.attributes.recording_id
+        take.release()
+        with disk_errors(f"discard take {self._discarded_id!r}"):
+            shutil.rmtree(take.spool.path)
+        logger.info("discard_take", recording_id=self._discarded_id)
+
+    def _settle(self) -> None:
+        """A take that the disk ended is checked as soon as somebody looks."""
+        if self._state == "recording" and self._take is not None and self._take.has_ended:
+            self._finish()
 
     def _finish(self) -> None:
-        self._span = TakeSpan(self._started_ns, self._clock.now_ns())
-        spool = self._spool
-        if spool is not None and self._failure is None:
-            try:
-                spool.flush()
-            except StorageError as error:
-                self._failure = error.message
-        self._facts = [
-            StreamFacts(
-                descriptor,
-                self._streams[descriptor.name],
-                _difference(driver.statistics, self._before[name]),
-            )
-            for name, driver in self._drivers.items()
-            for descriptor in driver.descriptors
-        ]
-        self._check = check_take(self._facts, self._span)
+        if self._take is not None:
+            self._check = self._take.end()
         self._state = "checking"
+        self._done["stop"] = None
 
     def _attributes(self, recording_id: str | None) -> RecordingAttributes:
         prompt = self._prompt
@@ -227,10 +254,26 @@ class Recorder:
             station=self._station,
             started_at=now,
             started_t_host_ns=self._clock.now_ns(),
-            calibration=self._calibration,
+            calibration=self._calibration | begin_take(self._drivers.values()),
             streams=tuple(streams),
             **prompt.model_dump(),
         )
+
+    def _recording_id(self) -> str | None:
+        return self._take.spool.attributes.recording_id if self._take else None
+
+    def _is_done(self, action: Action, recording_id: str | None) -> bool:
+        """Whether the action was done to the named take; an unnamed one is never a repetition."""
+        present = self._recording_id()
+        if recording_id is None or (action == "record" and present is None):
+            return False
+        if recording_id != present:
+            raise ConflictError(
+                f"recorder: cannot {action} take {recording_id!r}, the present one is {present!r}",
+                state=self._state,
+                recording_id=present,
+            )
+        return action in self._done
 
     def _expect(self, action: Action) -> None:
         if action not in ACTIONS[self._state]:
@@ -241,21 +284,6 @@ class Recorder:
             )
 
     def _problems(self) -> tuple[str, ...]:
-        failure = (self._failure,) if self._failure else ()
+        own = self._take.problems() if self._take else ()
         found = self._check.problems if self._check else ()
-        return (*failure, *(problem.message for problem in found))
-
-    def _taken(self) -> tuple[SpoolWriter, TakeCheck]:
-        if self._spool is None or self._check is None:
-            raise ConflictError("recorder: there is no take; record one first")
-        return self._spool, self._check
-
-
-def _copy(statistics: DecoderStatistics) -> DecoderStatistics:
-    return _difference(statistics, DecoderStatistics())
-
-
-def _difference(later: DecoderStatistics, earlier: DecoderStatistics) -> DecoderStatistics:
-    return DecoderStatistics(
-        **{f.name: getattr(later, f.name) - getattr(earlier, f.name) for f in fields(later)}
-    )
+        return (*own, *(problem.message for problem in found))

@@ -1,17 +1,22 @@
 """The station over HTTP: recorder actions come in; state, health and live views go out."""
 
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Depends, Response
+from fastapi import APIRouter, Body, Depends, FastAPI, Response
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.serving.access import RequireScope
 from dextouch.streams.packing import pack
+from services.acquisition.health_metrics import HealthCollector
 from services.acquisition.schemas import (
     CameraList,
+    HealthEvents,
     RecorderStatus,
     SaveTake,
     StationHealth,
+    TakeName,
     TakePrompt,
     UploadStatus,
 )
@@ -19,6 +24,7 @@ from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 
 SCOPE = "station"
+Named = Annotated[TakeName | None, Body()]
 
 
 def recorder_router(station: Station) -> APIRouter:
@@ -39,14 +45,14 @@ def recorder_router(station: Station) -> APIRouter:
         return await run_in_threadpool(recorder.arm, prompt)
 
     @router.post("/record")
-    async def record() -> RecorderStatus:
+    async def record(take: Named = None) -> RecorderStatus:
         """Start the take."""
-        return await run_in_threadpool(recorder.record)
+        return await run_in_threadpool(recorder.record, take.recording_id if take else None)
 
     @router.post("/stop")
-    async def stop() -> RecorderStatus:
+    async def stop(take: Named = None) -> RecorderStatus:
         """End the take and check it."""
-        return await run_in_threadpool(recorder.stop)
+        return await run_in_threadpool(recorder.stop, take.recording_id if take else None)
 
     @router.post("/save")
     async def save(how: Annotated[SaveTake | None, Body()] = None) -> RecorderStatus:
@@ -54,21 +60,37 @@ def recorder_router(station: Station) -> APIRouter:
         return await run_in_threadpool(recorder.save, how or SaveTake())
 
     @router.post("/discard")
-    async def discard() -> RecorderStatus:
+    async def discard(take: Named = None) -> RecorderStatus:
         """Throw the take away."""
-        return await run_in_threadpool(recorder.discard)
+        return await run_in_threadpool(recorder.discard, take.recording_id if take else None)
+
+    @router.post("/rerecord")
+    async def rerecord(take: Named = None) -> RecorderStatus:
+        """Throw the take away and arm the same prompt again."""
+        return await run_in_threadpool(recorder.rerecord, take.recording_id if take else None)
 
     return router
 
 
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
     """Health, live views and uploads."""
-    router = APIRouter(prefix="/v1", tags=["station"], dependencies=[Depends(RequireScope(SCOPE))])
+    station.health.watch_disk(station.recorder.spool_root)
+    router = APIRouter(
+        prefix="/v1",
+        tags=["station"],
+        dependencies=[Depends(RequireScope(SCOPE))],
+        lifespan=_health_metrics(station),
+    )
 
     @router.get("/health")
     async def health() -> StationHealth:
         """Every stream and device."""
-        return station.health.report()
+        return await run_in_threadpool(station.health.report)
+
+    @router.get("/health/events")
+    async def events(since_ns: int = 0) -> HealthEvents:
+        """When something was raised and when it ended, on the station's clock."""
+        return station.health.events(since_ns)
 
     @router.get("/live/taxels")
     async def taxels() -> Response:
@@ -93,3 +115,20 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         return await run_in_threadpool(uploader.status)
 
     return router
+
+
+def _health_metrics(
+    station: Station,
+) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
+    """Show the station's health at /metrics for as long as the application runs."""
+
+    @asynccontextmanager
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        collector = HealthCollector(station.health.report, station.health.raised)
+        app.state.registry.register(collector)
+        try:
+            yield
+        finally:
+            app.state.registry.unregister(collector)
+
+    return lifespan

@@ -2,13 +2,13 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from dextouch.schemas.episodes import Domain
+from dextouch.schemas.episodes import Domain, StoreId
 
 Level = Literal["OK", "WARN", "ERROR", "STALE"]
 State = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
-Action = Literal["arm", "record", "stop", "save", "discard"]
+Action = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
 
 
 class TakePrompt(BaseModel):
@@ -23,10 +23,20 @@ class TakePrompt(BaseModel):
     consent: bool = False
 
 
-class SaveTake(BaseModel):
-    """How a take ended; an incomplete one is only saved when `accept_incomplete` says so."""
+class TakeName(BaseModel):
+    """Which take an action is meant for; without an id, the present one.
+
+    A request that names its take may be sent again: what was done is not done twice. `record` gives
+    its take this id.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recording_id: StoreId | None = None
+
+
+class SaveTake(TakeName):
+    """How a take ended; an incomplete one is only saved when `accept_incomplete` says so."""
 
     success: bool | None = None
     accept_incomplete: bool = False
@@ -82,20 +92,41 @@ class RecorderStatus(BaseModel):
     check: TakeCheck | None = None
 
 
+class HealthFinding(BaseModel):
+    """Something wrong with a stream or the station, by a code that never changes its meaning."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    code: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
+    level: Literal["WARN", "ERROR"]
+    message: str
+
+
 class StreamHealth(BaseModel):
-    """One stream at this moment; `lost` and `received` count its device's packets since start."""
+    """One stream at this moment; `lost` and `received` count its device's packets since start.
+
+    `stale` says why nothing is known ("unplugged", "silent"); `figures` are the numbers behind
+    the findings by their Prometheus names, none while the stream is stale.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
     device: str
+    hand: Literal["left", "right"] | None = None
     level: Level
+    stale: str | None = None
     reasons: tuple[str, ...]
+    findings: tuple[HealthFinding, ...] = ()
+    figures: dict[str, FiniteFloat] = {}
     rate_hz: float | None
     nominal_rate_hz: float
     age_s: float | None
+    num_samples: int = 0
     received: int
     lost: int
+    skew_ppm: float | None = None
+    clock_residual_ms: float | None = None
 
 
 class DeviceHealth(BaseModel):
@@ -104,6 +135,7 @@ class DeviceHealth(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     device: str
+    hand: Literal["left", "right"] | None = None
     connected: bool
     address: str
     packets: int
@@ -112,19 +144,48 @@ class DeviceHealth(BaseModel):
     length_errors: int
     resync_bytes: int
     refused: int
+    repeated: int = 0
+    restarts: int = 0
+    queue_dropped: int = 0
     reconnects: int
+    failures: int = 0
     last_error: str | None
 
 
 class StationHealth(BaseModel):
-    """All streams and devices; `level` is the worst of the streams."""
+    """All streams and devices; `level` is the worst of the streams and of `findings`.
+
+    `findings` and `figures` are those of the station itself: disk and calibration.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     station: str
     level: Level
+    findings: tuple[HealthFinding, ...] = ()
+    figures: dict[str, FiniteFloat] = {}
     streams: tuple[StreamHealth, ...]
     devices: tuple[DeviceHealth, ...]
+
+
+class HealthEvent(BaseModel):
+    """A code of a stream (or of the `station`) reached a level; OK is its end."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    t_host_ns: int
+    stream: str
+    code: str
+    level: Level
+
+
+class HealthEvents(BaseModel):
+    """Changes of levels, oldest first, and the station's clock now."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    now_ns: int
+    events: tuple[HealthEvent, ...]
 
 
 class CameraLive(BaseModel):

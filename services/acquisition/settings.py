@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SecretStr
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, model_validator
 
 from dextouch.serving.settings import ServiceSettings, service_config
 from dextouch.tactile.layout import Side
@@ -17,33 +17,79 @@ class _DeviceSettings(BaseModel):
 
 
 class TactileGloveSettings(_DeviceSettings):
-    """A glove on a serial port, found by its serial number or, failing that, by a port name."""
+    """A glove on a serial port.
+
+    It is found by its serial number, or by a port name; with both, the port is opened and the
+    glove there must say that it has the number (protocol `dextouch`). Gloves of the protocol
+    `justfloat` tell nothing of themselves: their numbers a packet, full scale and rate are needed.
+    """
 
     kind: Literal["tactile_glove"] = "tactile_glove"
+    protocol: Literal["dextouch", "wuji", "justfloat"] = "dextouch"
     side: Side
     serial_number: str | None = None
     port: str | None = None
     baud_rate: int = Field(default=2_000_000, gt=0)
+    num_values: int | None = Field(default=None, ge=1, le=4096)
+    full_scale: float | None = Field(default=None, gt=0, le=1e30)
+    rate_hz: float | None = Field(default=None, gt=0, le=10_000)
+
+    @model_validator(mode="after")
+    def _form_where_needed(self) -> "TactileGloveSettings":
+        form = (self.num_values, self.full_scale, self.rate_hz)
+        if self.protocol == "justfloat" and None in form:
+            raise ValueError(
+                f"glove {self.side}: protocol 'justfloat' needs num_values, full_scale and rate_hz"
+            )
+        if self.protocol != "justfloat" and form != (None, None, None):
+            raise ValueError(
+                f"glove {self.side}: num_values, full_scale and rate_hz are set by protocol "
+                f"{self.protocol!r}; leave them out"
+            )
+        return self
 
 
-class FingerTrackerSettings(_DeviceSettings):
-    """A finger tracker by its HID ids."""
+class _TrackerSettings(_DeviceSettings):
+    """How a tracker is reached.
+
+    By `hid` or `usb` it is found by its ids and, where several are alike, its serial number; by
+    `bridge` it is asked for at the socket of its SDK's process: `path` of a local socket, or `host`
+    and `port`.
+    """
+
+    link: Literal["hid", "usb", "bridge"] = "hid"
+    vendor_id: int | None = Field(default=None, ge=0, le=0xFFFF)
+    product_id: int | None = Field(default=None, ge=0, le=0xFFFF)
+    serial_number: str | None = None
+    host: str = "127.0.0.1"
+    port: int | None = Field(default=None, gt=0, le=65535)
+    path: str | None = None
+
+    @model_validator(mode="after")
+    def _address_of_its_link(self) -> "_TrackerSettings":
+        num_ids = sum(number is not None for number in (self.vendor_id, self.product_id))
+        num_ends = sum(end is not None for end in (self.port, self.path))
+        if (num_ids, num_ends) != ((0, 1) if self.link == "bridge" else (2, 0)):
+            raise ValueError(
+                f"link {self.link!r}: got vendor_id {self.vendor_id}, product_id "
+                f"{self.product_id}, port {self.port}, path {self.path}; expected both ids (hid, "
+                "usb), or else a port or a path (bridge)"
+            )
+        return self
+
+
+class FingerTrackerSettings(_TrackerSettings):
+    """A finger tracker of one hand."""
 
     kind: Literal["finger_tracker"] = "finger_tracker"
     side: Side
-    vendor_id: int
-    product_id: int
-    serial_number: str | None = None
 
 
-class PoseTrackerSettings(_DeviceSettings):
-    """A pose tracker by its HID ids."""
+class PoseTrackerSettings(_TrackerSettings):
+    """A pose tracker on a wrist or on the head."""
 
     kind: Literal["pose_tracker"] = "pose_tracker"
     stream: POSE_STREAMS
-    vendor_id: int
-    product_id: int
-    serial_number: str | None = None
 
 
 class CameraSettings(_DeviceSettings):
@@ -55,7 +101,39 @@ class CameraSettings(_DeviceSettings):
     port: int = Field(gt=0, le=65535)
     height_px: int = Field(default=480, gt=0)
     width_px: int = Field(default=640, gt=0)
-    encoding: Literal["rgb8", "jpeg"] = "jpeg"
+    encoding: Literal["rgb8", "jpeg", "h264"] = "jpeg"
+
+
+class StationCameraSettings(_DeviceSettings):
+    """A camera on this host by V4L2, found by its serial number or, failing that, by a device.
+
+    `exposure_ms` absent leaves the exposure to the camera. `stamp_point` is the end of the
+    exposure at which its driver stamps. `latency_ms` is calibrated: from the middle of the
+    exposure to the earliest arrival; it comes with its sigma or not at all.
+    """
+
+    kind: Literal["station_camera"] = "station_camera"
+    stream: CAMERAS
+    serial_number: str | None = None
+    device: str | None = None
+    fourcc: str = Field(default="MJPG", min_length=4, max_length=4)
+    height_px: int = Field(default=480, gt=0)
+    width_px: int = Field(default=640, gt=0)
+    rate_hz: float = Field(default=30.0, gt=0, le=1000)
+    exposure_ms: float | None = Field(default=None, gt=0, le=1000)
+    stamp_point: Literal["start", "end"] = "start"
+    latency_ms: float | None = Field(default=None, ge=0, le=1000)
+    latency_sigma_ms: float | None = Field(default=None, gt=0, le=1000)
+    encoding: Literal["rgb8", "jpeg", "h264"] = "jpeg"
+
+    @model_validator(mode="after")
+    def _latency_with_sigma(self) -> "StationCameraSettings":
+        if (self.latency_ms is None) != (self.latency_sigma_ms is None):
+            raise ValueError(
+                f"camera {self.stream}: got latency {self.latency_ms} ms with sigma "
+                f"{self.latency_sigma_ms} ms, expected both or neither"
+            )
+        return self
 
 
 class RobotStateSettings(_DeviceSettings):
@@ -71,6 +149,7 @@ DeviceSettings = Annotated[
     | FingerTrackerSettings
     | PoseTrackerSettings
     | CameraSettings
+    | StationCameraSettings
     | RobotStateSettings,
     Field(discriminator="kind"),
 ]

@@ -11,7 +11,8 @@ from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.health import HealthMonitor
 from services.acquisition.live import LiveView
 from services.acquisition.recorder import Recorder
-from services.acquisition.supervisor import DeviceSupervisor
+from services.acquisition.supervisor import DeviceSupervisor, SpoolSafety
+from services.acquisition.take import DeviceEvents, TakeOptions
 
 CONNECT_TIMEOUT_S = 10.0
 
@@ -25,6 +26,7 @@ class Station:
         spool_root: folder of the takes.
         clock: stamps and waits.
         calibration: matrices that travel with every recording.
+        safety: how often the spool reaches the disk, and how much space is kept.
     """
 
     def __init__(
@@ -35,6 +37,7 @@ class Station:
         spool_root: Path,
         clock: StationClock,
         calibration: Mapping[str, Matrix],
+        safety: SpoolSafety | None = None,
     ) -> None:
         self.name = name
         self.clock = clock
@@ -44,6 +47,7 @@ class Station:
             drivers=drivers,
             clock=clock,
             calibration=calibration,
+            options=TakeOptions(safety or SpoolSafety(), self._device_events),
         )
         self.live = LiveView(drivers, calibration)
         self.supervisors = [
@@ -76,6 +80,9 @@ class Station:
         for stopper in stoppers:
             stopper.join()
         self.recorder.close()
+
+    def _device_events(self) -> DeviceEvents:
+        return {s.driver.name: s.events() for s in self.supervisors}
 
     def _accept(self, device: str, readings: Readings) -> None:
         self.recorder.accept(device, readings)

@@ -1,20 +1,43 @@
-"""One thread per device: its driver comes in, counted readings go to a sink, whatever happens."""
+"""Threads beside devices and disk: counted readings in order, and a flushed spool, come of them."""
 
+import os
 import threading
-from collections.abc import Callable
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import closing
+from dataclasses import dataclass
+from pathlib import Path
 
 import structlog
 
-from dextouch.errors import DeviceError
+from dextouch.episodes.batch_log import LOG_FILE
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.counters import DeviceCounters
 from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.pose_tracker import TrackingEvents
+from services.acquisition.drivers.reports import OrderFilter
 
 logger = structlog.get_logger(__name__)
 
 RETRY_NS = 200_000_000
+# What a supervisor counts besides the decoder's statistics and the device's counters. An error of
+# a driver says which of them it is in its detail `event`.
+EVENTS = (
+    "lost_device",
+    "wrong_version",
+    "wrong_side",
+    "wrong_serial_number",
+    "driver_failure",
+)
 Sink = Callable[[str, Readings], None]
+# Packets that overtake each other do so within a few; a restarted device jumps further.
+WINDOW_SAMPLES = 64
+MEBIBYTE = 2**20
 
 
 class DeviceSupervisor:
@@ -30,6 +53,8 @@ class DeviceSupervisor:
         self.driver = driver
         self.counters = DeviceCounters.of(driver)
         self.connected = threading.Event()
+        self._events = dict.fromkeys(EVENTS, 0)
+        self._guards = {d.name: SequenceGuard(d) for d in driver.descriptors}
         self._sink = sink
         self._clock = clock
         self._stopping = threading.Event()
@@ -50,16 +75,35 @@ class DeviceSupervisor:
         if self._thread.ident is not None:
             self._thread.join()
 
+    def events(self) -> dict[str, int]:
+        """Counts of what happened to the device since the start, by name."""
+        filters: list[SequenceGuard | OrderFilter] = [
+            *self._guards.values(),
+            *_order_filters(self.driver),
+        ]
+        tracking = getattr(self.driver.decoder, "tracking", None)
+        tracked: dict[str, int] = {}
+        if isinstance(tracking, TrackingEvents):
+            tracked = {str(kind): count for kind, count in tracking.packets.items()}
+        return {
+            **self._events,
+            "repeated": sum(each.repeated for each in filters),
+            "late": sum(each.late for each in filters),
+            **tracked,
+        }
+
     def _run(self) -> None:
         while not self._stopping.is_set():
             try:
                 self._read_until_lost()
             except DeviceError as error:
                 self.counters.last_error = error.message
+                self._count(error)
                 logger.warning("lose_device", device=self.driver.name, error=error.message)
                 self._close_and_wait()
             except Exception as error:
                 self.counters.failures += 1
+                self._events["driver_failure"] += 1
                 self.counters.last_error = f"{type(error).__name__}: {error}"
                 logger.exception("fail_device", device=self.driver.name)
                 self._close_and_wait()
@@ -71,10 +115,22 @@ class DeviceSupervisor:
         self._set_connected(is_connected=True)
         self._release_waiter()
         while not self._stopping.is_set():
-            readings = self.driver.read()
+            readings = self._in_order(self.driver.read())
             if readings:
                 self.counters.add(readings)
                 self._sink(self.driver.name, readings)
+
+    def _in_order(self, readings: Readings) -> Readings:
+        admitted = {name: self._guards[name].admit(samples) for name, samples in readings.items()}
+        return {name: samples for name, samples in admitted.items() if samples}
+
+    def _count(self, error: DeviceError) -> None:
+        event = error.details.get("event")
+        if isinstance(event, str) and event in self._events:
+            self._events[event] += 1
+        elif self.counters.is_connected:
+            # Failing to open a device that is gone is no further loss.
+            self._events["lost_device"] += 1
 
     def _set_connected(self, *, is_connected: bool) -> None:
         self.counters.is_connected = is_connected
@@ -104,3 +160,164 @@ class DeviceSupervisor:
                 waiter, self._waiter = self._waiter, None
                 with closing(waiter):
                     pass
+
+
+def _order_filters(driver: Driver) -> list[OrderFilter]:
+    """Where a tracker's decoder leaves repeated and late packets out by itself."""
+    places = (driver.decoder, getattr(driver.decoder, "poses", None))
+    found = [getattr(place, "order", None) for place in places]
+    return [each for each in found if isinstance(each, OrderFilter)]
+
+
+class SequenceGuard:
+    """Leaves out what a link delivers twice or behind what was sent later.
+
+    A stream promises samples in the order in which they were taken; a packet that comes again, or
+    too late, would be a sample that never was at its place. It is counted and left out, so that
+    its place stays a gap. A device that starts anew (another counter *and* another clock) passes.
+    Streams of devices without a sequence cannot be judged and pass as they are.
+
+    Args:
+        descriptor: of the stream.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        capabilities = descriptor.capabilities
+        self.repeated = 0
+        self.late = 0
+        self._judges = capabilities.sequence and capabilities.device_time
+        self._modulus = 1 << capabilities.sequence_bits
+        # Sequence and device time of the newest samples that passed.
+        self._passed: deque[tuple[int, int]] = deque(maxlen=WINDOW_SAMPLES)
+
+    def admit(self, samples: Sequence[Sample]) -> list[Sample]:
+        """The samples that go on, in order."""
+        if not self._judges:
+            return list(samples)
+        return [sample for sample in samples if self._passes(sample)]
+
+    def _passes(self, sample: Sample) -> bool:
+        if self._passed:
+            last_sequence, last_t_device_ns = self._passed[-1]
+            back = (last_sequence - sample.sequence) % self._modulus
+            if back < WINDOW_SAMPLES and self._is_old(sample, last_t_device_ns):
+                return False
+        self._passed.append((sample.sequence, sample.t_device_ns))
+        return True
+
+    def _is_old(self, sample: Sample, last_t_device_ns: int) -> bool:
+        """Whether a sample with a small step back is one of the same run of the device."""
+        if (sample.sequence, sample.t_device_ns) in self._passed:
+            self.repeated += 1
+            return True
+        first_t_device_ns = self._passed[0][1]
+        if first_t_device_ns < sample.t_device_ns < last_t_device_ns:
+            self.late += 1
+            return True
+        return False
+
+
+@dataclass(frozen=True)
+class SpoolSafety:
+    """How much a power loss may cost, and how much space is kept for closing a take.
+
+    Raises:
+        InvalidInputError: a period that is no positive number of seconds, or negative bytes.
+    """
+
+    flush_period_s: float = 0.5
+    min_free_bytes: int = 64 * MEBIBYTE
+
+    def __post_init__(self) -> None:
+        if not 0 < self.flush_period_s <= 3600 or self.min_free_bytes < 0:
+            raise InvalidInputError(
+                f"spool safety: got a period of {self.flush_period_s} s and {self.min_free_bytes} "
+                "bytes to keep free, expected 0 … 3600 s and no negative number"
+            )
+
+
+def check_free_space(folder: Path, safety: SpoolSafety) -> None:
+    """Refuse to write on where so little is left that a take could not be closed any more.
+
+    Raises:
+        StorageFullError: less than `min_free_bytes` are left.
+    """
+    with disk_errors(f"measure free space of {folder}"):
+        disk = os.statvfs(folder)
+    free_bytes = disk.f_bavail * disk.f_frsize
+    if free_bytes < safety.min_free_bytes:
+        raise StorageFullError(
+            f"spool {folder.name!r}: no space left to go on: {free_bytes / MEBIBYTE:.0f} MiB free, "
+            f"{safety.min_free_bytes / MEBIBYTE:.0f} MiB are kept for closing takes; what was "
+            "recorded stays and can be saved, free space before the next take",
+            free_bytes=free_bytes,
+        )
+
+
+class SpoolFlusher:
+    """A thread that makes a growing spool survive a power loss, again and again.
+
+    It has its own descriptor of the log, so it needs no lock of the writers and they never wait
+    for it; the disk's error, or a disk that is nearly full, ends it and is reported once.
+
+    Args:
+        path: of the spool.
+        safety: how often, and how much space must be left.
+        clock: of the station.
+        on_tick: called in the thread before each flush.
+        on_failure: called in the thread with what went wrong.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        *,
+        safety: SpoolSafety,
+        clock: StationClock,
+        on_tick: Callable[[], None],
+        on_failure: Callable[[StorageError], None],
+    ) -> None:
+        self.num_flushes = 0
+        self.longest_flush_s = 0.0
+        self._path = path
+        self._safety = safety
+        self._clock = clock
+        self._on_tick = on_tick
+        self._on_failure = on_failure
+        with disk_errors(f"open log of spool {path.name!r}"):
+            self._log = os.open(path / LOG_FILE, os.O_RDONLY)
+        self._waiter = clock.waiter()
+        self._thread = threading.Thread(target=self._run, name="flush-spool", daemon=True)
+        self._thread.start()
+
+    def cancel(self) -> None:
+        """End after the flush that is under way; waits for nothing."""
+        self._waiter.cancel()
+
+    def join(self) -> None:
+        """Wait until it has ended (not to be called in its own thread)."""
+        self._waiter.cancel()
+        self._thread.join()
+
+    def _run(self) -> None:
+        period_ns = round(self._safety.flush_period_s * 1e9)
+        try:
+            with closing(self._waiter) as waiter:
+                due_ns = self._clock.now_ns() + period_ns
+                while waiter.wait_until(due_ns):
+                    self._flush()
+                    # After a long stop of the process one flush is enough.
+                    due_ns = max(due_ns, self._clock.now_ns()) + period_ns
+        except StorageError as error:
+            self._on_failure(error)
+        finally:
+            os.close(self._log)
+
+    def _flush(self) -> None:
+        self._on_tick()
+        check_free_space(self._path, self._safety)
+        start_s = time.perf_counter()
+        with disk_errors(f"flush spool {self._path.name!r}"):
+            os.fdatasync(self._log)
+        self.longest_flush_s = max(self.longest_flush_s, time.perf_counter() - start_s)
+        self.num_flushes += 1

@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 import structlog
 
+from dextouch.episodes.files import disk_errors, replace_file
 from dextouch.episodes.log import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, DexTouchError, StorageError
 from dextouch.schemas.recordings import (
@@ -24,8 +25,9 @@ logger = structlog.get_logger(__name__)
 
 RECORDING_FILE = "recording.json"
 UPLOADED_FILE = "uploaded.json"
-MAX_BATCH_SAMPLES = 60
-MAX_BATCH_BYTES = 4 * 2**20
+MAX_BATCH_SAMPLES = 120
+# Of pixels: half of what may travel, since a JPEG image of noise can be larger than its pixels.
+MAX_BATCH_BYTES = 8 * 2**20
 
 
 @runtime_checkable
@@ -161,10 +163,12 @@ class Uploader:
             path.name, num_batches, success=known.success, ledger=known.ledger
         )
         logger.info("upload_take", recording_id=path.name)
-        if self._keep_uploaded:
-            (path / UPLOADED_FILE).write_text(status.model_dump_json(), encoding="utf-8")
-        else:
-            shutil.rmtree(path)
+        # Where this fails the take is sent again: the store then answers that it has everything.
+        with disk_errors(f"note the upload of {path.name!r}"):
+            if self._keep_uploaded:
+                replace_file(path / UPLOADED_FILE, status.model_dump_json().encode())
+            else:
+                shutil.rmtree(path)
         return True
 
 

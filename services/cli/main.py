@@ -49,6 +49,13 @@ COMMANDS = {
     "bench": Command("services.cli.bench", "time a stage against its error, beside its rivals"),
 }
 
+# A second word that another module does.
+INNER_COMMANDS = {
+    ("station", "calibrate"): Command(
+        "services.cli.calibrate", "measure tare and gain, lenses and mounts"
+    ),
+}
+
 EXIT_USAGE = 2
 EXIT_REFUSED = 3
 
@@ -56,6 +63,7 @@ EXIT_REFUSED = 3
 def usage() -> str:
     """The text of `dextouch --help`."""
     rows = [f"  {name:<10}{command.does}" for name, command in COMMANDS.items()]
+    rows += [f"  {' '.join(words)}: {inner.does}" for words, inner in INNER_COMMANDS.items()]
     return "\n".join(
         [
             "usage: dextouch COMMAND [options]",
@@ -87,9 +95,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"dextouch: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return EXIT_USAGE
+    command = COMMANDS[name]
+    if (name, *rest[:1]) in INNER_COMMANDS:
+        command = INNER_COMMANDS[name, rest[0]]
+        name, rest = f"{name} {rest[0]}", rest[1:]
     try:
-        module = importlib.import_module(COMMANDS[name].module)
-        status = module.main([*COMMANDS[name].before, *rest])
+        module = importlib.import_module(command.module)
+        status = module.main([*command.before, *rest])
     except DexTouchError as error:
         print(f"dextouch {name}: {error.message}", file=sys.stderr)
         return EXIT_REFUSED

@@ -19,7 +19,7 @@ RECORDER_PATH = "/v1/recorder"
 TAXELS_PATH = "/v1/live/taxels"
 CAMERAS_PATH = "/v1/live/cameras"
 
-ALL_ACTIONS = ("arm", "record", "stop", "save", "discard")
+ALL_ACTIONS = ("arm", "record", "stop", "save", "discard", "rerecord")
 
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -54,9 +54,17 @@ class DeviceHealth(_Answer):
     last_error: str | None = None
 
 
-class StationHealth(_Answer):
-    """All streams and devices."""
+class HealthFinding(_Answer):
+    """Something wrong with the station itself: its disk, its calibration."""
 
+    level: Level
+    message: str
+
+
+class StationHealth(_Answer):
+    """All streams and devices, and what is wrong with the station itself."""
+
+    findings: tuple[HealthFinding, ...] = ()
     streams: tuple[StreamHealth, ...]
     devices: tuple[DeviceHealth, ...] = ()
 
@@ -118,11 +126,12 @@ def station_view(health: object, recorder: object) -> StationView:
     devices = {device.device: device for device in station.devices}
     streams = tuple(_stream_view(item, devices.get(item.device)) for item in station.streams)
     levels = [stream.level for stream in streams]
+    notes = [finding.message for finding in station.findings]
     return StationView(
         reachable=True,
-        level=worst(levels),
+        level=worst([*levels, *(finding.level for finding in station.findings)]),
         summary=_summary(levels),
-        note="" if streams else "No devices are connected.",
+        note=" · ".join(notes if streams else ["No devices are connected.", *notes]),
         streams=streams,
         recorder=recorder_view(recorder),
     )
@@ -165,7 +174,7 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
     return StreamView(
         name=item.stream,
         level=item.level,
-        message=" · ".join(words),
+        message=" · ".join(dict.fromkeys(words)),
         rate_hz=item.rate_hz,
         nominal_rate_hz=item.nominal_rate_hz,
         dropped=item.lost,

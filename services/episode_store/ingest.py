@@ -75,7 +75,7 @@ class Ingest:
                 upload = self._upload(recording_id)
                 _check_same(attributes, upload.attributes)
                 return upload.status()
-            upload = Upload(SpoolWriter(path, attributes, sync=self._sync), sync=self._sync)
+            upload = Upload(SpoolWriter(path, attributes, sync=self._sync))
             self._keep(recording_id, upload)
             logger.info("recording_created", recording_id=recording_id)
             return upload.status()
@@ -97,7 +97,7 @@ class Ingest:
         Raises:
             NotFoundError: no such recording.
             UnknownNameError: no such stream.
-            ConflictError: a gap, other bytes under a known number, or a finished recording.
+            ConflictError: a gap, other samples under a known number, or a finished recording.
             PacketError, InvalidInputError: bytes that are no batch of this stream.
             UnavailableError: the recording is being finished; try again later.
             StorageFullError: no space; all that was acknowledged stays.
@@ -185,7 +185,7 @@ class Ingest:
         path = self._path(recording_id)
         if not path.exists():
             raise NotFoundError(f"recording {recording_id!r}: no upload was begun under this id")
-        upload = Upload(SpoolWriter.resume(path, sync=self._sync), sync=self._sync)
+        upload = Upload(SpoolWriter.resume(path, sync=self._sync))
         self._keep(recording_id, upload)
         return upload
 

@@ -1,12 +1,12 @@
-"""Numbered batches of one unfinished recording → its spool and receipts, which always agree."""
+"""Numbered batches of one unfinished recording → its spool, where append n is batch n."""
 
-import hashlib
+import numpy as np
 
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.log import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, UnknownNameError
 from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
+from dextouch.streams.samples import SampleBatch
 from dextouch.streams.wire import decode_batch
-from services.episode_store.receipts import Receipts
 
 
 class Upload:
@@ -14,17 +14,11 @@ class Upload:
 
     Args:
         spool: of the recording, open for writing.
-        sync: whether an acknowledged batch survives a power loss.
     """
 
-    def __init__(self, spool: SpoolWriter, *, sync: bool) -> None:
+    def __init__(self, spool: SpoolWriter) -> None:
         self._spool = spool
-        self._sync = sync
         self._streams = {stream.name: stream for stream in spool.attributes.streams}
-        self._receipts = {name: Receipts(spool.path / f"{name}.receipts") for name in self._streams}
-        for name, receipts in self._receipts.items():
-            # What was written but never acknowledged comes again.
-            spool.truncate(name, receipts.num_samples)
 
     @property
     def attributes(self) -> RecordingAttributes:
@@ -36,65 +30,54 @@ class Upload:
         return RecordingStatus(
             recording_id=self.attributes.recording_id,
             state="open",
-            next_batch={name: len(receipts) for name, receipts in self._receipts.items()},
+            next_batch={name: self._spool.num_batches(name) for name in self._streams},
         )
 
     def put(self, stream: str, number: int, data: bytes) -> BatchReceipt:
         """Take batch `number` of a stream in; raises as `Ingest.put_batch`."""
-        if stream not in self._receipts:
-            raise UnknownNameError("stream", stream, list(self._receipts))
-        receipts, recording_id = self._receipts[stream], self.attributes.recording_id
-        if number > len(receipts):
+        if stream not in self._streams:
+            raise UnknownNameError("stream", stream, list(self._streams))
+        expected, recording_id = self._spool.num_batches(stream), self.attributes.recording_id
+        if number > expected:
             raise ConflictError(
-                f"{recording_id} {stream}: got batch {number}, expected {len(receipts)}; "
+                f"{recording_id} {stream}: got batch {number}, expected {expected}; "
                 "send the missing ones first",
                 got=number,
-                expected=len(receipts),
+                expected=expected,
             )
-        replayed = number < len(receipts)
-        if replayed:
-            if hashlib.sha256(data).digest() != receipts[number].sha256:
-                raise ConflictError(
-                    f"{recording_id} {stream}: batch {number} is here with other bytes; "
-                    "a batch never changes",
-                    got=number,
-                    expected=len(receipts),
-                )
-        else:
-            self._append(stream, number, data)
-        before = receipts[number - 1].end_sample if number else 0
+        batch = decode_batch(data, self._streams[stream], number=number)
+        replayed = number < expected
+        if not replayed:
+            self._spool.append(stream, batch, flush=True)
+        elif not _same(SpoolReader(self._spool.path).appended(stream, number), batch):
+            raise ConflictError(
+                f"{recording_id} {stream}: batch {number} is here with other samples; "
+                "a batch never changes",
+                got=number,
+                expected=expected,
+            )
         return BatchReceipt(
             recording_id=recording_id,
             stream=stream,
             number=number,
-            num_samples=receipts[number].end_sample - before,
+            num_samples=len(batch),
             replayed=replayed,
         )
 
     def close(self) -> None:
         """Mark the spool as complete and give all files back."""
         self._spool.close()
-        self._close_receipts()
 
     def abandon(self) -> None:
         """Give all files back; the upload can be gone on with."""
         self._spool.abandon()
-        self._close_receipts()
 
-    def _close_receipts(self) -> None:
-        for receipts in self._receipts.values():
-            receipts.close()
 
-    def _append(self, stream: str, number: int, data: bytes) -> None:
-        receipts = self._receipts[stream]
-        batch = decode_batch(data, self._streams[stream], number=number)
-        self._spool.append(stream, batch)
-        acknowledged = False
-        try:
-            self._spool.flush()
-            end_sample = self._spool.num_samples(stream)
-            receipts.append(data, end_sample=end_sample, sync=self._sync)
-            acknowledged = True
-        finally:
-            if not acknowledged:
-                self._spool.truncate(stream, receipts.num_samples)
+def _same(ours: SampleBatch, theirs: SampleBatch) -> bool:
+    """Whether two batches hold the same samples; a NaN equals itself, -0.0 is not 0.0."""
+    columns = ("t_host_ns", "t_device_ns", "sequence")
+    if not all(np.array_equal(getattr(ours, name), getattr(theirs, name)) for name in columns):
+        return False
+    if ours.values.dtype == object:
+        return bool(np.array_equal(ours.values, theirs.values))
+    return ours.values.tobytes() == theirs.values.tobytes()

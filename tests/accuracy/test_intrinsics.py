@@ -1,6 +1,7 @@
 """Camera matrices against the one that photos were rendered with, and real photos."""
 
 import sys
+from functools import cache
 from pathlib import Path
 
 import cv2
@@ -9,8 +10,23 @@ import pytest
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
+from services.alignment.calibration.board_detection import (
+    CHARUCO,
+    EITHER_CHARUCO,
+    LEGACY_CHARUCO,
+    FoundBoards,
+    find_boards,
+)
 from services.alignment.calibration.hand_eye import DegenerateMotionError
-from services.alignment.calibration.intrinsics import CharucoBoard, Chessboard, calibrate_camera
+from services.alignment.calibration.intrinsics import (
+    CharucoBoard,
+    Chessboard,
+    calibrate_camera,
+    calibrate_found,
+    leave_one_out_rms_px,
+    unseen_parts,
+)
+from services.cli.bench.calibration import scenes
 
 PHOTOS = Path(__file__).parents[3] / "shared/data/camera_chessboard"
 CHARUCO_PHOTO = PHOTOS.parent / "hand_eye/charuco.jpg"
@@ -89,11 +105,13 @@ def test_real_photos_agree_with_themselves(capsys):
     with capsys.disabled():
         sys.stdout.write(
             f"\nintrinsics, 13 real photos: fx {whole.K[0, 0]:.1f} +- "
-            f"{whole.sigma_fxfycxcy_px[0]:.1f} px, rms {whole.rms_px:.2f} px, bound 0.6 | "
+            f"{whole.sigma_fxfycxcy_px[0]:.1f} px, rms {whole.rms_px:.3f} px, bound 0.20 | "
             f"halves {sigmas.max():.1f} sigma, bound 5"
         )
     assert len(whole.used_images) == 13
-    assert whole.rms_px <= 0.6
+    assert whole.rms_px <= 0.20
+    assert whole.rms_by_photo_px.shape == (13,)
+    assert whole.pattern == "chessboard"
     assert sigmas.max() <= 5
 
 
@@ -103,3 +121,112 @@ def test_real_charuco_board_is_found_but_one_view_is_not_enough():
     board = CharucoBoard(5, 7, 0.03, 0.02)
     with pytest.raises(DegenerateMotionError, match="tilted"):
         calibrate_camera([photo] * 5, board)
+    found = find_boards([photo], board)
+    assert found.pattern == EITHER_CHARUCO
+    assert len(found.pixels_px[0]) >= 20
+
+
+@pytest.mark.skipif(not PHOTOS.is_dir(), reason="no recordings in ../shared/data")
+def test_a_real_photo_is_predicted_from_the_others(capsys):
+    photos = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(PHOTOS.glob("*.jpg"))]
+    left_px = leave_one_out_rms_px(find_boards(photos, BOARD))
+    rms_px = float(np.sqrt(np.square(left_px).mean()))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\nintrinsics, leave one of 13 photos out: rms {rms_px:.3f} px, worst "
+            f"{left_px.max():.3f} px, bound 0.3"
+        )
+    assert left_px.shape == (13,)
+    assert left_px.max() <= 0.3
+
+
+@cache
+def simulated(seed, num_views):
+    motion = scenes.Motion(num_views=num_views, sideways_m=0.25)
+    views = scenes.make_scene(seed, motion).views
+    return FoundBoards(
+        tuple(points.astype(np.float32) for points in views.points_board),
+        tuple(pixels.astype(np.float32) for pixels in views.pixels_px),
+        scenes.IMAGE_SIZE_PX,
+        tuple(range(num_views)),
+        num_views,
+        "chessboard",
+    )
+
+
+def test_simulated_cameras_spread_as_their_sigmas_say(capsys):
+    rows, columns = [0, 1, 0, 1], [0, 1, 2, 2]
+    all_found = [calibrate_found(simulated(seed, 25)) for seed in range(20)]
+    errors_px = np.array([found.K[rows, columns] - scenes.K[rows, columns] for found in all_found])
+    sigmas_px = np.sqrt(np.mean([found.sigma_fxfycxcy_px**2 for found in all_found], axis=0))
+    focal = np.abs(errors_px[:, 0]) / scenes.K[0, 0]
+    ratios = sigmas_px / errors_px.std(axis=0)
+    bends = np.array([found.distortion for found in all_found])
+    bend_sigmas = np.sqrt(np.mean([found.sigma_distortion**2 for found in all_found], axis=0))
+    bend_ratios = bend_sigmas / bends.std(axis=0)
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\nintrinsics, 25 simulated views, 20 seeds: |df|/f median {np.median(focal):.2%}, "
+            f"bound 0.3 % (worst {focal.max():.2%}) | sigma over spread {np.round(ratios, 2)} "
+            f"{np.round(bend_ratios, 2)}, bounds 0.5 and 2"
+        )
+    assert np.median(focal) <= 0.003
+    for ratio in (*ratios, *bend_ratios):
+        assert 0.5 <= ratio <= 2
+
+
+def test_more_views_than_one_part_of_the_image_are_asked_for():
+    corner = [np.array([[10.0, 10.0], [200.0, 150.0], [100.0, 400.0]])]
+    assert unseen_parts(corner, (640, 480)) == (
+        "top", "top right", "left", "middle", "right", "bottom", "bottom right"
+    )  # fmt: skip
+    found = simulated(0, 25)
+    few = calibrate_found(found.only(range(8)))
+    assert any("7 more photos" in advice for advice in few.advice)
+    half = [(points, pixels, pixels[:, 0] < 500) for points, pixels in zip(
+        found.points_board, found.pixels_px, strict=True
+    )]  # fmt: skip
+    kept = [k for k, (_, _, is_left) in enumerate(half) if is_left.sum() >= 12]
+    left_only = FoundBoards(
+        tuple(half[k][0][half[k][2]] for k in kept),
+        tuple(half[k][1][half[k][2]] for k in kept),
+        found.image_size_px,
+        tuple(kept),
+        25,
+        "chessboard",
+    )
+    calibration = calibrate_found(left_only)
+    assert set(calibration.unseen) == {"top right", "right", "bottom right"}
+    assert "top right, right, bottom right" in calibration.advice[0]
+    assert calibration.coverage <= 0.75
+
+
+def charuco_photos(board, *, legacy):
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
+    printed = cv2.aruco.CharucoBoard(
+        (board.columns, board.rows), board.square_m, board.marker_m, dictionary
+    )
+    printed.setLegacyPattern(legacy)
+    size_px = (board.columns * 60, board.rows * 60)
+    picture = printed.generateImage(size_px, None, 0, 1)
+    rng = np.random.default_rng(0)
+    to_metres = np.diag([board.square_m / 60, board.square_m / 60, 1.0])
+    to_metres[:2, 2] = -0.5 * board.square_m * np.array([board.columns, board.rows])
+    photos = []
+    for _ in range(6):
+        R = rotation_from_vector(rng.uniform(-0.5, 0.5, 3))
+        t = np.array([*rng.uniform(-0.02, 0.02, 2), rng.uniform(0.3, 0.4)])
+        homography = K @ np.column_stack([R[:, 0], R[:, 1], t]) @ to_metres
+        photos.append(cv2.warpPerspective(picture, homography, (640, 480), borderValue=255))
+    return photos
+
+
+@pytest.mark.parametrize(("legacy", "name"), [(False, CHARUCO), (True, LEGACY_CHARUCO)])
+def test_both_printings_of_a_charuco_board_are_told_apart(legacy, name):
+    board = CharucoBoard(5, 6, 0.03, 0.022)
+    photos = charuco_photos(board, legacy=legacy)
+    found = calibrate_camera(photos, board)
+    assert found.pattern == name
+    assert found.used_images == tuple(range(6))
+    assert abs(found.K[0, 0] - K[0, 0]) <= 4 * found.sigma_fxfycxcy_px[0]
+    assert found.rms_px < 0.3

@@ -43,7 +43,7 @@ async def test_a_take_over_http(tmp_path):
         await until_samples(client, 5)
         stopped = (await client.post("/v1/recorder/stop")).json()
         assert stopped["state"] == "checking"
-        assert set(stopped["actions"]) == {"save", "discard"}
+        assert set(stopped["actions"]) == {"save", "discard", "rerecord"}
         body = {"success": True, "accept_incomplete": True}
         assert (await client.post("/v1/recorder/save", json=body)).json()["state"] == "saved"
         spool = SpoolReader(tmp_path / recording_id)

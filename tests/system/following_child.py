@@ -54,10 +54,13 @@ def take_id(number):
 
 
 def record(store, board, images, seconds):
-    """Live takes, one after the other, each then also as an episode; old ones are deleted."""
+    """Live takes, one after the other, each then also as an episode; old ones are deleted.
+
+    Two at least, however slow the machine: readers are to see one end and another begin.
+    """
     stop_s = time.monotonic() + seconds
     number = 0
-    while time.monotonic() < stop_s:
+    while time.monotonic() < stop_s or number < 2:
         board.set(current=number)
         record_take(store, board, images, number)
         write_episode(store, number, images)

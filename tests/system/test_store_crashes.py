@@ -324,11 +324,11 @@ def kill_spool(victims, root, counters_path, jpegs, delay_s):
         mode="spool", root=str(root), counters=str(counters_path), seed=SEED,
         seconds=60.0, kill_after_s=delay_s,
     )  # fmt: skip
-    reports = {report.stream: report for report in log.recover(root / FLIGHT)}
+    counts = log.recover(root / FLIGHT).num_samples
     spool = log.SpoolReader(root / FLIGHT)
     for name in STREAM_NAMES:
-        acknowledged, count = counters.get(APPENDED, name), reports[name].num_samples
-        # A block goes to the journal in one write, so a kill does not part it either.
+        acknowledged, count = counters.get(APPENDED, name), counts[name]
+        # A block goes to the log in one write, so a kill does not part it either.
         assert count in {acknowledged, acknowledged + SPOOL_BLOCK}
         got, made = spool.read(name), take_source.spool_batch(name, SEED, 0, count, jpegs)
         for field in ("t_host_ns", "t_device_ns", "sequence", "values"):

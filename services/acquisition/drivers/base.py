@@ -99,6 +99,7 @@ def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
             f"{device}: speaks packet version {packet.version}, expected {VERSION}; update the "
             "device or this station",
             device=device,
+            event="wrong_version",
         )
     if source is not None and packet.source != SOURCES[source]:
         names = {number: name for name, number in SOURCES.items()}
@@ -106,4 +107,5 @@ def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
         raise DeviceError(
             f"{device}: says it is {got!r}, expected {source!r}; is the wrong one plugged in?",
             device=device,
+            event="wrong_side",
         )

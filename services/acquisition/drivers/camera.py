@@ -1,24 +1,32 @@
-"""Camera bridge over a socket: packets with raw or JPEG images come in, images go out."""
+"""Camera bridge over a socket: packets with raw, JPEG or H.264 images come in, images go out."""
 
 import struct
-from typing import Literal
 
 import numpy as np
 
-from dextouch.errors import CorruptDataError, DeviceError
-from dextouch.images.jpeg import jpeg_size
+from dextouch.episodes.format import GOP_IMAGES
+from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError
+from dextouch.images.jpeg import decode_jpeg, jpeg_size
+from dextouch.streams.checks import check_encoded_image
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample, encoded_values
-from services.acquisition.drivers.base import Readings, check_packet
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver, Readings, check_packet
+from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups
+from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
 from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+from services.acquisition.transports.base import Transport
+
+__all__ = ["CameraDecoder", "CameraDriver", "ImageEncoding", "camera_descriptor"]
 
 MAGIC = b"DXCI"
 # height and width in pixels, encoding, three bytes of padding; then the image
 PAYLOAD_HEADER = struct.Struct("<HHB3x")
-ImageEncoding = Literal["rgb8", "jpeg"]
-ENCODING_CODES: dict[ImageEncoding, int] = {"rgb8": 0, "jpeg": 1}
+ENCODING_CODES: dict[ImageEncoding, int] = {"rgb8": 0, "jpeg": 1, "h264": 2}
 NOMINAL_RATE_HZ = 30.0
 MAX_PAYLOAD_BYTES = 4 * 1024 * 1024
+# Decoding a JPEG image costs more than looking at it.
+LOOK_AT_EVERY_JPEG = 10
 
 
 def camera_descriptor(
@@ -39,7 +47,11 @@ def camera_descriptor(
 
 
 class CameraDecoder:
-    """Images of one fixed size and encoding; JPEG images stay compressed (readers decode)."""
+    """Images of one fixed size and encoding; JPEG and H.264 images stay compressed.
+
+    H.264 images come in whole groups only, since the store takes no others: a group that lost an
+    image is left out and counted as `refused`.
+    """
 
     def __init__(
         self, stream: str, *, height_px: int, width_px: int, encoding: ImageEncoding = "rgb8"
@@ -50,11 +62,21 @@ class CameraDecoder:
         self._packets = PacketDecoder(
             MAGIC, min_payload=PAYLOAD_HEADER.size + 1, max_payload=MAX_PAYLOAD_BYTES
         )
+        descriptor = self.descriptors[0]
+        self._groups = WholeGroups()
+        self._checker = ImageChecker(period_ns=descriptor.period_ns())
+        self.damaged_images = 0
+        self._num_images = 0
 
     @property
     def statistics(self) -> DecoderStatistics:
         """What was seen so far; `refused` counts images that are no images."""
         return self._packets.statistics
+
+    @property
+    def quality(self) -> ImageQuality:
+        """What the images are like; of H.264 nothing is looked at."""
+        return self._checker.quality
 
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
@@ -69,21 +91,29 @@ class CameraDecoder:
         )
 
     def reset(self) -> None:
-        """Forget half a packet."""
+        """Forget half a packet, and a group that was begun."""
         self._packets.reset()
+        self._groups.reset()
+        self._count_left_out()
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """Images completed by `data`: uint8 [h, w, 3], or JPEG bytes as a 0-d object array.
+        """Images completed by `data`: uint8 [h, w, 3], or bytes as a 0-d object array.
 
         Raises:
-            DeviceError: another version, image size or encoding than announced.
+            DeviceError: another version, image size, encoding or length of groups than announced.
         """
-        samples = []
+        samples: list[Sample] = []
         for packet in self._packets.feed(data):
             check_packet(packet, device=self._stream, source=None)
-            image = self._image(packet.payload)
-            if image is not None:
-                samples.append(Sample(t_host_ns, image, packet.t_device_ns, packet.sequence))
+            values = self._image(packet.payload)
+            if values is None:
+                continue
+            sample = Sample(t_host_ns, values, packet.t_device_ns, packet.sequence)
+            if self._encoding == "h264":
+                samples += self._whole_group(sample)
+            else:
+                self._look(sample)
+                samples.append(sample)
         return {self._stream: samples} if samples else {}
 
     def _image(self, payload: bytes) -> np.ndarray | None:
@@ -95,7 +125,7 @@ class CameraDecoder:
                 f"({self._encoding}); set the camera or the station"
             )
         body = payload[PAYLOAD_HEADER.size :]
-        image = self._raw(body) if self._encoding == "rgb8" else self._jpeg(body)
+        image = self._raw(body) if self._encoding == "rgb8" else self._encoded(body)
         if image is None:
             self.statistics.refused += 1
         return image
@@ -105,10 +135,55 @@ class CameraDecoder:
             return None
         return np.frombuffer(body, dtype=np.uint8).reshape(*self._size, 3)
 
-    def _jpeg(self, body: bytes) -> np.ndarray | None:
+    def _encoded(self, body: bytes) -> np.ndarray | None:
         try:
-            if jpeg_size(body, where=self._stream) != self._size:
+            if self._encoding == "h264":
+                check_encoded_image(self.descriptors[0], body, where=self._stream)
+            elif jpeg_size(body, where=self._stream) != self._size:
                 return None
-        except CorruptDataError:
+        except (CorruptDataError, InvalidInputError):
             return None
         return encoded_values([body]).reshape(())
+
+    def _whole_group(self, sample: Sample) -> list[Sample]:
+        group = self._groups.add(sample)
+        self._count_left_out()
+        if group is None:
+            raise DeviceError(
+                f"{self._stream}: its H.264 groups have another length than {GOP_IMAGES} images; "
+                "set the bridge's encoder, or let it send JPEG images"
+            )
+        return group
+
+    def _count_left_out(self) -> None:
+        self.statistics.refused += self._groups.num_left_out
+        self._groups.num_left_out = 0
+
+    def _look(self, sample: Sample) -> None:
+        if self._encoding == "rgb8":
+            self._checker.check(sample.values, sample.t_device_ns)
+            return
+        data = sample.values.item()
+        self._checker.note(data, sample.t_device_ns)
+        if self._num_images % LOOK_AT_EVERY_JPEG == 0:
+            try:
+                self._checker.look(decode_jpeg(data, where=self._stream))
+            except CorruptDataError:
+                # A good header before a damaged image: recorded as it came, and counted here.
+                self.damaged_images += 1
+        self._num_images += 1
+
+
+class CameraDriver(Driver):
+    """A camera bridge with what is known of its images."""
+
+    def __init__(
+        self, name: str, *, transport: Transport, decoder: CameraDecoder, clock: StationClock
+    ) -> None:
+        super().__init__(name, transport=transport, decoder=decoder, clock=clock)
+        self._images = decoder
+
+    @property
+    def quality(self) -> ImageQuality:
+        """What the images are like."""
+        return self._images.quality

@@ -1,9 +1,12 @@
 """Finger tracker over HID: reports come in, 25 keypoints a sample (m, wrist frame) go out."""
 
 import struct
+from collections import Counter
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float32
 
 from dextouch.errors import DeviceError, PacketError
 from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, NODE_INDEX, NUM_KEYPOINTS, WRIST
@@ -16,6 +19,7 @@ from services.acquisition.drivers.packets import DecoderStatistics, PacketDecode
 from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     REPORT_BYTES,
+    OrderFilter,
     ReportReassembler,
 )
 from services.acquisition.transports.base import Transport
@@ -29,6 +33,7 @@ VALIDITY = struct.Struct("<I")
 PAYLOAD_BYTES = VALIDITY.size + NUM_KEYPOINTS * 12
 DESCRIPTOR_BYTES = 2 * NUM_KEYPOINTS
 DESCRIPTOR_READS = 200
+ALL_SEEN = (1 << NUM_KEYPOINTS) - 1
 
 
 def keypoints_descriptor(side: Side) -> StreamDescriptor:
@@ -47,21 +52,57 @@ def keypoints_descriptor(side: Side) -> StreamDescriptor:
     )
 
 
+def resolve_nodes(nodes: Sequence[tuple[str, str]]) -> list[int]:
+    """Our keypoint index of each (chain, joint), in the device's order, whatever that is.
+
+    Raises:
+        PacketError: a node unknown to us, missing, or named twice; the message says which.
+    """
+    counts = Counter(nodes)
+    unknown = [node for node in counts if node not in NODE_INDEX]
+    missing = [node for node in NODE_INDEX if node not in counts]
+    twice = [node for node, count in counts.items() if count > 1]
+    if unknown or missing or twice:
+        raise PacketError(
+            f"descriptor: expected each of the {NUM_KEYPOINTS} nodes once; unknown {unknown}, "
+            f"missing {missing}, named twice {twice}"
+        )
+    return [NODE_INDEX[node] for node in nodes]
+
+
 def parse_node_order(payload: bytes) -> list[int]:
-    """Our keypoint index of each node, in the device's order.
+    """Our keypoint index of each node of a `DXFD` payload, in the device's order.
 
     Raises:
         PacketError: a node unknown to us, or not each of the 25 exactly once.
     """
-    nodes = {(CHAIN_IDS[c], JOINT_IDS[j]): index for (c, j), index in NODE_INDEX.items()}
-    pairs = [(payload[at], payload[at + 1]) for at in range(0, len(payload) - 1, 2)]
-    order = [nodes[pair] for pair in pairs if pair in nodes]
-    if sorted(order) != list(range(NUM_KEYPOINTS)) or len(pairs) != NUM_KEYPOINTS:
-        raise PacketError(
-            f"descriptor: got nodes {pairs}, expected each of the {NUM_KEYPOINTS} (chain, joint) "
-            "ids once"
-        )
-    return order
+    chains = {number: name for name, number in CHAIN_IDS.items()}
+    joints = {number: name for name, number in JOINT_IDS.items()}
+    return resolve_nodes(
+        [
+            (chains.get(chain, f"chain {chain}"), joints.get(joint, f"joint {joint}"))
+            for chain, joint in zip(payload[::2], payload[1::2], strict=False)
+        ]
+    )
+
+
+def unpack_keypoints(payload: bytes, order: list[int]) -> tuple[Float32[np.ndarray, "25 3"], int]:
+    """Keypoints of a `DXFT` payload in our order, and how many nodes are not seen (NaN).
+
+    A node that the device calls seen but sends as NaN or infinity is not seen either.
+    """
+    (valid_bits,) = VALIDITY.unpack_from(payload)
+    points = np.frombuffer(payload, dtype="<f4", offset=VALIDITY.size).reshape(-1, 3)
+    keypoints = np.empty((NUM_KEYPOINTS, 3), dtype=np.float32)
+    keypoints[order] = points
+    is_seen = valid_bits & ALL_SEEN == ALL_SEEN
+    if is_seen and np.isfinite(points).all():
+        return keypoints, 0
+    if not is_seen:
+        keypoints[[order[i] for i in range(NUM_KEYPOINTS) if not valid_bits >> i & 1]] = np.nan
+    unseen = ~np.isfinite(keypoints).all(axis=1)
+    keypoints[unseen] = np.nan
+    return keypoints, int(unseen.sum())
 
 
 class FingerTrackerDecoder:
@@ -76,6 +117,7 @@ class FingerTrackerDecoder:
             DESCRIPTOR_MAGIC, min_payload=DESCRIPTOR_BYTES, max_payload=DESCRIPTOR_BYTES
         )
         self._order: list[int] | None = None
+        self.order = OrderFilter()
         self.undescribed = 0
         self.unseen_nodes = 0
 
@@ -99,6 +141,7 @@ class FingerTrackerDecoder:
         self.reports.reset()
         self._data.reset()
         self._descriptor.reset()
+        self.order.reset()
         self._order = None
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
@@ -117,23 +160,15 @@ class FingerTrackerDecoder:
         samples = []
         for packet in self._data.feed(body):
             check_packet(packet, device=self._device, source=self._side)
+            if not self.order.admits(packet.sequence):
+                continue
             if self._order is None:
                 self.undescribed += 1
                 continue
-            keypoints = self._keypoints(packet.payload, self._order)
+            keypoints, num_unseen = unpack_keypoints(packet.payload, self._order)
+            self.unseen_nodes += num_unseen
             samples.append(Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence))
         return {f"keypoints_{self._side}": samples} if samples else {}
-
-    def _keypoints(self, payload: bytes, order: list[int]) -> np.ndarray:
-        (valid_bits,) = VALIDITY.unpack_from(payload)
-        points = np.frombuffer(payload, dtype="<f4", offset=VALIDITY.size).reshape(-1, 3)
-        keypoints = np.empty((NUM_KEYPOINTS, 3), dtype=np.float32)
-        keypoints[order] = points
-        if valid_bits != (1 << NUM_KEYPOINTS) - 1:
-            unseen = [order[i] for i in range(NUM_KEYPOINTS) if not valid_bits >> i & 1]
-            keypoints[unseen] = np.nan
-            self.unseen_nodes += len(unseen)
-        return keypoints
 
     def _describe(self, body: bytes) -> None:
         for packet in self._descriptor.feed(body):

@@ -1,21 +1,39 @@
-"""Pose tracker over HID: one report a pose comes in, poses of a running tracker go out."""
+"""Pose tracker reports come in; poses of a running tracker go out, and what was left out is named.
 
+Gate for any pose source: only the running state counts, and a pose that the body cannot have
+reached since the last good one is a jump. Both leave a gap and an event, never another pose.
+"""
+
+import math
 import struct
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import IntEnum
+from typing import Literal
 
 import numpy as np
+from jaxtyping import Float64
 
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from services.acquisition.drivers.base import Readings, check_packet
-from services.acquisition.drivers.packets import SOURCES, DecoderStatistics, PacketDecoder
-from services.acquisition.drivers.reports import ReportReassembler
+from services.acquisition.drivers.packets import SOURCES, DecoderStatistics, Packet, PacketDecoder
+from services.acquisition.drivers.reports import OrderFilter, ReportReassembler
 
 MAGIC = b"DXPT"
 # running state, three bytes of padding, x y z (m), qw qx qy qz
 PAYLOAD = struct.Struct("<B3x7f")
 NOMINAL_RATE_HZ = 100.0
 NORM_TOLERANCE = 1e-3
+MAX_SPEED_M_PER_S = 5.0
+# 2000 °/s, the full scale of the gyroscopes in such trackers.
+MAX_TURN_RATE_RAD_PER_S = math.radians(2000.0)
+# Packets cannot be closer than half a period, whatever a stepped device clock says.
+MIN_STEP_NS = round(0.5e9 / NOMINAL_RATE_HZ)
+MAX_EVENTS = 256
+
+EventKind = Literal["occluded", "jumped", "stale"]
 
 
 class TrackingState(IntEnum):
@@ -26,6 +44,128 @@ class TrackingState(IntEnum):
     OUT_OF_RANGE = 2
     FALLBACK_ROTATION_ONLY = 3
     RUNNING_OK = 200
+
+
+@dataclass
+class TrackingEvent:
+    """A run of packets that were left out for one reason.
+
+    `state` is the tracker's at the first of them; the times are arrivals of the first and of the
+    last (host's monotonic clock).
+    """
+
+    kind: EventKind
+    state: int
+    first_sequence: int
+    last_sequence: int
+    t_first_host_ns: int
+    t_last_host_ns: int
+    num_packets: int = 1
+
+
+class TrackingEvents:
+    """The last 256 events of one tracker and how many packets each kind has cost."""
+
+    def __init__(self) -> None:
+        self.events: deque[TrackingEvent] = deque(maxlen=MAX_EVENTS)
+        self.num_events = 0
+        self.packets: dict[EventKind, int] = {"occluded": 0, "jumped": 0, "stale": 0}
+        self._going_on: TrackingEvent | None = None
+
+    def leave_out(self, kind: EventKind, *, state: int, sequence: int, t_host_ns: int) -> None:
+        """Note a packet that became no sample."""
+        self.packets[kind] += 1
+        event = self._going_on
+        if event is not None and event.kind == kind:
+            event.last_sequence, event.t_last_host_ns = sequence, t_host_ns
+            event.num_packets += 1
+            return
+        self._going_on = TrackingEvent(kind, state, sequence, sequence, t_host_ns, t_host_ns)
+        self.events.append(self._going_on)
+        self.num_events += 1
+
+    def end(self) -> None:
+        """A sample came, or the link was lost: the next event is another one."""
+        self._going_on = None
+
+
+class PoseGate:
+    """Refuses a pose that cannot be reached from the last good one since that was taken.
+
+    Reachable means: at 5 m/s and 2000 °/s at most. The time in between is the device's, at least
+    half a period for every packet, so that a step of its clock cannot shut the gate for good. A
+    position of exactly (0, 0, 0) is what trackers send for "none"; it is never reached from
+    another one. A quaternion and its negative are the same rotation.
+    """
+
+    def __init__(self) -> None:
+        self._last: tuple[float, ...] | None = None
+        self._elapsed_ns = 0
+        self._t_device_ns: int | None = None
+
+    def reset(self) -> None:
+        """Forget the last good pose: the link was lost, the tracker may be elsewhere."""
+        self._last = None
+        self._elapsed_ns = 0
+        self._t_device_ns = None
+
+    def pass_time(self, t_device_ns: int) -> None:
+        """A packet came, whatever becomes of it."""
+        if self._t_device_ns is not None:
+            self._elapsed_ns += max(t_device_ns - self._t_device_ns, MIN_STEP_NS)
+        self._t_device_ns = t_device_ns
+
+    def admits(self, pose: Sequence[float]) -> bool:
+        """Whether x y z (m) qw qx qy qz (unit) can be reached; if so it is the new last one."""
+        candidate = tuple(pose)
+        if self._last is not None and not self._is_reachable(self._last, candidate):
+            return False
+        self._last, self._elapsed_ns = candidate, 0
+        return True
+
+    def _is_reachable(self, last: tuple[float, ...], pose: tuple[float, ...]) -> bool:
+        if not any(pose[:3]) and any(last[:3]):
+            return False
+        elapsed_s = self._elapsed_ns / 1e9
+        if math.dist(pose[:3], last[:3]) > MAX_SPEED_M_PER_S * elapsed_s:
+            return False
+        cosine = abs(math.fsum(a * b for a, b in zip(pose[3:], last[3:], strict=True)))
+        return 2.0 * math.acos(min(1.0, cosine)) <= MAX_TURN_RATE_RAD_PER_S * elapsed_s
+
+
+class PoseStream:
+    """What all pose sources share: gate, order and events in; samples of one stream out."""
+
+    def __init__(self) -> None:
+        self.order = OrderFilter()
+        self.gate = PoseGate()
+        self.events = TrackingEvents()
+
+    def reset(self) -> None:
+        """The link was lost."""
+        self.order.reset()
+        self.gate.reset()
+        self.events.end()
+
+    def occlude(self, packet: Packet, *, state: int, t_host_ns: int) -> None:
+        """The tracker is not running: whatever pose it sends is none."""
+        self.gate.pass_time(packet.t_device_ns)
+        self.events.leave_out(
+            "occluded", state=state, sequence=packet.sequence, t_host_ns=t_host_ns
+        )
+
+    def take(
+        self, pose: Float64[np.ndarray, " 7"], packet: Packet, *, state: int, t_host_ns: int
+    ) -> Sample | None:
+        """The sample of a running tracker's pose (unit quaternion); None where it jumps."""
+        self.gate.pass_time(packet.t_device_ns)
+        if not self.gate.admits(pose.tolist()):
+            self.events.leave_out(
+                "jumped", state=state, sequence=packet.sequence, t_host_ns=t_host_ns
+            )
+            return None
+        self.events.end()
+        return Sample(t_host_ns, pose, packet.t_device_ns, packet.sequence)
 
 
 def pose_descriptor(stream: str) -> StreamDescriptor:
@@ -47,22 +187,27 @@ def pose_descriptor(stream: str) -> StreamDescriptor:
     )
 
 
+def source_of(stream: str) -> str:
+    """Where the tracker of a stream sits, as packets call it: left, right, head or none."""
+    source = stream.removeprefix("wrist_")
+    return source if source in SOURCES else "none"
+
+
 class PoseTrackerDecoder:
     """Poses [x y z qw qx qy qz] in the world frame, only while the tracker runs.
 
-    What a tracker sends in another state (some go on with a drifting pose and a "valid" flag) is
-    counted in `not_running` and not passed on: a gap, never a wrong pose.
+    What a tracker sends in another state (some go on with a drifting pose and a "valid" flag), and
+    a pose that jumps, is counted and noted in `events` and not passed on: a gap, never a wrong
+    pose.
     """
 
     def __init__(self, stream: str) -> None:
         self._stream = stream
         self._device = f"pose_tracker_{stream}"
-        self._source = stream.removeprefix("wrist_") if stream != "head" else "head"
-        if self._source not in SOURCES:
-            self._source = "none"
+        self._source = source_of(stream)
         self.reports = ReportReassembler()
+        self.poses = PoseStream()
         self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
-        self.not_running = 0
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -74,10 +219,26 @@ class PoseTrackerDecoder:
         """The pose stream."""
         return (pose_descriptor(self._stream),)
 
+    @property
+    def tracking(self) -> TrackingEvents:
+        """Occlusions and jumps: counts and the last events."""
+        return self.poses.events
+
+    @property
+    def not_running(self) -> int:
+        """Packets left out since the tracker was not running."""
+        return self.tracking.packets["occluded"]
+
+    @property
+    def jumped(self) -> int:
+        """Packets left out since their pose cannot have been reached."""
+        return self.tracking.packets["jumped"]
+
     def reset(self) -> None:
-        """Forget half a message."""
+        """Forget half a message and the last pose."""
         self.reports.reset()
         self._packets.reset()
+        self.poses.reset()
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Poses (float64 [7], unit quaternion) completed by one report.
@@ -91,14 +252,22 @@ class PoseTrackerDecoder:
         samples = []
         for packet in self._packets.feed(message[1]):
             check_packet(packet, device=self._device, source=self._source)
-            state, *numbers = PAYLOAD.unpack(packet.payload)
-            pose = np.array(numbers)
-            norm = float(np.linalg.norm(pose[3:]))
-            if state != TrackingState.RUNNING_OK:
-                self.not_running += 1
-            elif not np.all(np.isfinite(pose)) or abs(norm - 1.0) > NORM_TOLERANCE:
-                self.statistics.refused += 1
-            else:
-                pose[3:] /= norm
-                samples.append(Sample(t_host_ns, pose, packet.t_device_ns, packet.sequence))
+            sample = self._sample(packet, t_host_ns)
+            if sample is not None:
+                samples.append(sample)
         return {self._stream: samples} if samples else {}
+
+    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        if not self.poses.order.admits(packet.sequence):
+            return None
+        state, *numbers = PAYLOAD.unpack(packet.payload)
+        if state != TrackingState.RUNNING_OK:
+            self.poses.occlude(packet, state=state, t_host_ns=t_host_ns)
+            return None
+        pose = np.array(numbers)
+        norm = math.hypot(*numbers[3:])
+        if not all(map(math.isfinite, numbers)) or abs(norm - 1.0) > NORM_TOLERANCE:
+            self.statistics.refused += 1
+            return None
+        pose[3:] /= norm
+        return self.poses.take(pose, packet, state=state, t_host_ns=t_host_ns)

@@ -1,4 +1,4 @@
-"""A packet larger than a HID report: numbered 64-byte reports ↔ the packet's bytes."""
+"""Numbered 64-byte reports ↔ a packet's bytes, and which packets of a tracker are new."""
 
 import struct
 from dataclasses import dataclass
@@ -12,6 +12,9 @@ DESCRIPTOR_REPORT = 0x02
 REPORT_HEADER = struct.Struct("<BBBBB")
 PART_BYTES = REPORT_BYTES - REPORT_HEADER.size
 MAX_PARTS = 255
+SEQUENCE_MODULUS = 1 << 32
+# A step back of more than this is a restart of the device, not a packet that came late.
+LATE_PACKETS = 8
 
 
 def split_into_reports(report_id: int, counter: int, data: bytes) -> list[bytes]:
@@ -79,3 +82,33 @@ class ReportReassembler:
         message = b"".join(self._parts)
         self._parts = []
         return report_id, message
+
+
+class OrderFilter:
+    """Lets each packet through once and in order; what comes twice or late is left out.
+
+    Repetitions and late packets carry nothing that may become a sample behind a newer one. A larger
+    step back is a restart of the device, whose packets are new.
+    """
+
+    def __init__(self) -> None:
+        self.repeated = 0
+        self.late = 0
+        self._last: int | None = None
+
+    def reset(self) -> None:
+        """Another device, or the same one from the start, may follow."""
+        self._last = None
+
+    def admits(self, sequence: int) -> bool:
+        """Whether the packet with this number is newer than those before."""
+        if self._last is not None:
+            back = (self._last - sequence) % SEQUENCE_MODULUS
+            if back == 0:
+                self.repeated += 1
+                return False
+            if back <= LATE_PACKETS:
+                self.late += 1
+                return False
+        self._last = sequence
+        return True

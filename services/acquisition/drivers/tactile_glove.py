@@ -1,12 +1,16 @@
 """Tactile glove: bytes of our glove packet come in, 360 raw counts a sample go out."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
 from services.acquisition.drivers.base import Readings, check_packet
-from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+from services.acquisition.drivers.frames import DecoderStatistics
+from services.acquisition.drivers.glove_commands import MAX_REPLY, MIN_REPLY, REPLY_MAGIC
+from services.acquisition.drivers.packets import Packet, PacketDecoder
 
 MAGIC = b"DXTG"
 PAYLOAD_BYTES = 2 * NUM_RAW_TAXELS
@@ -34,11 +38,21 @@ class TactileGloveDecoder:
 
     Args:
         side: which glove it must be; None takes any.
+        on_reply: takes each reply to a command with its arrival; without it replies are passed
+            over.
     """
 
-    def __init__(self, side: Side | None = None) -> None:
-        self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD_BYTES, max_payload=PAYLOAD_BYTES)
+    def __init__(
+        self, side: Side | None = None, *, on_reply: Callable[[Packet, int], None] | None = None
+    ) -> None:
+        self._packets = PacketDecoder(
+            MAGIC,
+            min_payload=PAYLOAD_BYTES,
+            max_payload=PAYLOAD_BYTES,
+            others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
+        )
         self._side: Side | None = side
+        self._on_reply = on_reply
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -66,6 +80,10 @@ class TactileGloveDecoder:
         """
         samples = []
         for packet in self._packets.feed(data):
+            if packet.magic == REPLY_MAGIC:
+                if self._on_reply is not None:
+                    self._on_reply(packet, t_host_ns)
+                continue
             check_packet(packet, device=f"glove_{self._side or 'any'}", source=self._side)
             counts = np.frombuffer(packet.payload, dtype="<u2")
             samples.append(Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence))

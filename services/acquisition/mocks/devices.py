@@ -12,11 +12,11 @@ from services.acquisition.drivers.camera import CameraDecoder, ImageEncoding
 from services.acquisition.drivers.finger_tracker import FingerTracker
 from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.robot_state import STREAM_SIZES, RobotStateDecoder
-from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
 from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.finger_tracker import FingerTrackerSource
-from services.acquisition.mocks.ports import HidPort, MockPort, PtyPort, SocketPort
+from services.acquisition.mocks.glove_devices import mock_glove
+from services.acquisition.mocks.ports import HidPort, MockPort, SocketPort
 from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -25,7 +25,7 @@ from services.acquisition.mocks.replay import (
     device_rng,
 )
 from services.acquisition.mocks.robot_state import RobotStateSource
-from services.acquisition.mocks.tactile_glove import GloveCalibration, TactileGloveSource
+from services.acquisition.mocks.tactile_glove import GloveCalibration
 
 LATENCY_SIGMA_MS = 0.2
 
@@ -120,14 +120,15 @@ class MockFactory:
     def _hand(self, side: Side) -> list[MockPair]:
         pairs = []
         if f"tactile_{side}" in self._streams:
-            name = f"glove_{side}"
-            source = TactileGloveSource(
+            pair = mock_glove(
+                side,
                 self._streams[f"tactile_{side}"],
-                side=side,
                 calibration=self._gloves[side],
-                dead_taxels=self._faults.of(name).dead_taxels,
+                faults=self._faults.of(f"glove_{side}"),
+                seed=self._seed,
+                clock=self._clock,
             )
-            pairs.append(self._pair(name, source, PtyPort(name), TactileGloveDecoder(side)))
+            pairs.append(MockPair(*pair))
         if f"keypoints_{side}" in self._streams:
             pairs.append(self._finger_tracker(side))
         return pairs
@@ -164,7 +165,7 @@ class MockFactory:
         name: str,
         source: PacketSource,
         port: MockPort,
-        decoder: TactileGloveDecoder | PoseTrackerDecoder | CameraDecoder | RobotStateDecoder,
+        decoder: PoseTrackerDecoder | CameraDecoder | RobotStateDecoder,
     ) -> MockPair:
         driver = Driver(name, transport=port.transport, decoder=decoder, clock=self._clock)
         return MockPair(self._device(name, source, port), driver)

@@ -1,15 +1,40 @@
 """A seeded script of faults: true sample times come in, what happens to packets goes out."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Int64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from dextouch.errors import InvalidInputError
+from services.acquisition.drivers.packets import (
+    CRC,
+    HEADER,
+    MAGIC_SIZE,
+    SOURCES,
+    VERSION,
+    Packet,
+    encode_packet,
+)
+from services.acquisition.drivers.reports import (
+    REPORT_BYTES,
+    REPORT_HEADER,
+    ReportReassembler,
+    split_into_reports,
+)
+
 MILLISECOND_NS = 1_000_000
 MAX_BOOT_NS = 10**12
+OUR_MAGIC = b"DX"
+STUCK_COUNTS = 1_000
+SATURATED_COUNTS = 65_535
+# Where the numbers of a payload begin, and what they are.
+FLOATS = {b"DXFT": (4, "<f4"), b"DXPT": (4, "<f4"), b"DXRS": (0, "<f8")}
+OTHER_SIDE = {SOURCES["left"]: SOURCES["right"], SOURCES["right"]: SOURCES["left"]}
+
+Edit = Callable[[bytes, Packet], Packet]
 
 
 class DeviceFaults(BaseModel):
@@ -17,8 +42,15 @@ class DeviceFaults(BaseModel):
 
     Times in seconds count from the start of the device's first take. `jitter_ms` is the mean of an
     exponential delay on top of the constant `path_delay_ms`; packets never overtake each other.
-    Noise is per axis. `bit_error_rate` acts on serial lines only: USB and sockets have checksums
-    of their own. `dead_taxels` are raw cells that always read zero.
+    Noise is per axis. `bit_error_rate` and `byte_loss_rate` act on serial lines only: USB and
+    sockets have checksums of their own.
+
+    What comes during one of `stalls_s` arrives at its end; with `burst_ms` packets arrive together
+    at multiples of it. A reordered packet arrives behind the next one, of a half one the rest never
+    comes. From `wrong_side_from_s` on the other hand's device answers, from `version_from_s` on one
+    of another packet version. The counter starts at `first_sequence` and wraps at 2^32.
+    `dead_taxels` are raw cells that always read zero, stuck ones a constant, saturated ones full
+    scale. `nan_probability` puts a NaN into a packet of numbers.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -27,19 +59,32 @@ class DeviceFaults(BaseModel):
     path_delay_ms: float = Field(default=0.0, ge=0, le=1_000)
     jitter_ms: float = Field(default=0.0, ge=0, le=1_000)
     drop_probability: float = Field(default=0.0, ge=0, le=1)
+    duplicate_probability: float = Field(default=0.0, ge=0, le=1)
+    reorder_probability: float = Field(default=0.0, ge=0, le=1)
+    half_packet_probability: float = Field(default=0.0, ge=0, le=1)
+    nan_probability: float = Field(default=0.0, ge=0, le=1)
     bit_error_rate: float = Field(default=0.0, ge=0, le=0.01)
+    byte_loss_rate: float = Field(default=0.0, ge=0, le=0.01)
+    stalls_s: tuple[tuple[float, float], ...] = ()
+    burst_ms: float = Field(default=0.0, ge=0, le=1_000)
     position_noise_m: float = Field(default=0.0, ge=0, le=1)
     rotation_noise_rad: float = Field(default=0.0, ge=0, le=1)
     dead_taxels: tuple[int, ...] = ()
+    stuck_taxels: tuple[int, ...] = ()
+    saturated_taxels: tuple[int, ...] = ()
+    first_sequence: int = Field(default=0, ge=0, lt=2**32)
+    wrong_side_from_s: float | None = None
+    version_from_s: float | None = None
     unplugged_s: tuple[tuple[float, float], ...] = ()
     clock_step_at_s: float | None = None
     clock_step_s: float = Field(default=0.0, ge=-0.5, le=10)
 
     @model_validator(mode="after")
     def _windows_in_order(self) -> "DeviceFaults":
-        edges = [edge for window in self.unplugged_s for edge in window]
-        if any(later <= earlier for earlier, later in pairwise(edges)):
-            raise ValueError(f"unplugged_s: got {self.unplugged_s}, expected growing times")
+        for name, windows in (("unplugged_s", self.unplugged_s), ("stalls_s", self.stalls_s)):
+            edges = [edge for window in windows for edge in window]
+            if any(later <= earlier for earlier, later in pairwise(edges)):
+                raise ValueError(f"{name}: got {windows}, expected growing times")
         return self
 
 
@@ -110,6 +155,12 @@ def make_schedule(
         t_device_ns = t_device_ns + stepped * round(faults.clock_step_s * 1e9)
     delay_ms = faults.path_delay_ms + rng.exponential(1.0, len(t_true_ns)) * faults.jitter_ms
     arrival_ns = t_true_ns + np.rint(delay_ms * MILLISECOND_NS).astype(np.int64)
+    for start_s, stop_s in faults.stalls_s:
+        stalled = (arrival_ns >= start_s * 1e9) & (arrival_ns < stop_s * 1e9)
+        arrival_ns[stalled] = round(stop_s * 1e9)
+    if faults.burst_ms:
+        burst_ns = round(faults.burst_ms * MILLISECOND_NS)
+        arrival_ns = -(-arrival_ns // burst_ns) * burst_ns
     arrival_ns = np.maximum.accumulate(arrival_ns)
     is_unplugged = np.zeros(len(t_true_ns), dtype=np.bool_)
     for start_s, stop_s in faults.unplugged_s:
@@ -132,3 +183,85 @@ def flip_bits(data: bytes, rate: float, rng: np.random.Generator) -> tuple[bytes
     for bit in rng.choice(8 * len(data), num_flips, replace=False):
         damaged[bit // 8] ^= 1 << (bit % 8)
     return bytes(damaged), num_flips
+
+
+def lose_bytes(data: bytes, rate: float, rng: np.random.Generator) -> tuple[bytes, int]:
+    """`data` after a line that loses bytes at this rate, and how many it lost."""
+    num_lost = int(rng.binomial(len(data), rate)) if rate else 0
+    if not num_lost:
+        return data, 0
+    rest = np.delete(np.frombuffer(data, np.uint8), rng.choice(len(data), num_lost, replace=False))
+    return rest.tobytes(), num_lost
+
+
+def edit_units(units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
+    """The units of one packet after some edits, each given the magic and the packet.
+
+    Raises:
+        InvalidInputError: no packet of ours.
+    """
+    if not edits:
+        return list(units)
+    if units[0].startswith(OUR_MAGIC):
+        return [_edit_packet(b"".join(units), edits)]
+    reports = ReportReassembler()
+    messages = [m for m in map(reports.feed, units) if m is not None]
+    if len(messages) != 1:
+        raise InvalidInputError(f"mock fault: got {len(units)} units, expected one of our packets")
+    report_id, data = messages[0]
+    counter = REPORT_HEADER.unpack_from(units[0])[1]
+    return split_into_reports(report_id, counter, _edit_packet(data, edits))
+
+
+def halve_units(units: Sequence[bytes]) -> list[bytes]:
+    """The first half of a packet's bytes, or of its reports."""
+    if len(units) > 1:
+        return list(units[: len(units) // 2])
+    whole = units[0]
+    is_report = len(whole) == REPORT_BYTES and not whole.startswith(OUR_MAGIC)
+    return [whole[: REPORT_BYTES // 2 if is_report else len(whole) // 2]]
+
+
+def other_version(_: bytes, packet: Packet) -> Packet:
+    """The packet of a device with newer firmware."""
+    return replace(packet, version=VERSION + 1)
+
+
+def other_side(_: bytes, packet: Packet) -> Packet:
+    """The packet of the other hand's device."""
+    return replace(packet, source=OTHER_SIDE.get(packet.source, SOURCES["left"]))
+
+
+def pin_taxels(cells: Sequence[int], counts: int) -> Edit:
+    """Raw cells of a glove that show the same counts whatever presses them."""
+
+    def edit(magic: bytes, packet: Packet) -> Packet:
+        if magic != b"DXTG":
+            raise InvalidInputError(f"mock fault: pinned taxels on a {magic!r}, expected a glove")
+        values = np.frombuffer(packet.payload, dtype="<u2").copy()
+        values[list(cells)] = counts
+        return replace(packet, payload=values.tobytes())
+
+    return edit
+
+
+def put_nan(magic: bytes, packet: Packet) -> Packet:
+    """The first number is none."""
+    if magic not in FLOATS:
+        raise InvalidInputError(f"mock fault: a {magic!r} packet has no number that could be NaN")
+    start, dtype = FLOATS[magic]
+    values = np.frombuffer(packet.payload, dtype=dtype, offset=start).copy()
+    values[0] = np.nan
+    return replace(packet, payload=packet.payload[:start] + values.tobytes())
+
+
+def _edit_packet(data: bytes, edits: Sequence[Edit]) -> bytes:
+    magic = data[:MAGIC_SIZE]
+    if not magic.startswith(OUR_MAGIC):
+        raise InvalidInputError(f"mock fault: got a {magic!r} packet, expected one of ours")
+    _, version, source, length, sequence, t_device_ns = HEADER.unpack_from(data)
+    payload = data[HEADER.size : len(data) - CRC.size]
+    packet = Packet(version, source, sequence, t_device_ns, payload[:length])
+    for edit in edits:
+        packet = edit(magic, packet)
+    return encode_packet(magic, packet)

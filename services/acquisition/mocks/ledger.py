@@ -15,13 +15,25 @@ FORMAT = "dextouch mock ledger 1"
 
 
 class Fate(StrEnum):
-    """What became of one packet."""
+    """What became of one packet.
+
+    `sent` arrived whole and in order, `repeated` also a second time, `late` behind its successor;
+    of a `half` one the rest never came; a `refused` one arrived whole with something in it that a
+    driver must not take (version, side, NaN).
+    """
 
     SENT = "sent"
+    REPEATED = "repeated"
+    LATE = "late"
+    HALF = "half"
+    REFUSED = "refused"
     DROPPED = "dropped"
     CORRUPTED = "corrupted"
     UNPLUGGED = "unplugged"
     OVERRUN = "overrun"
+
+
+ACCEPTED = (Fate.SENT, Fate.REPEATED)
 
 
 @dataclass
@@ -49,9 +61,13 @@ class DeviceLedger:
         """How many packets met this fate."""
         return Counter(self.fate)[fate.value]
 
+    def accepted(self) -> list[int]:
+        """Sequence numbers of the packets that must become samples, in order."""
+        return [s for s, fate in zip(self.sequence, self.fate, strict=True) if fate in ACCEPTED]
+
     def count_lost_between(self) -> int:
         """Packets lost between the first and the last that arrived whole: what sequences show."""
-        whole = [index for index, fate in enumerate(self.fate) if fate == Fate.SENT]
+        whole = [index for index, fate in enumerate(self.fate) if fate in ACCEPTED]
         return whole[-1] - whole[0] + 1 - len(whole) if whole else 0
 
     def true_times_ns(self, sequences: np.ndarray) -> Int64[np.ndarray, " n"]:

@@ -12,13 +12,14 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
-from services.acquisition.mocks.link import Link, WatchedTransport
+from services.acquisition.mocks.link import KEEP_UP_TIMEOUT_S, Link, WatchedTransport
 from services.acquisition.transports.base import Transport
 from services.acquisition.transports.hid import HidDevice, HidTransport
 from services.acquisition.transports.serial import SerialTransport
 from services.acquisition.transports.socket import SocketTransport
 
-SEND_TIMEOUT_S = 1.0
+# A host that is merely busy loses nothing, as behind a real device with buffers of its own.
+SEND_TIMEOUT_S = KEEP_UP_TIMEOUT_S
 HID_RING_REPORTS = 63
 
 
@@ -48,17 +49,27 @@ class MockPort(Protocol):
 
 
 class PtyPort:
-    """A serial device: a pseudo terminal with a new name at every plugging."""
+    """A serial device: a pseudo terminal with a new name at every plugging.
+
+    Args:
+        name: of the device; also its serial number.
+        answer: what the device says to the bytes that the host writes.
+    """
 
     has_bit_errors = True
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
         self.link = Link()
         self._name = name
+        self._answer = answer
         self._master: int | None = None
         self._slave: int | None = None
-        self._transport = WatchedTransport(
-            SerialTransport(self._find, serial_number=name), self.link
+        self._sending = threading.Lock()
+        transport = SerialTransport(self._find, serial_number=name)
+        self._transport = (
+            WatchedTransport(transport, self.link)
+            if answer is None
+            else _HeardTransport(transport, self.link, self._hear)
         )
 
     @property
@@ -74,26 +85,52 @@ class PtyPort:
 
     def unplug(self) -> None:
         """Hang up."""
-        for descriptor in (self._master, self._slave):
-            if descriptor is not None:
-                os.close(descriptor)
-        self._master = self._slave = None
+        with self._sending:
+            for descriptor in (self._master, self._slave):
+                if descriptor is not None:
+                    os.close(descriptor)
+            self._master = self._slave = None
 
     def send(self, unit: bytes) -> bool:
-        """Write; what does not fit into the kernel's buffer within a second is lost."""
+        """Write; what does not fit into the kernel's buffer within 20 s is lost."""
         rest = memoryview(unit)
-        self.link.add_sent(len(unit))
-        while rest and self._master is not None:
-            if not select.select([], [self._master], [], SEND_TIMEOUT_S)[1]:
-                self.link.add_sent(-len(rest))
-                return False
-            rest = rest[os.write(self._master, rest) :]
+        with self._sending:
+            self.link.add_sent(len(unit))
+            while rest and self._master is not None:
+                if not select.select([], [self._master], [], SEND_TIMEOUT_S)[1]:
+                    self.link.add_sent(-len(rest))
+                    return False
+                rest = rest[os.write(self._master, rest) :]
         return True
 
     def _find(self) -> str:
         if self._slave is None:
             raise DeviceError(f"serial device {self._name!r} is not plugged in")
         return os.ttyname(self._slave)
+
+    def _hear(self, num_bytes: int) -> None:
+        """Read what the host has just written, and answer (in the host's thread)."""
+        data = b""
+        with contextlib.suppress(OSError, ValueError):  # unplugged in the middle of it
+            while len(data) < num_bytes and self._master is not None:
+                if not select.select([self._master], [], [], SEND_TIMEOUT_S)[0]:
+                    return
+                data += os.read(self._master, num_bytes - len(data))
+        for unit in self._answer(data) if self._answer is not None else []:
+            self.send(unit)
+
+
+class _HeardTransport(WatchedTransport):
+    """The host's transport to a device that answers: tells it how much was written."""
+
+    def __init__(self, transport: Transport, link: Link, hear: Callable[[int], None]) -> None:
+        super().__init__(transport, link)
+        self._hear = hear
+
+    def write(self, data: bytes) -> None:
+        """Write, and let the device read and answer."""
+        super().write(data)
+        self._hear(len(data))
 
 
 class FakeHid:
@@ -154,22 +191,47 @@ class FakeHid:
             raise OSError(errno.EIO, "read error")
 
 
-class HidPort:
-    """A HID device whose host end is the real HID transport on a `FakeHid`."""
+@runtime_checkable
+class ReportDevice(Protocol):
+    """A model of a device behind a real library: what it is told, and what it gives."""
+
+    on_write: Callable[[bytes], None] | None
+
+    def set_plugged(self, *, plugged: bool) -> None:
+        """Plug it in or pull it out."""
+        ...
+
+    def push(self, report: bytes) -> bool:
+        """A report for the host; False when its buffer is full."""
+        ...
+
+
+class ReportPort:
+    """A device of reports whose host end is a real transport.
+
+    Args:
+        device: the model that the transport's library is given.
+        transport: the host's end, not opened.
+        answer: what the device says to a report of the host.
+    """
 
     has_bit_errors = False
 
-    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
+    def __init__(
+        self,
+        device: ReportDevice,
+        transport: Transport,
+        answer: Callable[[bytes], list[bytes]] | None,
+    ) -> None:
         self.link = Link()
-        self.device = FakeHid()
+        self.device = device
         if answer is not None:
-            self.device.on_write = lambda report: self._send_all(answer(report))
-        transport = HidTransport(self.device.open, address=f"mock:{name}", serial_number=name)
+            device.on_write = lambda report: self._send_all(answer(report))
         self._transport = WatchedTransport(transport, self.link)
 
     @property
     def transport(self) -> Transport:
-        """A real HID transport."""
+        """The host's end."""
         return self._transport
 
     def plug(self) -> None:
@@ -181,7 +243,7 @@ class HidPort:
         self.device.set_plugged(plugged=False)
 
     def send(self, unit: bytes) -> bool:
-        """Push a report into the ring."""
+        """A report into the device's buffer."""
         self.link.add_sent(len(unit))
         taken = self.device.push(unit)
         if not taken:
@@ -191,6 +253,15 @@ class HidPort:
     def _send_all(self, reports: list[bytes]) -> None:
         for report in reports:
             self.send(report)
+
+
+class HidPort(ReportPort):
+    """A HID device whose host end is the real HID transport on a `FakeHid`."""
+
+    def __init__(self, name: str, answer: Callable[[bytes], list[bytes]] | None = None) -> None:
+        device = FakeHid()
+        transport = HidTransport(device.open, address=f"mock:{name}", serial_number=name)
+        super().__init__(device, transport, answer)
 
 
 class SocketPort:

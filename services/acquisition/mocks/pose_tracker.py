@@ -1,5 +1,8 @@
 """Poses of one tracked body come in; a pose tracker's HID reports, one a pose, go out."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Float64, Int64
 
@@ -14,6 +17,68 @@ from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
 
+DRIFT_M_PER_S = 0.5
+
+
+@dataclass(frozen=True)
+class Occlusion:
+    """The tracker is not seen in [start_s, stop_s): another state, and a pose that drifts away."""
+
+    start_s: float
+    stop_s: float
+    state: TrackingState = TrackingState.OUT_OF_RANGE
+
+
+@dataclass(frozen=True)
+class Jump:
+    """The tracker says it runs in [start_s, stop_s), but its pose is elsewhere by this much."""
+
+    start_s: float
+    stop_s: float
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_rad: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+TrackingFault = Occlusion | Jump
+
+
+class TrackedPoses:
+    """What a tracker says of a body: poses with noise and tracking faults, and the truth of these.
+
+    Args:
+        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
+        faults: position and rotation noise, per axis.
+        rng: of the noise.
+        tracking: occlusions and jumps; times count from the start of the stream.
+    """
+
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        faults: DeviceFaults,
+        rng: np.random.Generator,
+        tracking: Sequence[TrackingFault] = (),
+    ) -> None:
+        self.t_ns = stream.t_ns
+        self.poses = add_pose_noise(stream.values, faults, rng)
+        self.states = np.full(len(self.t_ns), int(TrackingState.RUNNING_OK))
+        # The ledger of this source: what is wrong with each sample, "" where nothing is.
+        self.labels = np.full(len(self.t_ns), "", dtype="<U8")
+        for fault in tracking:
+            during = (self.t_ns >= fault.start_s * 1e9) & (self.t_ns < fault.stop_s * 1e9)
+            if isinstance(fault, Occlusion):
+                self.states[during] = int(fault.state)
+                self.labels[during] = "occluded"
+                drift_s = (self.t_ns[during] - fault.start_s * 1e9) / 1e9
+                self.poses[during, 0] += DRIFT_M_PER_S * drift_s
+            else:
+                self.labels[during] = "jumped"
+                self.poses[during, :3] += np.array(fault.offset_m)
+                R_world_body = rotation_from_quaternion(self.poses[during, 3:])
+                turned = rotation_from_vector(np.array(fault.turn_rad)) @ R_world_body
+                self.poses[during, 3:] = quaternion_from_rotation(turned)
+
 
 class PoseTrackerSource:
     """Reports of one pose tracker.
@@ -22,23 +87,28 @@ class PoseTrackerSource:
         stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
         faults: position and rotation noise, per axis.
         rng: of the noise.
+        tracking: occlusions and jumps.
     """
 
     def __init__(
-        self, stream: ReplayStream, *, faults: DeviceFaults, rng: np.random.Generator
+        self,
+        stream: ReplayStream,
+        *,
+        faults: DeviceFaults,
+        rng: np.random.Generator,
+        tracking: Sequence[TrackingFault] = (),
     ) -> None:
-        self._stream = stream
         self._source = SOURCES[stream.descriptor.name.removeprefix("wrist_")]
-        self._poses = add_pose_noise(stream.values, faults, rng)
+        self.tracked = TrackedPoses(stream, faults=faults, rng=rng, tracking=tracking)
 
     @property
     def t_ns(self) -> Int64[np.ndarray, " n"]:
         """When each sample is taken."""
-        return self._stream.t_ns
+        return self.tracked.t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet in one report."""
-        payload = PAYLOAD.pack(TrackingState.RUNNING_OK, *self._poses[index])
+        payload = PAYLOAD.pack(self.tracked.states[index], *self.tracked.poses[index])
         packet = Packet(VERSION, self._source, sequence, t_device_ns, payload)
         return split_into_reports(DATA_REPORT, sequence, encode_packet(MAGIC, packet))
 

@@ -12,14 +12,26 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.mocks.faults import (
+    SATURATED_COUNTS,
+    STUCK_COUNTS,
     DeviceFaults,
+    Edit,
     Schedule,
     boot_time_ns,
+    edit_units,
     flip_bits,
+    halve_units,
+    lose_bytes,
     make_schedule,
+    other_side,
+    other_version,
+    pin_taxels,
+    put_nan,
 )
 from services.acquisition.mocks.ledger import DeviceLedger, Fate
 from services.acquisition.mocks.ports import MockPort
+
+SEQUENCE_MODULUS = 1 << 32
 
 
 @dataclass(frozen=True)
@@ -63,6 +75,18 @@ class PacketSource(Protocol):
         ...
 
 
+class _Edits(NamedTuple):
+    """What is changed in one packet; a driver must refuse one that `refused` changed."""
+
+    harmless: list[Edit]
+    refused: list[Edit]
+
+    @property
+    def all(self) -> list[Edit]:
+        """Both."""
+        return [*self.harmless, *self.refused]
+
+
 class _Event(NamedTuple):
     """Something a device does at a time counted from the start of the take."""
 
@@ -92,7 +116,18 @@ class MockDevice:
         self._rng = device_rng(seed, name)
         self._boot_ns = boot_time_ns(self._rng)
         self._bit_error_rate = faults.bit_error_rate if port.has_bit_errors else 0.0
-        self._next_sequence = 0
+        self._byte_loss_rate = faults.byte_loss_rate if port.has_bit_errors else 0.0
+        self._taxel_edits = [
+            pin_taxels(cells, counts)
+            for cells, counts in (
+                (faults.stuck_taxels, STUCK_COUNTS),
+                (faults.saturated_taxels, SATURATED_COUNTS),
+            )
+            if cells
+        ]
+        self._next_sequence = faults.first_sequence
+        # The place in the ledger and the units of a packet that the next one overtakes.
+        self._held: tuple[int, list[bytes]] | None = None
         self._start_host_ns = 0
         self.ledger = self._new_ledger()
 
@@ -122,6 +157,10 @@ class MockDevice:
             self._do(event, schedule)
             if lockstep:
                 self._let_host_keep_up(event)
+        if self._held is not None:
+            # Nothing came behind it: it is the last and in order.
+            self.ledger.fate[self._held[0]] = Fate.SENT.value
+            self._send_held()
         return True
 
     def _do(self, event: _Event, schedule: Schedule) -> None:
@@ -153,7 +192,7 @@ class MockDevice:
 
     def _send(self, index: int, schedule: Schedule) -> None:
         sequence = self._next_sequence
-        self._next_sequence += 1
+        self._next_sequence = (sequence + 1) % SEQUENCE_MODULUS
         t_device_ns = int(schedule.t_device_ns[index])
         fate, flips = Fate.SENT, 0
         if schedule.is_unplugged[index] or not self.port.link.is_open:
@@ -161,19 +200,71 @@ class MockDevice:
         elif schedule.is_dropped[index]:
             fate = Fate.DROPPED
         else:
-            for unit in self.source.units(index, sequence, t_device_ns):
-                damaged, num_flips = flip_bits(unit, self._bit_error_rate, self._rng)
-                flips += num_flips
-                if not self.port.send(damaged):
-                    fate = Fate.OVERRUN
-            if flips and fate is Fate.SENT:
-                fate = Fate.CORRUPTED
+            units = self.source.units(index, sequence, t_device_ns)
+            fate, flips = self._deliver(units, int(schedule.t_true_ns[index]))
         times_ns = (
             self._start_host_ns + int(schedule.t_true_ns[index]),
             t_device_ns,
             self._start_host_ns + int(schedule.t_arrival_ns[index]),
         )
         self.ledger.note(sequence, times_ns, fate, flips)
+
+    def _deliver(self, units: list[bytes], t_true_ns: int) -> tuple[Fate, int]:
+        """Send a packet through everything that can happen to it on its way."""
+        fate = Fate.SENT
+        edits = self._edits_of(t_true_ns)
+        if edits.refused:
+            fate = Fate.REFUSED
+        units = edit_units(units, edits.all)
+        if self._happens(self.faults.half_packet_probability):
+            units, fate = halve_units(units), Fate.HALF
+        elif self._may_wait(fate) and self._happens(self.faults.reorder_probability):
+            self._held = (len(self.ledger.fate), units)
+            return Fate.LATE, 0
+        elif fate is Fate.SENT and self._happens(self.faults.duplicate_probability):
+            units, fate = units * 2, Fate.REPEATED
+        fate, flips = self._put_on_line(units, fate)
+        self._send_held()
+        return fate, flips
+
+    def _put_on_line(self, units: list[bytes], fate: Fate) -> tuple[Fate, int]:
+        flips = 0
+        for unit in units:
+            damaged, num_flips = flip_bits(unit, self._bit_error_rate, self._rng)
+            damaged, num_lost = lose_bytes(damaged, self._byte_loss_rate, self._rng)
+            flips += num_flips
+            if num_flips or num_lost:
+                fate = Fate.CORRUPTED
+            if not self.port.send(damaged):
+                fate = Fate.OVERRUN
+        return fate, flips
+
+    def _send_held(self) -> None:
+        """Send the packet that another one has overtaken."""
+        held, self._held = self._held, None
+        if held is not None:
+            self._put_on_line(held[1], Fate.LATE)
+
+    def _may_wait(self, fate: Fate) -> bool:
+        return fate is Fate.SENT and self._held is None
+
+    def _happens(self, probability: float) -> bool:
+        # No random number is drawn for what cannot happen, so that one fault does not change
+        # what another one does.
+        return probability > 0 and bool(self._rng.random() < probability)
+
+    def _edits_of(self, t_true_ns: int) -> "_Edits":
+        faults = self.faults
+        refused: list[Edit] = []
+        for from_s, edit in (
+            (faults.version_from_s, other_version),
+            (faults.wrong_side_from_s, other_side),
+        ):
+            if from_s is not None and t_true_ns >= from_s * 1e9:
+                refused.append(edit)
+        if self._happens(faults.nan_probability):
+            refused.append(put_nan)
+        return _Edits(self._taxel_edits, refused)
 
     def _new_ledger(self) -> DeviceLedger:
         return DeviceLedger(path_delay_ns=round(self.faults.path_delay_ms * 1e6))

@@ -17,6 +17,7 @@ from services.acquisition.mocks.ledger import Ledger
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.schemas import SaveTake, TakeCheck, TakePrompt
 from services.acquisition.station import Station
+from services.acquisition.supervisor import SpoolSafety
 
 LEDGER_FILE = "mock_ledger.json"
 LEAD_NS = 20_000_000
@@ -46,6 +47,7 @@ class MockStation:
         name: of the station.
         calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
         image_encoding: of the cameras on the wire.
+        safety: of the spool.
     """
 
     def __init__(  # noqa: PLR0913 - all but the first four have a sensible default
@@ -59,6 +61,7 @@ class MockStation:
         name: str = "mock_station",
         calibration: Mapping[str, Matrix] | None = None,
         image_encoding: ImageEncoding = "rgb8",
+        safety: SpoolSafety | None = None,
     ) -> None:
         factory = MockFactory(
             streams, faults=faults, seed=seed, clock=clock, image_encoding=image_encoding
@@ -77,6 +80,7 @@ class MockStation:
                 **factory.latencies(self.pairs),
                 **(calibration or {}),
             },
+            safety=safety,
         )
         self._players: list[tuple[threading.Thread, Waiter]] = []
         self._failures: list[str] = []

@@ -10,6 +10,7 @@ from dextouch.errors import ShapeError
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.tactile_glove import FULL_SCALE_COUNTS, MAGIC
+from services.acquisition.mocks.glove_answers import GloveAnswers
 from services.acquisition.mocks.replay import ReplayStream, device_rng
 
 OFFSET_COUNTS = 120.0
@@ -50,6 +51,7 @@ class TactileGloveSource:
         side: which hand.
         calibration: of this glove.
         dead_taxels: raw cells that read zero.
+        answers: to the host's requests; without it the glove hears nothing.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class TactileGloveSource:
         side: Side,
         calibration: GloveCalibration,
         dead_taxels: Sequence[int] = (),
+        answers: GloveAnswers | None = None,
     ) -> None:
         if stream.descriptor.shape != (NUM_TAXELS,):
             raise ShapeError(
@@ -66,6 +69,7 @@ class TactileGloveSource:
             )
         self._stream = stream
         self._side = side
+        self._answers = answers
         self._counts = calibration.counts(stream.values, side=side)
         self._counts[:, list(dead_taxels)] = 0
 
@@ -75,7 +79,8 @@ class TactileGloveSource:
         return self._stream.t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
-        """One packet."""
-        payload = self._counts[index].tobytes()
-        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
-        return [encode_packet(MAGIC, packet)]
+        """One packet, and the reply that waited for it, if any."""
+        counts = self._counts[index]
+        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, counts.tobytes())
+        replies = [] if self._answers is None else self._answers.note_packet(counts)
+        return [encode_packet(MAGIC, packet), *replies]

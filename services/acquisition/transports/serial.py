@@ -1,5 +1,8 @@
 """A serial port by pyserial: a port name or a device's serial number comes in, bytes go out."""
 
+import contextlib
+import os
+import select
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -10,24 +13,36 @@ if TYPE_CHECKING:
     import serial
 
 READ_TIMEOUT_S = 0.1
+# A device that takes nothing in must not hold up the station for ever.
+WRITE_TIMEOUT_S = 0.5
+# More than a kernel buffer holds: one read takes all that has come.
+READ_BYTES = 65_536
 
 
 def find_port(serial_number: str) -> str:
     """The port of the device with this serial number, whatever its name is today.
 
     Raises:
-        DeviceError: no such device is plugged in; the message lists those that are.
+        DeviceError: no such device is plugged in (the message lists those that are), or several
+            with this number.
     """
     from serial.tools import list_ports
 
-    found = {port.serial_number: port.device for port in list_ports.comports()}
-    if serial_number not in found:
-        present = ", ".join(sorted(str(number) for number in found if number)) or "none"
+    ports = list_ports.comports()
+    found = sorted(port.device for port in ports if port.serial_number == serial_number)
+    if not found:
+        present = ", ".join(sorted(p.serial_number for p in ports if p.serial_number)) or "none"
         raise DeviceError(
             f"serial device {serial_number!r} is not plugged in; present: {present}",
             serial_number=serial_number,
         )
-    return found[serial_number]
+    if len(found) > 1:
+        raise DeviceError(
+            f"serial device {serial_number!r}: got {len(found)} devices with this number "
+            f"({', '.join(found)}), expected one; name the port instead",
+            serial_number=serial_number,
+        )
+    return found[0]
 
 
 class SerialTransport:
@@ -51,6 +66,7 @@ class SerialTransport:
         self._serial_number = serial_number
         self._address = "not opened"
         self._port: serial.Serial | None = None
+        self._poll = select.poll()
 
     @property
     def info(self) -> TransportInfo:
@@ -69,10 +85,20 @@ class SerialTransport:
         self._address = self._find()
         try:
             self._port = serial.Serial(
-                self._address, self._baud_rate, timeout=READ_TIMEOUT_S, exclusive=True
+                self._address,
+                self._baud_rate,
+                timeout=READ_TIMEOUT_S,
+                write_timeout=WRITE_TIMEOUT_S,
+                exclusive=True,
             )
         except (OSError, ValueError) as error:  # SerialException is an OSError
             raise DeviceError(f"{self.info}: cannot be opened ({error}); is it in use?") from error
+        # USB bridges of one maker hold bytes back for 16 ms unless told otherwise; now is the time,
+        # since doing it in full flow stalls them. Ports without such a timer refuse.
+        with contextlib.suppress(OSError, ValueError):
+            self._port.set_low_latency_mode(True)
+        self._poll = select.poll()
+        self._poll.register(self._port.fileno(), select.POLLIN)
 
     def read(self) -> bytes:
         """All that has arrived, waiting up to 0.1 s for the first byte.
@@ -81,16 +107,24 @@ class SerialTransport:
             DeviceError: the port is closed or the device is gone.
         """
         port = self._opened()
+        # The wait has its own bound: one left to the line ends only if nobody changes its settings.
+        if not self._poll.poll(READ_TIMEOUT_S * 1e3):
+            return b""
         try:
-            return port.read(max(1, port.in_waiting))
-        except OSError as error:  # SerialException is an OSError
+            data = os.read(port.fileno(), READ_BYTES)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
             raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
+        if not data:
+            raise DeviceError(f"{self.info}: unplugged while reading (its end was reached)")
+        return data
 
     def write(self, data: bytes) -> None:
-        """Send all bytes.
+        """Send all bytes, within 0.5 s.
 
         Raises:
-            DeviceError: the port is closed or the device is gone.
+            DeviceError: the port is closed, the device is gone or takes nothing in.
         """
         try:
             self._opened().write(data)

@@ -22,6 +22,22 @@ def tcp_connector(host: str, port: int) -> Callable[[], socket.socket]:
     return connect
 
 
+def unix_connector(path: str) -> Callable[[], socket.socket]:
+    """What connects to a bridge on this machine by its socket's path."""
+
+    def connect() -> socket.socket:
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        link.settimeout(CONNECT_TIMEOUT_S)
+        try:
+            link.connect(path)
+        except OSError:
+            link.close()
+            raise
+        return link
+
+    return connect
+
+
 class SocketTransport:
     """One stream socket, connected anew at every opening."""
 

@@ -1,38 +1,68 @@
 """Poses of a tracker and of a board seen by its camera in, the camera's place on the tracker out.
 
-With X = T_tracker_camera and Z = T_world_board every view says T_world_tracker · X · T_camera_board
-= Z. Two views give A X = X B for their relative motions; the rotation vectors of A and B differ by
-R_X alone (Park and Martin 1994), which gives a closed form. It starts a refinement of X and Z
-together, weighted by the noise that the residuals show, whose covariance is the answer's sigma.
+A closed form starts it and a gate refuses motion that does not show the mount; then the noise of
+tracker and camera is estimated from what the views leave over, and a bundle weighted with it finds
+mount, board and every view's tracker error together. Its covariance is the answer's sigma.
 """
 
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float64
-from scipy.optimize import least_squares
 
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry.rotations import rotation_angle, rotation_from_vector, vector_from_rotation
-from dextouch.geometry.transforms import invert, transform
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.geometry.rotations import rotation_angle
+from dextouch.geometry.transforms import invert
+from services.alignment.calibration.board_views import BoardViews, polish
+from services.alignment.calibration.bundle import (
+    Bundle,
+    pose_measurement,
+    predicted_jacobians,
+    solve_bundle,
+)
+from services.alignment.calibration.closed_form import (
+    Agreement,
+    Series,
+    agreeing_views,
+    view_errors,
+)
+from services.alignment.calibration.motion import AXIS_NAMES, DegenerateMotionError, checked_poses
+from services.alignment.calibration.noise_components import (
+    Component,
+    estimate_sigmas,
+    sensor_components,
+)
+from services.alignment.calibration.twists import adjoint, twist
 
-MIN_VIEWS = 4
-MAX_PAIRS = 5000
-# The second largest spread of rotation axes must reach this, or part of X cannot be seen.
-MIN_SECOND_SPREAD_RAD = np.deg2rad(10.0)
-# Near half a turn the sign of a rotation vector is noise; near none its direction is.
-USABLE_ANGLE_RAD = (np.deg2rad(2.0), np.deg2rad(165.0))
-# Residuals above this are no noise: frames are mixed up.
-MAX_ROTATION_RMS_RAD = np.deg2rad(5.0)
-MAX_TRANSLATION_RMS_M = 0.05
-NOISE_ROUNDS = 3
-NOISE_FLOOR = (1e-6, 1e-6)
-AXIS_NAMES = ("x", "y", "z")
+__all__ = ["DegenerateMotionError", "HandEyeNoise", "HandEyeResult", "mount_difference"]
+__all__ += ["solve_hand_eye"]
+
+TASK = "hand-eye"
+# A mount that is known worse than this is of no use (one sigma, three axes together).
+MAX_SIGMA_ROTATION_RAD = np.deg2rad(0.5)
+MAX_SIGMA_TRANSLATION_M = 0.01
 
 
-class DegenerateMotionError(InvalidInputError):
-    """The motion does not show what is asked for; the message names the missing motion."""
+@dataclass(frozen=True)
+class HandEyeNoise:
+    """Noise to expect (one sigma an axis); what the views show corrects it.
+
+    The first three hold for a Vive tracker and a sharp board. `board_*` are of a board's pose that
+    a solver found, in the camera's axes; they count only where no corners are given.
+    """
+
+    tracker_rotation_rad: float = 8.7e-4
+    tracker_translation_m: float = 5e-4
+    pixel_px: float = 0.3
+    board_tilt_rad: float = 1.5e-3
+    board_roll_rad: float = 5e-4
+    board_sideways_m: float = 1.5e-4
+    board_depth_m: float = 4e-4
+
+    def __post_init__(self) -> None:
+        for name, value in vars(self).items():
+            if not (np.isfinite(value) and value > 0):
+                raise InvalidInputError(f"{TASK}: noise {name} is {value}, expected above zero")
 
 
 @dataclass(frozen=True)
@@ -43,186 +73,153 @@ class HandEyeResult:
         T_tracker_camera: the mount.
         sigma_rotation_rad: of the mount's rotation, length of the three axes' sigmas.
         sigma_translation_m: of its translation, likewise.
+        covariance: [6, 6] of its twist: turn (rad) and shift (m) along the camera's own axes.
         T_world_board: where the board stood.
-        rotation_rms_rad: what is left of the views' rotations.
-        translation_rms_m: what is left of their translations.
+        rotation_rms_rad: how far the views turn the board from there.
+        translation_rms_m: how far they put it from there.
+        board_spread_m: mean distance of the board's places from their middle.
+        noise: what the views show of the noise (one sigma an axis), named as in `HandEyeNoise`.
+        left_out_views: views that were far off and did not count.
     """
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
     sigma_rotation_rad: float
     sigma_translation_m: float
+    covariance: Float64[np.ndarray, "6 6"]
     T_world_board: Float64[np.ndarray, "4 4"]
     rotation_rms_rad: float
     translation_rms_m: float
+    board_spread_m: float
+    noise: dict[str, float]
+    left_out_views: tuple[int, ...]
 
 
-def solve_hand_eye(Ts_world_tracker: np.ndarray, Ts_camera_board: np.ndarray) -> HandEyeResult:
+def solve_hand_eye(
+    Ts_world_tracker: np.ndarray,
+    Ts_camera_board: np.ndarray,
+    *,
+    views: BoardViews | None = None,
+    noise: HandEyeNoise | None = None,
+) -> HandEyeResult:
     """Mount of a camera on a tracker, from views of a board that stands still.
 
     Args:
         Ts_world_tracker: [n ≥ 4, 4, 4] poses of the tracker in the world.
         Ts_camera_board: [n, 4, 4] poses of the board in the camera, same moments.
+        views: the corners that the board's poses were found from; with them each view counts as
+            much as its pixels say, which is the better answer.
+        noise: what to expect; default `HandEyeNoise()`.
 
     Raises:
-        DegenerateMotionError: the tracker was turned too little, or about one axis only.
-        InvalidInputError: too few views, or views that contradict each other (one of the two
-            series is probably inverted; the message says so where that is seen).
+        DegenerateMotionError: the tracker was turned too little, or about one axis only, or the
+            mount stays less known than half a degree and 10 mm.
+        InvalidInputError: too few views, or views that contradict each other (an inverted series
+            is named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
     """
-    tracker, board = _checked(Ts_world_tracker, Ts_camera_board)
-    a_rad, b_rad, A, B = _relative_motions(tracker, board)
-    _check_motion(a_rad)
-    start = _closed_form(a_rad, b_rad, A, B)
-    result = _refine(tracker, board, start)
-    if (
-        result.rotation_rms_rad > MAX_ROTATION_RMS_RAD
-        or result.translation_rms_m > MAX_TRANSLATION_RMS_M
-    ):
-        raise InvalidInputError(_contradiction(tracker, board, result))
+    tracker, board = checked_poses(
+        TASK, Ts_world_tracker=Ts_world_tracker, Ts_camera_board=Ts_camera_board
+    )
+    if views is not None and len(views.points_board) != len(tracker):
+        raise ShapeError(
+            f"{TASK}: got {len(views.points_board)} views of corners and {len(tracker)} poses, "
+            "expected corners of every pose"
+        )
+    names = ("Ts_world_tracker", "Ts_camera_board")
+    series = Series(TASK, "tracker", tracker, board, names)
+    agreed = agreeing_views(series)
+    series = series.only(agreed.views)
+    corners = None if views is None else views.only(agreed.views)
+    bundle, sigmas = _weighted(series, agreed, corners, noise or HandEyeNoise())
+    covariance = bundle.covariance[:6, :6]
+    variances = np.diag(covariance)
+    _, errors = view_errors(series, bundle.X)
+    rms = np.sqrt(np.square(errors).mean(axis=0))
+    result = HandEyeResult(
+        T_tracker_camera=bundle.X,
+        sigma_rotation_rad=float(np.sqrt(variances[:3].sum())),
+        sigma_translation_m=float(np.sqrt(variances[3:].sum())),
+        covariance=covariance,
+        T_world_board=bundle.Z,
+        rotation_rms_rad=float(rms[0]),
+        translation_rms_m=float(rms[1]),
+        board_spread_m=float(errors[:, 1].mean()),
+        noise=sigmas,
+        left_out_views=tuple(sorted(set(range(len(tracker))) - set(agreed.views.tolist()))),
+    )
+    _check_budget(result)
     return result
 
 
-def _checked(
-    Ts_world_tracker: np.ndarray, Ts_camera_board: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 4 4"], Float64[np.ndarray, "n 4 4"]]:
-    tracker = np.asarray(Ts_world_tracker, dtype=np.float64)
-    board = np.asarray(Ts_camera_board, dtype=np.float64)
-    if tracker.ndim != 3 or tracker.shape[1:] != (4, 4) or tracker.shape != board.shape:
-        raise ShapeError(
-            f"hand-eye: got poses {tracker.shape} and {board.shape}, expected two [n, 4, 4]"
-        )
-    for name, poses in (("Ts_world_tracker", tracker), ("Ts_camera_board", board)):
-        if not np.isfinite(poses).all():
-            raise NonFiniteError(f"hand-eye: {name} holds NaN or infinity; leave those views out")
-        R = poses[:, :3, :3]
-        if not np.allclose(R @ np.swapaxes(R, 1, 2), np.eye(3), atol=1e-3):
-            raise InvalidInputError(f"hand-eye: {name} holds matrices that are no rigid transforms")
-    if len(tracker) < MIN_VIEWS:
-        raise InvalidInputError(
-            f"hand-eye: got {len(tracker)} views, expected at least {MIN_VIEWS}, better 20"
-        )
-    return tracker, board
-
-
-def _relative_motions(
-    tracker: np.ndarray, board: np.ndarray
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Rotation vectors and transforms of A and B for pairs of views, A X = X B."""
-    pairs = np.array(list(combinations(range(len(tracker)), 2)))
-    pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
-    A = invert(tracker[pairs[:, 1]]) @ tracker[pairs[:, 0]]
-    B = board[pairs[:, 1]] @ invert(board[pairs[:, 0]])
-    a_rad, b_rad = vector_from_rotation(A[:, :3, :3]), vector_from_rotation(B[:, :3, :3])
-    return a_rad, b_rad, A, B
-
-
-def _check_motion(a_rad: np.ndarray) -> None:
-    """Refuse turns about one axis only; `a_rad` are turns in the tracker's own frame."""
-    _, spread, axes = np.linalg.svd(a_rad / np.sqrt(len(a_rad)), full_matrices=False)
-    if spread[1] >= MIN_SECOND_SPREAD_RAD:
-        return
-    told = "/".join(f"{value:.1f}" for value in np.rad2deg(spread))
-    wanted = [axes[1], axes[2]] if spread[0] >= MIN_SECOND_SPREAD_RAD else list(axes)
-    names = sorted({AXIS_NAMES[int(np.argmax(np.abs(axis)))] for axis in wanted})
-    raise DegenerateMotionError(
-        f"hand-eye: turns of the tracker spread {told} degrees along three axes, expected the "
-        f"second at least {np.rad2deg(MIN_SECOND_SPREAD_RAD):.0f}; also turn the tracker by 30 "
-        f"degrees and more about its {' and '.join(names)} axis",
-        spread_deg=[float(value) for value in np.rad2deg(spread)],
-        missing_axes=names,
+def _weighted(
+    series: Series, agreed: Agreement, corners: BoardViews | None, noise: HandEyeNoise
+) -> tuple[Bundle, dict[str, float]]:
+    """The bundle with the noise that the views show, and that noise."""
+    tracker, board = series.Ts_world_body, series.Ts_mounted_target
+    X_B = invert(tracker) @ agreed.Z
+    Ts = invert(agreed.X) @ X_B
+    J, C = predicted_jacobians(Ts, X_B)
+    if corners is None:
+        own = board_components(Ts, noise)
+    else:
+        one_pixel = corners.measurement(1.0)
+        board = polish(one_pixel, board)
+        shapes = np.linalg.inv(one_pixel(board).information)
+        own = {"pixel_px": Component(noise.pixel_px, shapes)}
+    components = sensor_components(
+        "tracker", C, (noise.tracker_rotation_rad, noise.tracker_translation_m)
     )
+    components |= own
+    found = estimate_sigmas(twist(invert(board) @ Ts), J, list(components.values()))
+    sigmas = dict(zip(components, (float(value) for value in found), strict=True))
+    if corners is None:
+        shares = [Component(sigmas[name], own[name].shapes).covariances for name in own]
+        measurement = pose_measurement(board, np.linalg.inv(np.sum(shares, axis=0)))
+    else:
+        measurement = corners.measurement(sigmas["pixel_px"])
+    tracker_sigma = sigmas["tracker_rotation_rad"], sigmas["tracker_translation_m"]
+    return solve_bundle(tracker, measurement, tracker_sigma, (agreed.X, agreed.Z)), sigmas
 
 
-def _closed_form(
-    a_rad: np.ndarray, b_rad: np.ndarray, A: np.ndarray, B: np.ndarray
-) -> Float64[np.ndarray, "4 4"]:
-    """Park's rotation by an orthogonal fit of rotation vectors, then linear translation."""
-    low, high = USABLE_ANGLE_RAD
-    angles = np.linalg.norm(a_rad, axis=1), np.linalg.norm(b_rad, axis=1)
-    use = np.logical_and.reduce([(angle > low) & (angle < high) for angle in angles])
-    if use.sum() < 2:
-        use = np.ones(len(a_rad), dtype=bool)
-    U, _, Vt = np.linalg.svd(a_rad[use].T @ b_rad[use])
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    left = (A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    right = ((R @ B[:, :3, 3:])[..., 0] - A[:, :3, 3]).reshape(-1)
-    t, *_ = np.linalg.lstsq(left, right, rcond=None)
-    return transform(R, t)
-
-
-def _refine(tracker: np.ndarray, board: np.ndarray, start: np.ndarray) -> HandEyeResult:
-    """Gauss–Newton on X and Z; the noise of rotation and translation is taken from what is left."""
-    views = tracker @ start @ board
-    X, Z = start, _mean_pose(views)
-    noise = np.array([1e-2, 1e-2])
-    covariance = np.eye(12)
-    for _ in range(NOISE_ROUNDS):
-
-        def weighted(
-            step: np.ndarray,
-            X: np.ndarray = X,
-            Z: np.ndarray = Z,
-            noise: np.ndarray = noise,
-        ) -> np.ndarray:
-            rotation, translation = _residuals(
-                tracker, board, _moved(X, step[:6]), _moved(Z, step[6:])
-            )
-            return np.concatenate([rotation / noise[0], translation / noise[1]], axis=None)
-
-        fit = least_squares(weighted, np.zeros(12), x_scale="jac")
-        X, Z = _moved(X, fit.x[:6]), _moved(Z, fit.x[6:])
-        rotation, translation = _residuals(tracker, board, X, Z)
-        # 12 of the 6 n numbers are used up by the unknowns.
-        unused = 1 - 12 / (6 * len(tracker))
-        left = [float(np.mean(part**2)) / unused for part in (rotation, translation)]
-        noise = np.maximum(np.sqrt(left), NOISE_FLOOR)
-        jacobian: np.ndarray = np.array(fit.jac)
-        covariance = np.linalg.pinv(jacobian.T @ jacobian)
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0))
-    return HandEyeResult(
-        T_tracker_camera=X,
-        sigma_rotation_rad=float(np.linalg.norm(sigma[:3])),
-        sigma_translation_m=float(np.linalg.norm(sigma[3:6])),
-        T_world_board=Z,
-        rotation_rms_rad=float(np.sqrt((rotation**2).sum(axis=1).mean())),
-        translation_rms_m=float(np.sqrt((translation**2).sum(axis=1).mean())),
+def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[str, Component]:
+    """Noise of a board's pose: a camera sees tilt and depth worse than the rest."""
+    R = Ts_camera_board[:, :3, :3]
+    along = np.swapaxes(R, 1, 2)[:, :, 2:] @ R[:, 2:]
+    across = np.eye(3) - along
+    rows = (
+        ("board_tilt_rad", noise.board_tilt_rad, across, slice(0, 3)),
+        ("board_roll_rad", noise.board_roll_rad, along, slice(0, 3)),
+        ("board_sideways_m", noise.board_sideways_m, across, slice(3, 6)),
+        ("board_depth_m", noise.board_depth_m, along, slice(3, 6)),
     )
+    components = {}
+    for name, sigma, block, place in rows:
+        shapes = np.zeros((len(R), 6, 6))
+        shapes[:, place, place] = block
+        components[name] = Component(sigma, shapes)
+    return components
 
 
-def _residuals(
-    tracker: np.ndarray, board: np.ndarray, X: np.ndarray, Z: np.ndarray
-) -> tuple[Float64[np.ndarray, "n 3"], Float64[np.ndarray, "n 3"]]:
-    """What separates each view's board from Z: rotation vectors and translations, board axes."""
-    E = invert(Z) @ tracker @ X @ board
-    return vector_from_rotation(E[:, :3, :3]), E[:, :3, 3]
-
-
-def _moved(T: np.ndarray, step: np.ndarray) -> Float64[np.ndarray, "4 4"]:
-    """T after a small turn in its own frame and a shift in its parent's."""
-    return transform(T[:3, :3] @ rotation_from_vector(step[:3]), T[:3, 3] + step[3:])
-
-
-def _mean_pose(Ts: np.ndarray) -> Float64[np.ndarray, "4 4"]:
-    """Rotation nearest to the mean matrix (chordal mean), mean translation."""
-    U, _, Vt = np.linalg.svd(Ts[:, :3, :3].mean(axis=0))
-    R = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return transform(R, Ts[:, :3, 3].mean(axis=0))
-
-
-def _contradiction(tracker: np.ndarray, board: np.ndarray, result: HandEyeResult) -> str:
-    hint = "check that both series belong to the same moments and the board stood still"
-    for name, other in (
-        ("Ts_world_tracker", (invert(tracker), board)),
-        ("Ts_camera_board", (tracker, invert(board))),
+def _check_budget(result: HandEyeResult) -> None:
+    """Refuse a mount that stays too uncertain."""
+    if (
+        result.sigma_rotation_rad <= MAX_SIGMA_ROTATION_RAD
+        and result.sigma_translation_m <= MAX_SIGMA_TRANSLATION_M
     ):
-        motions = _relative_motions(*other)
-        again = _refine(*other, _closed_form(*motions))
-        if again.translation_rms_m < 0.2 * result.translation_rms_m:
-            hint = f"{name} is probably inverted: the views agree when it is turned round"
-    return (
-        f"hand-eye: the views contradict each other by {np.rad2deg(result.rotation_rms_rad):.1f} "
-        f"degrees and {result.translation_rms_m * 1e3:.0f} mm RMS, expected at most "
-        f"{np.rad2deg(MAX_ROTATION_RMS_RAD):.0f} and {MAX_TRANSLATION_RMS_M * 1e3:.0f}; {hint}"
+        return
+    # In the tracker's axes, as the operator turns the tracker.
+    turned = adjoint(result.T_tracker_camera)
+    covariance = turned @ result.covariance @ turned.T
+    worst = np.linalg.eigh(covariance[:3, :3])[1][:, -1]
+    axis = AXIS_NAMES[int(np.argmax(np.abs(worst)))]
+    others = " and ".join(name for name in AXIS_NAMES if name != axis)
+    raise DegenerateMotionError(
+        f"{TASK}: the mount stays uncertain by {np.rad2deg(result.sigma_rotation_rad):.2f} degrees "
+        f"and {result.sigma_translation_m * 1e3:.1f} mm (one sigma), expected at most "
+        f"{np.rad2deg(MAX_SIGMA_ROTATION_RAD):.1f} and {MAX_SIGMA_TRANSLATION_M * 1e3:.0f}; the "
+        f"turn about the tracker's {axis} axis is known worst: turn it more about {others}, take "
+        "more views, and bring the board nearer",
+        missing_axes=[name for name in AXIS_NAMES if name != axis],
     )
 
 

@@ -2,50 +2,55 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
+from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.hand_eye import DegenerateMotionError
+from services.alignment.calibration.board_detection import (
+    CharucoBoard,
+    Chessboard,
+    FoundBoards,
+    find_boards,
+)
+from services.alignment.calibration.motion import DegenerateMotionError
+
+__all__ = ["CameraCalibration", "CharucoBoard", "Chessboard", "calibrate_camera"]
+__all__ += ["calibrate_found", "leave_one_out_rms_px", "unseen_parts"]
 
 MIN_VIEWS = 5
-MIN_CORNERS = 8
 # Views from one direction alone cannot tell focal length from distance.
 MIN_TILT_SPREAD_RAD = np.deg2rad(15.0)
 MAX_FOCAL_SIGMA = 0.05
-DICTIONARIES = ("DICT_4X4_50", "DICT_5X5_250", "DICT_6X6_250", "DICT_APRILTAG_36h11")
-
-
-@dataclass(frozen=True)
-class Chessboard:
-    """A plain chessboard: `columns` × `rows` inner corners, squares of `square_m`."""
-
-    columns: int
-    rows: int
-    square_m: float
-
-
-@dataclass(frozen=True)
-class CharucoBoard:
-    """A ChArUco board: `columns` × `rows` squares, with markers of a dictionary in them."""
-
-    columns: int
-    rows: int
-    square_m: float
-    marker_m: float
-    dictionary: str = "DICT_5X5_250"
+# What is advised, beyond what is required.
+GOOD_VIEWS = 15
+GOOD_FOCAL_SIGMA = 0.003
+PARTS = (
+    ("top left", "top", "top right"),
+    ("left", "middle", "right"),
+    ("bottom left", "bottom", "bottom right"),
+)
 
 
 @dataclass(frozen=True)
 class CameraCalibration:
     """A pinhole camera with distortion k1 k2 p1 p2 k3.
 
-    `sigma_*` are standard deviations of fx fy cx cy and of the distortion; they tell how good the
-    calibration is. `rms_px` does not: it is as small for 8 views as for 40. `coverage` is the part
-    of a 4 × 4 grid over the image in which corners were seen.
+    Attributes:
+        K: the camera's matrix (px).
+        distortion: k1 k2 p1 p2 k3.
+        sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they tell how good the calibration
+            is. `rms_px` does not: it is as small for 8 views as for 40.
+        sigma_distortion: of the distortion.
+        rms_px: of what is left between corners and model, both axes together.
+        rms_by_photo_px: the same by photo; one that stands out is blurred or the board was bent.
+        coverage: share of a 4 × 4 grid over the image in which corners were seen.
+        unseen: parts of the image (thirds both ways) in which none was.
+        advice: what would make the calibration better; empty where nothing would.
+        pattern: how the board is printed.
+        image_size_px: width, height.
+        used_images: indices of the photos on which the board was found.
     """
 
     K: Float64[np.ndarray, "3 3"]
@@ -53,7 +58,11 @@ class CameraCalibration:
     sigma_fxfycxcy_px: Float64[np.ndarray, "4"]
     sigma_distortion: Float64[np.ndarray, "5"]
     rms_px: float
+    rms_by_photo_px: Float64[np.ndarray, " n"]
     coverage: float
+    unseen: tuple[str, ...]
+    advice: tuple[str, ...]
+    pattern: str
     image_size_px: tuple[int, int]
     used_images: tuple[int, ...]
 
@@ -72,118 +81,126 @@ def calibrate_camera(
         DegenerateMotionError: the views do not show the focal length; tilt the board.
         ShapeError: no images, or of different sizes.
     """
+    found = find_boards(images, board)
+    if len(found.photos) < MIN_VIEWS:
+        raise InvalidInputError(
+            f"photos: the board is found in {len(found.photos)} of {found.num_photos}, expected at "
+            f"least {MIN_VIEWS}; check the board's size and kind ({board}), light and sharpness"
+        )
+    return calibrate_found(found)
+
+
+def calibrate_found(found: FoundBoards) -> CameraCalibration:
+    """Intrinsics from corners that were found before.
+
+    Raises:
+        InvalidInputError: too few photos.
+        DegenerateMotionError: the views do not show the focal length; tilt the board.
+    """
     import cv2
 
-    photos = [_grey(image, index) for index, image in enumerate(images)]
-    if len({photo.shape for photo in photos}) != 1:
-        shapes = sorted({photo.shape for photo in photos})
-        raise ShapeError(f"photos: got sizes {shapes}, expected one size and at least one photo")
-    detect = (
-        _chessboard_detector(board) if isinstance(board, Chessboard) else _charuco(board, photos)
-    )
-    found = {index: corners for index, p in enumerate(photos) if (corners := detect(p)) is not None}
-    if len(found) < MIN_VIEWS:
+    if len(found.photos) < MIN_VIEWS:
         raise InvalidInputError(
-            f"photos: the board is found in {len(found)} of {len(photos)}, expected at least "
-            f"{MIN_VIEWS}; check the board's size and kind ({board}), light and sharpness"
+            f"photos: got {len(found.photos)} with a board, expected at least {MIN_VIEWS}"
         )
-    height, width = photos[0].shape
-    rms_px, K, distortion, turns, _, sigma, *_ = cv2.calibrateCameraExtended(
-        [points for points, _ in found.values()],
-        [pixels for _, pixels in found.values()],
-        (width, height),
+    rms_px, K, distortion, turns, _, sigma, _, by_photo = cv2.calibrateCameraExtended(
+        list(found.points_board),
+        list(found.pixels_px),
+        found.image_size_px,
         np.eye(3),
         np.zeros(5),
     )
     sigma = np.asarray(sigma, dtype=np.float64).ravel()
-    _check_views(np.array(turns, dtype=np.float64).reshape(-1, 3), np.asarray(K), sigma)
+    K = np.asarray(K, dtype=np.float64)
+    spread_rad = _tilt_spread_rad(np.array(turns, dtype=np.float64).reshape(-1, 3))
+    relative = float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1]))
+    _check_views(spread_rad, relative)
+    unseen = unseen_parts(found.pixels_px, found.image_size_px)
     return CameraCalibration(
-        K=np.asarray(K, dtype=np.float64),
+        K=K,
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:5],
         sigma_fxfycxcy_px=sigma[:4],
         sigma_distortion=sigma[4:9],
         rms_px=float(rms_px),
-        coverage=_coverage([pixels for _, pixels in found.values()], width, height),
-        image_size_px=(width, height),
-        used_images=tuple(found),
+        rms_by_photo_px=np.asarray(by_photo, dtype=np.float64).ravel(),
+        coverage=len(_cells(found.pixels_px, found.image_size_px, 4)) / 16,
+        unseen=unseen,
+        advice=_advice(len(found.photos), unseen, relative),
+        pattern=found.pattern,
+        image_size_px=found.image_size_px,
+        used_images=found.photos,
     )
 
 
-View = tuple[Float32[np.ndarray, "n 3"], Float32[np.ndarray, "n 2"]]
+def leave_one_out_rms_px(found: FoundBoards) -> Float64[np.ndarray, " n"]:
+    """What each photo leaves over when the camera is calibrated from the others.
 
+    Only the board's pose is fitted to the photo itself; unlike `rms_px` the figure grows where
+    the other photos do not determine the camera.
 
-def _grey(image: np.ndarray, index: int) -> np.ndarray:
-    image = np.asarray(image)
-    if image.dtype != np.uint8 or image.ndim not in {2, 3} or image.shape[2:] not in {(), (3,)}:
-        raise ShapeError(
-            f"photo {index}: got {image.dtype} {image.shape}, expected uint8 [h, w] or [h, w, 3]"
-        )
-    return image if image.ndim == 2 else np.rint(image.mean(axis=2)).astype(np.uint8)
-
-
-def _chessboard_detector(board: Chessboard) -> Any:  # noqa: ANN401 - a function of one image
+    Raises:
+        InvalidInputError: too few photos, or a photo without a pose.
+        DegenerateMotionError: without some photo the views do not show the focal length.
+    """
     import cv2
 
-    if min(board.columns, board.rows) < 3 or board.square_m <= 0:
-        raise InvalidInputError(f"board: got {board}, expected at least 3 by 3 inner corners")
-    rows, columns = np.mgrid[: board.rows, : board.columns]
-    flat = np.stack([columns, rows, np.zeros_like(rows)], axis=-1).reshape(-1, 3)
-    points = (flat * board.square_m).astype(np.float32)
-
-    def detect(photo: np.ndarray) -> View | None:
-        ok, corners = cv2.findChessboardCorners(photo, (board.columns, board.rows))
+    left = []
+    for index, photo in enumerate(found.photos):
+        others = calibrate_found(found.only([k for k in range(len(found.photos)) if k != index]))
+        points, pixels = found.points_board[index], found.pixels_px[index]
+        camera = others.K, others.distortion
+        ok, turn, shift = cv2.solvePnP(points, pixels, *camera)
         if not ok:
-            return None
-        # A window of less than half a square, or the next corner pulls.
-        gap_px = np.linalg.norm(np.diff(corners.reshape(board.rows, -1, 2), axis=1), axis=-1).min()
-        half_px = int(np.clip(0.35 * gap_px, 2, 11))
-        stop = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-3)
-        corners = cv2.cornerSubPix(photo, corners, (half_px, half_px), (-1, -1), stop)
-        return points, np.asarray(corners, dtype=np.float32).reshape(-1, 2)
-
-    return detect
+            raise InvalidInputError(f"photo {photo}: no pose of the board fits; leave it out")
+        projected, _ = cv2.projectPoints(points, turn, shift, *camera)
+        error = np.asarray(projected, dtype=np.float64).reshape(-1, 2) - pixels
+        left.append(np.sqrt(np.square(error).sum(axis=1).mean()))
+    return np.array(left)
 
 
-def _charuco(board: CharucoBoard, photos: Sequence[np.ndarray]) -> Any:  # noqa: ANN401 - likewise
-    """A detector for the board's printing; boards printed before OpenCV 4.6 start otherwise."""
-    import cv2
+def unseen_parts(
+    pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int]
+) -> tuple[str, ...]:
+    """Names of the thirds of the image, both ways, in which no corner was seen."""
+    seen = _cells(pixels_px, image_size_px, 3)
+    return tuple(
+        name
+        for row, names in enumerate(PARTS)
+        for column, name in enumerate(names)
+        if (column, row) not in seen
+    )
 
-    if board.dictionary not in DICTIONARIES:
-        raise UnknownNameError("marker dictionary", board.dictionary, list(DICTIONARIES))
-    if min(board.columns, board.rows) < 3 or not 0 < board.marker_m < board.square_m:
-        raise InvalidInputError(f"board: got {board}, expected markers smaller than squares")
-    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, board.dictionary))
-    detectors = []
-    for legacy in (False, True):
-        printed = cv2.aruco.CharucoBoard(
-            (board.columns, board.rows), board.square_m, board.marker_m, dictionary
+
+def _cells(
+    pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int], num: int
+) -> set[tuple[int, int]]:
+    """Cells (column, row) of a grid of num × num over the image in which there are corners."""
+    share = np.concatenate(list(pixels_px)) / np.array(image_size_px)
+    return {(int(x), int(y)) for x, y in (share * num).astype(int).clip(0, num - 1)}
+
+
+def _advice(num_views: int, unseen: tuple[str, ...], focal_sigma: float) -> tuple[str, ...]:
+    advice = []
+    if unseen:
+        advice.append(f"hold the board where none was seen: {', '.join(unseen)}")
+    if num_views < GOOD_VIEWS:
+        advice.append(f"take {GOOD_VIEWS - num_views} more photos, the board tilted otherwise")
+    if focal_sigma > GOOD_FOCAL_SIGMA:
+        advice.append(
+            f"the focal length is known to {focal_sigma:.2%} only: tilt the board by 30 to 45 "
+            "degrees about both its axes and bring it nearer"
         )
-        printed.setLegacyPattern(legacy)
-        detectors.append(_charuco_detector(printed))
-    seen = [sum(detect(photo) is not None for photo in photos) for detect in detectors]
-    return detectors[int(np.argmax(seen))]
+    return tuple(advice)
 
 
-def _charuco_detector(printed: Any) -> Any:  # noqa: ANN401 - OpenCV's board, a function
-    import cv2
-
-    detector = cv2.aruco.CharucoDetector(printed)
-    places = np.asarray(printed.getChessboardCorners(), dtype=np.float32)
-
-    def detect(photo: np.ndarray) -> View | None:
-        corners, ids, _, _ = detector.detectBoard(photo)
-        if ids is None or len(ids) < MIN_CORNERS:
-            return None
-        return places[ids.ravel()], np.asarray(corners, dtype=np.float32).reshape(-1, 2)
-
-    return detect
-
-
-def _check_views(turns_rad: np.ndarray, K: np.ndarray, sigma: np.ndarray) -> None:
-    """Refuse views that do not show the focal length; `turns_rad` are the board's rotations."""
+def _tilt_spread_rad(turns_rad: np.ndarray) -> float:
+    """Largest angle between two directions of the board; `turns_rad` are its rotations."""
     normals = rotation_from_vector(turns_rad)[:, :, 2]
-    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
-    relative = float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1]))
+    return float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
+
+
+def _check_views(spread_rad: float, relative: float) -> None:
+    """Refuse views that do not show the focal length."""
     if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
         raise DegenerateMotionError(
             f"intrinsics: the board's directions differ by {np.rad2deg(spread_rad):.0f} degrees "
@@ -193,8 +210,3 @@ def _check_views(turns_rad: np.ndarray, K: np.ndarray, sigma: np.ndarray) -> Non
             spread_deg=float(np.rad2deg(spread_rad)),
             relative_sigma=relative,
         )
-
-
-def _coverage(pixels: Sequence[np.ndarray], width: int, height: int) -> float:
-    cells = (np.concatenate(list(pixels)) / np.array([width, height]) * 4).astype(int).clip(0, 3)
-    return len({(int(x), int(y)) for x, y in cells}) / 16

@@ -1,17 +1,27 @@
 """One stream's stamps in, the times of its samples on the host's clock and a clock report out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.clocks import find_lost_samples, fit_clock, unwrap_counter
+from dextouch.clocks import date_by_counting, find_lost_samples, fit_clock, unwrap_counter
+from dextouch.clocks.counters import prefers_sequence
 from dextouch.errors import ClockFitError
 from dextouch.schemas.episodes import ClockReport
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
 
 NS_PER_MS = 1e6
+# A device whose samples are counted must be a steady one. Beyond these its nominal rate is wrong
+# or it samples when it likes, and its arrivals say more.
+MAX_COUNTED_SKEW_PPM = 20_000.0
+MAX_COUNTED_LOSS = 0.1
+MAX_STEPS_PER_SAMPLE = 0.001
+MIN_COUNTED_SAMPLES = 60
+
+Method = Literal["device", "sequence", "counting", "arrival"]
 
 
 @dataclass(frozen=True)
@@ -23,12 +33,27 @@ class TimedStream:
         t_host_ns: their times on the host's clock, strictly increasing.
         report: of the clock fit.
         num_steps: how often the device's clock was stepped.
+        method: what dates the samples: the device's stamps, its sequence numbers, the count of
+            samples that must have been sent, or the arrivals as they are.
     """
 
     kept: Int64[np.ndarray, " n"]
     t_host_ns: Int64[np.ndarray, " n"]
     report: ClockReport
     num_steps: int
+    method: Method
+
+
+@dataclass(frozen=True)
+class _Dated:
+    """Times on the host's clock, the path's delay still in them, and what is known of the clock."""
+
+    t_host_ns: Int64[np.ndarray, " n"]
+    method: Method
+    num_lost: int = 0
+    num_steps: int = 0
+    skew_ppm: float | None = None
+    residual_rms_ns: float | None = None
 
 
 def time_stream(
@@ -36,8 +61,9 @@ def time_stream(
 ) -> TimedStream:
     """Fit the device's clock and date every sample.
 
-    The device's stamps are used where there are any, else its sequence numbers times the nominal
-    period, else the arrivals as they are.
+    The device's stamps are used where there are any (unless they are coarser than a quarter of
+    the period and samples are numbered), else its sequence numbers times the nominal period, else
+    the count of samples that a steady device must have sent, else the arrivals as they are.
 
     Args:
         batch: the whole take of one stream.
@@ -47,46 +73,77 @@ def time_stream(
     Raises:
         ClockFitError: too few samples, or stamps that no clock gives; names the stream.
     """
-    device_ns = _device_time(batch, descriptor)
     try:
-        model = None if device_ns is None else fit_clock(device_ns, batch.t_host_ns)
+        dated = _dated(batch, descriptor)
     except ClockFitError as error:
         raise ClockFitError(
             f"stream {descriptor.name!r}: {error.message}", stream=descriptor.name, **error.details
         ) from error
-    if model is None or device_ns is None:
-        t_host_ns = batch.t_host_ns - latency_ns
-    else:
-        t_host_ns = model.to_host_ns(device_ns, batch.t_host_ns) - latency_ns
+    t_host_ns = dated.t_host_ns - latency_ns
     # A sample not later than one before it is a repeat, or lies at the seam of a clock step.
     latest = np.maximum.accumulate(np.concatenate([t_host_ns[:1] - 1, t_host_ns[:-1]]))
     kept = np.flatnonzero(t_host_ns > latest)
+    rms_ns = dated.residual_rms_ns
     report = ClockReport(
         stream=descriptor.name,
-        skew_ppm=None if model is None else model.skew_ppm,
+        skew_ppm=dated.skew_ppm,
         latency_ms=latency_ns / NS_PER_MS,
-        residual_rms_ms=None if model is None else model.residual_rms_ns / NS_PER_MS,
+        residual_rms_ms=None if rms_ns is None else rms_ns / NS_PER_MS,
         num_samples=len(kept),
-        num_dropped=_num_lost(batch, descriptor) + len(batch) - len(kept),
+        num_dropped=dated.num_lost + len(batch) - len(kept),
     )
-    return TimedStream(kept, t_host_ns[kept], report, 0 if model is None else model.num_steps)
+    return TimedStream(kept, t_host_ns[kept], report, dated.num_steps, dated.method)
 
 
-def _device_time(
-    batch: SampleBatch, descriptor: StreamDescriptor
-) -> Int64[np.ndarray, " n"] | None:
+def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
     capabilities = descriptor.capabilities
-    if not (batch.t_device_ns == NO_DEVICE_TIME).any():
-        straight = _unwrap(
-            batch.t_device_ns, capabilities.device_time_bits, capabilities.tick_ns, batch
-        )
-        # A stamp is cut down to whole ticks: on average the sample lies half a tick later.
-        return straight + capabilities.tick_ns // 2
-    if not (batch.sequence == NO_SEQUENCE).any():
-        period_ns = descriptor.period_ns()
+    has_time = not (batch.t_device_ns == NO_DEVICE_TIME).any()
+    has_sequence = not (batch.sequence == NO_SEQUENCE).any()
+    period_ns = descriptor.period_ns()
+    if has_time and not (has_sequence and prefers_sequence(capabilities.tick_ns, period_ns)):
+        bits, tick_ns = capabilities.device_time_bits, capabilities.tick_ns
+        device_ns = _unwrap(batch.t_device_ns, bits, tick_ns, batch)
+        dated = _fitted(device_ns, batch, descriptor, "device")
+        # A stamp is cut down to whole ticks: on average the sample lies half a tick later. The fit
+        # does not see it, as it hangs on the stamps that were cut least.
+        return replace(dated, t_host_ns=dated.t_host_ns + tick_ns // 2)
+    if has_sequence:
         numbers = batch.sequence * period_ns
-        return _unwrap(numbers, capabilities.sequence_bits, period_ns, batch)
-    return None
+        device_ns = _unwrap(numbers, capabilities.sequence_bits, period_ns, batch)
+        return _fitted(device_ns, batch, descriptor, "sequence")
+    return _counted(batch, period_ns)
+
+
+def _fitted(
+    device_ns: np.ndarray, batch: SampleBatch, descriptor: StreamDescriptor, method: Method
+) -> _Dated:
+    model = fit_clock(device_ns, batch.t_host_ns)
+    return _Dated(
+        model.to_host_ns(device_ns, batch.t_host_ns),
+        method,
+        _num_lost(batch, descriptor),
+        model.num_steps,
+        model.skew_ppm,
+        model.residual_rms_ns,
+    )
+
+
+def _counted(batch: SampleBatch, period_ns: int) -> _Dated:
+    """Dates by counting where the arrivals look like those of a steady device, else arrivals."""
+    arrivals = _Dated(batch.t_host_ns, "arrival")
+    if len(batch) < MIN_COUNTED_SAMPLES or (np.diff(batch.t_host_ns) < 0).any():
+        return arrivals
+    take = date_by_counting(batch.t_host_ns, period_ns=period_ns)
+    is_steady = (
+        abs(take.skew_ppm) <= MAX_COUNTED_SKEW_PPM
+        and take.num_lost <= MAX_COUNTED_LOSS * len(batch)
+        and take.num_steps <= MAX_STEPS_PER_SAMPLE * len(batch)
+    )
+    if not is_steady:
+        return arrivals
+    waited_ns = (batch.t_host_ns - take.t_host_ns).astype(np.float64)
+    rms_ns = float(np.sqrt(np.mean(waited_ns**2)))
+    return _Dated(take.t_host_ns, "counting", take.num_lost, take.num_steps, take.skew_ppm, rms_ns)
 
 
 def _unwrap(

@@ -43,6 +43,15 @@ class StageEntry(NamedTuple):
 
 
 STAGES = {
+    "acquisition": StageEntry(
+        "services.cli.bench.acquisition.stage",
+        "decode glove packets over a bad line, read eight gloves at once",
+        "Sends packets of three glove families over a line with bit errors and byte loss, and "
+        "counts what our decoders and their rivals (the mark and a length; the mark alone) give "
+        "that was never sent, and what they lose untouched. Times every way by the size of reads, "
+        "and reads eight gloves at 60 Hz on pseudo terminals. Close other programs first: timings "
+        "on a busy machine say little.",
+    ),
     "store": StageEntry(
         "services.cli.bench.store.stage",
         "write and read a take: ours, zarr-python, MCAP",
@@ -61,6 +70,24 @@ STAGES = {
         "steps of the world model on windows that are in memory, the loader of "
         "`dextouch train world-model --streaming` alone, and both together. Ends with how many "
         "times faster windows are read than learned from.",
+    ),
+    "clocks": StageEntry(
+        "services.cli.bench.clocks.stage",
+        "date the samples of devices: ours, arrival stamps, regressions",
+        "Simulates takes through paths that queue, poll, lose and congest, with clocks that drift, "
+        "wander and jump, and dates every sample in several ways: our fits online and offline, "
+        "arrival stamps, least squares, a smoothed offset regression, and a line through minima of "
+        "one second. Reports errors against the truth and processor time a sample, also of streams "
+        "that have no stamps; ends with what clocks promise and whether it holds.",
+    ),
+    "calibration": StageEntry(
+        "services.cli.bench.calibration.stage",
+        "find mounts and cameras of known places: ours beside OpenCV's methods",
+        "Simulates views of a board with noise of pixels and tracker and finds the camera's mount "
+        "with our weighted bundle and with every method of OpenCV, in turns on the same scenes; "
+        "calibrates cameras from few and many views; and tries motion that shows no mount. "
+        "Reports processor time, errors against the truth and how honest our sigmas are; ends with "
+        "what calibration promises and whether it holds.",
     ),
 }
 

@@ -57,6 +57,7 @@ export class RecorderPanel {
 
   async act(action) {
     if (action === "discard" && !this.confirmed(action, "Discard this take?")) return;
+    if (action === "rerecord" && !this.confirmed(action, "Discard this take and arm the same task again?")) return;
     if (action === "save" && !this.recorder.complete && !this.confirmed(action, "This take is incomplete. Save it anyway?")) return;
     if (action === "arm" && !this.find("prompt").reportValidity()) return;
     const body = this.body(action);

@@ -4,7 +4,7 @@ import importlib.util
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,7 +26,6 @@ from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.errors import StorageError
 from dextouch.schemas.episodes import json_ready
 from services.episode_store.catalog import Catalog, EpisodeFilter
-from services.episode_store.receipts import Receipts
 from services.episode_store.words.context import (
     EXIT_DAMAGED,
     Context,
@@ -171,14 +170,7 @@ def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
         return ItemReport(kind, folder.name, findings=(finding,))
     if kind == "stage":
         return inspect_stage(folder)
-    report = inspect_upload(folder)
-    found = []
-    for path in sorted(folder.glob("*.receipts")):
-        try:
-            Receipts(path)
-        except StorageError as error:
-            found.append(Finding(f"upload {folder.name}: {error.message}", path.stem))
-    return replace(report, findings=(*report.findings, *found))
+    return inspect_upload(folder)
 
 
 def _say_report(context: Context, report: ItemReport) -> None:

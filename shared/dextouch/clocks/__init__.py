@@ -1,14 +1,33 @@
 """Clocks: straight counters, and device time to host time, offline and as samples arrive."""
 
 from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock
+from dextouch.clocks.counters import TickCounter
+from dextouch.clocks.look_ahead import (
+    CountedSample,
+    CountedTake,
+    LookAheadClock,
+    LookAheadUpdate,
+    date_by_counting,
+)
 from dextouch.clocks.online_clock import OnlineClock
+from dextouch.clocks.round_trips import ClockOffset, PathLatency, RoundTrip, RoundTripClock
 from dextouch.clocks.timestamps import SequenceReport, find_lost_samples, unwrap_counter
 
 __all__ = [
     "ClockModel",
+    "ClockOffset",
     "ClockSegment",
+    "CountedSample",
+    "CountedTake",
+    "LookAheadClock",
+    "LookAheadUpdate",
     "OnlineClock",
+    "PathLatency",
+    "RoundTrip",
+    "RoundTripClock",
     "SequenceReport",
+    "TickCounter",
+    "date_by_counting",
     "find_lost_samples",
     "fit_clock",
     "unwrap_counter",

@@ -25,7 +25,7 @@ from dextouch.episodes.format import (
     stream_arrays,
     with_rows,
 )
-from dextouch.episodes.journal import CHUNK_JOURNAL, journal_path, part_path, read_rows
+from dextouch.episodes.journal import journal_path, part_path, read_rows
 from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.stage import read_stage
@@ -249,7 +249,7 @@ def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
     for stream in attributes.streams:
         arrays = stream_arrays(stream, kind)
         rows = {
-            name: read_rows(stage, name, CHUNK_JOURNAL)
+            name: read_rows(stage, name)
             for name in arrays
             if journal_path(stage, name).is_file() and part_path(stage, name).is_file()
         }

@@ -33,11 +33,14 @@ class GroupReader(Generic[A]):
         self.content_sha256 = contents.content_sha256
         self.streams: dict[str, StreamDescriptor] = {s.name: s for s in self.attributes.streams}
         self._whole: dict[str, np.ndarray] = {}
+        # Names and codecs of the streams, which are asked for with every window.
+        stamp = STAMPS[self._kind][0]
+        self._stamps = {name: f"{name}_{stamp}" for name in self.streams}
+        self._codecs = {name: codec_of(stream) for name, stream in self.streams.items()}
 
     def num_samples(self, name: str) -> int:
         """How many samples a stream holds; nothing is read."""
-        stamp = STAMPS[self._kind][0]
-        return self._contents.entries[f"{self._stream(name).name}_{stamp}"].shape[0]
+        return self._contents.entries[self._stamps[self._stream(name).name]].shape[0]
 
     def count(self, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> int:
         """How many samples `read` would give; only stamps are read."""
@@ -46,7 +49,7 @@ class GroupReader(Generic[A]):
 
     def stamps_ns(self, name: str) -> np.ndarray:
         """The stamps of a stream that put its samples in order, int64 [n], read-only."""
-        return self._column(f"{self._stream(name).name}_{STAMPS[self._kind][0]}")
+        return self._column(self._stamps[self._stream(name).name])
 
     def images(
         self,
@@ -136,23 +139,23 @@ class GroupReader(Generic[A]):
 
     def _column(self, name: str) -> np.ndarray:
         """A whole small array (stamps, actions), read once and kept."""
-        if name not in self._whole:
+        column = self._whole.get(name)
+        if column is None:
             column = self._contents.shard(name).read()
             column.flags.writeable = False
             self._whole[name] = column
-        return self._whole[name]
+        return column
 
     def _range(self, name: str, start_ns: int | None, stop_ns: int | None) -> tuple[int, int]:
         stamps = self.stamps_ns(name)
-        low = 0 if start_ns is None else int(np.searchsorted(stamps, start_ns))
-        high = len(stamps) if stop_ns is None else int(np.searchsorted(stamps, stop_ns))
+        low = 0 if start_ns is None else int(stamps.searchsorted(start_ns))
+        high = len(stamps) if stop_ns is None else int(stamps.searchsorted(stop_ns))
         return low, max(low, high)
 
     def _values(self, name: str, start: int, stop: int) -> np.ndarray:
-        descriptor = self._stream(name)
-        if codec_of(descriptor) == "zstd":
+        if self._codecs[name] == "zstd":
             return self._contents.shard(name).read(start, stop)
-        return self._pick_images(descriptor, np.arange(start, stop), FULL_FORM, None)
+        return self._pick_images(self.streams[name], np.arange(start, stop), FULL_FORM, None)
 
     def _image_chunks(self, descriptor: StreamDescriptor) -> ImageChunks:
         entry = self._contents.entries[descriptor.name]

@@ -13,6 +13,7 @@ from pathlib import Path
 import google_crc32c
 import numpy as np
 
+from dextouch.episodes.batch_log import body_at, find_records, open_log
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -26,15 +27,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.group_contents import CommittedGroup, get_metadata, read_group
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.journal import (
-    CHUNK_JOURNAL,
-    SAMPLE_JOURNAL,
-    JournalLayout,
-    journal_path,
-    part_path,
-    read_payloads,
-    read_rows,
-)
+from dextouch.episodes.journal import journal_path, part_path, read_payloads, read_rows
 from dextouch.episodes.shard_reader import decode_rows
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
@@ -202,7 +195,33 @@ def inspect_upload(folder: Path) -> ItemReport:
         names = [stream.name for stream in read_attributes(folder).streams]
     except StorageError as error:
         return ItemReport("upload", folder.name, findings=(Finding(error.message),))
-    return _inspect_logs(folder, "upload", names, SAMPLE_JOURNAL)
+    return _inspect_batches(folder, names)
+
+
+def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
+    what, busy = f"upload {folder.name}", is_held(folder)
+    findings, torn, num_bytes = [], [], 0
+    numbers = dict.fromkeys(range(len(names)), 0)
+    try:
+        with open_log(folder) as data:
+            records = find_records(data)
+            for start, stop in records.damage:
+                message = f"{what}: bytes {start} … {stop - 1} of its log are no record"
+                findings.append(Finding(message))
+            for row in records.rows:
+                stream = int(row["stream"])
+                number = numbers[stream] = numbers.get(stream, 0) + 1
+                if body_at(data, row) is None:
+                    name = names[stream] if stream < len(names) else str(stream)
+                    message = f"{what}: batch {number - 1} of {name!r} does not match its checksum"
+                    torn.append(Finding(message, name, number - 1))
+                else:
+                    # What a writer that lives has not written yet is no damage, nor a torn end.
+                    findings += torn
+                    torn, num_bytes = [], num_bytes + int(row["length"])
+    except StorageError as error:
+        findings.append(Finding(f"{what}: {error.message}"))
+    return ItemReport("upload", folder.name, len(names), num_bytes, tuple(findings), busy)
 
 
 def inspect_stage(folder: Path) -> ItemReport:
@@ -215,17 +234,13 @@ def inspect_stage(folder: Path) -> ItemReport:
         return ItemReport("stage", folder.name, busy=is_held(folder))
     kind = kind_of(attributes)
     names = [name for stream in attributes.streams for name in stream_arrays(stream, kind)]
-    return _inspect_logs(folder, "stage", names, CHUNK_JOURNAL)
-
-
-def _inspect_logs(folder: Path, kind: str, names: list[str], layout: JournalLayout) -> ItemReport:
-    findings, num_bytes, busy = [], 0, is_held(folder)
+    findings, num_bytes = [], 0
     present = [n for n in names if journal_path(folder, n).is_file() and _part(folder, n)]
     for name in present:
         try:
-            rows = read_rows(folder, name, layout)
+            rows = read_rows(folder, name)
         except StorageError as error:
-            findings.append(Finding(f"{kind} {folder.name}: {error.message}", name))
+            findings.append(Finding(f"stage {folder.name}: {error.message}", name))
             continue
         # What a writer that lives has not written yet is no damage, nor is a torn end.
         for number, row in enumerate(rows):
@@ -233,11 +248,13 @@ def _inspect_logs(folder: Path, kind: str, names: list[str], layout: JournalLayo
                 (payload,) = read_payloads(folder, name, np.array([row]))
             except StorageError as error:
                 if not _only_bad_follow(folder, name, rows[number:]):
-                    message = f"{kind} {folder.name}: row {number}: {error.message}"
+                    message = f"stage {folder.name}: row {number}: {error.message}"
                     findings.append(Finding(message, name, number))
             else:
                 num_bytes += len(payload)
-    return ItemReport(kind, folder.name, len(present), num_bytes, tuple(findings), busy)
+    return ItemReport(
+        "stage", folder.name, len(present), num_bytes, tuple(findings), is_held(folder)
+    )
 
 
 def _part(folder: Path, name: str) -> bool:

@@ -1,15 +1,12 @@
-"""Payloads ↔ a `part` file and a `journal` whose fixed rows vouch for them: the one log.
+"""Storage chunks ↔ a `part` file and a `journal` whose fixed rows vouch for them.
 
 A payload is there when its row is there: the payload is written first, then the row, each with a
-crc32c. Rows have one length, so a torn tail is found from the file's size alone. The station's
-spool keeps samples this way, an episode that is being written its storage chunks.
+crc32c. Rows have one length, so a torn tail is found from the file's size alone. The rows have a
+file of their own because the part file becomes the shard as it is.
 """
 
 import os
 import struct
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import cached_property
 from pathlib import Path
 
 import google_crc32c
@@ -21,34 +18,17 @@ from dextouch.errors import CorruptDataError, StorageError
 _CRC = struct.Struct("<I")
 
 
-@dataclass(frozen=True)
-class JournalLayout:
-    """What a journal says about each payload besides where it lies.
-
-    A row is offset u64, then these numbers, then length u32, payload crc32c u32 and the crc32c of
-    all that as u32; little endian.
-    """
-
-    magic: bytes
-    numbers: tuple[tuple[str, str], ...]
-
-    @cached_property
-    def dtype(self) -> np.dtype[np.void]:
-        """A row as numpy reads it."""
-        crcs = [("payload_crc32c", "<u4"), ("row_crc32c", "<u4")]
-        return np.dtype([("offset", "<u8"), *self.numbers, ("length", "<u4"), *crcs])
-
-    @cached_property
-    def body(self) -> struct.Struct:
-        """A row without its own crc32c, as struct packs it: much faster than numpy for one row."""
-        codes = {"<i8": "q", "<u4": "I"}
-        return struct.Struct("<Q" + "".join(codes[kind] for _, kind in self.numbers) + "II")
-
-
-SAMPLE_JOURNAL = JournalLayout(
-    b"DXTJRNL\x01", (("t_host_ns", "<i8"), ("t_device_ns", "<i8"), ("sequence", "<i8"))
+JOURNAL_MAGIC = b"DXTJRNL\x02"
+_BODY = struct.Struct("<QIII")
+JOURNAL_ROW = np.dtype(
+    [
+        ("offset", "<u8"),
+        ("num_rows", "<u4"),
+        ("length", "<u4"),
+        ("payload_crc32c", "<u4"),
+        ("row_crc32c", "<u4"),
+    ]
 )
-CHUNK_JOURNAL = JournalLayout(b"DXTJRNL\x02", (("num_rows", "<u4"),))
 
 
 def part_path(folder: Path, name: str) -> Path:
@@ -61,27 +41,27 @@ def journal_path(folder: Path, name: str) -> Path:
     return folder / f"{name}.journal"
 
 
-def read_rows(folder: Path, name: str, layout: JournalLayout) -> np.ndarray:
+def read_rows(folder: Path, name: str) -> np.ndarray:
     """All good rows of a journal, whose payloads are wholly in the part file.
 
     Rows that are not whole at the end are left out: that is what a crash leaves. A bad row before
     a good one is damage, and refused.
 
     Raises:
-        CorruptDataError: damage in the middle, or no journal of this layout.
+        CorruptDataError: damage in the middle, or no journal.
     """
     with disk_errors(f"read journal of {name}"):
         data = journal_path(folder, name).read_bytes()
         part_bytes = part_path(folder, name).stat().st_size
-    size = len(layout.magic)
+    size = len(JOURNAL_MAGIC)
     if len(data) < size:
-        return np.empty(0, dtype=layout.dtype)
-    if data[:size] != layout.magic:
+        return np.empty(0, dtype=JOURNAL_ROW)
+    if data[:size] != JOURNAL_MAGIC:
         raise CorruptDataError(
-            f"journal of {name!r}: begins with {data[:size]!r}, expected {layout.magic!r}"
+            f"journal of {name!r}: begins with {data[:size]!r}, expected {JOURNAL_MAGIC!r}"
         )
-    num_rows = (len(data) - size) // layout.dtype.itemsize
-    rows = np.frombuffer(data, dtype=layout.dtype, count=num_rows, offset=size)
+    num_rows = (len(data) - size) // JOURNAL_ROW.itemsize
+    rows = np.frombuffer(data, dtype=JOURNAL_ROW, count=num_rows, offset=size)
     good = _rows_hold(rows, part_bytes)
     num_good = int(np.flatnonzero(good)[-1]) + 1 if good.any() else 0
     if not good[:num_good].all():
@@ -139,17 +119,14 @@ class JournalWriter:
     Args:
         folder: of the log.
         name: of the log.
-        layout: of its rows.
         num_rows: None for new files, else how many rows to keep and go on after.
 
     Raises:
         StorageError: the files exist already, or cannot be made.
     """
 
-    def __init__(
-        self, folder: Path, name: str, layout: JournalLayout, *, num_rows: int | None = None
-    ) -> None:
-        self.name, self._layout, self._folder = name, layout, folder
+    def __init__(self, folder: Path, name: str, *, num_rows: int | None = None) -> None:
+        self.name, self._folder = name, folder
         self._part = self._journal = -1
         self.num_rows = 0
         self._part_bytes = 0
@@ -157,38 +134,31 @@ class JournalWriter:
         with disk_errors(f"open log {name}"):
             self._part = os.open(part_path(folder, name), flags, 0o644)
             self._journal = os.open(journal_path(folder, name), flags, 0o644)
-            if os.fstat(self._journal).st_size < len(layout.magic):
+            if os.fstat(self._journal).st_size < len(JOURNAL_MAGIC):
                 os.ftruncate(self._journal, 0)
-                os.pwrite(self._journal, layout.magic, 0)
-                os.lseek(self._journal, len(layout.magic), os.SEEK_SET)
+                os.pwrite(self._journal, JOURNAL_MAGIC, 0)
+                os.lseek(self._journal, len(JOURNAL_MAGIC), os.SEEK_SET)
             if num_rows is not None:
                 self.truncate(num_rows)
 
-    def append(self, payloads: Sequence[bytes], numbers: Sequence[Sequence[int]]) -> None:
-        """Append payloads, all or none.
-
-        Args:
-            payloads: the bytes.
-            numbers: of each payload, in the layout's order.
+    def append(self, payload: bytes, num_rows: int) -> None:
+        """Append a storage chunk with so many rows of the array, whole or not at all.
 
         Raises:
             StorageFullError: no space; the files are as they were before this call.
         """
-        pack, offset, rows = self._layout.body.pack, self._part_bytes, []
-        for payload, values in zip(payloads, numbers, strict=True):
-            body = pack(offset, *values, len(payload), google_crc32c.value(payload))
-            rows.append(body + _CRC.pack(google_crc32c.value(body)))
-            offset += len(payload)
+        crc = google_crc32c.value(payload)
+        body = _BODY.pack(self._part_bytes, num_rows, len(payload), crc)
         try:
             with disk_errors(f"log {self.name}"):
-                write_all(self._part, payloads[0] if len(payloads) == 1 else b"".join(payloads))
-                write_all(self._journal, b"".join(rows))
+                write_all(self._part, payload)
+                write_all(self._journal, body + _CRC.pack(google_crc32c.value(body)))
         except StorageError:
             # Cutting off needs no space: what was acknowledged before stays readable.
             self._cut()
             raise
-        self.num_rows += len(rows)
-        self._part_bytes = offset
+        self.num_rows += 1
+        self._part_bytes += len(payload)
 
     def sync(self) -> None:
         """Make everything appended survive a power loss: payloads first, then rows."""
@@ -202,7 +172,7 @@ class JournalWriter:
         Raises:
             StorageError: fewer rows than that exist.
         """
-        rows = read_rows(self._folder, self.name, self._layout)
+        rows = read_rows(self._folder, self.name)
         if num_rows > len(rows):
             raise StorageError(
                 f"stream {self.name!r}: got {len(rows)} rows, expected at least {num_rows}"
@@ -229,7 +199,7 @@ class JournalWriter:
     def _cut(self) -> None:
         for descriptor, size in (
             (self._part, self._part_bytes),
-            (self._journal, len(self._layout.magic) + self.num_rows * self._layout.dtype.itemsize),
+            (self._journal, len(JOURNAL_MAGIC) + self.num_rows * JOURNAL_ROW.itemsize),
         ):
             os.ftruncate(descriptor, size)
             os.lseek(descriptor, size, os.SEEK_SET)

@@ -9,10 +9,9 @@ import shutil
 from pathlib import Path
 from types import TracebackType
 
-import numpy as np
-
+from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
+from dextouch.episodes.batch_log import BatchLogWriter, read_bodies, read_records
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
-from dextouch.episodes.journal import SAMPLE_JOURNAL, JournalWriter
 from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
 from dextouch.episodes.spool_reader import (
     CLOSED_FILE,
@@ -20,10 +19,9 @@ from dextouch.episodes.spool_reader import (
     SpoolReader,
     read_attributes,
 )
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import ENCODED_UNITS, check_batch
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.checks import check_batch
 from dextouch.streams.samples import SampleBatch
 
 __all__ = ["RecoveryReport", "SpoolReader", "SpoolWriter", "read_attributes", "recover"]
@@ -56,24 +54,25 @@ class SpoolWriter:
     ) -> None:
         self.path, self.attributes = path, attributes
         self._sync = sync
-        num_rows: dict[str, int] = {}
+        self._streams = {d.name: number for number, d in enumerate(attributes.streams)}
+        self._num_samples = dict.fromkeys(self._streams, 0)
+        self._num_batches = dict.fromkeys(self._streams, 0)
+        # The last stamp of each stream, which the next may not go below.
+        self._last_t_host_ns: dict[str, int | None] = dict.fromkeys(self._streams)
+        end = None
         if resume:
-            num_rows = {report.stream: report.num_samples for report in recover(path)}
+            recover(path)
             with disk_errors(f"resume spool {path.name}"):
                 (path / CLOSED_FILE).unlink(missing_ok=True)
         else:
             _create(path, attributes)
         self._lock = lock_spool(path)
-        self._descriptors = {d.name: d for d in attributes.streams}
-        self._journals: dict[str, JournalWriter] = {}
-        # The last stamp of each stream, which the next may not go below.
-        self._last_t_host_ns: dict[str, int | None] = {}
-        for name in self._descriptors:
-            self._journals[name] = JournalWriter(
-                path, name, SAMPLE_JOURNAL, num_rows=num_rows.get(name)
-            )
-            self.truncate(name, num_rows.get(name, 0))
-        self._dirty: set[str] = set()
+        if resume:
+            end = self._count()
+        self._log = BatchLogWriter(path, end=end)
+        # What a process wrote that died before it flushed is taken for kept from here on.
+        self._is_dirty = resume
+        self.flush()
         with disk_errors(f"open spool {path.name}"):
             sync_folder(path)
 
@@ -88,7 +87,7 @@ class SpoolWriter:
         """
         return cls(path, read_attributes(path), sync=sync, resume=True)
 
-    def append(self, stream_name: str, batch: SampleBatch) -> None:
+    def append(self, stream_name: str, batch: SampleBatch, *, flush: bool = False) -> None:
         """Append consecutive samples of a stream; cheap enough for every arrival.
 
         Args:
@@ -96,37 +95,50 @@ class SpoolWriter:
             batch: of the stream's dtype and shape; `t_host_ns` never decreases. Values of `jpeg`
                 and `h264` streams are an object array of bytes, one an image
                 (`dextouch.streams.samples.encoded_values`).
+            flush: keep the batch only if `flush` succeeds too.
 
         Raises:
             UnknownNameError: no such stream.
             InvalidInputError: a batch that does not fit the stream.
             StorageFullError: no space; everything appended before stays.
         """
-        journal = self._journal(stream_name)
-        descriptor = self._descriptors[stream_name]
+        number = self._number(stream_name)
+        descriptor = self.attributes.streams[number]
         check_batch(descriptor, batch, last_t_host_ns=self._last_t_host_ns[stream_name])
         if not len(batch):
             return
-        columns = (batch.t_host_ns.tolist(), batch.t_device_ns.tolist(), batch.sequence.tolist())
-        journal.append(_payloads(descriptor, batch.values), list(zip(*columns, strict=True)))
-        self._last_t_host_ns[stream_name] = columns[0][-1]
-        self._dirty.add(stream_name)
+        place = self._log.append(
+            batch_bytes(descriptor, batch),
+            stream=number,
+            first_sample=self._num_samples[stream_name],
+            num_samples=len(batch),
+        )
+        self._is_dirty = True
+        if flush:
+            try:
+                self.flush()
+            except StorageError:
+                self._log.undo(place)
+                raise
+        self._num_samples[stream_name] += len(batch)
+        self._num_batches[stream_name] += 1
+        self._last_t_host_ns[stream_name] = int(batch.t_host_ns[-1])
 
     def num_samples(self, stream_name: str) -> int:
         """How many samples of a stream are spooled."""
-        return self._journal(stream_name).num_rows
+        self._number(stream_name)
+        return self._num_samples[stream_name]
+
+    def num_batches(self, stream_name: str) -> int:
+        """In how many appends the samples of a stream came."""
+        self._number(stream_name)
+        return self._num_batches[stream_name]
 
     def flush(self) -> None:
         """Make what was appended survive a power loss (unless opened with `sync=False`)."""
-        if self._sync:
-            for name in sorted(self._dirty):
-                self._journals[name].sync()
-        self._dirty.clear()
-
-    def truncate(self, stream_name: str, num_samples: int) -> None:
-        """Keep the first samples of a stream: undoes appends that were not acknowledged."""
-        rows = self._journal(stream_name).truncate(num_samples)
-        self._last_t_host_ns[stream_name] = int(rows["t_host_ns"][-1]) if num_samples else None
+        if self._sync and self._is_dirty:
+            self._log.sync()
+        self._is_dirty = False
 
     def set_attributes(self, attributes: RecordingAttributes) -> None:
         """Replace what is known of the recording (ledger, success); id and streams stay.
@@ -156,8 +168,7 @@ class SpoolWriter:
 
     def abandon(self) -> None:
         """Give the files back without marking the recording as complete."""
-        for journal in self._journals.values():
-            journal.close()
+        self._log.close()
         if self._lock >= 0:
             os.close(self._lock)
             self._lock = -1
@@ -176,10 +187,27 @@ class SpoolWriter:
         else:
             self.abandon()
 
-    def _journal(self, name: str) -> JournalWriter:
-        if name not in self._journals:
-            raise UnknownNameError("stream", name, list(self._journals))
-        return self._journals[name]
+    def _number(self, name: str) -> int:
+        if name not in self._streams:
+            raise UnknownNameError("stream", name, list(self._streams))
+        return self._streams[name]
+
+    def _count(self) -> int:
+        """Take over what an existing log holds; where it ends."""
+        records = read_records(self.path)
+        for name, number in self._streams.items():
+            rows = records.rows[records.rows["stream"] == number]
+            self._num_samples[name] = int(rows["num_samples"].sum())
+            self._num_batches[name] = len(rows)
+            if len(rows):
+                last = batch_of_bytes(
+                    self.attributes.streams[number],
+                    read_bodies(self.path, rows[-1:]),
+                    rows[-1:]["num_samples"].tolist(),
+                    what=f"spool {self.path.name!r}",
+                )
+                self._last_t_host_ns[name] = int(last.t_host_ns[-1])
+        return records.end
 
 
 def _create(path: Path, attributes: RecordingAttributes) -> None:
@@ -197,11 +225,3 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         unborn.mkdir(parents=True)
         write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
         unborn.rename(path)
-
-
-def _payloads(descriptor: StreamDescriptor, values: np.ndarray) -> list[bytes]:
-    if descriptor.unit in ENCODED_UNITS:
-        return list(values)
-    data = np.ascontiguousarray(values, dtype=descriptor.numpy_dtype()).tobytes()
-    size = len(data) // len(values)
-    return [data[i * size : (i + 1) * size] for i in range(len(values))]

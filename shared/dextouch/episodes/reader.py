@@ -65,7 +65,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             CorruptDataError: damaged bytes.
         """
         low, high = self._range(name, start_ns, stop_ns)
-        stamps = self._column(f"{name}_t_ref_ns")[low:high].copy()
+        stamps = self.stamps_ns(name)[low:high].copy()
         return StreamData(stamps, self._values(name, low, high))
 
     @overload

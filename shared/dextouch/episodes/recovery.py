@@ -5,30 +5,22 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
-from dextouch.episodes.files import disk_errors
-from dextouch.episodes.journal import (
-    SAMPLE_JOURNAL,
-    JournalWriter,
-    journal_path,
-    part_path,
-    read_payloads,
-    read_rows,
-)
+import numpy as np
+
+from dextouch.episodes.batch_log import LOG_FILE, BatchLogWriter, body_at, open_log, read_records
 from dextouch.episodes.spool_reader import read_attributes
-from dextouch.errors import ConflictError, CorruptDataError
+from dextouch.errors import ConflictError
 
 
 @dataclass(frozen=True)
 class RecoveryReport:
-    """What was found in one stream of a spool, and what had to go."""
+    """What is left of a spool: samples by stream, and how many bytes had to go."""
 
-    stream: str
-    num_samples: int
-    dropped_journal_bytes: int
-    dropped_part_bytes: int
+    num_samples: dict[str, int]
+    dropped_bytes: int
 
 
-def recover(path: Path) -> list[RecoveryReport]:
+def recover(path: Path) -> RecoveryReport:
     """Cut a spool back to its last good samples after a crash, and say how much went.
 
     Everything that `append` had acknowledged stays. Calling it again changes nothing.
@@ -41,36 +33,32 @@ def recover(path: Path) -> list[RecoveryReport]:
     attributes = read_attributes(path)
     lock = lock_spool(path)
     try:
-        return [
-            _recover_stream(path, name) for name in [stream.name for stream in attributes.streams]
-        ]
+        if not (path / LOG_FILE).exists():
+            # The process died before it had made the log.
+            BatchLogWriter(path).close()
+        records = read_records(path)
+        rows = records.rows[: _num_trusted(path, records.rows)]
+        kept = (
+            records.end
+            if len(rows) == len(records.rows)
+            else int(records.rows["offset"][len(rows)])
+        )
+        BatchLogWriter(path, end=kept).close()
     finally:
         os.close(lock)
+    counts = {
+        stream.name: int(rows["num_samples"][rows["stream"] == number].sum())
+        for number, stream in enumerate(attributes.streams)
+    }
+    return RecoveryReport(counts, max(0, records.num_bytes - kept))
 
 
-def _recover_stream(path: Path, name: str) -> RecoveryReport:
-    part, journal = part_path(path, name), journal_path(path, name)
-    with disk_errors(f"recover {name}"):
-        part.touch()
-        journal.touch()
-        before = part.stat().st_size, journal.stat().st_size
-    num_rows = _num_trusted_rows(path, name)
-    JournalWriter(path, name, SAMPLE_JOURNAL, num_rows=num_rows).close()
-    after = part.stat().st_size, journal.stat().st_size
-    return RecoveryReport(name, num_rows, max(0, before[1] - after[1]), before[0] - after[0])
-
-
-def _num_trusted_rows(path: Path, name: str) -> int:
-    """Rows left when those at the end are dropped whose payload never reached the disk."""
-    rows = read_rows(path, name, SAMPLE_JOURNAL)
+def _num_trusted(path: Path, rows: np.ndarray) -> int:
+    """Records left when those at the end are dropped whose body never reached the disk."""
     num_rows = len(rows)
-    while num_rows:
-        try:
-            read_payloads(path, name, rows[num_rows - 1 : num_rows])
-        except CorruptDataError:
+    with open_log(path) as data:
+        while num_rows and body_at(data, rows[num_rows - 1]) is None:
             num_rows -= 1
-        else:
-            break
     return num_rows
 
 

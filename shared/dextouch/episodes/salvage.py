@@ -5,13 +5,15 @@ counted as `lost_to_damage`.
 """
 
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import google_crc32c
 import numpy as np
 
+from dextouch.episodes.batch_bytes import batch_of_bytes
+from dextouch.episodes.batch_log import body_at, find_records, open_log, read_bodies
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     GOP_IMAGES,
@@ -25,13 +27,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.inspection import STAGING, hashed_bytes
-from dextouch.episodes.journal import (
-    CHUNK_JOURNAL,
-    SAMPLE_JOURNAL,
-    JournalLayout,
-    journal_path,
-    part_path,
-)
+from dextouch.episodes.journal import JOURNAL_MAGIC, JOURNAL_ROW, journal_path, part_path
 from dextouch.episodes.shard_index import salvaged_index
 from dextouch.episodes.shard_reader import ShardReader, decode_rows
 from dextouch.episodes.sources import LocalFile
@@ -41,9 +37,9 @@ from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
 from dextouch.schemas.recordings import LedgerEntry
-from dextouch.streams.checks import ENCODED_UNITS, check_encoded_image
+from dextouch.streams.checks import check_batch
 from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import encoded_values
+from dextouch.streams.samples import SampleBatch, encoded_values
 
 LOST = "lost_to_damage"
 # Rows of these belong to each other by their number: the steps of the model grid.
@@ -143,7 +139,7 @@ def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
         # A writer, or a recovery, that died while it committed has closed some shards.
         closed = stage / name / shard_path(len(entry.shape))
         path = closed if closed.is_file() else part_path(stage, name)
-        rows, hold = lenient_rows(stage, name, CHUNK_JOURNAL, _bytes_of(path))
+        rows, hold = lenient_rows(stage, name, _bytes_of(path))
         numbers = np.flatnonzero(hold)
         index = np.zeros((len(rows), 2), dtype=np.uint64)
         index[hold] = np.stack([rows["offset"][hold], rows["length"][hold]], axis=1)
@@ -156,8 +152,17 @@ def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
 
 
 def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
-    """What holds of a spool, sample by sample."""
-    return [_spooled(spool, stream) for stream in attributes.streams]
+    """What holds of a spool, batch by batch."""
+    with open_log(spool) as data:
+        rows = find_records(data).rows
+        holds = np.array(
+            [_holds(attributes.streams, row, body_at(data, row)) for row in rows], bool
+        )
+    mine = [rows["stream"] == number for number in range(len(attributes.streams))]
+    return [
+        _spooled(spool, stream, rows[own], holds[own])
+        for stream, own in zip(attributes.streams, mine, strict=True)
+    ]
 
 
 def write_salvaged(
@@ -268,13 +273,11 @@ def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
     ]
 
 
-def lenient_rows(
-    folder: Path, name: str, layout: JournalLayout, payloads: bytes
-) -> tuple[np.ndarray, np.ndarray]:
+def lenient_rows(folder: Path, name: str, payloads: bytes) -> tuple[np.ndarray, np.ndarray]:
     """All rows of a journal, and of each whether it and its payload hold, whatever is around it."""
-    data = _bytes_of(journal_path(folder, name))[len(layout.magic) :]
-    size = layout.dtype.itemsize
-    rows = np.frombuffer(data[: len(data) // size * size], layout.dtype)
+    data = _bytes_of(journal_path(folder, name))[len(JOURNAL_MAGIC) :]
+    size = JOURNAL_ROW.itemsize
+    rows = np.frombuffer(data[: len(data) // size * size], JOURNAL_ROW)
     hold = np.zeros(len(rows), dtype=bool)
     for number, row in enumerate(rows):
         body = data[number * size : (number + 1) * size - 4]
@@ -292,35 +295,45 @@ def _bytes_of(path: Path) -> bytes:
         return path.read_bytes() if path.is_file() else b""
 
 
-def _spooled(spool: Path, descriptor: StreamDescriptor) -> SalvagedStream:
-    data = _bytes_of(part_path(spool, descriptor.name))
-    rows, kept = lenient_rows(spool, descriptor.name, SAMPLE_JOURNAL, data)
+def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None) -> bool:
+    if body is None or row["stream"] >= len(streams):
+        return False
+    try:
+        _batch(streams[int(row["stream"])], [body], [int(row["num_samples"])])
+    except (CorruptDataError, InvalidInputError):
+        return False
+    return True
+
+
+def _batch(
+    descriptor: StreamDescriptor, bodies: Iterable[bytes], counts: Sequence[int]
+) -> SampleBatch:
+    batch = batch_of_bytes(descriptor, bodies, counts, what="log")
+    check_batch(descriptor, batch)
+    return batch
+
+
+def _spooled(
+    spool: Path, descriptor: StreamDescriptor, rows: np.ndarray, holds: np.ndarray
+) -> SalvagedStream:
     # What is torn off at the end was never acknowledged; it is no loss.
-    count = int(np.flatnonzero(kept)[-1]) + 1 if kept.any() else 0
-    rows, kept = rows[:count], kept[:count]
-    payloads = [data[int(r["offset"]) : int(r["offset"]) + int(r["length"])] for r in rows]
-    kept &= np.array([_fits(descriptor, payload) for payload in payloads], dtype=bool)
+    count = int(np.flatnonzero(holds)[-1]) + 1 if holds.any() else 0
+    rows = rows[:count][holds[:count]]
+    ends = rows["first_sample"] + rows["num_samples"]
+    kept = np.zeros(int(ends[-1]) if len(rows) else 0, dtype=bool)
+    for row in rows:
+        kept[int(row["first_sample"]) :][: int(row["num_samples"])] = True
     if codec_of(descriptor) == "h264":
         kept = _whole_groups(kept, GOP_IMAGES)
 
     def read(start: int, stop: int, wanted: np.ndarray) -> Block:
-        chosen = rows[start:stop][wanted]
-        mine = [payload for payload, want in zip(payloads[start:stop], wanted, strict=True) if want]
-        stamps = {stamp: chosen[stamp].astype(np.int64) for stamp in STAMPS["recording"]}
-        if descriptor.unit in ENCODED_UNITS:
-            return encoded_values(mine), stamps
-        values = np.frombuffer(b"".join(mine), dtype=descriptor.numpy_dtype())
-        return values.reshape(len(mine), *descriptor.shape), stamps
+        inside = rows[(rows["first_sample"] < stop) & (ends > start)]
+        batch = _batch(descriptor, read_bodies(spool, inside), inside["num_samples"].tolist())
+        numbers = np.concatenate(
+            [np.arange(r["num_samples"]) + int(r["first_sample"]) for r in inside]
+        )
+        chosen = np.isin(numbers, start + np.flatnonzero(wanted))
+        stamps = {stamp: getattr(batch, stamp)[chosen] for stamp in STAMPS["recording"]}
+        return batch.values[chosen], stamps
 
     return SalvagedStream(descriptor, kept, read)
-
-
-def _fits(descriptor: StreamDescriptor, payload: bytes) -> bool:
-    if descriptor.unit not in ENCODED_UNITS:
-        size = int(np.prod(descriptor.shape, dtype=np.int64)) * descriptor.numpy_dtype().itemsize
-        return len(payload) == size
-    try:
-        check_encoded_image(descriptor, payload, where=descriptor.name)
-    except InvalidInputError:
-        return False
-    return True

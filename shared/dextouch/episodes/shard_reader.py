@@ -6,6 +6,7 @@ crc32c, so a flipped bit or a torn file is refused and never becomes a number.
 """
 
 import math
+from collections.abc import Iterator
 
 import google_crc32c
 import numpy as np
@@ -22,6 +23,9 @@ INDEX_ENTRY_BYTES = 16
 _ZSTD_MAX_RATIO = 1 << 15
 # The length of an access unit, a start code and the header of its first unit.
 _H264_MIN_BYTES = 4 + 3 + 1
+# Storage chunks that lie behind each other are fetched together up to this many bytes: once for
+# most windows, while whole arrays still come in pieces.
+_SPAN_BYTES = 1 << 21
 
 
 def with_crc(data: bytes) -> bytes:
@@ -29,11 +33,19 @@ def with_crc(data: bytes) -> bytes:
     return data + google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
 
 
-def _without_crc(data: memoryview | bytes, what: str) -> bytes:
-    body, crc = bytes(data[:-CRC_BYTES]), data[-CRC_BYTES:]
-    if len(data) < CRC_BYTES or google_crc32c.value(body) != int.from_bytes(crc, "little"):
+def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -> bytes:
+    """The `length` bytes from `start` on, but for their checksum, which was compared."""
+    stop = start + length
+    if len(data) < stop:
         raise CorruptDataError(
-            f"{what}: checksum does not hold ({len(data)} bytes read); "
+            f"{what} lies outside the file ({max(0, len(data) - start)} of {length} bytes there); "
+            "the file is truncated, restore it from a copy"
+        )
+    # Copied before it is checked, so that a file that changes below us cannot differ from it.
+    body, crc = bytes(data[start : stop - CRC_BYTES]), data[stop - CRC_BYTES : stop]
+    if length < CRC_BYTES or google_crc32c.value(body) != int.from_bytes(crc, "little"):
+        raise CorruptDataError(
+            f"{what}: checksum does not hold ({length} bytes read); "
             "the file is damaged or truncated, restore it from a copy"
         )
     return body
@@ -53,7 +65,8 @@ class ShardReader:
         self, source: ByteSource, entry: ArrayEntry, *, what: str, index: np.ndarray | None = None
     ) -> None:
         self._source, self._entry, self._what = source, entry, what
-        self._dtype = np.dtype(entry.dtype).newbyteorder("<")
+        self._layout = _ChunkLayout(entry)
+        self._num_rows, self._rows_each = entry.shape[0], entry.chunk_rows
         self._num_chunks = -(-entry.shape[0] // entry.chunk_rows)
         self._index = index
 
@@ -64,20 +77,29 @@ class ShardReader:
             InvalidInputError: rows outside the array.
             CorruptDataError: a checksum does not hold, or bytes are missing.
         """
-        num_rows, rows_each = self._entry.shape[0], self._entry.chunk_rows
+        num_rows, rows_each = self._num_rows, self._rows_each
         stop = num_rows if stop is None else stop
         if not 0 <= start <= stop <= num_rows:
             raise InvalidInputError(
                 f"{self._what}: got rows {start} … {stop}, expected within 0 … {num_rows}"
             )
-        self.check_index()
-        rows = np.empty((stop - start, *self._entry.shape[1:]), dtype=self._dtype)
-        for number in range(start // rows_each, -(-stop // rows_each) if stop > start else 0):
-            chunk = self._decode(number)
-            first = number * rows_each
-            low, high = max(start, first), min(stop, first + rows_each)
-            rows[low - start : high - start] = chunk[low - first : high - first]
-        return rows
+        first = start // rows_each
+        places = self.check_index()[first : -(-stop // rows_each) if stop > start else first]
+        layout = self._layout
+        rows = np.empty((stop - start) * layout.row_bytes, dtype=np.uint8)
+        # As plain bytes, which are cheaper to copy than rows where a window is small.
+        wanted, skip = rows.data, start % rows_each * layout.row_bytes
+        for what, payload in self._payloads(first, places.tolist()):
+            data = decompress(payload, size=layout.num_bytes, what=what)
+            part = memoryview(data)[skip : skip + len(wanted)]
+            wanted[: len(part)] = part
+            wanted, skip = wanted[len(part) :], 0
+        if wanted:
+            raise CorruptDataError(
+                f"{self._what}: its index names {len(places)} storage chunks of rows {start} … "
+                f"{stop}, expected all of them; the last {len(wanted)} bytes are missing"
+            )
+        return rows.view(layout.dtype).reshape(stop - start, *layout.row_shape)
 
     def payload(self, number: int) -> bytes:
         """The encoded bytes of one storage chunk, without their checksum, which was compared.
@@ -85,12 +107,27 @@ class ShardReader:
         Raises:
             CorruptDataError: a checksum does not hold, or bytes are missing.
         """
-        offset, length = (int(value) for value in self.check_index()[number])
+        offset, length = self.check_index()[number].tolist()
         what = f"{self._what}: storage chunk {number}"
-        data = self._source.read(offset, length)
-        if len(data) != length:
-            raise CorruptDataError(f"{what} lies outside the file")
-        return _without_crc(data, what)
+        return _without_crc(self._source.read(offset, length), 0, length, what)
+
+    def _payloads(self, number: int, places: list[list[int]]) -> Iterator[tuple[str, bytes]]:
+        """Name in errors and payload of storage chunks from `number` on, by offset and length.
+
+        Those that lie behind each other are fetched together.
+        """
+        while places:
+            begin, end, count = places[0][0], places[0][0], 0
+            for offset, length in places:
+                if count and (offset != end or end + length - begin > _SPAN_BYTES):
+                    break
+                end, count = end + length, count + 1
+            data = self._source.read(begin, end - begin)
+            for offset, length in places[:count]:
+                what = f"{self._what}: storage chunk {number}"
+                yield what, _without_crc(data, offset - begin, length, what)
+                number += 1
+            places = places[count:]
 
     def check_index(self) -> np.ndarray:
         """The (offset, length) of every storage chunk, read once, before anything is allocated.
@@ -126,7 +163,7 @@ class ShardReader:
             return
         bound = int(lengths.min())
         if entry.codec == "zstd":
-            claimed = -(-self._chunk_bytes() // _ZSTD_MAX_RATIO)
+            claimed = -(-self._layout.num_bytes // _ZSTD_MAX_RATIO)
         elif entry.codec == "h264":
             full = lengths[: entry.shape[0] // entry.chunk_rows]
             bound = int(full.min()) if len(full) else int(lengths[-1])
@@ -140,20 +177,23 @@ class ShardReader:
                 f"bytes, got one of {bound}"
             )
 
-    def _chunk_bytes(self) -> int:
-        return self._entry.chunk_rows * math.prod(self._entry.shape[1:]) * self._dtype.itemsize
-
     def _read_index(self, file_size: int) -> np.ndarray:
         size = self._num_chunks * INDEX_ENTRY_BYTES + CRC_BYTES
         start = file_size - size
         if start < 0:
             raise CorruptDataError(f"{self._what}: file is too short for its index of {size} bytes")
-        body = _without_crc(self._source.read(start, size), f"{self._what}: shard index")
+        body = _without_crc(self._source.read(start, size), 0, size, f"{self._what}: shard index")
         return np.frombuffer(body, dtype="<u8").reshape(-1, 2)
 
-    def _decode(self, number: int) -> np.ndarray:
-        what = f"{self._what}: storage chunk {number}"
-        return decode_rows(self.payload(number), self._entry, what=what)
+
+class _ChunkLayout:
+    """How the rows of a `zstd` storage chunk lie in its bytes; worked out once an array."""
+
+    def __init__(self, entry: ArrayEntry) -> None:
+        self.dtype = np.dtype(entry.dtype).newbyteorder("<")
+        self.row_shape = entry.shape[1:]
+        self.row_bytes = math.prod(self.row_shape) * self.dtype.itemsize
+        self.num_bytes = entry.chunk_rows * self.row_bytes
 
 
 def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.ndarray, "n ..."]:
@@ -162,8 +202,6 @@ def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.nd
     Raises:
         CorruptDataError: not that many rows.
     """
-    dtype = np.dtype(entry.dtype).newbyteorder("<")
-    shape = (entry.chunk_rows, *entry.shape[1:])
-    expected = math.prod(shape) * dtype.itemsize
-    data = decompress(payload, size=expected, what=what)
-    return np.frombuffer(data, dtype=dtype).reshape(shape)
+    layout = _ChunkLayout(entry)
+    data = decompress(payload, size=layout.num_bytes, what=what)
+    return np.frombuffer(data, dtype=layout.dtype).reshape(entry.chunk_rows, *layout.row_shape)

@@ -8,7 +8,7 @@ import numpy as np
 
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ArrayEntry, shard_path, with_rows
-from dextouch.episodes.journal import CHUNK_JOURNAL, JournalWriter, journal_path, part_path
+from dextouch.episodes.journal import JournalWriter, journal_path, part_path
 from dextouch.episodes.shard_reader import with_crc
 from dextouch.episodes.zstd import compress
 
@@ -36,7 +36,7 @@ class ShardWriter:
         self._index: list[tuple[int, int]] = []
         self._offset = 0
         self._sha256 = hashlib.sha256()
-        self._log = JournalWriter(stage, name, CHUNK_JOURNAL)
+        self._log = JournalWriter(stage, name)
 
     def append(self, rows: np.ndarray) -> None:
         """Append rows [n, *row_shape] of the array's dtype (checked by the caller)."""
@@ -81,7 +81,7 @@ class ShardWriter:
 
     def _log_chunk(self, payload: bytes, num_rows: int) -> None:
         encoded = with_crc(payload)
-        self._log.append([encoded], [(num_rows,)])
+        self._log.append(encoded, num_rows)
         if self._sync:
             self._log.sync()
         self._index.append((self._offset, len(encoded)))

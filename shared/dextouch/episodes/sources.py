@@ -50,7 +50,7 @@ class _MappedFiles:
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
         self._guard = threading.Lock()
-        self._maps: OrderedDict[tuple[Path, int, int, int], mmap.mmap] = OrderedDict()
+        self._maps: OrderedDict[tuple[str, int, int, int], mmap.mmap] = OrderedDict()
 
     def get(self, path: Path) -> memoryview | None:
         """The file's bytes; None where it is missing or empty."""
@@ -59,7 +59,7 @@ class _MappedFiles:
         except (FileNotFoundError, NotADirectoryError):
             return None
         # A file of the same name that was written anew is another file.
-        key = (path, status.st_ino, status.st_size, status.st_mtime_ns)
+        key = (str(path), status.st_ino, status.st_size, status.st_mtime_ns)
         with self._guard:
             known = self._maps.get(key)
             if known is None:
@@ -101,15 +101,21 @@ class LocalFile:
 
     def size(self) -> int | None:
         """Its length in bytes; None where there is no such file."""
-        with disk_errors(f"read {self.path}"):
-            data = _MAPPED.get(self.path)
+        data = self._bytes()
         return None if data is None else len(data)
 
     def read(self, offset: int, length: int) -> memoryview:
         """Bytes offset … offset + length − 1."""
-        with disk_errors(f"read {self.path}"):
-            data = _MAPPED.get(self.path)
+        data = self._bytes()
         return memoryview(b"") if data is None else data[offset : offset + length]
+
+    def _bytes(self) -> memoryview | None:
+        try:
+            return _MAPPED.get(self.path)
+        except OSError:
+            # Entered only now: on the way of every read it would cost as much as the lookup.
+            with disk_errors(f"read {self.path}"):
+                raise
 
 
 class LocalGroup:

@@ -6,13 +6,12 @@ from pathlib import Path
 import numpy as np
 from pydantic import ValidationError
 
+from dextouch.episodes.batch_bytes import batch_of_bytes
+from dextouch.episodes.batch_log import read_bodies, read_records
 from dextouch.episodes.files import disk_errors
-from dextouch.episodes.journal import SAMPLE_JOURNAL, journal_path, read_payloads, read_rows
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import ENCODED_UNITS
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.streams.samples import SampleBatch
 
 RECORDING_FILE = "recording.json"
 CLOSED_FILE = "closed"
@@ -20,9 +19,9 @@ DEFAULT_BATCH_SAMPLES = 60
 
 
 class SpoolReader:
-    """Reads a spool, even while it is written: every sample whose row is whole.
+    """Reads a spool, even while it is written: every sample whose record is whole.
 
-    A stream's journal is read when the stream is first asked for; what comes later is not seen.
+    The log is looked through when a stream is first asked for; what comes later is not seen.
 
     Args:
         path: of the spool.
@@ -37,16 +36,16 @@ class SpoolReader:
         self.attributes = read_attributes(path)
         self.closed = (path / CLOSED_FILE).exists()
         self.streams = {d.name: d for d in self.attributes.streams}
-        self._rows: dict[str, np.ndarray] = {}
+        self._rows: dict[str, np.ndarray] | None = None
 
     def num_samples(self, stream_name: str) -> int:
-        """How many samples a stream held when it was first asked for.
+        """How many samples a stream held when the log was looked through.
 
         Raises:
             UnknownNameError: no such stream.
             CorruptDataError: damage that is no torn end.
         """
-        return len(self._stream_rows(stream_name))
+        return int(self._stream_rows(stream_name)["num_samples"].sum())
 
     def read(self, stream_name: str, start: int = 0, stop: int | None = None) -> SampleBatch:
         """Samples start … stop-1 of a stream, each checked.
@@ -55,20 +54,39 @@ class SpoolReader:
             InvalidInputError: outside the stream.
             CorruptDataError: a payload does not match its checksum.
         """
-        rows = self._stream_rows(stream_name)
-        stop = len(rows) if stop is None else stop
-        if not 0 <= start <= stop <= len(rows):
+        total = self.num_samples(stream_name)
+        stop = total if stop is None else stop
+        if not 0 <= start <= stop <= total:
             raise InvalidInputError(
-                f"{stream_name}: got samples {start} … {stop}, expected within 0 … {len(rows)}"
+                f"{stream_name}: got samples {start} … {stop}, expected within 0 … {total}"
             )
-        rows = rows[start:stop]
-        payloads = read_payloads(self.path, stream_name, rows)
+        rows = self._stream_rows(stream_name)
+        first = int(np.searchsorted(rows["first_sample"], start, side="right")) - 1
+        last = int(np.searchsorted(rows["first_sample"], stop, side="left"))
+        rows = rows[max(0, first) : max(0, first, last)]
+        batch = self._batch(stream_name, rows)
+        skipped = start - int(rows["first_sample"][0]) if len(rows) else 0
+        wanted = slice(skipped, skipped + stop - start)
         return SampleBatch(
-            rows["t_host_ns"].astype(np.int64),
-            rows["t_device_ns"].astype(np.int64),
-            rows["sequence"].astype(np.int64),
-            _values(self.streams[stream_name], payloads),
+            batch.t_host_ns[wanted],
+            batch.t_device_ns[wanted],
+            batch.sequence[wanted],
+            batch.values[wanted],
         )
+
+    def appended(self, stream_name: str, number: int) -> SampleBatch:
+        """The samples of one append, the first being number 0.
+
+        Raises:
+            InvalidInputError: there were not so many.
+            CorruptDataError: they do not match their checksum.
+        """
+        rows = self._stream_rows(stream_name)
+        if not 0 <= number < len(rows):
+            raise InvalidInputError(
+                f"{stream_name}: got append {number}, expected within 0 … {len(rows) - 1}"
+            )
+        return self._batch(stream_name, rows[number : number + 1])
 
     def batches(
         self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES, first: int = 0
@@ -83,13 +101,27 @@ class SpoolReader:
             if stop <= total or self.closed:
                 yield self.read(stream_name, start, min(stop, total))
 
+    def _batch(self, name: str, rows: np.ndarray) -> SampleBatch:
+        return batch_of_bytes(
+            self.streams[name],
+            read_bodies(self.path, rows),
+            rows["num_samples"].tolist(),
+            what=f"spool {self.path.name!r}",
+        )
+
     def _stream_rows(self, name: str) -> np.ndarray:
         if name not in self.streams:
             raise UnknownNameError("stream", name, list(self.streams))
-        if name not in self._rows:
-            if not journal_path(self.path, name).exists():
-                raise CorruptDataError(f"spool {self.path.name!r}: journal of {name!r} is missing")
-            self._rows[name] = read_rows(self.path, name, SAMPLE_JOURNAL)
+        if self._rows is None:
+            rows = read_records(self.path).rows
+            if len(rows) and int(rows["stream"].max()) >= len(self.streams):
+                raise CorruptDataError(
+                    f"spool {self.path.name!r}: its log has a stream number "
+                    f"{int(rows['stream'].max())}, {RECORDING_FILE} has {len(self.streams)} streams"
+                )
+            self._rows = {
+                stream: rows[rows["stream"] == number] for number, stream in enumerate(self.streams)
+            }
         return self._rows[name]
 
 
@@ -108,10 +140,3 @@ def read_attributes(path: Path) -> RecordingAttributes:
         return RecordingAttributes.model_validate_json(text)
     except ValidationError as error:
         raise CorruptDataError(f"spool {path.name!r}: {RECORDING_FILE}: {error}") from error
-
-
-def _values(descriptor: StreamDescriptor, payloads: list[bytes]) -> np.ndarray:
-    if descriptor.unit in ENCODED_UNITS:
-        return encoded_values(payloads)
-    values = np.frombuffer(b"".join(payloads), dtype=descriptor.numpy_dtype())
-    return values.reshape(len(payloads), *descriptor.shape)

@@ -20,7 +20,6 @@ from dextouch.episodes.format import (
     with_rows,
 )
 from dextouch.episodes.journal import (
-    CHUNK_JOURNAL,
     JournalWriter,
     journal_path,
     part_path,
@@ -145,7 +144,7 @@ def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
             shutil.rmtree(stage / name)
         part_path(stage, name).touch()
         journal_path(stage, name).touch()
-    rows = read_rows(stage, name, CHUNK_JOURNAL)
+    rows = read_rows(stage, name)
     # After a power loss rows may be there whose payload is not.
     while len(rows):
         try:
@@ -175,7 +174,7 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
             payload = values[: int(row["num_rows"])].tobytes()
         digest.update(payload)
     index = [(int(row["offset"]), int(row["length"])) for row in rows[:num_kept]]
-    log = JournalWriter(stage, name, CHUNK_JOURNAL, num_rows=num_kept)
+    log = JournalWriter(stage, name, num_rows=num_kept)
     try:
         finish_shard(stage, name, entry, log, index)
     finally:

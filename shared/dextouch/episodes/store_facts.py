@@ -26,7 +26,7 @@ PLACES: dict[str, str] = {
     TRASH: "",
 }
 MAX_BYTES = 16 << 20
-_SAMPLES = (".part", ".journal", ".receipts")
+_SAMPLES = (".part", ".journal", ".log")
 _WORD = "A-Za-z0-9_-"
 _AROUND_STAGE = re.compile(r"(episode|recording|migrated|old|deleted)-(.+)-[0-9a-f]{32}")
 _AROUND_TRASH = re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+")

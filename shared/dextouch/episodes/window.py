@@ -110,7 +110,8 @@ def mean_over_ranges(
     """
     valid = ranges[:, 1] > ranges[:, 0]
     means = np.zeros((len(ranges), *values.shape[1:]), dtype=np.float32)
-    for step in np.flatnonzero(valid):
-        low, high = ranges[step]
-        means[step] = values[low:high].mean(axis=0, dtype=np.float64)
+    for step, (low, high) in enumerate(ranges.tolist()):
+        if high > low:
+            # What `mean` does to the last bit, without what it looks up around it.
+            means[step] = np.add.reduce(values[low:high], axis=0, dtype=np.float64) / (high - low)
     return means, valid

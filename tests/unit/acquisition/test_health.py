@@ -1,14 +1,20 @@
 import numpy as np
 import pytest
+from prometheus_client import CollectorRegistry, generate_latest
 
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.camera import camera_descriptor
 from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
-from services.acquisition.health import HealthMonitor, Hysteresis
+from services.acquisition.health import HealthMonitor
+from services.acquisition.health_levels import Board, Hysteresis
+from services.acquisition.health_metrics import HealthCollector
+from services.acquisition.health_station import CalibrationJudge, DiskJudge
 from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import HidPort, PtyPort
+from services.acquisition.schemas import HealthFinding
 from services.acquisition.supervisor import DeviceSupervisor
 
 CALIBRATION = {
@@ -43,6 +49,8 @@ class Bench:
         self.monitor = HealthMonitor(
             self.supervisors, live=self.live, clock=self.clock, station="bench"
         )
+        for supervisor in self.supervisors:
+            supervisor.counters.is_connected = True
         self.counts = np.full(360, 100, np.uint16)
 
     def second(self, *, rate=1.0, lost=0, crc=0, evaluate=True):
@@ -131,11 +139,13 @@ def test_dead_taxels_are_counted(bench):
     for _ in range(7):
         bench.second()
     assert bench.levels()["tactile_left"] == "WARN"
-    assert bench.reasons()["tactile_left"] == ("2 taxels dead or saturated",)
+    assert bench.reasons()["tactile_left"] == ("2 taxels dead",)
     bench.counts[:30] = 65535
     for _ in range(8):
         bench.second()
     assert bench.levels()["tactile_left"] == "ERROR"
+    codes = [f.code for f in bench.monitor.report().streams[0].findings]
+    assert codes == ["taxels_saturated", "taxels_dead"]
 
 
 def test_reconnects_are_mentioned(bench):
@@ -152,6 +162,101 @@ def test_hysteresis():
     hysteresis = Hysteresis()
     seen = [hysteresis.update(level) for level in ["WARN", "OK", "WARN", "WARN"] + 5 * ["OK"]]
     assert seen == ["OK", "OK", "OK", "WARN", "WARN", "WARN", "WARN", "WARN", "OK"]
+
+
+def finding(level, code="loss"):
+    return HealthFinding(code=code, level=level, message=level)
+
+
+def test_a_code_rises_to_the_milder_of_two_and_falls_to_the_graver_of_five():
+    board = Board()
+    assert board.update([finding("ERROR")]) == []
+    assert board.is_rising
+    assert board.update([finding("WARN")]) == [("loss", "WARN")]
+    assert board.update([finding("ERROR")]) == []
+    assert board.update([finding("ERROR"), finding("WARN")]) == [("loss", "ERROR")]
+    assert not board.is_rising
+    changes = [board.update([finding("WARN")]) for _ in range(5)]
+    assert changes == [[], [], [], [], [("loss", "WARN")]]
+    assert board.active() == (finding("WARN"),)
+
+
+def test_an_evaluation_in_between_raises_and_never_clears():
+    board = Board()
+    board.update([finding("WARN")])
+    assert board.update([finding("WARN"), finding("WARN", "rate")], confirming=True)
+    for _ in range(20):
+        assert board.update([], confirming=True) == []
+    assert [item.code for item in board.active()] == ["loss"]
+
+
+def test_a_stale_stream_tells_no_figures(bench):
+    for _ in range(3):
+        bench.second()
+    assert bench.monitor.report().streams[0].figures["rate_hz"] == pytest.approx(60)
+    bench.wait(0.3)
+    stream = bench.monitor.report().streams[0]
+    assert (stream.level, stream.stale, stream.figures, stream.rate_hz) == (
+        "STALE",
+        "silent",
+        {},
+        None,
+    )
+
+
+def test_a_lost_device_is_stale_at_once(bench):
+    bench.second()
+    bench.supervisors[0].counters.is_connected = False
+    bench.supervisors[0].counters.last_error = "port vanished"
+    stream = bench.monitor.report().streams[0]
+    assert (stream.stale, stream.reasons) == ("unplugged", ("port vanished",))
+    assert bench.levels()["head"] == "OK"
+
+
+def test_calibration_that_is_missing_or_old_is_told():
+    descriptors = [camera_descriptor("camera_head", height_px=8, width_px=8, encoding="rgb8")]
+    day_s = 86_400.0
+
+    def found(calibration):
+        judge = CalibrationJudge(descriptors, calibration, unix_s=lambda: 10 * day_s)
+        return [(f.code, f.level) for f in judge.judge(0).findings]
+
+    K_head = ((1.0, 0.0, 0.0),) * 3
+    assert found({}) == [("calibration_missing", "ERROR")]
+    assert found({"K_head": K_head}) == []
+    assert found({"K_head": K_head, "calibrated_at_unix_s": ((4 * day_s,),)}) == []
+    assert found({"K_head": K_head, "calibrated_at_unix_s": ((2 * day_s,),)}) == [
+        ("calibration_age", "WARN")
+    ]
+
+
+@pytest.mark.parametrize(("minutes", "level"), [(40, None), (20, "WARN"), (4, "ERROR")])
+def test_the_disk_is_judged_by_the_time_it_lasts(bench, tmp_path, minutes, level):
+    rate = 60 * 720 + 100 * 56
+    disk = DiskJudge(tmp_path, bench.supervisors, free_bytes=lambda: round(minutes * 60 * rate))
+    disk.judge(bench.clock.now_ns())
+    for _ in range(3):
+        bench.second()
+        verdict = disk.judge(bench.clock.now_ns())
+    assert verdict.figures["disk_left_seconds"] == pytest.approx(minutes * 60, rel=1e-3)
+    assert [f.level for f in verdict.findings] == ([] if level is None else [level])
+
+
+def test_metrics_have_the_names_and_labels_that_alerts_use(bench):
+    for _ in range(3):
+        bench.second(crc=1)
+    registry = CollectorRegistry()
+    registry.register(HealthCollector(bench.monitor.report, bench.monitor.raised))
+    text = generate_latest(registry).decode()
+    glove = 'device="glove_left",hand="left"'
+    assert f"dextouch_crc_errors_total{{{glove}}} 3.0" in text
+    assert f'dextouch_stream_level{{{glove},stream="tactile_left"}} 1.0' in text
+    assert f'dextouch_rate_hz{{{glove},stream="tactile_left"}} ' in text
+    assert 'dextouch_health_findings_total{code="damage",stream="tactile_left"} 1.0' in text
+    bench.wait(1.0)
+    text = generate_latest(registry).decode()
+    assert f'dextouch_stream_level{{{glove},stream="tactile_left"}} 3.0' in text
+    assert "dextouch_rate_hz{" not in text
 
 
 def test_live_pressures_are_in_kpa_and_never_old(bench):

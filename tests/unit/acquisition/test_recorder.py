@@ -47,8 +47,9 @@ def advance(clock, duration_ns):
 
 
 def play(recorder, clock, seconds, streams=("tactile_left", "head")):
-    counts, pose = np.zeros(360, np.uint16), np.array([0.0, 0, 0, 1, 0, 0, 0])
+    rest, pose = np.full(360, 120, np.uint16), np.array([0.0, 0, 0, 1, 0, 0, 0])
     for index in range(round(seconds * 100)):
+        counts = rest + np.uint16(index % 3)
         now_ns = clock.now_ns()
         if "head" in streams:
             recorder.accept("pose_tracker_head", {"head": [Sample(now_ns, pose, 5, index)]})

@@ -1,3 +1,6 @@
+import errno
+import os
+
 import numpy as np
 import pytest
 
@@ -16,7 +19,7 @@ STREAMS = tuple(
 )
 
 
-def spool(root, name="take", count=150, *, close=True):
+def spool(root, name="take", count=270, *, close=True):
     attributes = RecordingAttributes(
         recording_id=name, task="t", instruction="i", domain="human", station="s", streams=STREAMS
     )
@@ -100,6 +103,70 @@ def test_every_interruption_is_made_up_for(tmp_path, failure):
     assert uploader.status()[0].uploaded
 
 
+class DyingStore(FakeStore):
+    """A store that dies at random moments: before it has done what was asked, or right after."""
+
+    def __init__(self, rng, probability):
+        super().__init__()
+        self.rng, self.probability, self.deaths = rng, probability, 0
+
+    def _die_or(self, action):
+        if self.rng.random() < self.probability:
+            self.deaths += 1
+            if self.rng.random() < 0.5:
+                action()
+            raise UnavailableError("store: connection lost")
+        return action()
+
+    def create(self, attributes):
+        return self._die_or(lambda: super(DyingStore, self).create(attributes))
+
+    def send_batch(self, recording_id, descriptor, batch, *, number):
+        send = super().send_batch
+        return self._die_or(lambda: send(recording_id, descriptor, batch, number=number))
+
+    def finish(self, recording_id, num_batches, *, success=None, ledger=()):
+        finish = super().finish
+        return self._die_or(
+            lambda: finish(recording_id, num_batches, success=success, ledger=ledger)
+        )
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_a_store_that_dies_at_random_moments_gets_everything_once(tmp_path, seed):
+    names = ["a", "b", "c"]
+    paths = {name: spool(tmp_path, name) for name in names}
+    store = DyingStore(np.random.default_rng(seed), 0.4)
+    done = []
+    for _ in range(500):
+        # Each time another process of the station.
+        done += Uploader(tmp_path, store, period_s=1.0).upload_all()
+        if len(done) == len(names):
+            break
+    assert sorted(done) == names
+    assert store.deaths > 0
+    for name, path in paths.items():
+        for stream in STREAMS:
+            expected = SpoolReader(path).read(stream.name).values
+            np.testing.assert_array_equal(store.samples(name, stream.name), expected)
+
+
+def test_a_full_disk_does_not_end_the_uploads(tmp_path, monkeypatch):
+    path = spool(tmp_path)
+    store = FakeStore()
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "write", full)
+    assert uploader.upload_all() == []
+    monkeypatch.undo()
+    assert "no space left" in uploader.status()[0].error
+    assert uploader.upload_all() == ["take"]
+    assert (path / UPLOADED_FILE).exists()
+
+
 def test_open_takes_wait(tmp_path):
     spool(tmp_path, close=False)
     store = FakeStore()
@@ -163,8 +230,8 @@ def test_recovery_closes_what_was_left_open(tmp_path):
 
 def test_batches_of_large_images_are_small():
     image = STREAMS[0].model_copy(update={"shape": (480, 640, 3), "dtype": "uint8"})
-    assert batch_samples(image) == 4
-    assert batch_samples(STREAMS[0]) == 60
+    assert batch_samples(image) == 9
+    assert batch_samples(STREAMS[0]) == 120
 
 
 def test_a_damaged_take_does_not_keep_the_others(tmp_path):

@@ -39,6 +39,14 @@ async def test_what_ails_a_device_is_said(feeds, services):
     assert stream.message == "no sample for 2.0 s · 3 reconnects · gone"
 
 
+async def test_what_ails_the_station_itself_is_said(feeds, services):
+    full = {"code": "disk", "level": "ERROR", "message": "the disk is full in 4 minutes"}
+    services.health["findings"] = [full]
+    view = await feeds.station()
+    assert (view.level, view.note) == ("ERROR", "the disk is full in 4 minutes")
+    assert view.streams[0].level == "OK"
+
+
 async def test_incomplete_take_is_shown(feeds, services):
     problem = {"stream": "head", "code": "gap", "level": "ERROR", "message": "head: 0.4 s gap"}
     services.recorder = {
@@ -115,7 +123,7 @@ async def test_refusal_keeps_its_class(feeds):
 
 
 async def test_unknown_action(feeds):
-    with pytest.raises(UnknownNameError, match="valid: arm, discard, record, save, stop"):
+    with pytest.raises(UnknownNameError, match="valid: arm, discard, record, rerecord, save, stop"):
         await feeds.operate("../health", {})
 
 

@@ -55,11 +55,11 @@ def test_the_same_recording_comes_out(ingest, store, commit, batch_of):
 
 
 def test_its_errors_are_ours(ingest, store):
-    (part,) = (store.root / ".uploads" / "take-1").glob("glove_left.part")
-    data = bytearray(part.read_bytes())
-    data[1000] ^= 1
-    part.write_bytes(bytes(data))
-    with pytest.raises(CorruptDataError, match="glove_left"):
+    log = store.root / ".uploads" / "take-1" / "batches.log"
+    data = bytearray(log.read_bytes())
+    data[5000] ^= 1
+    log.write_bytes(bytes(data))
+    with pytest.raises(CorruptDataError, match="log of spool 'take-1'"):
         ingest.finish("take-1", COUNTS)
     assert not store.exists("take-1", kind="recording")
     assert ingest.finish("take-2", COUNTS).state == "finished"

@@ -102,7 +102,7 @@ def test_gaps_changes_and_strangers_are_refused(ingest, attributes, send, batch_
         send(ingest, 2)
     assert caught.value.details == {"got": 2, "expected": 1}
     other = encode_batch(attributes.streams[0], batch_of(1, 5), number=0)
-    with pytest.raises(ConflictError, match="other bytes"):
+    with pytest.raises(ConflictError, match="other samples"):
         ingest.put_batch("take-1", "glove_left", 0, other)
     with pytest.raises(UnknownNameError, match="wrist_left"):
         ingest.put_batch("take-1", "glove", 0, other)
@@ -150,22 +150,19 @@ def test_a_restart_keeps_what_was_acknowledged(store, attributes, send, batch_of
     assert_complete(store, batch_of, 10)
 
 
-def test_a_crash_between_data_and_receipt_counts_once(
-    store, attributes, send, batch_of, monkeypatch
-):
+def test_a_crash_before_the_answer_counts_once(store, attributes, send, batch_of, monkeypatch):
     first = Ingest(store, sync=False, max_open_uploads=2)
     first.create(attributes)
     send(first, 0)
     with monkeypatch.context() as patch:
-        # The process dies after the samples were spooled and before the receipt was written.
-        patch.setattr(upload_module.Receipts, "append", _die)
-        patch.setattr(ingest_module.SpoolWriter, "truncate", lambda *_: None)
+        # The process dies after the samples were spooled and before the station hears of it.
+        patch.setattr(upload_module, "BatchReceipt", _die)
         with pytest.raises(KeyboardInterrupt):
             send(first, 1)
     first.close()
     second = Ingest(store, sync=False, max_open_uploads=2)
-    assert second.status("take-1").next_batch["glove_left"] == 1
-    send(second, 1)
+    assert second.status("take-1").next_batch["glove_left"] == 2
+    assert send(second, 1).replayed
     finish(second, 2)
     assert_complete(store, batch_of, 10)
 

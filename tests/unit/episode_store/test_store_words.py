@@ -14,7 +14,6 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from services.episode_store import __main__ as command_line
-from services.episode_store.receipts import Receipts
 from services.episode_store.words.context import readable_size, seconds_of, table
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
@@ -171,12 +170,8 @@ def test_verify_names_item_array_and_storage_chunk(store, word):
     with SpoolWriter(spool, recording_attributes("take-1", None), sync=False) as writer:
         numbers = np.arange(9)
         writer.append("force", SampleBatch(numbers, numbers, numbers, np.ones((9, 2), "f4")))
-    flip(spool / "force.part")
-    receipts = Receipts(spool / "force.receipts")
-    for end in (4, 9):
-        receipts.append(b"batch", end_sample=end, sync=False)
-    receipts.close()
-    flip(spool / "force.receipts")
+        writer.append("force", SampleBatch(numbers + 9, numbers, numbers, np.ones((9, 2), "f4")))
+    flip(spool / "batches.log", 100)
     status, out, _ = word("verify", "--json", "-")
     found = json.loads(out)
     assert status == 1
@@ -184,8 +179,7 @@ def test_verify_names_item_array_and_storage_chunk(store, word):
     assert "array 'force_t_host_ns': storage chunk 0" in found["damaged"]["r-1"]
     assert "extra belongs to no array" in found["damaged"]["r-1"]
     assert "commit.json is missing" in found["damaged"]["foreign"]
-    assert "row 0" in found["damaged"]["take-1"]
-    assert "receipt 0 does not hold" in found["damaged"]["take-1"]
+    assert "batch 0 of 'force'" in found["damaged"]["take-1"]
     status, out, _ = word("verify", "--kind", "recording", "r-1")
     assert (status, out.count("DAMAGED")) == (1, 2)
 

@@ -99,3 +99,10 @@ def group(units, count=None, lengths=None):
     lengths = [len(unit) for unit in units] if lengths is None else lengths
     count = len(units) if count is None else count
     return struct.pack(f"<{1 + len(lengths)}I", count, *lengths) + b"".join(units)
+
+
+def flip(path, place):
+    """Turn one bit of a file over."""
+    data = bytearray(path.read_bytes())
+    data[place] ^= 0x10
+    path.write_bytes(data)

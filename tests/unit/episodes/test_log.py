@@ -1,5 +1,6 @@
 """The spool: what was acknowledged stays, whatever happens to the process, the disk or the bits."""
 
+import errno
 import random
 import subprocess
 import sys
@@ -9,13 +10,14 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import log
-from dextouch.episodes.journal import SAMPLE_JOURNAL
+from dextouch.episodes.batch_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
     InvalidInputError,
     NotFoundError,
     ShapeError,
+    StorageError,
     StorageFullError,
     UnknownNameError,
 )
@@ -115,77 +117,175 @@ def test_resume_goes_on_where_it_stopped(path):
         with pytest.raises(InvalidInputError, match="goes back"):
             writer.append("glove_left", glove_batch(8))
         writer.append("glove_left", glove_batch(10, 2))
-        writer.truncate("camera_head", 1)
+        assert (writer.num_samples("glove_left"), writer.num_batches("glove_left")) == (12, 11)
     reader = log.SpoolReader(path)
     assert_same(reader.read("glove_left"), glove_batch(0, 12))
-    assert_same(reader.read("camera_head"), camera_batch(0))
+    assert_same(reader.read("camera_head"), camera_batch(0, 3))
+
+
+def test_samples_come_back_by_place_and_by_append(path):
+    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+        for first, count in ((0, 3), (3, 1), (4, 5)):
+            writer.append("glove_left", glove_batch(first, count))
+            writer.append("camera_head", camera_batch(first, count))
+    reader = log.SpoolReader(path)
+    for start in range(10):
+        for stop in range(start, 10):
+            assert_same(reader.read("glove_left", start, stop), glove_batch(start, stop - start))
+            assert len(reader.read("camera_head", start, stop)) == stop - start
+    assert_same(reader.read("camera_head", 2, 5), camera_batch(2, 3))
+    assert_same(reader.appended("glove_left", 2), glove_batch(4, 5))
+    for number in (-1, 3):
+        with pytest.raises(InvalidInputError, match="append"):
+            reader.appended("glove_left", number)
+
+
+GLOVE_BODY = 3 * 8 + 720
+GLOVE_RECORD = HEADER_BYTES + GLOVE_BODY
+
+
+@pytest.fixture
+def gloves(path):
+    """A spool whose log is ten records of the same length."""
+    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+        for first in range(10):
+            writer.append("glove_left", glove_batch(first))
+    assert (path / LOG_FILE).stat().st_size == len(LOG_MAGIC) + 10 * GLOVE_RECORD
+    return path
 
 
 def test_torn_ends_are_cut_and_counted(path):
     fill(path)
-    with (path / "glove_left.journal").open("ab") as journal:
-        journal.write(b"\x01" * (SAMPLE_JOURNAL.dtype.itemsize + 7))
-    with (path / "glove_left.part").open("ab") as part:
-        part.write(b"half a sample")
+    with (path / LOG_FILE).open("ab") as file:
+        file.write(b"\x01" * 1234)
     assert log.SpoolReader(path).num_samples("glove_left") == 10
-    glove, camera = log.recover(path)
-    assert (glove.num_samples, glove.dropped_part_bytes) == (10, 13)
-    assert glove.dropped_journal_bytes == SAMPLE_JOURNAL.dtype.itemsize + 7
-    assert (camera.num_samples, camera.dropped_part_bytes) == (3, 0)
-    assert log.recover(path)[0].dropped_part_bytes == 0
-
-
-@pytest.mark.parametrize("lost_bytes", [1, 720, 3000])
-def test_rows_whose_payload_never_arrived_are_dropped(path, lost_bytes):
-    fill(path)
-    part = path / "glove_left.part"
-    whole = part.read_bytes()
-    # Power loss: the journal reached the disk, the end of the part file did not, or as zeros.
-    part.write_bytes(whole[:-lost_bytes])
-    expected = (7200 - lost_bytes) // 720
-    assert log.recover(path)[0].num_samples == expected
-    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, expected))
-
-
-def test_zeroed_payloads_at_the_end_are_dropped(path):
-    fill(path)
-    part = path / "glove_left.part"
-    part.write_bytes(part.read_bytes()[:-1000] + bytes(1000))
-    assert log.recover(path)[0].num_samples == 8
-
-
-def test_damage_in_the_middle_is_refused_and_changes_nothing(path):
-    fill(path)
-    journal = path / "glove_left.journal"
-    whole = bytearray(journal.read_bytes())
-    whole[len(SAMPLE_JOURNAL.magic) + 3 * SAMPLE_JOURNAL.dtype.itemsize + 8] ^= 1
-    journal.write_bytes(whole)
-    with pytest.raises(CorruptDataError, match="row 3 of 10"):
-        log.recover(path)
-    assert journal.read_bytes() == bytes(whole)
-    with pytest.raises(CorruptDataError, match="glove_left"):
-        log.SpoolReader(path).num_samples("glove_left")
+    report = log.recover(path)
+    assert report.num_samples == {"glove_left": 10, "camera_head": 3}
+    assert report.dropped_bytes == 1234
+    assert log.recover(path).dropped_bytes == 0
     assert_same(log.SpoolReader(path).read("camera_head"), camera_batch(0, 3))
 
 
-def test_a_flipped_payload_bit_is_refused(path):
-    fill(path)
-    part = path / "glove_left.part"
-    whole = bytearray(part.read_bytes())
-    whole[800] ^= 4
-    part.write_bytes(whole)
-    reader = log.SpoolReader(path)
+@pytest.mark.parametrize("lost_bytes", [1, 20, 720, GLOVE_RECORD - 1, GLOVE_RECORD, 3000, 7800])
+def test_a_log_cut_off_anywhere_ends_with_its_last_whole_record(gloves, lost_bytes):
+    file = gloves / LOG_FILE
+    whole = file.read_bytes()
+    file.write_bytes(whole[:-lost_bytes])
+    expected = max(0, 10 * GLOVE_RECORD - lost_bytes) // GLOVE_RECORD
+    assert log.recover(gloves).num_samples["glove_left"] == expected
+    assert_same(log.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected))
+    with log.SpoolWriter.resume(gloves) as writer:
+        writer.append("glove_left", glove_batch(expected))
+    assert (
+        file.read_bytes()[: len(LOG_MAGIC) + expected * GLOVE_RECORD]
+        == (whole[: len(LOG_MAGIC) + expected * GLOVE_RECORD])
+    )
+    assert_same(log.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected + 1))
+
+
+def test_zeroed_bytes_at_the_end_are_dropped(gloves):
+    # Power loss: the length of the file reached the disk, its last bytes did not.
+    file = gloves / LOG_FILE
+    file.write_bytes(file.read_bytes()[:-1000] + bytes(1000))
+    report = log.recover(gloves)
+    assert report.num_samples["glove_left"] == 8
+    assert report.dropped_bytes == 2 * GLOVE_RECORD
+
+
+@pytest.mark.parametrize("place", [0, 5, 13, 20, 25, 30, 37])
+def test_a_damaged_header_in_the_middle_is_refused_and_changes_nothing(gloves, place):
+    file = gloves / LOG_FILE
+    whole = bytearray(file.read_bytes())
+    whole[len(LOG_MAGIC) + 3 * GLOVE_RECORD + place] ^= 1
+    file.write_bytes(whole)
+    with pytest.raises(CorruptDataError, match="no record, yet whole ones follow"):
+        log.recover(gloves)
+    assert file.read_bytes() == bytes(whole)
+    with pytest.raises(CorruptDataError, match="restore the file"):
+        log.SpoolReader(gloves).num_samples("glove_left")
+
+
+def test_a_record_that_is_missing_is_refused(gloves):
+    file = gloves / LOG_FILE
+    whole = file.read_bytes()
+    start = len(LOG_MAGIC) + 3 * GLOVE_RECORD
+    file.write_bytes(whole[:start] + whole[start + GLOVE_RECORD :])
+    # Every record behind lies where it does not say; none holds.
+    assert log.SpoolReader(gloves).num_samples("glove_left") == 3
+    file.write_bytes(whole[:start] + bytes(GLOVE_RECORD) + whole[start + GLOVE_RECORD :])
+    with pytest.raises(CorruptDataError, match="no record"):
+        log.SpoolReader(gloves).num_samples("glove_left")
+
+
+def test_a_flipped_bit_of_a_body_is_refused(gloves):
+    file = gloves / LOG_FILE
+    whole = bytearray(file.read_bytes())
+    whole[len(LOG_MAGIC) + GLOVE_RECORD + 700] ^= 4
+    file.write_bytes(whole)
+    reader = log.SpoolReader(gloves)
     assert_same(reader.read("glove_left", 0, 1), glove_batch(0))
-    with pytest.raises(CorruptDataError, match="glove_left"):
+    with pytest.raises(CorruptDataError, match="does not match its checksum"):
         reader.read("glove_left")
 
 
-def test_a_foreign_journal_is_refused(path):
+def test_a_log_inside_an_image_is_not_read_as_one(path):
+    """A station may well film a screen, or send anything: records are found by their place."""
+    video = CAMERA.model_copy(update={"unit": "h264"})
+    attributes = ATTRIBUTES.model_copy(update={"streams": (video,)})
+    with log.SpoolWriter(path, attributes) as writer:
+        one = SampleBatch(*np.zeros((3, 1), dtype=np.int64), encoded_values([b"\0\0\1\x65"]))
+        writer.append("camera_head", one)
+    forged = b"\0\0\1\x65" + (path / LOG_FILE).read_bytes() * 3
+    with log.SpoolWriter.resume(path) as writer:
+        writer.append(
+            "camera_head", SampleBatch(*np.ones((3, 1), np.int64), encoded_values([forged]))
+        )
+    file = path / LOG_FILE
+    whole = bytearray(file.read_bytes())
+    second = len(whole) - len(forged) - 4 - 24 - HEADER_BYTES
+    assert log.SpoolReader(path).read("camera_head").values[1] == forged
+    whole[second] ^= 1
+    file.write_bytes(whole)
+    assert log.recover(path).num_samples == {"camera_head": 1}
+
+
+def test_a_foreign_or_missing_log_is_refused(path):
     fill(path)
-    journal = path / "glove_left.journal"
-    journal.write_bytes(b"DXTJRNL\x02" + journal.read_bytes()[8:])
+    file = path / LOG_FILE
+    file.write_bytes(b"DXTBLOG\x02" + file.read_bytes()[8:])
     with pytest.raises(CorruptDataError, match="expected"):
         log.recover(path)
+    file.unlink()
+    with pytest.raises(CorruptDataError, match="missing"):
+        log.SpoolReader(path).num_samples("glove_left")
+    # The process died before it made its log: nothing was acknowledged.
+    assert log.recover(path).num_samples == {"glove_left": 0, "camera_head": 0}
+
+
+def test_a_log_of_other_streams_is_refused(path):
+    fill(path)
+    smaller = GLOVE.model_copy(update={"shape": (300,)})
+    for streams in ((GLOVE,), (smaller, CAMERA)):
+        attributes = ATTRIBUTES.model_copy(update={"streams": streams})
+        (path / "recording.json").write_text(attributes.model_dump_json())
+        with pytest.raises(CorruptDataError, match="stream"):
+            log.SpoolReader(path).read("glove_left")
+
+
+def test_a_batch_that_cannot_be_flushed_is_not_there(path, monkeypatch):
+    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+        writer.append("glove_left", glove_batch(0), flush=True)
+        with monkeypatch.context() as patch:
+            patch.setattr("os.fdatasync", _fail)
+            with pytest.raises(StorageError, match="sync"):
+                writer.append("glove_left", glove_batch(1), flush=True)
+        assert writer.num_batches("glove_left") == 1
+        writer.append("glove_left", glove_batch(1, 2), flush=True)
+    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
+
+
+def _fail(_descriptor):
+    raise OSError(errno.EIO, "the disk is broken")
 
 
 def test_a_full_disk_keeps_what_was_recorded(path, file_size_limit):
@@ -270,10 +370,10 @@ def check_kills(folder: Path, count: int, seed: int):
     for trial in range(count):
         path = folder / f"take-{trial}"
         acknowledged = kill_in_the_middle(path, rng.randint(1, 200))
-        report = log.recover(path)[0]
-        assert acknowledged <= report.num_samples <= acknowledged + 1
+        count = log.recover(path).num_samples["glove_left"]
+        assert acknowledged <= count <= acknowledged + 1
         got = log.SpoolReader(path).read("glove_left")
-        assert_same(got, glove_batch(0, report.num_samples))
+        assert_same(got, glove_batch(0, count))
 
 
 def test_a_killed_process_loses_nothing_acknowledged(tmp_path):

@@ -7,24 +7,16 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import CHUNK_SECONDS, GOP_IMAGES
-from dextouch.episodes.inspection import inspect_group, inspect_stage, inspect_upload
-from dextouch.episodes.log import SpoolWriter
-from dextouch.episodes.repair import repair_group, repair_unfinished
+from dextouch.episodes.inspection import inspect_group
+from dextouch.episodes.repair import repair_group
 from dextouch.episodes.sources import LocalGroup
-from dextouch.episodes.video import GopEncoder, VideoSettings
-from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import ConflictError, CorruptDataError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from tests.unit.episodes.hostile_group import flip
 
 ID = "stand-bottle-0003"
 NEW = f"{ID}-salvaged-1"
 VIDEO, STILLS, TOUCH = "camera_head", "camera_wrist_left", "tactile_left"
 TOUCH_ROWS = round(60 * CHUNK_SECONDS)
-FORCE = StreamDescriptor(
-    name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
-)
 
 
 @pytest.fixture
@@ -47,12 +39,6 @@ def folder(store):
 
 def shard_of(folder, name):
     return next(path for path in (folder / name / "c").rglob("*") if path.is_file())
-
-
-def flip(path, place):
-    data = bytearray(path.read_bytes())
-    data[place] ^= 0x10
-    path.write_bytes(data)
 
 
 def damage_chunk(folder, name, number):
@@ -259,139 +245,3 @@ def test_foreign_things_are_named_and_left(store, folder, truth, tmp_path):
     assert repair_group(store.root, "episode", ID).action == "left"
     assert (folder / "notes.txt").is_file()
     assert (tmp_path / "store").is_dir()
-
-
-def recording_attributes():
-    return RecordingAttributes(
-        recording_id="take-1",
-        task="stand_bottle",
-        instruction="",
-        domain="human",
-        station="bench",
-        streams=(FORCE,),
-    )
-
-
-def batch(first, count):
-    numbers = np.arange(first, first + count, dtype=np.int64)
-    values = np.stack([numbers, numbers + 0.5], axis=1).astype("f4")
-    return SampleBatch(numbers * 10, numbers, numbers, values)
-
-
-@pytest.fixture
-def spool(store):
-    path = store.root / ".uploads" / "take-1"
-    with SpoolWriter(path, recording_attributes(), sync=False) as writer:
-        writer.append("force", batch(0, 50))
-    return path
-
-
-@pytest.mark.parametrize(
-    ("file", "place"), [("force.part", 7 * 8 + 3), ("force.journal", 8 + 7 * 44 + 5)]
-)
-def test_a_damaged_upload_is_salvaged(store, spool, file, place):
-    flip(spool / file, place)
-    report = inspect_upload(spool)
-    assert report.damaged
-    assert "row 7" in report.findings[0].message
-    (result,) = repair_unfinished(store.root)
-    assert (result.kind, result.action, result.lost) == ("upload", "salvaged", {"force": 1})
-    reader = store.recording("take-1-salvaged-1")
-    reader.verify()
-    assert reader.read("force").sequence.tolist() == [n for n in range(50) if n != 7]
-    expected = batch(0, 50).values[np.arange(50) != 7]
-    np.testing.assert_array_equal(reader.read("force").values, expected)
-    (ledger,) = reader.attributes.ledger
-    assert (ledger.stream, ledger.event, ledger.count) == ("force", "lost_to_damage", 1)
-    assert reader.attributes.recovered
-    # The station may send all of it anew.
-    assert not spool.exists()
-    assert not store.exists("take-1", kind="recording")
-    store.restore("take-1", kind="upload")
-    assert (spool / file).is_file()
-
-
-@pytest.mark.parametrize(("number", "lost"), [(0, 8), (10, 8), (15, 8), (17, 4), (19, 1)])
-def test_of_video_in_an_upload_whole_groups_are_kept(store, number, lost):
-    """An image of H.264 cannot do without those before it; what is torn off last is no damage."""
-    camera = StreamDescriptor(
-        name="camera",
-        kind="image",
-        shape=(32, 32, 3),
-        dtype="uint8",
-        unit="h264",
-        nominal_rate_hz=30,
-    )
-    encoder = GopEncoder(32, 32, rate_hz=30.0, settings=VideoSettings())
-    units = [encoder.encode(np.full((32, 32, 3), 9 * i, np.uint8)) for i in range(20)]
-    attributes = recording_attributes().model_copy(update={"streams": (camera, FORCE)})
-    spool = store.root / ".uploads" / "take-1"
-    numbers = np.arange(20)
-    with SpoolWriter(spool, attributes, sync=False) as writer:
-        writer.append("camera", SampleBatch(numbers, numbers, numbers, encoded_values(units)))
-        writer.append("force", batch(0, 9))
-    flip(spool / "force.part", 3)
-    flip(spool / "camera.part", sum(map(len, units[:number])) + 6)
-    (result,) = repair_unfinished(store.root)
-    torn = number == 19
-    assert result.lost == {"force": 1} | ({} if torn else {"camera": lost})
-    reader = store.recording("take-1-salvaged-1")
-    first = number // 8 * 8
-    kept = [i for i in range(20) if not first <= i < first + 8] if not torn else list(range(19))
-    assert reader.read("camera").sequence.tolist() == kept
-    assert reader.encoded_images("camera", 0, len(kept)) == [units[i] for i in kept]
-    assert len(reader.images("camera")) == len(kept)
-
-
-def test_whole_and_torn_uploads_are_left_to_their_station(store, spool):
-    assert not inspect_upload(spool).damaged
-    journal = spool / "force.journal"
-    journal.write_bytes(journal.read_bytes()[:-3])
-    assert not inspect_upload(spool).damaged
-    flip(spool / "force.part", -9)
-    assert not inspect_upload(spool).damaged
-    assert repair_unfinished(store.root) == []
-
-
-@pytest.fixture
-def stage(store):
-    """What a killed writer leaves, with two storage chunks of five rows in its journals."""
-    options = WriteOptions(recoverable=True)
-    writer = store.writer(kind="recording", attributes=recording_attributes(), options=options)
-    part = batch(0, 17)
-    writer.append(
-        "force",
-        values=part.values,
-        t_host_ns=part.t_host_ns,
-        t_device_ns=part.t_device_ns,
-        sequence=part.sequence,
-    )
-    (stage,) = (store.root / ".staging").iterdir()
-    shutil.copytree(stage, store.root / "kept")
-    writer.__exit__(KeyboardInterrupt, None, None)
-    (store.root / "kept").rename(stage)
-    return stage
-
-
-def test_a_whole_stage_is_recovered(store, stage):
-    assert not inspect_stage(stage).damaged
-    (result,) = repair_unfinished(store.root)
-    assert (result.action, result.item_id) == ("recovered", "take-1")
-    assert store.recording("take-1").num_samples("force") == 15
-
-
-@pytest.mark.parametrize(
-    ("file", "place"), [("force.part", 30), ("force.journal", 10), ("force_sequence.part", 9)]
-)
-def test_a_damaged_stage_is_salvaged(store, stage, file, place):
-    flip(stage / file, place)
-    assert inspect_stage(stage).damaged
-    with pytest.raises(CorruptDataError):
-        store.recover()
-    (result,) = repair_unfinished(store.root)
-    assert (result.kind, result.action, result.lost) == ("stage", "salvaged", {"force": 5})
-    reader = store.recording("take-1-salvaged-1")
-    reader.verify()
-    assert reader.read("force").sequence.tolist() == list(range(5, 15))
-    np.testing.assert_array_equal(reader.read("force").values, batch(5, 10).values)
-    assert [entry.kind for entry in store.trash_list()] == ["stage"]

@@ -6,7 +6,7 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.episodes.window import nearest_indices, step_ranges
+from dextouch.episodes.window import mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands import actions as act
 
@@ -123,3 +123,21 @@ def test_ranges_tile_the_time_and_windows_agree(stamps, start, count):
         low, high = whole[step]
         inside = (stamps_ns > grid_ns[step - 1] + 1000) & (stamps_ns <= grid_ns[step] + 1000)
         assert np.flatnonzero(inside).tolist() == list(range(low, high))
+
+
+@given(
+    num_rows=st.integers(0, 40),
+    edges=st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), min_size=1, max_size=6),
+    dtype=st.sampled_from(["uint16", "float32", "float64"]),
+    seed=st.integers(0, 2**32 - 1),
+)
+def test_means_over_ranges_are_those_of_numpy(num_rows, edges, dtype, seed):
+    rng = np.random.default_rng(seed)
+    values = (rng.gamma(2.0, 300.0, (num_rows, 320))).astype(dtype)
+    ranges = np.minimum(np.array(edges, dtype=np.int64), num_rows)
+    means, valid = mean_over_ranges(values, ranges)
+    assert means.dtype == np.float32
+    for mean, held, (low, high) in zip(means, valid, ranges, strict=True):
+        assert held == (low < high)
+        plain = values[low:high].mean(axis=0, dtype=np.float64) if held else np.zeros(320)
+        np.testing.assert_array_equal(mean, plain.astype(np.float32))

@@ -1,5 +1,6 @@
 """A folder in; how long a small numeric append takes, in the middle and at worst, out."""
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,8 +20,10 @@ from services.cli.bench.store.workload import Workload
 
 STREAM = "tactile_left"
 SPOOL, SPOOL_SYNCED, ZARR = "spool", "spool, on the disk", "zarr append"
+# What no log can beat: as many bytes to a file, and the wait for them.
+DISK = "bare write and fdatasync"
 # Slow ways get fewer appends, so that all take about as long.
-_NUM_APPENDS = {SPOOL: 4000, SPOOL_SYNCED: 1000, ZARR: 300}
+_NUM_APPENDS = {SPOOL: 4000, SPOOL_SYNCED: 1000, DISK: 1000, ZARR: 300}
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,8 @@ def measure_appends(
 ) -> list[AppendResult]:
     """Append glove samples one by one to the spool, with and without waiting for the disk.
 
+    Beside it the disk without any log, and an array of zarr.
+
     Args:
         workload: whose left glove is appended, over and over.
         folder: for the spools.
@@ -48,6 +53,7 @@ def measure_appends(
     ways: dict[str, Callable[[Workload, Path, int], np.ndarray]] = {
         SPOOL: partial(_spool, sync=False),
         SPOOL_SYNCED: partial(_spool, sync=True),
+        DISK: _bare,
         ZARR: _zarr,
     }
     counts = {name: max(100, round(share * _NUM_APPENDS[name])) for name in ways}
@@ -99,6 +105,22 @@ def _batch(values: np.ndarray, index: int) -> SampleBatch:
         sequence=np.array([index], dtype=np.int64),
         values=values[row : row + 1],
     )
+
+
+def _bare(workload: Workload, folder: Path, count: int) -> np.ndarray:
+    values = workload.numbers[STREAM].values
+    taken_ms = np.empty(count)
+    descriptor = os.open(folder, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
+    try:
+        for index in range(count):
+            data = values[index % len(values)].tobytes()
+            begun_s = time.perf_counter()
+            os.write(descriptor, data)
+            os.fdatasync(descriptor)
+            taken_ms[index] = (time.perf_counter() - begun_s) * 1e3
+    finally:
+        os.close(descriptor)
+    return taken_ms
 
 
 def _zarr(workload: Workload, folder: Path, count: int) -> np.ndarray:

@@ -1,0 +1,279 @@
+"""What an SDK process says over a bridge comes in: who it is, and packets checked and in order.
+
+The bytes are documented in docs/device_packets.md, "Bridges".
+"""
+
+from typing import Final, Literal
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from dextouch.errors import DeviceError
+from services.acquisition.drivers.base import check_packet
+from services.acquisition.drivers.packets import DecoderStatistics, Packet, PacketDecoder
+from services.acquisition.drivers.reports import OrderFilter
+
+PROTOCOL: Final = "dextouch-bridge"
+PROTOCOL_VERSION = 1
+MAX_HELLO_BYTES = 16384
+MAX_AGE_NS = 200_000_000
+# A clock that goes back further than this was set anew; less is a sample that is not new.
+RESTART_NS = 1_000_000_000
+# How fast a source's clock may drift away from the host's before its data counts as old.
+MAX_DRIFT_PPM = 200
+LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+
+BridgeKind = Literal["finger_tracker", "pose_tracker"]
+SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+
+
+class _Message(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class BridgedDevice(_Message):
+    """One device behind a bridge: its index in packets, serial number and place."""
+
+    index: int = Field(ge=0, le=65535)
+    serial_number: str = Field(min_length=1, max_length=128)
+    source: Literal["left", "right", "head"]
+
+
+class FrameConvention(_Message):
+    """How the sender's coordinates lie in ours.
+
+    `axes` says for the sender's x, y and z in turn which axis of our frame points the same way.
+    `handedness` says the same again in one word; a convention that contradicts itself is refused.
+    """
+
+    handedness: Literal["left", "right"]
+    axes: tuple[SignedAxis, SignedAxis, SignedAxis]
+
+    @model_validator(mode="after")
+    def _agrees(self) -> "FrameConvention":
+        if {axis[1] for axis in self.axes} != {"x", "y", "z"}:
+            raise ValueError(f"axes: got {self.axes}, expected each of x, y and z once")
+        handedness = "right" if np.linalg.det(self.ours_from_theirs()) > 0 else "left"
+        if handedness != self.handedness:
+            raise ValueError(
+                f"axes {self.axes} are {handedness}-handed, but handedness says {self.handedness}"
+            )
+        return self
+
+    def ours_from_theirs(self) -> Float64[np.ndarray, "3 3"]:
+        """The matrix M (a signed permutation) with p_ours = M p_theirs; det −1 if left-handed."""
+        matrix = np.zeros((3, 3))
+        for column, axis in enumerate(self.axes):
+            matrix["xyz".index(axis[1]), column] = 1.0 if axis[0] == "+" else -1.0
+        return matrix
+
+
+class BridgeHello(_Message):
+    """The first line of every connection."""
+
+    protocol: Literal["dextouch-bridge"]
+    version: int
+    kind: BridgeKind
+    software: str = Field(max_length=256)
+    devices: tuple[BridgedDevice, ...] = Field(min_length=1)
+    frame: FrameConvention
+    length_unit: Literal["m", "cm", "mm"]
+    nodes: tuple[tuple[str, str], ...] | None = None
+
+    @model_validator(mode="after")
+    def _tells_devices_apart(self) -> "BridgeHello":
+        for name in ("index", "serial_number"):
+            values = [getattr(device, name) for device in self.devices]
+            if len(set(values)) < len(values):
+                raise ValueError(f"devices: {name} {values} are not all different")
+        if (self.nodes is None) is (self.kind == "finger_tracker"):
+            raise ValueError("nodes: needed from a finger tracker, and from nothing else")
+        return self
+
+    def scale_m(self) -> float:
+        """Metres of the sender's unit of length."""
+        return LENGTH_UNITS_M[self.length_unit]
+
+
+def parse_hello(line: bytes, *, device: str) -> BridgeHello:
+    """The hello of a bridge.
+
+    Raises:
+        DeviceError: no such hello, or one of another version.
+    """
+    try:
+        hello = BridgeHello.model_validate_json(line)
+    except ValidationError as error:
+        found = "; ".join(
+            f"{'.'.join(map(str, part['loc'])) or 'hello'}: {part['msg']}"
+            for part in error.errors(include_url=False)[:3]
+        )
+        raise DeviceError(
+            f"{device}: the bridge's first line is no {PROTOCOL!r} hello ({found}); is this the "
+            "address of a bridge?",
+            device=device,
+            event="wrong_hello",
+        ) from error
+    if hello.version != PROTOCOL_VERSION:
+        raise DeviceError(
+            f"{device}: the bridge speaks version {hello.version}, expected {PROTOCOL_VERSION}; "
+            "update the bridge or this station",
+            device=device,
+            event="wrong_version",
+        )
+    return hello
+
+
+class FreshnessGate:
+    """Tells whether a sample is new: its stamp goes on, and it came within 200 ms of its time.
+
+    The source's clock has any origin, so the age is counted from the fastest sample so far; that
+    reference may rise by 200 ppm, since clocks drift. What was already old when the connection
+    began cannot be seen.
+    """
+
+    def __init__(self) -> None:
+        self.num_old = 0
+        self.num_frozen = 0
+        self._offset_ns: float | None = None
+        self._t_host_ns = 0
+        self._t_device_ns = 0
+
+    def reset(self) -> None:
+        """Another source, or the same one started anew, may follow."""
+        self._offset_ns = None
+
+    def admits(self, t_device_ns: int, t_host_ns: int) -> bool:
+        """Whether a sample taken at `t_device_ns` that arrived at `t_host_ns` is new."""
+        delay_ns = float(t_host_ns - t_device_ns)
+        if self._offset_ns is None or t_device_ns < self._t_device_ns - RESTART_NS:
+            self._offset_ns = delay_ns
+        elif t_device_ns <= self._t_device_ns:
+            self.num_frozen += 1
+            return False
+        else:
+            drift_ns = (t_host_ns - self._t_host_ns) * (MAX_DRIFT_PPM * 1e-6)
+            self._offset_ns = min(delay_ns, self._offset_ns + drift_ns)
+        self._t_host_ns, self._t_device_ns = t_host_ns, t_device_ns
+        if delay_ns - self._offset_ns > MAX_AGE_NS:
+            self.num_old += 1
+            return False
+        return True
+
+
+class BridgeConnection:
+    """Hello and packets of one connection, for one of the bridge's devices.
+
+    Args:
+        kind: what the bridge must be.
+        device: our name of the device, for messages.
+        source: where the wanted device sits.
+        serial_number: of the wanted device; the only one of its source if None.
+        packets: finds the packets; an empty payload must be allowed, it is a sign of life.
+        payload_bytes: of a packet with a sample.
+    """
+
+    def __init__(
+        self,
+        kind: BridgeKind,
+        *,
+        device: str,
+        source: str,
+        serial_number: str | None,
+        packets: PacketDecoder,
+        payload_bytes: int,
+    ) -> None:
+        self.order = OrderFilter()
+        self.hello: BridgeHello | None = None
+        self.chosen: BridgedDevice | None = None
+        self._kind = kind
+        self._device = device
+        self._source = source
+        self._serial_number = serial_number
+        self._packets = packets
+        self._payload_bytes = payload_bytes
+        self._line = bytearray()
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """What was seen so far; `refused` counts packets of a wrong size too."""
+        return self._packets.statistics
+
+    def reset(self) -> None:
+        """The connection was lost: the next one begins with a hello."""
+        self.hello = self.chosen = None
+        self._line.clear()
+        self._packets.reset()
+        self.order.reset()
+
+    def feed(self, data: bytes) -> list[Packet]:
+        """New packets with a sample, of any device of the bridge.
+
+        Raises:
+            DeviceError: no hello, another version, or a bridge without the wanted device.
+        """
+        if self.hello is None:
+            self._line += data
+            line, found, rest = self._line.partition(b"\n")
+            if not found or len(line) > MAX_HELLO_BYTES:
+                self._refuse_endless(len(line))
+                return []
+            self._line = bytearray()
+            hello = parse_hello(bytes(line), device=self._device)
+            self.chosen = self._choose(hello)
+            self.hello, data = hello, bytes(rest)
+        return [packet for packet in self._packets.feed(data) if self._is_new(packet)]
+
+    def _is_new(self, packet: Packet) -> bool:
+        check_packet(packet, device=self._device, source=None)
+        if not self.order.admits(packet.sequence) or not packet.payload:
+            return False
+        if len(packet.payload) != self._payload_bytes:
+            self.statistics.refused += 1
+            return False
+        return True
+
+    def _refuse_endless(self, num_bytes: int) -> None:
+        if num_bytes > MAX_HELLO_BYTES:
+            raise DeviceError(
+                f"{self._device}: the bridge sent {num_bytes} bytes without a hello line, expected "
+                f"at most {MAX_HELLO_BYTES}; is this the address of a bridge?",
+                device=self._device,
+                event="wrong_hello",
+            )
+
+    def _choose(self, hello: BridgeHello) -> BridgedDevice:
+        present = ", ".join(f"{d.serial_number} ({d.source})" for d in hello.devices)
+        if hello.kind != self._kind:
+            raise DeviceError(
+                f"{self._device}: the bridge is a {hello.kind}, expected a {self._kind}",
+                device=self._device,
+                event="wrong_hello",
+            )
+        wanted = self._serial_number
+        if wanted is not None:
+            found = [d for d in hello.devices if d.serial_number == wanted]
+        else:
+            found = [d for d in hello.devices if d.source == self._source]
+        if len(found) > 1:
+            raise DeviceError(
+                f"{self._device}: several devices are {self._source!r}; set serial_number to one "
+                f"of: {present}",
+                device=self._device,
+                event="ambiguous_device",
+            )
+        if not found and wanted is not None:
+            raise DeviceError(
+                f"{self._device}: the bridge has no device {wanted!r}; present: {present}",
+                device=self._device,
+                event="absent_device",
+            )
+        if not found or found[0].source != self._source:
+            raise DeviceError(
+                f"{self._device}: the bridge has {present}, expected {self._source!r}; is the "
+                "wrong one connected?",
+                device=self._device,
+                event="wrong_side",
+            )
+        return found[0]

@@ -1,0 +1,200 @@
+"""Our glove as a device: a transport comes in, samples go out, and commands are answered."""
+
+import itertools
+import threading
+
+import numpy as np
+from jaxtyping import UInt16
+
+from dextouch.clocks import RoundTrip
+from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.tactile.layout import Side
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.glove_commands import (
+    MAX_TARE_PACKETS,
+    Command,
+    GloveDiagnostics,
+    GloveIdentity,
+    Reply,
+    check_status,
+    encode_request,
+    parse_diagnostics,
+    parse_identity,
+    parse_reply,
+    parse_round_trip,
+    parse_tare,
+)
+from services.acquisition.drivers.packets import SEQUENCE_MODULUS, Packet
+from services.acquisition.drivers.tactile_glove import NOMINAL_RATE_HZ, TactileGloveDecoder
+from services.acquisition.transports.base import Transport
+
+ANSWER_TIMEOUT_NS = 300_000_000
+NUM_ATTEMPTS = 3
+# A virtual clock stands still while a device is opened; silent reads then measure the waiting.
+MAX_SILENT_READS = 5
+
+
+class TactileGlove(Driver):
+    """Reads one glove and asks it things.
+
+    Every opening asks who it is: a glove of another serial number or of the other hand is
+    refused by name before any sample is taken from it.
+
+    Args:
+        side: which hand's glove it must be.
+        transport: where it is.
+        clock: of the station.
+        serial_number: that it must have; None takes any.
+    """
+
+    def __init__(
+        self,
+        side: Side,
+        *,
+        transport: Transport,
+        clock: StationClock,
+        serial_number: str | None = None,
+    ) -> None:
+        decoder = TactileGloveDecoder(side, on_reply=self._accept)
+        super().__init__(f"glove_{side}", transport=transport, decoder=decoder, clock=clock)
+        self.identity: GloveIdentity | None = None
+        self._side: Side = side
+        self._serial_number = serial_number
+        self._numbers = itertools.count(1)
+        self._asked: dict[int, int] = {}
+        self._replies: dict[int, tuple[Packet, int]] = {}
+        self._answered = threading.Condition()
+        self._writing = threading.Lock()
+        self._held: Readings = {}
+        self._reader: int | None = None
+
+    def open(self) -> None:
+        """Open the transport and ask the glove who it is.
+
+        Raises:
+            DeviceError: absent, silent, or another glove than this one should be.
+        """
+        self._reader = threading.get_ident()
+        self._held = {}
+        self.identity = None
+        super().open()
+        identity = self.identify()
+        self._check(identity)
+        self.identity = identity
+
+    def read(self) -> Readings:
+        """New samples by stream; those that came during a request of this thread go first."""
+        self._reader = threading.get_ident()
+        if self._held:
+            held, self._held = self._held, {}
+            return held
+        return super().read()
+
+    def identify(self) -> GloveIdentity:
+        """Serial number, firmware and side, as the glove tells them."""
+        packet, _ = self._ask(Command.IDENTIFY)
+        return parse_identity(self._body(Command.IDENTIFY, packet), packet.source)
+
+    def diagnostics(self) -> GloveDiagnostics:
+        """The glove's own counters."""
+        packet, _ = self._ask(Command.DIAGNOSTICS)
+        return parse_diagnostics(self._body(Command.DIAGNOSTICS, packet))
+
+    def time_round_trip(self) -> RoundTrip:
+        """One request for the glove's time; `dextouch.clocks.RoundTripClock` takes many of them."""
+        packet, (asked_ns, answered_ns) = self._ask(Command.TIME_SYNC)
+        body = self._body(Command.TIME_SYNC, packet)
+        reply = Reply(Command.TIME_SYNC, body, asked_ns, answered_ns, packet.t_device_ns)
+        return parse_round_trip(reply)
+
+    def tare(self, num_packets: int) -> UInt16[np.ndarray, "360"]:
+        """Mean counts of the next packets, in raw scan order; the glove must be without load.
+
+        Args:
+            num_packets: 1 … 600.
+
+        Raises:
+            InvalidInputError: another number.
+            DeviceError: no answer in twice the time that the packets take.
+        """
+        if not 1 <= num_packets <= MAX_TARE_PACKETS:
+            raise InvalidInputError(f"tare: got {num_packets}, expected 1 … {MAX_TARE_PACKETS}")
+        timeout_ns = ANSWER_TIMEOUT_NS + round(2e9 * num_packets / NOMINAL_RATE_HZ)
+        packet, _ = self._ask(Command.TARE, argument=num_packets, timeout_ns=timeout_ns)
+        return parse_tare(self._body(Command.TARE, packet))
+
+    def _check(self, identity: GloveIdentity) -> None:
+        where = f"{self.name}: the glove {identity.serial_number!r} at {self.info.address}"
+        if self._serial_number not in (None, identity.serial_number):
+            raise DeviceError(
+                f"{where} is not {self._serial_number!r}; are two gloves exchanged, or is the "
+                "serial number in the settings another glove's?",
+                device=self.name,
+                event="wrong_serial_number",
+            )
+        if identity.side != self._side:
+            raise DeviceError(
+                f"{where} says it is {identity.side!r}, expected {self._side!r}; left and right "
+                "are swapped: exchange the gloves or their entries in the settings",
+                device=self.name,
+                event="wrong_side",
+            )
+
+    def _ask(
+        self, command: Command, *, argument: int = 0, timeout_ns: int = ANSWER_TIMEOUT_NS
+    ) -> tuple[Packet, tuple[int, int]]:
+        """The reply packet and the host's stamps of request and reply."""
+        for _ in range(NUM_ATTEMPTS):
+            number = next(self._numbers) % SEQUENCE_MODULUS
+            data = encode_request(command, argument=argument, request=number)
+            with self._writing:
+                self._asked[number] = self._clock.now_ns()
+                self.transport.write(data)
+            reply = self._await(number, timeout_ns)
+            asked_ns = self._asked.pop(number)
+            if reply is not None:
+                return reply[0], (asked_ns, reply[1])
+        raise DeviceError(
+            f"{self.name}: no answer to {command.name.lower()} from {self.info} in "
+            f"{NUM_ATTEMPTS} attempts; is it a glove of this protocol?",
+            device=self.name,
+        )
+
+    def _await(self, number: int, timeout_ns: int) -> tuple[Packet, int] | None:
+        """The reply; read here if this is the reading thread, else that one brings it."""
+        if self._reader in (None, threading.get_ident()):
+            return self._read_until(number, timeout_ns)
+        with self._answered:
+            self._answered.wait_for(lambda: number in self._replies, timeout_ns * 1e-9)
+            return self._replies.pop(number, None)
+
+    def _read_until(self, number: int, timeout_ns: int) -> tuple[Packet, int] | None:
+        end_ns = self._clock.now_ns() + timeout_ns
+        num_silent = 0
+        while number not in self._replies:
+            if num_silent >= MAX_SILENT_READS or self._clock.now_ns() > end_ns:
+                return None
+            data = self.transport.read()
+            num_silent = 0 if data else num_silent + 1
+            if data:
+                for name, samples in self.decoder.decode(data, self._clock.now_ns()).items():
+                    self._held.setdefault(name, []).extend(samples)
+        return self._replies.pop(number)
+
+    def _accept(self, packet: Packet, t_host_ns: int) -> None:
+        """A reply came (called by the decoder); those that nobody waits for are passed over."""
+        with self._answered:
+            if packet.sequence in self._asked:
+                self._replies[packet.sequence] = (packet, t_host_ns)
+                self._answered.notify_all()
+
+    def _body(self, command: Command, packet: Packet) -> bytes:
+        answered, status, body = parse_reply(packet)
+        if answered != command:
+            raise DeviceError(
+                f"{self.name}: answered command {answered}, expected {int(command)}",
+                device=self.name,
+            )
+        check_status(self.name, command, status)
+        return body

@@ -1,0 +1,221 @@
+"""Gloves that send bare float32s: bytes come in, N readings a sample go out, judged by form alone.
+
+The family (VOFA's "justfloat") has neither checksum nor sequence nor time: N float32s, then the
+tail 00 00 80 7f, which is +infinity. A packet is released only between two tails exactly one
+packet apart, and only when its numbers can be readings. A bit error that leaves such a number is
+not seen by anyone; the stream's capabilities say so.
+"""
+
+import numpy as np
+from jaxtyping import Float32
+
+from dextouch.errors import DeviceError, InvalidInputError
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import Sample
+from dextouch.tactile.layout import Side
+from services.acquisition.drivers.base import Readings
+from services.acquisition.drivers.frames import DecoderStatistics
+
+TAIL = b"\x00\x00\x80\x7f"
+FLOAT_BYTES = 4
+MAX_VALUES = 4096
+# So many packets alike, but of another length than expected, are another device.
+NUM_FOREIGN = 3
+_SMALLEST_NORMAL = 0x00800000
+_ONE = np.uint32(1)
+_VALUE = np.dtype("<f4")
+
+
+class JustFloatFrames:
+    """Finds packets between tails; the result does not depend on the portions.
+
+    Args:
+        num_values: float32s of a packet.
+        full_scale: the largest reading.
+    """
+
+    def __init__(self, num_values: int, full_scale: float) -> None:
+        if not 1 <= num_values <= MAX_VALUES:
+            raise InvalidInputError(f"num_values: got {num_values}, expected 1 … {MAX_VALUES}")
+        self.statistics = DecoderStatistics()
+        self._payload = FLOAT_BYTES * num_values
+        self._size = self._payload + len(TAIL)
+        self._largest_bits = bits_of(full_scale)
+        self._buffer = bytearray()
+        self._needed = 0
+        self._is_after_tail = False
+        self._foreign = (0, 0)
+
+    def reset(self) -> None:
+        """Forget half a packet (the link was lost); counters stay."""
+        self.statistics.resync_bytes += len(self._buffer)
+        self._buffer.clear()
+        self._needed = 0
+        self._is_after_tail = False
+        self._foreign = (0, 0)
+
+    def feed(self, data: bytes) -> list[bytes]:
+        """Payloads completed by `data`.
+
+        Raises:
+            DeviceError: packets of another length, three in a row.
+        """
+        buffer = self._buffer
+        buffer += data
+        if len(buffer) < self._needed:
+            return []
+        self._needed = 0
+        found: list[bytes] = []
+        position = 0
+        while True:
+            if not self._is_after_tail:
+                position = self._seek(position)
+                if not self._is_after_tail:
+                    break
+            end = position + self._payload
+            if len(buffer) < end + len(TAIL):
+                self._needed = end + len(TAIL)
+                break
+            if buffer[end : end + len(TAIL)] == TAIL:
+                position = self._release(position, found)
+            elif len(buffer) < end + len(TAIL) + self._size:
+                self._needed = end + len(TAIL) + self._size
+                break
+            else:
+                position = self._pass_over(position)
+        del buffer[:position]
+        self._needed = max(0, self._needed - position)
+        return found
+
+    def _seek(self, position: int) -> int:
+        """The place behind the next tail, or where to look on when more has come."""
+        tail = self._buffer.find(TAIL, position)
+        self._is_after_tail = tail >= 0
+        unread = max(position, len(self._buffer) - len(TAIL) + 1)
+        after = unread if tail < 0 else tail + len(TAIL)
+        self.statistics.resync_bytes += after - position
+        return after
+
+    def _release(self, position: int, found: list[bytes]) -> int:
+        """A tail stands on either side: give the packet if its numbers can be readings."""
+        payload = bytes(self._buffer[position : position + self._payload])
+        if not are_readings(np.frombuffer(payload, _VALUE), self._largest_bits):
+            self.statistics.suspects += 1
+            self._is_after_tail = False
+            return position
+        self.statistics.packets += 1
+        self._foreign = (0, 0)
+        found.append(payload)
+        return position + self._size
+
+    def _pass_over(self, position: int) -> int:
+        """No tail where one belongs: its bits are wrong, or bytes are missing.
+
+        If the tail after it is in place, only this packet is lost; otherwise the next tail is
+        looked for from here on.
+        """
+        self.statistics.length_errors += 1
+        next_tail = position + self._size + self._payload
+        if self._buffer[next_tail : next_tail + len(TAIL)] == TAIL:
+            self.statistics.resync_bytes += self._size
+            return position + self._size
+        self._note_length(self._buffer.find(TAIL, position) - position)
+        self._is_after_tail = False
+        return position
+
+    def _note_length(self, length: int) -> None:
+        if length <= 0 or length % FLOAT_BYTES:
+            self._foreign = (0, 0)
+            return
+        same = self._foreign[1] + 1 if length == self._foreign[0] else 1
+        self._foreign = (length, same)
+        if same >= NUM_FOREIGN:
+            self.reset()
+            raise DeviceError(
+                f"glove: sends packets of {length // FLOAT_BYTES} numbers, expected "
+                f"{self._payload // FLOAT_BYTES}; is it another version? Set num_values to what "
+                "it sends",
+                event="wrong_version",
+            )
+
+
+class JustFloatGloveDecoder:
+    """Decodes one glove's byte stream.
+
+    Args:
+        side: of the glove; it does not tell itself.
+        num_values: float32s of a packet (known versions send 401, 415 or 615).
+        full_scale: the largest reading; packets with larger ones are held back.
+        rate_hz: nominal rate; the stream has no clock of its own.
+    """
+
+    def __init__(self, side: Side, *, num_values: int, full_scale: float, rate_hz: float) -> None:
+        self._frames = JustFloatFrames(num_values, full_scale)
+        self._descriptor = justfloat_descriptor(side, num_values=num_values, rate_hz=rate_hz)
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """What was seen so far; without a sequence, losses cannot be counted."""
+        return self._frames.statistics
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The raw stream."""
+        return (self._descriptor,)
+
+    def reset(self) -> None:
+        """Forget half a packet."""
+        self._frames.reset()
+
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+        """Samples (float32 [num_values]) completed by `data`, without stamp and number.
+
+        Args:
+            data: the next bytes of the stream, in any portion.
+            t_host_ns: when they arrived; 0 where only the content matters.
+
+        Raises:
+            DeviceError: packets of another length, three in a row.
+        """
+        return [
+            Sample(t_host_ns, np.frombuffer(payload, _VALUE)) for payload in self._frames.feed(data)
+        ]
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """The same by stream name."""
+        samples = self.feed(data, t_host_ns)
+        return {self._descriptor.name: samples} if samples else {}
+
+
+def justfloat_descriptor(side: Side, *, num_values: int, rate_hz: float) -> StreamDescriptor:
+    """The raw stream of one glove; neither its unit nor its time is told by the device."""
+    return StreamDescriptor(
+        name=f"tactile_{side}",
+        kind="tactile",
+        shape=(num_values,),
+        dtype="float32",
+        unit="raw",
+        nominal_rate_hz=rate_hz,
+        side=side,
+        device=f"glove_{side}",
+        capabilities=ClockCapabilities(),
+    )
+
+
+def bits_of(full_scale: float) -> int:
+    """The bit pattern of the largest reading."""
+    return int(np.float32(full_scale).view(np.uint32))
+
+
+def are_readings(values: Float32[np.ndarray, " n"], largest_bits: int) -> bool:
+    """Whether every number is 0 or a normal number up to the one with the largest bits.
+
+    Numbers below 1.2e-38 are what shifted bytes look like (the high half of a float is then zero),
+    never readings: refusing them keeps a search from settling in the wrong place.
+    """
+    bits = values.view(np.uint32)
+    # As bits, negative numbers, infinities and NaN are larger than any reading; less one, zero is
+    # the largest, so that the smallest is the smallest of the rest.
+    largest = int(np.maximum.reduce(bits))
+    smallest = int(np.minimum.reduce(bits - _ONE)) + 1
+    return largest <= largest_bits and smallest >= _SMALLEST_NORMAL

@@ -1,0 +1,177 @@
+"""Wuji tactile glove: bytes of its data packet come in, 24 × 32 pressures of full scale go out."""
+
+import binascii
+import math
+import struct
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float32
+
+from dextouch.errors import DeviceError
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import Sample
+from dextouch.tactile.layout import Side
+from services.acquisition.drivers.base import Readings
+from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
+
+MARK = b"\xaa\x55"
+PACKET_BYTES = 3088
+GRID = (24, 32)
+NUM_CELLS = GRID[0] * GRID[1]
+# mark, length of the whole packet, hand, three bytes that say nothing
+HEAD = struct.Struct("<2sHB3x")
+# after the cells: sequence, milliseconds since the device started
+STAMPS = struct.Struct("<HI")
+CRC = struct.Struct("<H")
+CRC_START = 0xFFFF
+CRC_OFFSET = PACKET_BYTES - CRC.size
+HANDS: dict[int, Side] = {0: "left", 1: "right"}
+SEQUENCE_BITS = 16
+TIME_BITS = 32
+TICK_NS = 1_000_000
+NOMINAL_RATE_HZ = 120.0
+_CELL = np.dtype("<f4")
+
+
+class WujiPacket(NamedTuple):
+    """One packet whose checksum and range held."""
+
+    hand: int
+    sequence: int
+    time_ms: int
+    cells: Float32[np.ndarray, "768"]
+
+
+class WujiFrames(FrameSearch[WujiPacket]):
+    """Finds the packets: CRC-16 (polynomial 0x1021, start 0xFFFF), then the range of the cells.
+
+    Sixteen bits let one damaged packet of 65 536 pass, so numbers that are no pressures are held
+    back beyond it and counted as suspects.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(MARK)
+        self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
+        self._last_ms: int | None = None
+
+    def _take(self, position: int) -> tuple[WujiPacket, int] | None:
+        buffer = self._buffer
+        if len(buffer) < position + HEAD.size:
+            self._needed = position + HEAD.size
+            return None
+        _, length, hand = HEAD.unpack_from(buffer, position)
+        if length != PACKET_BYTES:
+            self.statistics.length_errors += 1
+            return None
+        if len(buffer) < position + PACKET_BYTES:
+            self._needed = position + PACKET_BYTES
+            return None
+        # A copy of its own, in which the cells lie at a multiple of their size.
+        packet = bytes(buffer[position : position + PACKET_BYTES])
+        if CRC.unpack_from(packet, CRC_OFFSET)[0] != crc16(packet[len(MARK) : CRC_OFFSET]):
+            self.statistics.crc_errors += 1
+            return None
+        cells = np.frombuffer(packet, _CELL, NUM_CELLS, HEAD.size)
+        if not are_pressures(cells):
+            self.statistics.suspects += 1
+            return None
+        sequence, time_ms = STAMPS.unpack_from(packet, CRC_OFFSET - STAMPS.size)
+        self._sequence.count(sequence, is_restarted=self._went_back(time_ms))
+        return WujiPacket(hand, sequence, time_ms, cells), PACKET_BYTES
+
+    def _went_back(self, time_ms: int) -> bool:
+        """Whether the device's clock started anew; running over 2³² ms is none."""
+        last_ms, self._last_ms = self._last_ms, time_ms
+        return last_ms is not None and (time_ms - last_ms) % (1 << TIME_BITS) >= 1 << TIME_BITS - 1
+
+
+class WujiGloveDecoder:
+    """Decodes one glove's byte stream; cells that the glove has not are NaN, as it sends them.
+
+    Args:
+        side: which glove it must be; None takes any.
+    """
+
+    def __init__(self, side: Side | None = None) -> None:
+        self._frames = WujiFrames()
+        self._side: Side | None = side
+
+    @property
+    def statistics(self) -> DecoderStatistics:
+        """What was seen so far."""
+        return self._frames.statistics
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The raw stream (named for the left hand when the side is open)."""
+        return (wuji_descriptor(self._side or "left"),)
+
+    def reset(self) -> None:
+        """Forget half a packet."""
+        self._frames.reset()
+
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+        """Samples (float32 [768] of full scale, row by row) completed by `data`.
+
+        Args:
+            data: the next bytes of the stream, in any portion.
+            t_host_ns: when they arrived; 0 where only the content matters.
+
+        Raises:
+            DeviceError: the other hand's glove, or a hand that there is not.
+        """
+        samples = []
+        for packet in self._frames.feed(data):
+            self._check_hand(packet.hand)
+            t_device_ns = packet.time_ms * TICK_NS
+            samples.append(Sample(t_host_ns, packet.cells, t_device_ns, packet.sequence))
+        return samples
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """The same by stream name."""
+        samples = self.feed(data, t_host_ns)
+        return {self.descriptors[0].name: samples} if samples else {}
+
+    def _check_hand(self, hand: int) -> None:
+        side = HANDS.get(hand)
+        if side is None or self._side not in (None, side):
+            raise DeviceError(
+                f"glove_{self._side or 'any'}: says it is hand {hand} ({side!r}), expected "
+                f"{self._side or 'left or right'!r}; are left and right swapped?",
+                event="wrong_side",
+            )
+
+
+def wuji_descriptor(side: Side) -> StreamDescriptor:
+    """The raw stream of one glove; `unit` is the share of full scale, 0 … 1."""
+    return StreamDescriptor(
+        name=f"tactile_{side}",
+        kind="tactile",
+        shape=(NUM_CELLS,),
+        dtype="float32",
+        unit="full_scale",
+        nominal_rate_hz=NOMINAL_RATE_HZ,
+        side=side,
+        device=f"glove_{side}",
+        capabilities=ClockCapabilities(
+            crc=True,
+            sequence=True,
+            sequence_bits=SEQUENCE_BITS,
+            device_time=True,
+            tick_ns=TICK_NS,
+            device_time_bits=TIME_BITS,
+        ),
+    )
+
+
+def crc16(data: bytes) -> int:
+    """CRC-16-CCITT: polynomial 0x1021, start 0xFFFF, most significant bit first."""
+    return binascii.crc_hqx(data, CRC_START)
+
+
+def are_pressures(cells: Float32[np.ndarray, " n"]) -> bool:
+    """Whether every number is within 0 … 1 or NaN."""
+    # These two pass over NaN unless there is nothing else.
+    low, high = float(np.fmin.reduce(cells)), float(np.fmax.reduce(cells))
+    return (low >= 0.0 and high <= 1.0) or math.isnan(low)

@@ -1,0 +1,292 @@
+"""Images of one camera come in, samples with JPEG or H.264 bytes go out, from a thread of its own.
+
+The store takes an H.264 stream only in closed groups of GOP_IMAGES images, counted from the first
+image of the take. Hence images are dropped before they are encoded, never after; an encoder goes
+on with its group over a gap and over a reopened device; and a take begins with a new group.
+"""
+
+import concurrent.futures
+import threading
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes.video import (
+    FULL_FORM,
+    GopEncoder,
+    VideoSettings,
+    check_video_size,
+    decoder_of_this_thread,
+    is_keyframe,
+)
+from dextouch.errors import NotFoundError
+from dextouch.images.jpeg import encode_jpeg
+from dextouch.schemas.episodes import Matrix
+from dextouch.streams.checks import H264_UNIT
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, Sample, encoded_values
+
+ImageEncoding = Literal["rgb8", "jpeg", "h264"]
+MAX_WAITING_IMAGES = 8
+
+
+@dataclass(frozen=True)
+class StampedImage:
+    """An image with the stamps that its sample is going to carry."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    t_host_ns: int
+    t_device_ns: int = NO_DEVICE_TIME
+    sequence: int = NO_SEQUENCE
+
+    def sample(self, values: np.ndarray) -> Sample:
+        """The sample with these values."""
+        return Sample(self.t_host_ns, values, self.t_device_ns, self.sequence)
+
+
+@runtime_checkable
+class TakeAware(Protocol):
+    """A driver that prepares for a take."""
+
+    def begin_take(self) -> Mapping[str, Matrix]:
+        """A take begins: what comes from now on must be readable without what came before.
+
+        Returns:
+            What the driver knows of its streams' calibration at this moment.
+        """
+        ...
+
+
+class ImageEncoder:
+    """Encodes the images of one camera in their order; used by one thread.
+
+    Args:
+        encoding: `rgb8` leaves the image as it is.
+        size_px: height and width; even for `h264`.
+        rate_hz: nominal.
+        video: quality of `h264`.
+
+    Raises:
+        InvalidInputError: a size that H.264 cannot have.
+    """
+
+    def __init__(
+        self,
+        encoding: ImageEncoding,
+        size_px: tuple[int, int],
+        *,
+        rate_hz: float,
+        video: VideoSettings | None = None,
+    ) -> None:
+        self.encoding: ImageEncoding = encoding
+        self._size_px, self._rate_hz = size_px, rate_hz
+        self._settings = video or VideoSettings()
+        self._video: GopEncoder | None = None
+        if encoding == "h264":
+            check_video_size(*size_px)
+
+    def prepare(self) -> None:
+        """Load the encoder now, so that the first images need not wait for it."""
+        if self.encoding == "h264" and self._video is None:
+            self._video = self._new_video()
+
+    def encode(self, image: UInt8[np.ndarray, "h w 3"], *, begins: bool) -> np.ndarray:
+        """The values of the image's sample: uint8 [h, w, 3], or bytes as a 0-d object array.
+
+        Args:
+            image: RGB.
+            begins: whether it must begin a group of pictures.
+        """
+        if self.encoding == "rgb8":
+            return image
+        if self.encoding == "jpeg":
+            return encoded_values([encode_jpeg(image)]).reshape(())
+        if self._video is None or begins:
+            # A new encoder begins a new group; it costs no more than encoding an image.
+            self._video = self._new_video()
+        return encoded_values([self._video.encode(image)]).reshape(())
+
+    def _new_video(self) -> GopEncoder:
+        return GopEncoder(*self._size_px, rate_hz=self._rate_hz, settings=self._settings)
+
+
+class EncodingQueue:
+    """Hands images to an encoder in a thread of its own; what finds the queue full is dropped.
+
+    `put` and `collect` belong to the reader thread, `begin_group` to any.
+
+    Args:
+        encoder: of the camera; used by the queue's thread alone.
+        name: of the stream, for the thread.
+        max_waiting: images that may wait.
+    """
+
+    def __init__(
+        self, encoder: ImageEncoder, *, name: str, max_waiting: int = MAX_WAITING_IMAGES
+    ) -> None:
+        self.num_dropped = 0
+        self._encoder, self._name, self._max_waiting = encoder, name, max_waiting
+        self._waiting: deque[concurrent.futures.Future[Sample]] = deque()
+        self._thread: concurrent.futures.ThreadPoolExecutor | None = None
+        self._begun = 0
+        self._wanted = 0
+        self._lock = threading.Lock()
+
+    def prepare(self) -> None:
+        """Load the encoder; only while nothing is queued."""
+        if self._thread is None:
+            self._encoder.prepare()
+
+    def begin_group(self) -> None:
+        """The next image that is put begins a group."""
+        with self._lock:
+            self._wanted += 1
+
+    def put(self, image: StampedImage) -> bool:
+        """Queue an image, whose pixels nobody changes any more; False when it was dropped."""
+        num_waiting = sum(not future.done() for future in self._waiting)
+        if num_waiting >= self._max_waiting:
+            self.num_dropped += 1
+            return False
+        if self._thread is None:
+            self._thread = concurrent.futures.ThreadPoolExecutor(
+                max_workers=1, thread_name_prefix=f"encode-{self._name}"
+            )
+        with self._lock:
+            begins, self._begun = self._begun != self._wanted, self._wanted
+        self._waiting.append(self._thread.submit(self._encode, image, begins))
+        return True
+
+    def collect(self, wait_s: float = 0.0) -> list[Sample]:
+        """Samples that are ready, in order.
+
+        Args:
+            wait_s: how long to wait for those that are not.
+
+        Raises:
+            DexTouchError: an image could not be encoded.
+        """
+        if wait_s > 0 and self._waiting:
+            concurrent.futures.wait(self._waiting, timeout=wait_s)
+        samples = []
+        while self._waiting and self._waiting[0].done():
+            samples.append(self._waiting.popleft().result())
+        return samples
+
+    def stop(self) -> None:
+        """Encode what waits and end the thread; `collect` still gives it, `put` starts anew."""
+        if self._thread is not None:
+            self._thread.shutdown()
+            self._thread = None
+
+    def _encode(self, image: StampedImage, begins: bool) -> Sample:  # noqa: FBT001 - submitted
+        return image.sample(self._encoder.encode(image.image, begins=begins))
+
+
+class GroupGate:
+    """Lets the H.264 samples of one take pass from the first one that begins a group."""
+
+    def __init__(self) -> None:
+        self.num_left_out = 0
+        self._is_open = False
+
+    def admit(self, samples: Sequence[Sample]) -> list[Sample]:
+        """Those of the samples that can be decoded within the take."""
+        admitted = []
+        for sample in samples:
+            self._is_open = self._is_open or is_keyframe(sample.values.item())
+            if self._is_open:
+                admitted.append(sample)
+            else:
+                self.num_left_out += 1
+        return admitted
+
+
+def begin_take(drivers: Iterable[object]) -> dict[str, Matrix]:
+    """Tell all drivers that want to know that a take begins; what they know of their streams."""
+    aware = [driver for driver in drivers if isinstance(driver, TakeAware)]
+    return {name: matrix for driver in aware for name, matrix in driver.begin_take().items()}
+
+
+def take_gates(streams: Iterable[StreamDescriptor]) -> dict[str, GroupGate]:
+    """A gate for every stream of a take that needs one, by name."""
+    return {stream.name: GroupGate() for stream in streams if stream.unit == H264_UNIT}
+
+
+class GroupPreview:
+    """Keeps the H.264 images since the last key frame, so that the newest one can be looked at."""
+
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        self._size_px = size_px
+        # Replaced, never changed: a viewer's thread may hold it.
+        self._group: tuple[bytes, ...] = ()
+
+    def add(self, access_unit: bytes) -> None:
+        """The next image."""
+        if is_keyframe(access_unit):
+            self._group = (access_unit,)
+        elif 0 < len(self._group) < GOP_IMAGES:
+            self._group = (*self._group, access_unit)
+        else:
+            self._group = ()
+
+    def image(self) -> UInt8[np.ndarray, "h w 3"]:
+        """The newest image, decoded now.
+
+        Raises:
+            NotFoundError: no key frame came yet.
+            CorruptDataError: the bytes are no such images.
+        """
+        group = list(self._group)
+        if not group:
+            raise NotFoundError("H.264 preview: no key frame has come yet; ask again in a moment")
+        pixels = np.empty((1, *self._size_px, 3), dtype=np.uint8)
+        decoder = decoder_of_this_thread(*self._size_px)
+        decoder.decode(group, [len(group) - 1], FULL_FORM, pixels)
+        return pixels[0]
+
+
+class WholeGroups:
+    """H.264 samples of a device that encodes itself in; the same in whole groups out.
+
+    A group that lost an image is left out as a whole: the store could not take the rest of it.
+    """
+
+    def __init__(self) -> None:
+        self.num_left_out = 0
+        self._group: list[Sample] = []
+        # Of the sample that a group is expected to begin after; None where any may.
+        self._whole_until: int | None = None
+
+    def add(self, sample: Sample) -> list[Sample] | None:
+        """The next sample; a whole group when it is the last one of it.
+
+        Returns:
+            The group, [] while it is not whole, None when the device's groups have another length.
+        """
+        begins = is_keyframe(sample.values.item())
+        follows = bool(self._group) and sample.sequence == self._group[-1].sequence + 1
+        # Nothing is missing in either case: the device means its groups to be so long.
+        is_too_short = begins and follows
+        is_too_long = not begins and sample.sequence - 1 == self._whole_until
+        if begins or not follows:
+            self.reset()
+        if is_too_short or is_too_long or not (begins or follows):
+            self.num_left_out += 1
+            return None if is_too_short or is_too_long else []
+        self._group.append(sample)
+        if len(self._group) < GOP_IMAGES:
+            return []
+        self._whole_until = sample.sequence
+        whole, self._group = self._group, []
+        return whole
+
+    def reset(self) -> None:
+        """Leave out what was begun; the next sample need not follow."""
+        self.num_left_out += len(self._group)
+        self._group, self._whole_until = [], None

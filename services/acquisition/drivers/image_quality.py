@@ -1,0 +1,219 @@
+"""Images of one camera come in; whether they are frozen, blurred or badly exposed goes out.
+
+Cheap enough for every image of a 720p camera: a checksum of a few pixels of each image, and of
+every third image sharpness and exposure at a quarter of the size.
+"""
+
+import zlib
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dextouch.errors import InvalidInputError
+
+CHECK_EVERY = 3
+# More than three equal images in a row: no sensor is that free of noise.
+MAX_EQUAL_IMAGES = 3
+BLURRED_BELOW = 0.3
+# Before that many checks there is no session to compare with.
+MIN_SHARPNESSES = 10
+MAX_SHARPNESSES = 512
+CLIPPED_ABOVE = 0.2
+DARK_LEVEL, BRIGHT_LEVEL = 5, 250
+# A gap of the driver's stamps stays a current flag for this long.
+GAP_PERIODS = 1.5
+GAP_SHOWN_NS = 1_000_000_000
+_CHECKSUM_ROWS = 90
+_QUARTER = 4
+
+
+@dataclass(frozen=True)
+class ImageQuality:
+    """What the newest images of one camera are like, and what was counted since the start.
+
+    Attributes:
+        frozen: more than three images in a row were equal.
+        blurred: sharpness below 0.3 of the session's median.
+        clipped_ratio: share of pixels at the dark or the bright end, 0 … 1.
+        gap: the driver's stamps left out at least one image within the last second.
+        num_checked: images whose sharpness and exposure were looked at.
+        num_images: all images seen.
+        num_frozen: images that were equal to at least three before them.
+        num_blurred: of the checked ones.
+        num_clipped: of the checked ones, those with more than 20 % clipped pixels.
+        num_gaps: gaps of the driver's stamps.
+        num_dropped: images that found the encoder's queue full.
+        largest_gap_ns: between two stamps.
+        sharpness: variance of the Laplacian of the newest checked image.
+        median_sharpness: of the session; None before there is enough to compare with.
+    """
+
+    frozen: bool = False
+    blurred: bool = False
+    clipped_ratio: float = 0.0
+    gap: bool = False
+    num_checked: int = 0
+    num_images: int = 0
+    num_frozen: int = 0
+    num_blurred: int = 0
+    num_clipped: int = 0
+    num_gaps: int = 0
+    num_dropped: int = 0
+    largest_gap_ns: int = 0
+    sharpness: float | None = None
+    median_sharpness: float | None = None
+
+    @property
+    def clipped(self) -> bool:
+        """Whether the newest checked image is over- or under-exposed."""
+        return self.clipped_ratio > CLIPPED_ABOVE
+
+
+class SessionMedian:
+    """The median of a whole session in bounded memory: evenly thinned out when it gets full."""
+
+    def __init__(self) -> None:
+        self._values: list[float] = []
+        self._every = 1
+        self._num_seen = 0
+
+    def add(self, value: float) -> None:
+        """One more value."""
+        if self._num_seen % self._every == 0:
+            self._values.append(value)
+        self._num_seen += 1
+        if len(self._values) == MAX_SHARPNESSES:
+            self._values = self._values[::2]
+            self._every *= 2
+
+    @property
+    def value(self) -> float | None:
+        """The median; None of fewer than 10 values."""
+        if len(self._values) < MIN_SHARPNESSES:
+            return None
+        return float(np.median(self._values))
+
+
+class ImageChecker:
+    """Looks at the images of one camera in the order in which they come; used by one thread.
+
+    Args:
+        period_ns: nominal distance of two images.
+        check_every: of how many images one has its sharpness and exposure checked.
+    """
+
+    def __init__(self, *, period_ns: int, check_every: int = CHECK_EVERY) -> None:
+        if period_ns <= 0 or check_every < 1:
+            raise InvalidInputError(
+                f"image checker: got period {period_ns} ns and every {check_every}, expected a "
+                "positive period and at least 1"
+            )
+        self._period_ns = period_ns
+        self._check_every = check_every
+        self._checksum: int | None = None
+        self._num_equal = 0
+        self._last_t_ns: int | None = None
+        self._gap_seen_ns: int | None = None
+        self._median = SessionMedian()
+        self._counts = dict.fromkeys(
+            ("num_checked", "num_images", "num_frozen", "num_blurred", "num_clipped", "num_gaps"), 0
+        )
+        self._largest_gap_ns = 0
+        self._sharpness: float | None = None
+        self._is_blurred = False
+        self._clipped_ratio = 0.0
+
+    def check(self, image: UInt8[np.ndarray, "h w 3"], t_ns: int | None = None) -> None:
+        """Look at the next image.
+
+        Args:
+            image: RGB.
+            t_ns: the driver's stamp, if it gives one; must grow.
+        """
+        step = max(1, min(image.shape[:2]) // _CHECKSUM_ROWS)
+        self.note(image[::step, ::step].tobytes(), t_ns)
+        if (self._counts["num_images"] - 1) % self._check_every == 0:
+            self.look(image)
+
+    def note(self, data: bytes, t_ns: int | None = None) -> None:
+        """The next image as bytes that are equal only for equal images, such as its JPEG bytes."""
+        self._counts["num_images"] += 1
+        checksum = zlib.crc32(data)
+        self._num_equal = self._num_equal + 1 if checksum == self._checksum else 1
+        self._checksum = checksum
+        self._counts["num_frozen"] += self._num_equal > MAX_EQUAL_IMAGES
+        if t_ns is not None:
+            self._note_stamp(t_ns)
+
+    def look(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
+        """Sharpness and exposure of an image."""
+        gray = quarter_size(image)
+        sharpness = laplacian_variance(gray)
+        clipped = int(np.count_nonzero((gray <= DARK_LEVEL) | (gray >= BRIGHT_LEVEL)))
+        self._sharpness, self._clipped_ratio = sharpness, clipped / gray.size
+        median = self._median.value
+        self._is_blurred = median is not None and sharpness < BLURRED_BELOW * median
+        self._median.add(sharpness)
+        self._counts["num_checked"] += 1
+        self._counts["num_blurred"] += self._is_blurred
+        self._counts["num_clipped"] += int(self._clipped_ratio > CLIPPED_ABOVE)
+
+    @property
+    def quality(self) -> ImageQuality:
+        """What was found so far."""
+        last_ns, gap_ns = self._last_t_ns, self._gap_seen_ns
+        return ImageQuality(
+            frozen=self._num_equal > MAX_EQUAL_IMAGES,
+            blurred=self._is_blurred,
+            clipped_ratio=self._clipped_ratio,
+            gap=last_ns is not None and gap_ns is not None and last_ns - gap_ns <= GAP_SHOWN_NS,
+            largest_gap_ns=self._largest_gap_ns,
+            sharpness=self._sharpness,
+            median_sharpness=self._median.value,
+            **self._counts,
+        )
+
+    def _note_stamp(self, t_ns: int) -> None:
+        if self._last_t_ns is not None:
+            gap_ns = t_ns - self._last_t_ns
+            self._largest_gap_ns = max(self._largest_gap_ns, gap_ns)
+            if gap_ns > GAP_PERIODS * self._period_ns:
+                self._counts["num_gaps"] += 1
+                self._gap_seen_ns = t_ns
+        self._last_t_ns = t_ns
+
+
+def quarter_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b"]:
+    """Green at a quarter of height and width: the mean of 4 of each 16 pixels, against noise.
+
+    Images of less than 12 pixels are taken as they are.
+    """
+    green = image[..., 1]
+    height, width = image.shape[0] // _QUARTER * _QUARTER, image.shape[1] // _QUARTER * _QUARTER
+    if min(height, width) < 3 * _QUARTER:
+        return np.ascontiguousarray(green)
+    rows, columns = slice(0, height, _QUARTER), slice(0, width, _QUARTER)
+    lower, right = slice(2, height, _QUARTER), slice(2, width, _QUARTER)
+    total = green[rows, columns].astype(np.uint16)
+    total += green[rows, right]
+    total += green[lower, columns]
+    total += green[lower, right]
+    return (total >> 2).astype(np.uint8)
+
+
+def laplacian_variance(gray: UInt8[np.ndarray, "h w"]) -> float:
+    """Variance of the Laplacian (4 neighbours), in counts squared; the smaller, the blurrier.
+
+    The border is left out; an image without an inside has none: 0.
+    """
+    if min(gray.shape) < 3:
+        return 0.0
+    wide = gray.astype(np.int16)
+    edges = wide[1:-1, :-2] + wide[1:-1, 2:]
+    edges += wide[:-2, 1:-1]
+    edges += wide[2:, 1:-1]
+    edges -= wide[1:-1, 1:-1] << 2
+    flat = edges.ravel().astype(np.float32)
+    mean = float(flat.mean(dtype=np.float64))
+    return float(np.dot(flat, flat)) / flat.size - mean * mean

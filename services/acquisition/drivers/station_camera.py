@@ -1,0 +1,235 @@
+"""A camera on the station itself: captured images come in, stamped, checked, encoded samples out.
+
+Stamps of the driver are on this host's monotonic clock; an image carries the middle of its
+exposure. A camera whose stamps are on another clock gives arrival stamps only, and says so.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from dextouch.errors import DeviceError
+from dextouch.schemas.episodes import Matrix
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import NO_DEVICE_TIME
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.driver_stamps import DriverStamps
+from services.acquisition.drivers.image_encoding import (
+    EncodingQueue,
+    ImageEncoder,
+    ImageEncoding,
+    StampedImage,
+)
+from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
+from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.drivers.video_capture import (
+    NS_PER_MS,
+    CapturedImage,
+    CaptureLink,
+    CaptureRequest,
+    StampPoint,
+)
+
+READ_TIMEOUT_S = 0.05
+# A camera that says nothing for so long is lost; the first image may take longer.
+MIN_SILENCE_NS = 250_000_000
+SILENT_PERIODS = 5
+FIRST_IMAGE_NS = 3_000_000_000
+# The kernel stamps in microseconds.
+STAMP_TICK_NS = 1_000
+
+
+@dataclass(frozen=True)
+class CameraTiming:
+    """What is known, or assumed, of when a camera takes its images.
+
+    Attributes:
+        stamp_point: the end of the exposure at which the driver stamps.
+        latency_ns: calibrated, from the middle of the exposure to the earliest arrival.
+        latency_sigma_ns: of it.
+    """
+
+    stamp_point: StampPoint = "start"
+    latency_ns: int | None = None
+    latency_sigma_ns: int | None = None
+
+
+class _CaptureDecoder:
+    """The decoder's part of a camera that gives images and no bytes."""
+
+    def __init__(self, stream: str, request: CaptureRequest, encoding: ImageEncoding) -> None:
+        self.statistics = DecoderStatistics()
+        self.stamps = DriverStamps(stream, period_ns=request.period_ns, statistics=self.statistics)
+        self._stream, self._request, self._encoding = stream, request, encoding
+
+    @property
+    def descriptors(self) -> tuple[StreamDescriptor, ...]:
+        """The image stream; without device time once the driver's stamps proved useless."""
+        request = self._request
+        has_time = self.stamps.usable is not False
+        descriptor = StreamDescriptor(
+            name=self._stream,
+            kind="image",
+            shape=(request.height_px, request.width_px, 3),
+            dtype="uint8",
+            unit=self._encoding,
+            nominal_rate_hz=request.rate_hz,
+            frame=self._stream,
+            device=self._stream,
+            capabilities=ClockCapabilities(
+                device_time=has_time, tick_ns=STAMP_TICK_NS if has_time else 1
+            ),
+        )
+        return (descriptor,)
+
+    def reset(self) -> None:
+        """There is no half image."""
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """Refused."""
+        raise DeviceError(f"{self._stream}: got {len(data)} bytes at {t_host_ns}, no image")
+
+
+class StationCamera(Driver):
+    """A camera on this host; encodes in a thread of its own.
+
+    `t_host_ns` of a sample is when its image was fetched, `t_device_ns` the middle of its exposure
+    by the driver's stamp, on the same clock.
+
+    Args:
+        stream: name of the stream and of the device.
+        link: opens the camera.
+        request: what the camera is asked for.
+        encoding: of the samples.
+        timing: what is known of its delays.
+        clock: of the station.
+        max_encode_wait_s: how long a read waits for the encoder, so that an image need not wait
+            for the next one; half a period if None.
+    """
+
+    def __init__(  # noqa: PLR0913 - the last two have a sensible default
+        self,
+        stream: str,
+        *,
+        link: CaptureLink,
+        request: CaptureRequest,
+        encoding: ImageEncoding,
+        clock: StationClock,
+        timing: CameraTiming | None = None,
+        max_encode_wait_s: float | None = None,
+    ) -> None:
+        decoder = _CaptureDecoder(stream, request, encoding)
+        super().__init__(stream, transport=link, decoder=decoder, clock=clock)
+        self._link, self._request = link, request
+        self.timing = timing or CameraTiming()
+        size_px = (request.height_px, request.width_px)
+        encoder = ImageEncoder(encoding, size_px, rate_hz=request.rate_hz)
+        self._queue = EncodingQueue(encoder, name=stream)
+        self._checker = ImageChecker(period_ns=request.period_ns)
+        self._stamps = decoder.stamps
+        period_s = request.period_ns / 1e9
+        self._encode_wait_s = period_s / 2 if max_encode_wait_s is None else max_encode_wait_s
+        self._exposure_ns = request.exposure_ns
+        self._heard_ns: int | None = None
+        self._silence_ns = FIRST_IMAGE_NS
+
+    @property
+    def quality(self) -> ImageQuality:
+        """What the images are like."""
+        return replace(self._checker.quality, num_dropped=self._queue.num_dropped)
+
+    @property
+    def least_delay_ns(self) -> int | None:
+        """Shortest time from a driver's stamp to the arrival so far: what a latency is made of."""
+        return self._stamps.least_delay_ns
+
+    def calibration(self) -> dict[str, Matrix]:
+        """Latency with its sigma, if calibrated, and the exposure that the stamps assume."""
+        record = {
+            "latency_ns": self.timing.latency_ns,
+            "latency_sigma_ns": self.timing.latency_sigma_ns,
+            "exposure_ns": self._exposure_ns,
+        }
+        return {
+            f"{self.name}_{name}": ((float(value),),)
+            for name, value in record.items()
+            if value is not None
+        }
+
+    def begin_take(self) -> Mapping[str, Matrix]:
+        """The next image begins a group of pictures; called from any thread."""
+        self._queue.begin_group()
+        return self.calibration()
+
+    def open(self) -> None:
+        """Open the camera.
+
+        Raises:
+            DeviceError: it is absent, in use, or cannot do what it is asked for.
+        """
+        # Loading a video encoder takes longer than the first images would wait.
+        self._queue.prepare()
+        super().open()
+        exposure_ns = self._link.capture.exposure_ns
+        self._exposure_ns = self._request.exposure_ns if exposure_ns is None else exposure_ns
+        self._heard_ns, self._silence_ns = self._clock.now_ns(), FIRST_IMAGE_NS
+
+    def read(self) -> Readings:
+        """New samples, each image once; empty when none came.
+
+        Raises:
+            DeviceError: the camera is gone, silent, or gives other images than asked for.
+        """
+        capture = self._link.capture
+        if capture.wait(READ_TIMEOUT_S):
+            t_host_ns = self._clock.now_ns()
+            self._heard_ns = t_host_ns
+            self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._request.period_ns)
+            self._take(capture.retrieve(), t_host_ns)
+        else:
+            self._check_silence()
+        samples = self._queue.collect(self._encode_wait_s)
+        return {self.name: samples} if samples else {}
+
+    def close(self) -> None:
+        """Close the camera; what is being encoded comes with the first read after reopening."""
+        super().close()
+        self._queue.stop()
+
+    def _take(self, captured: CapturedImage | None, t_host_ns: int) -> None:
+        statistics = self.statistics
+        if captured is None:
+            statistics.refused += 1
+            return
+        image, expected = captured.image, (self._request.height_px, self._request.width_px, 3)
+        if image.shape != expected:
+            raise DeviceError(
+                f"{self.name}: sends images {image.shape}, expected {expected}; plug it in again"
+            )
+        statistics.packets += 1
+        stamp = self._stamps.accept(captured.t_driver_ns, t_host_ns)
+        if stamp is None:
+            return
+        t_driver_ns, number = stamp
+        has_time = t_driver_ns != NO_DEVICE_TIME
+        self._checker.check(image, t_driver_ns if has_time else None)
+        t_device_ns = self._middle_of_exposure_ns(t_driver_ns) if has_time else NO_DEVICE_TIME
+        if not self._queue.put(StampedImage(image, t_host_ns, t_device_ns, number)):
+            statistics.lost += 1
+
+    def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
+        half_ns = (self._exposure_ns or 0) // 2
+        return (
+            t_driver_ns + half_ns if self.timing.stamp_point == "start" else t_driver_ns - half_ns
+        )
+
+    def _check_silence(self) -> None:
+        if self._heard_ns is None:
+            return
+        silent_ns = self._clock.now_ns() - self._heard_ns
+        if silent_ns > self._silence_ns:
+            raise DeviceError(
+                f"{self.name}: no image for {silent_ns / NS_PER_MS:.0f} ms from {self.info}, "
+                f"expected one every {self._request.period_ns / NS_PER_MS:.0f} ms",
+                device=self.name,
+            )

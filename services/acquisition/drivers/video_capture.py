@@ -1,0 +1,289 @@
+"""A camera on this host comes in by OpenCV, images with the driver's stamps go out.
+
+What OpenCV's V4L2 backend does, and what follows from it here: `waitAny` waits with a timeout and
+fetches the buffer, while `grab` alone may block for 10 s; a lost device is a `cv2.error`, or ready
+without an image; a damaged JPEG image is an empty one. Only the very first image after opening is
+waited for without our timeout.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import UInt8
+
+from dextouch.errors import DeviceError, InvalidInputError
+from services.acquisition.transports.base import TransportInfo
+
+BY_ID = Path("/dev/v4l/by-id")
+NS_PER_MS = 1_000_000
+# V4L2 counts exposure in steps of 100 µs; 1 is its manual mode, 3 that of automatic exposure.
+EXPOSURE_UNIT_NS = 100_000
+MANUAL_EXPOSURE, AUTOMATIC_EXPOSURE = 1, 3
+RATE_TOLERANCE = 0.02
+StampPoint = Literal["start", "end"]
+
+
+@dataclass(frozen=True)
+class CaptureRequest:
+    """What a camera is asked for; it is refused if it gives another size or rate.
+
+    Attributes:
+        height_px: of the images.
+        width_px: of the images.
+        rate_hz: images a second.
+        fourcc: pixel format on the wire, such as MJPG or YUYV.
+        exposure_ns: fixed exposure; None leaves it to the camera.
+    """
+
+    height_px: int
+    width_px: int
+    rate_hz: float = 30.0
+    fourcc: str = "MJPG"
+    exposure_ns: int | None = None
+
+    def __post_init__(self) -> None:
+        exposure_ns = self.exposure_ns
+        if min(self.height_px, self.width_px) < 1 or self.rate_hz <= 0 or len(self.fourcc) != 4:
+            raise InvalidInputError(f"camera: got {self}, expected sizes, a rate and a fourcc")
+        if exposure_ns is not None and not 0 < exposure_ns <= 1e9 / self.rate_hz:
+            raise InvalidInputError(
+                f"camera: got an exposure of {exposure_ns} ns, expected more than 0 and at most "
+                f"the period of {self.rate_hz:g} Hz"
+            )
+
+    @property
+    def period_ns(self) -> int:
+        """Nominal distance of two images."""
+        return round(1e9 / self.rate_hz)
+
+
+@dataclass(frozen=True)
+class CapturedImage:
+    """An image, RGB, and what the driver says about when it was taken (None: nothing)."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    t_driver_ns: int | None
+
+
+@runtime_checkable
+class Capture(Protocol):
+    """An opened camera."""
+
+    @property
+    def exposure_ns(self) -> int | None:
+        """The exposure that the camera states; None where it does not."""
+        ...
+
+    def wait(self, timeout_s: float) -> bool:
+        """Fetch the next image; False when none came in time.
+
+        Raises:
+            DeviceError: the camera is gone.
+        """
+        ...
+
+    def retrieve(self) -> CapturedImage | None:
+        """Decode the image fetched by `wait`; None when it is damaged."""
+        ...
+
+    def close(self) -> None:
+        """Give the camera back."""
+        ...
+
+
+class CaptureLink:
+    """The transport of a camera: opens it anew each time and says where it is.
+
+    Args:
+        opener: finds and opens the camera.
+        address: for messages.
+        serial_number: of the camera, for messages.
+    """
+
+    def __init__(
+        self, opener: Callable[[], Capture], *, address: str, serial_number: str | None = None
+    ) -> None:
+        self._opener = opener
+        self._info = TransportInfo("camera", address, serial_number)
+        self._capture: Capture | None = None
+
+    @property
+    def info(self) -> TransportInfo:
+        """Where the camera is."""
+        return self._info
+
+    @property
+    def capture(self) -> Capture:
+        """The opened camera.
+
+        Raises:
+            DeviceError: it is not open.
+        """
+        if self._capture is None:
+            raise DeviceError(f"{self.info}: not open")
+        return self._capture
+
+    def open(self) -> None:
+        """Open the camera; an open one is closed first.
+
+        Raises:
+            DeviceError: it is absent, in use, or cannot do what it is asked for.
+        """
+        self.close()
+        self._capture = self._opener()
+
+    def read(self) -> bytes:
+        """Refused: a camera gives images (`capture`), not bytes."""
+        raise DeviceError(f"{self.info}: gives images, not bytes; read it by its capture")
+
+    def write(self, data: bytes) -> None:
+        """Refused: a camera takes no bytes."""
+        raise DeviceError(f"{self.info}: takes no bytes, got {len(data)}")
+
+    def close(self) -> None:
+        """Close the camera; closing twice is fine."""
+        if self._capture is not None:
+            capture, self._capture = self._capture, None
+            capture.close()
+
+
+class OpenCvCapture:
+    """A camera by OpenCV's V4L2 backend; or a video file, which has no stamps of a clock.
+
+    Args:
+        source: device such as /dev/video0, or the file.
+        request: what it is asked for.
+        is_file: whether `source` is a video file; its images come as fast as they are read.
+
+    Raises:
+        DeviceError: absent, in use, or not able to do what it is asked for.
+    """
+
+    def __init__(self, source: str, request: CaptureRequest, *, is_file: bool = False) -> None:
+        import cv2
+
+        self._cv2, self._source, self._is_file = cv2, source, is_file
+        self.exposure_ns: int | None = None
+        try:
+            self._video = cv2.VideoCapture(source, cv2.CAP_FFMPEG if is_file else cv2.CAP_V4L2)
+        except cv2.error as error:
+            raise DeviceError(f"camera {source}: cannot be opened ({error})") from error
+        try:
+            self._set_up(request)
+        except DeviceError:
+            self._video.release()
+            raise
+
+    def wait(self, timeout_s: float) -> bool:
+        """Fetch the next image; False when none came in time.
+
+        Raises:
+            DeviceError: the camera is gone, or the file is at its end.
+        """
+        if self._is_file:
+            if not self._video.grab():
+                raise DeviceError(f"camera {self._source}: no more images")
+            return True
+        try:
+            came, ready = self._cv2.VideoCapture.waitAny(
+                [self._video], timeoutNs=max(1, round(timeout_s * 1e9))
+            )
+        except self._cv2.error as error:
+            raise DeviceError(f"camera {self._source}: unplugged while reading") from error
+        if came and not len(ready):
+            # Neither an image nor the end of the timeout: hung up.
+            raise DeviceError(f"camera {self._source}: unplugged while waiting")
+        return bool(came)
+
+    def retrieve(self) -> CapturedImage | None:
+        """Decode the image fetched by `wait`; None when it is damaged."""
+        stamp_ms = self._video.get(self._cv2.CAP_PROP_POS_MSEC)
+        try:
+            is_whole, image = self._video.retrieve()
+        except self._cv2.error:
+            return None
+        if not is_whole or image is None or image.ndim != 3:
+            return None
+        t_driver_ns = round(stamp_ms * NS_PER_MS) if stamp_ms > 0 else None
+        return CapturedImage(self._cv2.cvtColor(image, self._cv2.COLOR_BGR2RGB), t_driver_ns)
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._video.release()
+
+    def _set_up(self, request: CaptureRequest) -> None:
+        if not self._video.isOpened():
+            raise DeviceError(
+                f"camera {self._source}: cannot be opened; is it plugged in, is it in use, may "
+                "this user read it?"
+            )
+        if not self._is_file:
+            self._ask(request)
+            self._set_exposure(request.exposure_ns)
+        self._check(request)
+
+    def _ask(self, request: CaptureRequest) -> None:
+        cv2, video = self._cv2, self._video
+        # The pixel format comes first: it decides which sizes and rates there are.
+        fourcc = cv2.VideoWriter.fourcc(*request.fourcc)
+        video.set(cv2.CAP_PROP_FOURCC, fourcc)
+        video.set(cv2.CAP_PROP_FRAME_WIDTH, request.width_px)
+        video.set(cv2.CAP_PROP_FRAME_HEIGHT, request.height_px)
+        video.set(cv2.CAP_PROP_FPS, request.rate_hz)
+        if int(video.get(cv2.CAP_PROP_FOURCC)) != fourcc:
+            raise DeviceError(f"camera {self._source}: has no pixel format {request.fourcc!r}")
+
+    def _set_exposure(self, exposure_ns: int | None) -> None:
+        cv2, video = self._cv2, self._video
+        if exposure_ns is None:
+            # Cameras without the control refuse it; they are automatic anyway.
+            video.set(cv2.CAP_PROP_AUTO_EXPOSURE, AUTOMATIC_EXPOSURE)
+        else:
+            units = max(1, round(exposure_ns / EXPOSURE_UNIT_NS))
+            is_set = video.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL_EXPOSURE)
+            if not is_set or not video.set(cv2.CAP_PROP_EXPOSURE, units):
+                raise DeviceError(f"camera {self._source}: has no fixed exposure; leave it out")
+        # Of automatic exposure this is where it begins, and all that is known.
+        units = round(video.get(cv2.CAP_PROP_EXPOSURE))
+        self.exposure_ns = units * EXPOSURE_UNIT_NS if units > 0 else None
+
+    def _check(self, request: CaptureRequest) -> None:
+        cv2, video = self._cv2, self._video
+        got = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)))
+        if got != (request.height_px, request.width_px):
+            raise DeviceError(
+                f"camera {self._source}: gives {got[1]} by {got[0]} px, expected "
+                f"{request.width_px} by {request.height_px}; ask for a size that it has"
+            )
+        rate_hz = video.get(cv2.CAP_PROP_FPS)
+        # Cameras that do not tell their rate say 0.
+        if rate_hz > 0 and abs(rate_hz / request.rate_hz - 1) > RATE_TOLERANCE:
+            raise DeviceError(
+                f"camera {self._source}: gives {rate_hz:g} images a second, expected "
+                f"{request.rate_hz:g}; ask for a rate that it has"
+            )
+
+
+def find_camera(serial_number: str, folder: Path = BY_ID) -> str:
+    """The device of the camera with this serial number, whatever its name is today.
+
+    Args:
+        serial_number: as the kernel has it in the names of `folder`.
+        folder: where the kernel's links are.
+
+    Raises:
+        DeviceError: no such camera is plugged in, or two are; the message lists those that are.
+    """
+    present = sorted(folder.glob("*-video-index0")) if folder.is_dir() else []
+    found = [path for path in present if path.name.endswith(f"_{serial_number}-video-index0")]
+    if len(found) != 1:
+        names = ", ".join(path.name.removesuffix("-video-index0") for path in present) or "none"
+        what = "is there twice" if found else "is not plugged in"
+        raise DeviceError(
+            f"camera with serial number {serial_number!r} {what}; present: {names}",
+            serial_number=serial_number,
+        )
+    return str(found[0].resolve())

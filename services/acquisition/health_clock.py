@@ -1,0 +1,157 @@
+"""Device stamps and arrivals of one device come in; skew, residual and steps of its clock go out.
+
+Runs at the evaluation, never in the reader, and only for devices that stamp their samples.
+"""
+
+from collections import deque
+
+import numpy as np
+
+from dextouch.clocks import OnlineClock
+from dextouch.errors import InvalidInputError
+from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.health_blocks import Block, Rolling
+from services.acquisition.health_levels import Verdict, above
+from services.acquisition.schemas import HealthFinding
+
+WINDOW_NS = 10_000_000_000
+SKEW_LIMITS_PPM = (200.0, 1000.0)
+RESIDUAL_LIMITS_S = (2e-3, 5e-3)
+STEP_NS = 4_000_000
+HOUR_NS = 3_600_000_000_000
+STEP_SHOWN_NS = 60_000_000_000
+# Two ways of seeing one step: what comes within this time of a known step is the same one.
+SAME_STEP_NS = 2_500_000_000
+STEPS_ERROR = 3
+MIN_RESIDUALS = 30
+# Before the clock has a slope of its own, two halves of so many samples give a first one.
+MIN_EARLY_SAMPLES = 40
+BINS = 10
+
+
+class ClockJudge:
+    """Judges one device's clock by the first of its streams (all share their stamps)."""
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        self._descriptor = descriptor
+        self._restart()
+        self._residuals = Rolling(WINDOW_NS)
+        self._drift_ns = 0
+        self._offsets = Rolling(WINDOW_NS)
+        self._steps: deque[int] = deque(maxlen=64)
+        self.num_steps = 0
+
+    def _restart(self) -> None:
+        self._clock = OnlineClock(self._descriptor)
+        self._known_steps = 0
+        self._last: tuple[int, int, int] | None = None
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        if not len(block):
+            return Verdict(self._judge_steps(now_ns), self._figures())
+        for t_ns in self._jumps(block):
+            self._note(t_ns)
+        try:
+            residuals_ns = self._follow(block)
+        except InvalidInputError as error:
+            self._restart()
+            finding = HealthFinding(code="clock_stamps", level="ERROR", message=error.message)
+            return Verdict((finding, *self._judge_steps(now_ns)))
+        kept_s = self._residuals.add(block.t_host_ns, residuals_ns * 1e-9, now_ns)
+        skew_ppm = self._clock.skew_ppm or self._early_skew_ppm()
+        figures = {**self._figures(), "clock_skew_ratio": skew_ppm * 1e-6}
+        text = f"its clock is off by {skew_ppm:+.0f} ppm"
+        findings = above("clock_skew", abs(skew_ppm), SKEW_LIMITS_PPM, text)
+        if len(kept_s) >= MIN_RESIDUALS:
+            # The median is path delay, which stamps of one direction cannot tell from offset.
+            scatter_s = float(np.percentile(np.abs(kept_s - np.median(kept_s)), 95))
+            figures["clock_residual_p95_seconds"] = scatter_s
+            figures["clock_sigma_seconds"] = self._sigma_s(kept_s)
+            text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about its clock"
+            findings += above("clock_residual", scatter_s, RESIDUAL_LIMITS_S, text)
+        return Verdict((*findings, *self._judge_steps(now_ns)), figures)
+
+    def _figures(self) -> dict[str, float]:
+        return {"clock_resets": float(self.num_steps)}
+
+    def _follow(self, block: Block) -> np.ndarray:
+        """Arrival minus estimated time of each sample, ns."""
+        residuals_ns = np.empty(len(block), dtype=np.int64)
+        stamps = zip(
+            block.t_host_ns.tolist(),
+            block.t_device_ns.tolist(),
+            block.sequence.tolist(),
+            strict=True,
+        )
+        for index, (t_host_ns, t_device_ns, sequence) in enumerate(stamps):
+            estimate_ns = self._clock.update(
+                t_host_ns=t_host_ns, t_device_ns=t_device_ns, sequence=sequence
+            )
+            residuals_ns[index] = t_host_ns - estimate_ns
+        if self._clock.num_steps > self._known_steps:
+            self._known_steps = self._clock.num_steps
+            self._note(int(block.t_host_ns[-1]))
+        return residuals_ns
+
+    def _jumps(self, block: Block) -> list[int]:
+        """Arrivals at which the device's stamp departs from its sequence and from the host."""
+        capabilities = self._descriptor.capabilities
+        stamps = np.stack([block.t_host_ns, block.t_device_ns, block.sequence])
+        if self._last is not None:
+            stamps = np.concatenate([np.array(self._last)[:, None], stamps], axis=1)
+        self._last = (int(stamps[0, -1]), int(stamps[1, -1]), int(stamps[2, -1]))
+        if stamps.shape[1] < 2 or stamps[1].min() < 0:
+            return []
+        host_ns, device_ns, numbers = np.diff(stamps, axis=1)
+        device_ns = _signed(device_ns, capabilities.device_time_bits, capabilities.tick_ns)
+        offsets_ns = self._drift_ns + np.cumsum(host_ns - device_ns)
+        self._drift_ns = int(offsets_ns[-1])
+        self._offsets.add(stamps[0, 1:], offsets_ns, int(stamps[0, -1]))
+        if not capabilities.sequence:
+            return []
+        numbers = _signed(numbers, capabilities.sequence_bits, 1)
+        off_sequence = np.abs(device_ns - numbers * self._descriptor.period_ns()) > STEP_NS
+        off_host = np.abs(device_ns - host_ns) > STEP_NS
+        jumped = off_sequence & off_host & (numbers > 0)
+        return [int(t_ns) for t_ns in stamps[0, 1:][jumped]]
+
+    def _early_skew_ppm(self) -> float:
+        """Slope of the offsets' lower edge over two halves, less what its scatter could feign."""
+        offsets_ns, t_ns = self._offsets.values, self._offsets.t_ns
+        if len(t_ns) < MIN_EARLY_SAMPLES or self._steps:
+            return 0.0
+        first, second = np.array_split(offsets_ns, 2)
+        span_s = (t_ns[-1] - t_ns[0]) * 0.5e-9
+        slope_ppm = (second.min() - first.min()) * 1e-3 / span_s
+        above_ns = np.concatenate([first - first.min(), second - second.min()]).mean()
+        doubt_ppm = 4.0 * above_ns * 1e-3 / len(first) / span_s
+        return float(np.sign(slope_ppm) * max(0.0, abs(slope_ppm) - doubt_ppm))
+
+    def _note(self, t_ns: int) -> None:
+        if self._steps and t_ns - self._steps[-1] < SAME_STEP_NS:
+            return
+        self._steps.append(t_ns)
+        self.num_steps += 1
+
+    def _judge_steps(self, now_ns: int) -> tuple[HealthFinding, ...]:
+        in_an_hour = sum(t_ns > now_ns - HOUR_NS for t_ns in self._steps)
+        text = f"its clock was set or restarted {in_an_hour} times within an hour"
+        if in_an_hour >= STEPS_ERROR:
+            return (HealthFinding(code="clock_step", level="ERROR", message=text),)
+        if self._steps and self._steps[-1] > now_ns - STEP_SHOWN_NS:
+            return (HealthFinding(code="clock_step", level="WARN", message=text),)
+        return ()
+
+    def _sigma_s(self, residuals_s: np.ndarray) -> float:
+        """How far the lower edge of the residuals moves from second to second."""
+        edges = [part.min() for part in np.array_split(residuals_s, BINS)]
+        return float(1.4826 * np.median(np.abs(edges - np.median(edges))))
+
+
+def _signed(steps: np.ndarray, bits: int, unit: int) -> np.ndarray:
+    """Steps of a counter that wraps, as small signed numbers."""
+    modulus = 2**bits * unit
+    if modulus > 2**62:
+        return steps
+    return (steps + modulus // 2) % modulus - modulus // 2

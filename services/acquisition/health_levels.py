@@ -1,0 +1,146 @@
+"""Single judgements come in; levels with hysteresis, findings by code and an event log go out."""
+
+from collections import deque
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+from services.acquisition.schemas import HealthEvent, HealthFinding, Level
+
+RAISE_AFTER = 2
+CLEAR_AFTER = 5
+MAX_EVENTS = 2000
+SEVERITY: tuple[Level, ...] = ("OK", "WARN", "ERROR", "STALE")
+
+Judgement = Literal["OK", "WARN", "ERROR"]
+
+
+def worst(levels: Sequence[Level], default: Level = "OK") -> Level:
+    """The most severe level; STALE stands above ERROR, since nothing newer is known."""
+    return max(levels, key=SEVERITY.index, default=default)
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What one judge says: findings, figures by metric name, and whether to look again soon.
+
+    `suspicious` asks for another evaluation before the regular one, for faults that must last a
+    while before they count.
+    """
+
+    findings: tuple[HealthFinding, ...] = ()
+    figures: Mapping[str, float] = field(default_factory=dict)
+    suspicious: bool = False
+
+
+def above(
+    code: str, value: float, limits: tuple[float, float], message: str
+) -> tuple[HealthFinding, ...]:
+    """A finding when `value` lies above the first limit, an ERROR from the second one on."""
+    if not value > limits[0]:
+        return ()
+    level: Literal["WARN", "ERROR"] = "ERROR" if value >= limits[1] else "WARN"
+    return (HealthFinding(code=code, level=level, message=message),)
+
+
+class Hysteresis:
+    """A level that rises when 2 judgements in a row agree and falls when 5 do.
+
+    It rises to the milder of the last 2, and falls to the graver of the last 5.
+    """
+
+    def __init__(self) -> None:
+        self.level: Judgement = "OK"
+        self._recent: deque[Judgement] = deque(maxlen=CLEAR_AFTER)
+
+    @property
+    def is_rising(self) -> bool:
+        """Whether one more judgement like the last one would raise the level."""
+        return bool(self._recent) and _rank(self._recent[-1]) > _rank(self.level)
+
+    def update(self, judgement: Judgement) -> Judgement:
+        """One evaluation."""
+        recent = self._recent
+        recent.append(judgement)
+        if len(recent) >= RAISE_AFTER:
+            mildest = min(list(recent)[-RAISE_AFTER:], key=_rank)
+            if _rank(mildest) > _rank(self.level):
+                self.level = mildest
+        if len(recent) == CLEAR_AFTER:
+            gravest = max(recent, key=_rank)
+            if _rank(gravest) < _rank(self.level):
+                self.level = gravest
+        return self.level
+
+
+class Board:
+    """The findings of one stream (or of the station), each code with a hysteresis of its own."""
+
+    def __init__(self) -> None:
+        self._codes: dict[str, Hysteresis] = {}
+        self._messages: dict[str, str] = {}
+
+    @property
+    def is_rising(self) -> bool:
+        """Whether something was seen once and awaits its confirmation."""
+        return any(hysteresis.is_rising for hysteresis in self._codes.values())
+
+    def update(
+        self, findings: Sequence[HealthFinding], *, confirming: bool = False
+    ) -> list[tuple[str, Judgement]]:
+        """One evaluation; codes whose level changed, with the new level.
+
+        Args:
+            findings: at most one a code counts: the gravest.
+            confirming: an evaluation between the regular ones. It may raise, never clear.
+        """
+        judged: dict[str, Judgement] = {}
+        for finding in sorted(findings, key=lambda item: _rank(item.level)):
+            judged[finding.code] = finding.level
+            self._messages[finding.code] = finding.message
+            self._codes.setdefault(finding.code, Hysteresis())
+        changes: list[tuple[str, Judgement]] = []
+        for code, hysteresis in list(self._codes.items()):
+            judgement = judged.get(code, "OK")
+            before = hysteresis.level
+            if confirming and _rank(judgement) <= _rank(before):
+                continue
+            if hysteresis.update(judgement) != before:
+                changes.append((code, hysteresis.level))
+        return changes
+
+    def active(self) -> tuple[HealthFinding, ...]:
+        """What is raised now, gravest first."""
+        raised = []
+        for code, hysteresis in self._codes.items():
+            level = hysteresis.level
+            if level != "OK":
+                raised.append(HealthFinding(code=code, level=level, message=self._messages[code]))
+        return tuple(sorted(raised, key=lambda item: -_rank(item.level)))
+
+
+class EventLog:
+    """The newest changes of levels, oldest first."""
+
+    def __init__(self) -> None:
+        self._events: deque[HealthEvent] = deque(maxlen=MAX_EVENTS)
+        self._raised: dict[tuple[str, str], int] = {}
+
+    def add(self, t_host_ns: int, stream: str, code: str, level: Level) -> None:
+        """A code of a stream has reached a level; OK is its end."""
+        event = HealthEvent(t_host_ns=t_host_ns, stream=stream, code=code, level=level)
+        self._events.append(event)
+        if level != "OK":
+            self._raised[stream, code] = self._raised.get((stream, code), 0) + 1
+
+    def events(self, since_ns: int = 0) -> tuple[HealthEvent, ...]:
+        """Events from a moment on."""
+        return tuple(event for event in list(self._events) if event.t_host_ns >= since_ns)
+
+    def raised(self) -> dict[tuple[str, str], int]:
+        """How often each (stream, code) was raised since the station's start."""
+        return dict(self._raised)
+
+
+def _rank(level: Level) -> int:
+    return SEVERITY.index(level)

@@ -1,0 +1,115 @@
+"""Counters, findings and figures come in; what a viewer is told about streams and devices goes out.
+
+Silence is judged here, whenever someone asks: a stream that is not heard tells no figures.
+"""
+
+from collections.abc import Mapping, Sequence
+
+from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.health_levels import worst
+from services.acquisition.health_link import queue_dropped
+from services.acquisition.schemas import DeviceHealth, HealthFinding, Level, StreamHealth
+from services.acquisition.supervisor import DeviceSupervisor
+
+STALE_AFTER_NS = {"image": 500_000_000}
+STALE_AFTER_OTHERS_NS = 200_000_000
+LATE_PERIODS = 3
+
+
+def stale_after_ns(descriptor: StreamDescriptor) -> int:
+    """Age from which a stream is stale; a slow stream has 3 of its periods at least."""
+    limit_ns = STALE_AFTER_NS.get(descriptor.kind, STALE_AFTER_OTHERS_NS)
+    return max(limit_ns, LATE_PERIODS * descriptor.period_ns())
+
+
+def stale_code(
+    supervisor: DeviceSupervisor, descriptor: StreamDescriptor, now_ns: int
+) -> str | None:
+    """Why a stream is stale, None when it is not.
+
+    "unplugged" when the device is not open, "silent" when it is and nothing comes.
+    """
+    counters = supervisor.counters
+    if not counters.is_connected:
+        return "unplugged"
+    last_ns = counters.streams[descriptor.name].last_t_host_ns
+    if last_ns is None or now_ns - last_ns > stale_after_ns(descriptor):
+        return "silent"
+    return None
+
+
+def stream_health(
+    supervisor: DeviceSupervisor,
+    descriptor: StreamDescriptor,
+    now_ns: int,
+    *,
+    findings: Sequence[HealthFinding],
+    figures: Mapping[str, float],
+) -> StreamHealth:
+    """One stream at this moment."""
+    counters, statistics = supervisor.counters, supervisor.driver.statistics
+    stream = counters.streams[descriptor.name]
+    age_ns = None
+    if stream.last_t_host_ns is not None:
+        age_ns = max(0, now_ns - stream.last_t_host_ns)
+    level: Level = worst([finding.level for finding in findings])
+    reasons = [finding.message for finding in findings]
+    stale = stale_code(supervisor, descriptor, now_ns)
+    if stale is not None:
+        level, figures = "STALE", {}
+        reasons.insert(0, _words(supervisor, stale, age_ns))
+    elif age_ns is not None and age_ns > LATE_PERIODS * descriptor.period_ns() and level == "OK":
+        level, reasons = "WARN", ["late"]
+    skew, residual_s = figures.get("clock_skew_ratio"), figures.get("clock_residual_p95_seconds")
+    return StreamHealth(
+        stream=descriptor.name,
+        device=supervisor.driver.name,
+        hand=descriptor.side,
+        level=level,
+        stale=stale,
+        reasons=tuple(reasons),
+        findings=tuple(findings),
+        figures=dict(figures),
+        rate_hz=figures.get("rate_hz"),
+        nominal_rate_hz=descriptor.nominal_rate_hz,
+        age_s=None if age_ns is None else age_ns / 1e9,
+        num_samples=stream.num_samples,
+        received=statistics.packets,
+        lost=statistics.lost,
+        skew_ppm=None if skew is None else skew * 1e6,
+        clock_residual_ms=None if residual_s is None else residual_s * 1e3,
+    )
+
+
+def device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
+    """A device's counters."""
+    driver, counters = supervisor.driver, supervisor.counters
+    statistics = driver.statistics
+    sides = {descriptor.side for descriptor in driver.descriptors}
+    return DeviceHealth(
+        device=driver.name,
+        hand=sides.pop() if len(sides) == 1 else None,
+        connected=counters.is_connected,
+        address=str(driver.info),
+        packets=statistics.packets,
+        lost=statistics.lost,
+        crc_errors=statistics.crc_errors,
+        length_errors=statistics.length_errors,
+        resync_bytes=statistics.resync_bytes,
+        refused=statistics.refused,
+        repeated=statistics.repeated,
+        restarts=statistics.restarts,
+        queue_dropped=queue_dropped(driver),
+        reconnects=counters.reconnects,
+        failures=counters.failures,
+        last_error=counters.last_error,
+    )
+
+
+def _words(supervisor: DeviceSupervisor, stale: str, age_ns: int | None) -> str:
+    error = supervisor.counters.last_error
+    if error is not None:
+        return error
+    if stale == "unplugged":
+        return "not connected"
+    return "no data yet" if age_ns is None else f"no data for {age_ns * 1e-9:.1f} s"

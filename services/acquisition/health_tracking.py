@@ -1,0 +1,157 @@
+"""Poses and keypoints come in; lost tracking, jumps and jitter at rest go out."""
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.pose_tracker import TrackingEvents
+from services.acquisition.health_blocks import Block, Rolling
+from services.acquisition.health_levels import Verdict, above
+
+WINDOW_NS = 10_000_000_000
+LOST_LIMITS = (0.01, 0.05)
+# Any jump is worth a word.
+JUMP_LIMITS = (0.0, 0.05)
+# Ratios of the first moments after a start say nothing.
+MIN_PACKETS = 100
+JITTER_LIMITS_M = (1e-3, 5e-3)
+MAX_SPEED_M_S = 5.0
+REST_SPEED_M_S = 0.02
+REST_NS = 1_000_000_000
+MIN_REST_SAMPLES = 40
+
+
+@runtime_checkable
+class TellsTracking(Protocol):
+    """A decoder that leaves out what a tracker sends while it does not track."""
+
+    @property
+    def tracking(self) -> TrackingEvents:
+        """What was left out, by kind."""
+        ...
+
+
+class TrackingJudge:
+    """Judges what a tracker's decoder left out: occluded, jumped, older than it pretends."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._counts: deque[tuple[int, int, Mapping[str, int]]] = deque()
+        self._count(0)
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del block
+        counts = self._counts
+        self._count(now_ns)
+        while len(counts) > 2 and counts[1][0] <= now_ns - WINDOW_NS:
+            counts.popleft()
+        left_out = {
+            kind: count - counts[0][2].get(kind, 0) for kind, count in counts[-1][2].items()
+        }
+        packets = max(MIN_PACKETS, counts[-1][1] - counts[0][1])
+        lost = (left_out.get("occluded", 0) + left_out.get("stale", 0)) / packets
+        jumped = left_out.get("jumped", 0)
+        findings = (
+            *above("tracking", lost, LOST_LIMITS, f"not tracked for {lost:.0%} of 10 s"),
+            *above("jump", jumped / packets, JUMP_LIMITS, f"{jumped} jumps left out within 10 s"),
+        )
+        return Verdict(findings, {"tracking_lost_ratio": lost})
+
+    def _count(self, now_ns: int) -> None:
+        decoder = self._driver.decoder
+        kinds: dict[str, int] = {}
+        if isinstance(decoder, TellsTracking):
+            kinds.update(decoder.tracking.packets.items())
+        self._counts.append((now_ns, self._driver.statistics.packets, kinds))
+
+
+class PoseJudge:
+    """Judges the poses of one body: jumps that came through, and its trembling at rest."""
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        self._descriptor = descriptor
+        self._last: tuple[int, np.ndarray] | None = None
+        self._jumps = Rolling(WINDOW_NS)
+        self._rest_ns = np.empty(0, dtype=np.int64)
+        self._rest_m = np.empty((0, 3))
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        if block.values is None or not len(block):
+            return Verdict()
+        times_ns = block.t_device_ns
+        if not self._descriptor.capabilities.device_time or times_ns.min() < 0:
+            times_ns = block.t_host_ns
+        positions_m = block.values[:, :3].astype(np.float64)
+        share = self._jumped_share(times_ns, positions_m, block.t_host_ns, now_ns)
+        text = f"{share:.1%} of its steps are faster than {MAX_SPEED_M_S:g} m/s"
+        findings = above("jump", share, JUMP_LIMITS, text)
+        figures: dict[str, float] = {}
+        jitter_m = self._jitter_m(times_ns, positions_m)
+        if jitter_m is not None:
+            figures["stationary_jitter_meters"] = jitter_m
+            text = f"trembles by {jitter_m * 1e3:.1f} mm at rest"
+            findings += above("pose_jitter", jitter_m, JITTER_LIMITS_M, text)
+        return Verdict(findings, figures)
+
+    def _jumped_share(
+        self, times_ns: np.ndarray, positions_m: np.ndarray, t_host_ns: np.ndarray, now_ns: int
+    ) -> float:
+        when, steps_ns = t_host_ns[1:], np.diff(times_ns)
+        steps_m = np.linalg.norm(np.diff(positions_m, axis=0), axis=1)
+        if self._last is not None:
+            when = t_host_ns
+            steps_ns = np.concatenate([[times_ns[0] - self._last[0]], steps_ns])
+            first_m = np.linalg.norm(positions_m[0] - self._last[1])
+            steps_m = np.concatenate([[first_m], steps_m])
+        self._last = (int(times_ns[-1]), positions_m[-1])
+        # A step back of the clock says nothing about speed.
+        jumped = (steps_ns > 0) & (steps_m > MAX_SPEED_M_S * steps_ns * 1e-9)
+        shares = self._jumps.add(when, jumped, now_ns)
+        return float(shares.mean()) if len(shares) else 0.0
+
+    def _jitter_m(self, times_ns: np.ndarray, positions_m: np.ndarray) -> float | None:
+        """RMS about a parabola through the last second; None unless the body rests."""
+        all_ns = np.concatenate([self._rest_ns, times_ns])
+        all_m = np.concatenate([self._rest_m, positions_m])
+        kept = (all_ns >= all_ns[-1] - REST_NS) & (all_ns <= all_ns[-1])
+        self._rest_ns, self._rest_m = all_ns[kept], all_m[kept]
+        if len(self._rest_ns) < MIN_REST_SAMPLES:
+            return None
+        t_s = (self._rest_ns - self._rest_ns[-1]) * 1e-9
+        basis = np.stack([np.ones_like(t_s), t_s, t_s**2], axis=1)
+        fitted, *_ = np.linalg.lstsq(basis, self._rest_m, rcond=None)
+        speeds_m_s = np.linalg.norm(fitted[1] + 2 * t_s[:, None] * fitted[2], axis=1)
+        if speeds_m_s.mean() > REST_SPEED_M_S:
+            return None
+        errors_m = self._rest_m - basis @ fitted
+        return float(np.sqrt((errors_m**2).sum(axis=1).mean()))
+
+
+class FiniteJudge:
+    """Judges how much of a stream's values is missing (NaN): nodes not seen, broken cells.
+
+    What never held a number is no part of the device (a glove model's empty cells).
+    """
+
+    def __init__(self, code: str, word: str) -> None:
+        self._code, self._word = code, word
+        self._shares = Rolling(WINDOW_NS)
+        self._ever: np.ndarray | None = None
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        if block.values is None or not len(block) or block.values.dtype.kind != "f":
+            return Verdict()
+        finite = np.isfinite(block.values.reshape(len(block), -1))
+        ever = finite.any(axis=0) if self._ever is None else self._ever | finite.any(axis=0)
+        self._ever = ever
+        shares = 1.0 - finite[:, ever].mean(axis=1) if ever.any() else np.ones(len(block))
+        ratio = float(self._shares.add(block.t_host_ns, shares, now_ns).mean())
+        text = f"{ratio:.1%} of the {self._word}"
+        return Verdict(above(self._code, ratio, LOST_LIMITS, text), {"missing_ratio": ratio})

@@ -1,0 +1,54 @@
+"""`python -m services.acquisition.mocks.bridge_process KIND PLACE`: a mock SDK process.
+
+It plays the made-up pattern of one hand or tracker over a bridge until it is ended, and writes one
+line of JSON with its port to the standard output once it listens.
+"""
+
+import argparse
+import json
+import sys
+
+import numpy as np
+
+from dextouch.tactile.layout import Side
+from services.acquisition.clock import RealClock
+from services.acquisition.mocks.bridge_server import BridgeServer
+from services.acquisition.mocks.bridge_sources import (
+    BridgeFingerTrackerSource,
+    BridgePoseSource,
+    BridgeSource,
+)
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.pattern import pattern_streams
+
+
+def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:
+    """The pattern of `finger_tracker` `left`/`right`, or `pose_tracker` `wrist_left`/…/`head`."""
+    streams = {stream.descriptor.name: stream for stream in pattern_streams()}
+    rng = np.random.default_rng(seed)
+    if kind == "finger_tracker":
+        side: Side = "left" if place == "left" else "right"
+        return BridgeFingerTrackerSource(streams[f"keypoints_{side}"], side=side, rng=rng)
+    return BridgePoseSource(streams[place], faults=DeviceFaults(), rng=rng)
+
+
+def main() -> None:
+    """Serve until ended."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("kind", choices=("finger_tracker", "pose_tracker"))
+    parser.add_argument("place", choices=("left", "right", "wrist_left", "wrist_right", "head"))
+    parser.add_argument("--port", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0)
+    options = parser.parse_args()
+    is_hand = options.place in {"left", "right"}
+    if is_hand != (options.kind == "finger_tracker"):
+        parser.error(f"a {options.kind} cannot sit at {options.place!r}")
+    source = pattern_source(options.kind, options.place, seed=options.seed)
+    with BridgeServer(source, clock=RealClock(), port=options.port) as server:
+        sys.stdout.write(json.dumps({"port": server.port}) + "\n")
+        sys.stdout.flush()
+        server.play()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,164 @@
+"""What a bridge says comes in; a local socket that says it to every station goes out."""
+
+import contextlib
+import socket
+import threading
+from collections.abc import Callable
+from types import TracebackType
+
+from dextouch.errors import DeviceError
+from services.acquisition.clock import StationClock
+from services.acquisition.mocks.bridge_sources import BridgeSource, sign_of_life
+from services.acquisition.mocks.link import Link, WatchedTransport
+from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
+from services.acquisition.transports.base import Transport
+from services.acquisition.transports.socket import SocketTransport
+
+LIFE_PERIOD_NS = 50_000_000
+
+
+class _HelloTransport(WatchedTransport):
+    """Counts the hello that waits in every new connection as sent."""
+
+    def __init__(self, transport: Transport, link: Link, hello: Callable[[], bytes]) -> None:
+        super().__init__(transport, link)
+        self._hello = hello
+
+    def open(self) -> None:
+        super().open()
+        self._link.add_sent(len(self._hello()))
+
+
+class BridgePort(SocketPort):
+    """A mock device's end of a bridge: a socket pair whose connections begin with the hello.
+
+    It sends no signs of life of its own, so a host on a real clock finds it silent while the
+    device says nothing.
+    """
+
+    def __init__(self, name: str, hello: Callable[[], bytes]) -> None:
+        super().__init__(name)
+        self._hello = hello
+        transport = SocketTransport(self._connect, address=f"mock:{name}")
+        self._transport = _HelloTransport(transport, self.link, hello)
+
+    def _connect(self) -> socket.socket:
+        host_end = super()._connect()
+        if self._device_end is not None:
+            self._device_end.sendall(self._hello())
+        return host_end
+
+
+class BridgeServer:
+    """A bridge process's socket: says hello to every connection and sends all of them the same.
+
+    Args:
+        source: what is said.
+        clock: paces the signs of life.
+        port: to listen on; any free one if 0.
+    """
+
+    def __init__(self, source: BridgeSource, *, clock: StationClock, port: int = 0) -> None:
+        self._source = source
+        self._clock = clock
+        self._lock = threading.Lock()
+        self._connections: list[socket.socket] = []
+        self._sequence = 0
+        self._t_sent_ns = clock.now_ns()
+        self._stopping = threading.Event()
+        self._waiter = clock.waiter()
+        self._listener = socket.create_server(("127.0.0.1", port))
+        self.port = int(self._listener.getsockname()[1])
+        self._threads = [
+            threading.Thread(target=run, name=f"bridge-{name}", daemon=True)
+            for name, run in (("accept", self._accept), ("life", self._show_life))
+        ]
+
+    def __enter__(self) -> "BridgeServer":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.stop()
+
+    def stop(self) -> None:
+        """Close all connections and stop listening."""
+        self._stopping.set()
+        self._waiter.cancel()
+        with contextlib.suppress(OSError):
+            self._listener.shutdown(socket.SHUT_RDWR)
+        self._listener.close()
+        for thread in self._threads:
+            if thread.ident is not None:
+                thread.join()
+        self._waiter.close()
+        self.disconnect()
+
+    def disconnect(self) -> None:
+        """Close all connections, as a process does that ends."""
+        with self._lock:
+            for connection in self._connections:
+                connection.close()
+            self._connections.clear()
+
+    def send_sample(self, index: int, t_device_ns: int) -> None:
+        """Send one sample to every connection."""
+        with self._lock:
+            for unit in self._source.units(index, self._sequence, t_device_ns):
+                self._send(unit)
+
+    def play(self, *, laps: int | None = None) -> None:
+        """Send the whole source in its own time, once or `laps` times or until the end.
+
+        Raises:
+            DeviceError: the server has been stopped before.
+        """
+        if self._stopping.is_set():
+            raise DeviceError("mock bridge: stopped")
+        waiter = self._clock.waiter(drives_time=True)
+        t_ns = self._source.t_ns
+        lap_ns = int(t_ns[-1] + t_ns[-1] // max(1, len(t_ns) - 1))
+        start_ns, lap = self._clock.now_ns(), 0
+        while laps is None or lap < laps:
+            for index, sample_ns in enumerate(t_ns):
+                due_ns = start_ns + lap * lap_ns + int(sample_ns)
+                if not waiter.wait_until(due_ns) or self._stopping.is_set():
+                    return
+                self.send_sample(index, due_ns)
+            lap += 1
+        waiter.close()
+
+    def _accept(self) -> None:
+        while not self._stopping.is_set():
+            try:
+                connection, _ = self._listener.accept()
+            except OSError:  # stopped
+                return
+            connection.settimeout(SEND_TIMEOUT_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            with self._lock, contextlib.suppress(OSError):
+                connection.sendall(self._source.hello())
+                self._connections.append(connection)
+
+    def _show_life(self) -> None:
+        while self._waiter.wait_until(self._clock.now_ns() + LIFE_PERIOD_NS):
+            now_ns = self._clock.now_ns()
+            with self._lock:
+                if now_ns - self._t_sent_ns >= LIFE_PERIOD_NS:
+                    self._send(sign_of_life(self._source.magic, self._sequence, now_ns))
+
+    def _send(self, unit: bytes) -> None:
+        self._sequence += 1
+        self._t_sent_ns = self._clock.now_ns()
+        for connection in list(self._connections):
+            try:
+                connection.sendall(unit)
+            except OSError:  # the station has gone
+                connection.close()
+                self._connections.remove(connection)

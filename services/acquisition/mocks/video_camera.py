@@ -1,0 +1,196 @@
+"""Images of an episode come in; a mock camera on the station's own bus and its driver go out.
+
+What a driver hands over is not bytes, so this mock stands behind the `Capture` protocol: images
+with the kernel's stamps, four buffers, an error when it is pulled out.
+"""
+
+import struct
+import threading
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.errors import DeviceError
+from services.acquisition.clock import StationClock, Waiter
+from services.acquisition.drivers.image_encoding import ImageEncoding
+from services.acquisition.drivers.station_camera import CameraTiming, StationCamera
+from services.acquisition.drivers.video_capture import (
+    CapturedImage,
+    CaptureLink,
+    CaptureRequest,
+)
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.link import Link
+from services.acquisition.mocks.replay import MockDevice, ReplayStream
+
+# V4L2 drivers fill the buffers they are given and lose what comes after.
+NUM_BUFFERS = 4
+UNIT_HEADER = struct.Struct("<qHH")
+# With a virtual clock, time must not go on while an image is being encoded.
+LOCKSTEP_WAIT_S = 20.0
+
+
+class VideoPort:
+    """The device's end of a camera; each opening of the host gets a new capture."""
+
+    has_bit_errors = False
+
+    def __init__(self, name: str, *, exposure_ns: int | None = None) -> None:
+        self.link = Link()
+        self.exposure_ns = exposure_ns
+        self._name = name
+        self._changed = threading.Condition()
+        self._buffers: deque[bytes] = deque()
+        self._is_plugged = False
+        self.transport = CaptureLink(self._open, address=f"mock:{name}", serial_number=name)
+
+    def plug(self) -> None:
+        """Plug in."""
+        with self._changed:
+            self._is_plugged = True
+
+    def unplug(self) -> None:
+        """Pull out: a waiting host notices at once."""
+        with self._changed:
+            self._is_plugged = False
+            self._buffers.clear()
+            self._changed.notify_all()
+
+    def send(self, unit: bytes) -> bool:
+        """An image is there; False when all buffers were full."""
+        with self._changed:
+            if not self._is_plugged or len(self._buffers) >= NUM_BUFFERS:
+                return False
+            self.link.add_sent(len(unit))
+            self._buffers.append(unit)
+            self._changed.notify_all()
+        return True
+
+    def take(self, timeout_s: float) -> bytes | None:
+        """The oldest image; None when none comes in time.
+
+        Raises:
+            DeviceError: unplugged.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._buffers or not self._is_plugged, timeout_s)
+            if not self._is_plugged:
+                raise DeviceError(f"camera mock:{self._name}: unplugged while reading")
+            return self._buffers.popleft() if self._buffers else None
+
+    def _open(self) -> "MockCapture":
+        with self._changed:
+            if not self._is_plugged:
+                raise DeviceError(f"camera mock:{self._name}: is not plugged in")
+            self._buffers.clear()
+        self.link.set_open(is_open=True)
+        return MockCapture(self)
+
+
+class MockCapture:
+    """The host's end of a mock camera."""
+
+    def __init__(self, port: VideoPort) -> None:
+        self._port = port
+        self._unit = b""
+
+    @property
+    def exposure_ns(self) -> int | None:
+        """What the mock states."""
+        return self._port.exposure_ns
+
+    def wait(self, timeout_s: float) -> bool:
+        """Fetch the next image; what was fetched before has been processed by now."""
+        self._port.link.add_consumed(len(self._unit))
+        self._unit = self._port.take(timeout_s) or b""
+        return bool(self._unit)
+
+    def retrieve(self) -> CapturedImage | None:
+        """The image fetched."""
+        t_driver_ns, height_px, width_px = UNIT_HEADER.unpack_from(self._unit)
+        pixels = np.frombuffer(self._unit, dtype=np.uint8, offset=UNIT_HEADER.size)
+        if pixels.size != height_px * width_px * 3:
+            return None
+        return CapturedImage(pixels.reshape(height_px, width_px, 3), t_driver_ns)
+
+    def close(self) -> None:
+        """Give the camera back."""
+        self._port.link.set_open(is_open=False)
+
+
+class VideoSource:
+    """Images with the stamps of the kernel.
+
+    Args:
+        stream: uint8 [n, h, w, 3].
+    """
+
+    def __init__(self, stream: ReplayStream) -> None:
+        self._stream = stream
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each image is taken."""
+        return self._stream.t_ns
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One image; cameras have no sequence."""
+        del sequence
+        image = self._stream.values[index]
+        return [UNIT_HEADER.pack(t_device_ns, *image.shape[:2]) + image.tobytes()]
+
+
+class VideoDevice(MockDevice):
+    """A mock device whose clock is the host's, since the host's kernel stamps its images."""
+
+    def play(
+        self, clock: StationClock, waiter: Waiter, *, start_host_ns: int, offset_ns: int = 0
+    ) -> bool:
+        """Play the whole source once, as every mock device does."""
+        self._boot_ns = start_host_ns
+        return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
+
+
+@dataclass(frozen=True)
+class VideoPair:
+    """A simulated camera and the real driver on its other end."""
+
+    device: VideoDevice
+    driver: StationCamera
+
+
+def video_camera(
+    stream: ReplayStream,
+    *,
+    faults: DeviceFaults,
+    seed: int,
+    clock: StationClock,
+    encoding: ImageEncoding,
+    timing: CameraTiming | None = None,
+) -> VideoPair:
+    """A mock camera that plays a stream of images, and its driver.
+
+    Args:
+        stream: of the episode.
+        faults: what disturbs it.
+        seed: of everything random.
+        clock: of the station.
+        encoding: of the samples.
+        timing: what the station knows of the camera.
+    """
+    name = stream.descriptor.name
+    port = VideoPort(name)
+    height_px, width_px = stream.descriptor.shape[:2]
+    driver = StationCamera(
+        name,
+        link=port.transport,
+        request=CaptureRequest(height_px, width_px, stream.descriptor.nominal_rate_hz),
+        encoding=encoding,
+        clock=clock,
+        timing=timing,
+        max_encode_wait_s=LOCKSTEP_WAIT_S,
+    )
+    device = VideoDevice(name, source=VideoSource(stream), port=port, faults=faults, seed=seed)
+    return VideoPair(device, driver)

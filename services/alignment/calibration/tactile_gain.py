@@ -1,0 +1,268 @@
+"""Takes of a glove under known pressures in, counts a kPa of each taxel with sigma out."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.tactile.layout import NUM_TAXELS, select_taxels
+from services.alignment.calibration.tactile_faults import (
+    DEAD,
+    FULL_SCALE_COUNTS,
+    IMPRECISE,
+    MIN_MOVE_COUNTS,
+    NONLINEAR,
+    OK,
+    SATURATED,
+    SATURATED_RATIO,
+    SILENT_RATIO,
+    UNPROVEN,
+    judge_taxels,
+    kind_of_silence,
+)
+from services.alignment.calibration.tactile_tare import (
+    Level,
+    TaxelTare,
+    checked_counts,
+    steady_level,
+)
+
+# A reading at the stop says nothing about the pressure; so few of them are knocks.
+MAX_SATURATED_READINGS = 0.01
+# Below this highest pressure the straight line is not seen, however low the noise.
+MIN_RANGE_KPA = 5.0
+MAX_RELATIVE_SIGMA = 0.1
+# Deviation from the straight line, as a part of the largest response and in sigmas.
+MAX_NONLINEARITY = 0.05
+MIN_NONLINEARITY_SIGMAS = 3.0
+MIN_POINTS_FOR_LINE = 3
+ROUNDS = 4
+# Between the halves of a press the counts may creep by this part of the response.
+MAX_CREEP = 0.1
+MAX_CREEPING = 0.25
+
+
+@dataclass(frozen=True)
+class TaxelPress:
+    """One take during which a known pressure lay on some taxels.
+
+    Args:
+        pressure_kpa: above 0; force / area for a weight.
+        sigma_kpa: one standard deviation of it, 0 or more.
+        counts: [T ≥ 60, 360] raw readings while it lay.
+        taxels: which taxels (anatomical order) it lay on.
+
+    Raises:
+        InvalidInputError: a pressure that is not above 0, or no taxel.
+        NonFiniteError: NaN or infinity in the pressure.
+    """
+
+    pressure_kpa: float
+    sigma_kpa: float
+    counts: np.ndarray
+    taxels: Bool[np.ndarray, "320"]
+
+    def __post_init__(self) -> None:
+        if not np.isfinite([self.pressure_kpa, self.sigma_kpa]).all():
+            raise NonFiniteError("press: pressure or sigma is not finite")
+        if self.pressure_kpa <= 0 or self.sigma_kpa < 0 or not self.taxels.any():
+            raise InvalidInputError(
+                f"press: got {self.pressure_kpa:g} ± {self.sigma_kpa:g} kPa on "
+                f"{int(self.taxels.sum())} taxels, expected above 0 on at least one"
+            )
+
+
+@dataclass(frozen=True)
+class TaxelGain:
+    """Counts a kPa of each of the 320 taxels, anatomical order.
+
+    Attributes:
+        gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
+        sigma_counts_per_kpa: of the gain, 0 where refused. What is wrong about the pressures
+            themselves is common to all taxels and in it.
+        state: index into `tactile_faults.STATES`.
+        residual_kpa: [press, 320] what each press is off the line, 0 where not used.
+    """
+
+    gain_counts_per_kpa: Float64[np.ndarray, "320"]
+    sigma_counts_per_kpa: Float64[np.ndarray, "320"]
+    state: UInt8[np.ndarray, "320"]
+    residual_kpa: Float64[np.ndarray, "press 320"]
+
+
+@dataclass(frozen=True)
+class _Points:
+    """Levels of all presses and the rest take: rows 0 … K−1 presses, row K the tare."""
+
+    pressure_kpa: Float64[np.ndarray, " k"]
+    sigma_kpa: Float64[np.ndarray, " k"]
+    counts: Float64[np.ndarray, "k 320"]
+    sigma_counts: Float64[np.ndarray, "k 320"]
+    used: Bool[np.ndarray, "k 320"]
+    saturated: Bool[np.ndarray, "k 320"]
+
+
+def fit_gain(
+    tare: TaxelTare,
+    presses: Sequence[TaxelPress],
+    *,
+    full_scale_counts: float = FULL_SCALE_COUNTS,
+) -> TaxelGain:
+    """Weighted straight line of counts over pressure through each taxel's tare.
+
+    A taxel is refused, with its state, where it does not answer, saturates in all presses, bends,
+    or was pressed too little for 10 % of gain; its gain is then 0 and must not be used.
+
+    Args:
+        tare: of the same glove.
+        presses: at least one; several pressures show a bent response.
+        full_scale_counts: the largest count that the glove can send.
+
+    Raises:
+        InvalidInputError: no press, no taxel that answers, counts that fall under pressure, or
+            pressures that do not belong to the takes.
+    """
+    if not presses:
+        raise InvalidInputError("gain: got no press, expected at least one known pressure")
+    points = _points(tare, presses, full_scale_counts)
+    _check_direction(points)
+    takes = [press.counts for press in presses]
+    state = judge_taxels(takes, tare, full_scale_counts=full_scale_counts)
+    silent = _silent_under_pressure(points)
+    state[silent & (state != SATURATED)] = kind_of_silence(takes, tare.side)[
+        silent & (state != SATURATED)
+    ]
+    pressed = points.used[:-1].any(axis=0)
+    state[points.saturated[:-1].any(axis=0) & ~pressed] = SATURATED
+    state[~pressed & (state == OK)] = UNPROVEN
+    state[pressed & (state == UNPROVEN)] = OK
+    gain, sigma, zero, excess = _lines(points)
+    state = _judge_lines(points, (gain, sigma, excess), state)
+    good = state == OK
+    line = zero + gain * points.pressure_kpa[:-1, None]
+    safe = np.where(good, gain, 1.0)
+    residual_kpa = np.where(points.used[:-1] & good, (points.counts[:-1] - line) / safe, 0.0)
+    return TaxelGain(np.where(good, gain, 0.0), np.where(good, sigma, 0.0), state, residual_kpa)
+
+
+def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: float) -> _Points:
+    limit = SATURATED_RATIO * full_scale_counts
+    counts, sigmas, used, full = [], [], [], []
+    for index, press in enumerate(presses):
+        raw = checked_counts(press.counts, what=f"press {index} ({press.pressure_kpa:g} kPa)")
+        level = steady_level(raw)
+        _check_steady(raw, level, press, tare)
+        counts.append(select_taxels(level.mean_counts, side=tare.side))
+        sigmas.append(select_taxels(level.sigma_counts, side=tare.side))
+        at_stop = select_taxels((raw >= limit).mean(axis=0), side=tare.side)
+        full.append(press.taxels & (at_stop > MAX_SATURATED_READINGS))
+        used.append(press.taxels & ~full[-1])
+    return _Points(
+        np.array([*(press.pressure_kpa for press in presses), 0.0]),
+        np.array([*(press.sigma_kpa for press in presses), 0.0]),
+        np.stack([*counts, select_taxels(tare.level.mean_counts, side=tare.side)]),
+        np.stack([*sigmas, select_taxels(tare.level.sigma_counts, side=tare.side)]),
+        np.stack([*used, np.ones(NUM_TAXELS, dtype=np.bool_)]),
+        np.stack([*full, np.zeros(NUM_TAXELS, dtype=np.bool_)]),
+    )
+
+
+def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelTare) -> None:
+    """Refuse takes in which the pressure came, went or grew."""
+    half = len(raw) // 2
+    creep = np.abs(np.median(raw[:half], axis=0) - np.median(raw[half:], axis=0))
+    response = np.abs(level.mean_counts - tare.level.mean_counts)
+    allowed = np.maximum(MAX_CREEP * response, MIN_MOVE_COUNTS)
+    unsteady = (creep > allowed) | (level.clipped > MAX_CREEPING)
+    share = float(select_taxels(unsteady, side=tare.side)[press.taxels].mean())
+    if share > MAX_CREEPING:
+        raise InvalidInputError(
+            f"press of {press.pressure_kpa:g} kPa: {share:.0%} of its taxels changed while it "
+            f"lay, expected at most {MAX_CREEPING:.0%}; use only the time in which the pressure "
+            "holds (start_s and stop_s of the list of presses)"
+        )
+
+
+def _check_direction(points: _Points) -> None:
+    """Refuse takes in which nothing answers, or in which counts fall under pressure."""
+    response = (points.counts[:-1] - points.counts[-1])[points.used[:-1]]
+    answering = np.abs(response) >= MIN_MOVE_COUNTS
+    if points.saturated.any() and not answering.any():
+        raise InvalidInputError(
+            "gain: every pressed taxel is at full scale; press less, or lower the glove's gain"
+        )
+    if not answering.any():
+        raise InvalidInputError(
+            f"gain: no pressed taxel moved by {MIN_MOVE_COUNTS:g} counts or more; check that the "
+            "presses are those of this glove and side, and that the glove is connected"
+        )
+    if (response[answering] < 0).mean() > 0.5:
+        raise InvalidInputError(
+            "gain: counts fall under pressure; the rest take and a pressed take are probably "
+            "exchanged, or this glove counts downwards and needs a decoder that turns it round"
+        )
+
+
+def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, "320"]:
+    """Taxels that show next to nothing in every press under which the others answer."""
+    response = points.counts[:-1] - points.counts[-1]
+    usual = np.array(
+        [
+            np.median(row[used]) if used.any() else 0.0
+            for row, used in zip(response, points.used[:-1], strict=True)
+        ]
+    )[:, None]
+    told = points.used[:-1] & (usual >= MIN_MOVE_COUNTS)
+    silent = told & (np.abs(response) < SILENT_RATIO * usual)
+    return told.any(axis=0) & (silent == told).all(axis=0)
+
+
+def _lines(points: _Points) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Gain, its sigma, zero and excess (χ² a degree of freedom) of each taxel's line.
+
+    The pressure's sigma enters through the gain, hence the rounds (York 1966, uncorrelated).
+    """
+    P = points.pressure_kpa[:, None]
+    gain = np.zeros(NUM_TAXELS)
+    for _ in range(ROUNDS):
+        variance = points.sigma_counts**2 + (gain * points.sigma_kpa[:, None]) ** 2
+        weight = np.where(points.used, 1 / np.maximum(variance, 1e-12), 0.0)
+        total = weight.sum(axis=0)
+        mean_P, mean_c = (weight * P).sum(axis=0) / total, (weight * points.counts).sum(axis=0)
+        mean_c = mean_c / total
+        spread = (weight * (P - mean_P) ** 2).sum(axis=0)
+        slope = (weight * (P - mean_P) * (points.counts - mean_c)).sum(axis=0)
+        gain = np.divide(slope, spread, out=np.zeros(NUM_TAXELS), where=spread > 0)
+    zero = mean_c - gain * mean_P
+    chi2 = (weight * (points.counts - zero - gain * P) ** 2).sum(axis=0)
+    free = np.maximum(points.used.sum(axis=0) - 2, 1)
+    excess = chi2 / free
+    sigma = np.sqrt(np.maximum(excess, 1.0) / np.maximum(spread, 1e-300))
+    return gain, sigma, zero, excess
+
+
+def _judge_lines(
+    points: _Points, line: tuple[np.ndarray, np.ndarray, np.ndarray], state: np.ndarray
+) -> UInt8[np.ndarray, "320"]:
+    gain, sigma, excess = line
+    good = state == OK
+    P = points.pressure_kpa[:, None]
+    mean = (points.used * points.counts).sum(axis=0) / points.used.sum(axis=0)
+    middle = (points.used * P).sum(axis=0) / points.used.sum(axis=0)
+    off = np.where(points.used, points.counts - mean - gain * (P - middle), 0.0)
+    highest_kpa = np.where(points.used, P, 0.0).max(axis=0)
+    bent = np.abs(off).max(axis=0) > MAX_NONLINEARITY * np.abs(gain) * highest_kpa
+    bent &= (excess > MIN_NONLINEARITY_SIGMAS**2) & (points.used.sum(axis=0) >= MIN_POINTS_FOR_LINE)
+    state = state.copy()
+    state[good & ((highest_kpa < MIN_RANGE_KPA) | (sigma > MAX_RELATIVE_SIGMA * gain))] = IMPRECISE
+    state[good & bent] = NONLINEAR
+    state[good & (gain <= 0)] = DEAD
+    if good.any() and (state[good] == NONLINEAR).mean() > 0.5:
+        raise InvalidInputError(
+            f"gain: {int((state == NONLINEAR).sum())} taxels are off a straight line by more than "
+            f"{MAX_NONLINEARITY:.0%}; the pressures probably do not belong to these takes, or "
+            "they did not settle; check the list of presses"
+        )
+    return state

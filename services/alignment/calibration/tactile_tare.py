@@ -1,0 +1,150 @@
+"""Counts of a glove that nothing touches in, each cell's zero with sigma and noise out."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.tactile.layout import NUM_RAW_TAXELS, Side, select_taxels
+
+# One second of a 60 Hz glove: below that, slow noise cannot be told from the zero.
+MIN_SAMPLES = 60
+NUM_BLOCKS = 10
+# Readings further than this from the median (in robust standard deviations) are knocks.
+CLIP_SIGMAS = 4.0
+MIN_CLIP_COUNTS = 2.0
+# What a cell may move between the halves of a rest take, in standard deviations of one reading.
+MAX_SHIFT_SIGMAS = 4.0
+MIN_SHIFT_COUNTS = 2.0
+MAX_CLIPPED = 0.2
+# More restless taxels than this, and the hand did not rest.
+MAX_RESTLESS = 0.05
+
+
+@dataclass(frozen=True)
+class Level:
+    """What each cell reads over a take in which nothing changes, in counts.
+
+    Attributes:
+        mean_counts: middle of the readings, knocks left out.
+        sigma_counts: of that middle: noise, slow noise and the rounding to whole counts.
+        noise_counts: standard deviation of one reading.
+        clipped: part of the readings that were left out, 0 … 1.
+    """
+
+    mean_counts: Float64[np.ndarray, "360"]
+    sigma_counts: Float64[np.ndarray, "360"]
+    noise_counts: Float64[np.ndarray, "360"]
+    clipped: Float64[np.ndarray, "360"]
+
+
+@dataclass(frozen=True)
+class TaxelTare:
+    """The zero of each of the 360 raw cells of one glove.
+
+    Attributes:
+        side: which glove.
+        level: what each cell reads without load.
+        restless: taxels (anatomical order) that moved during the take; few are tolerated.
+        num_samples: readings that were used.
+    """
+
+    side: Side
+    level: Level
+    restless: Bool[np.ndarray, "320"]
+    num_samples: int
+
+
+def measure_tare(rest_counts: np.ndarray, *, side: Side) -> TaxelTare:
+    """Zero of every cell from a take without contact.
+
+    Args:
+        rest_counts: [T ≥ 60, 360] raw counts in scan order.
+        side: which glove.
+
+    Raises:
+        InvalidInputError: too short, or the glove was touched or still settling.
+        ShapeError, NonFiniteError: no [T, 360], or NaN.
+    """
+    counts = checked_counts(rest_counts, what=f"rest take of the {side} glove")
+    level = steady_level(counts)
+    restless = select_taxels(_restless(counts, level), side=side)
+    if restless.mean() > MAX_RESTLESS:
+        raise InvalidInputError(
+            f"rest take of the {side} glove: {int(restless.sum())} of 320 taxels moved during the "
+            f"take, expected at most {MAX_RESTLESS:.0%}; lay the glove down untouched, wait a "
+            "minute and record again"
+        )
+    return TaxelTare(side, level, restless, len(counts))
+
+
+def steady_level(counts: Float64[np.ndarray, "time 360"]) -> Level:
+    """Middle, sigma and noise of each cell's readings; knocks are left out."""
+    median = np.median(counts, axis=0)
+    spread = 1.4826 * np.median(np.abs(counts - median), axis=0)
+    reach = np.maximum(CLIP_SIGMAS * spread, MIN_CLIP_COUNTS)
+    kept = np.abs(counts - median) <= reach
+    num_kept = kept.sum(axis=0)
+    mean = np.where(kept, counts, 0.0).sum(axis=0) / num_kept
+    squares = np.where(kept, (counts - mean) ** 2, 0.0).sum(axis=0)
+    noise = np.sqrt(squares / np.maximum(num_kept - 1, 1))
+    white = noise / np.sqrt(num_kept) * _slow_noise_factor(np.where(kept, counts, mean), noise)
+    return Level(mean, np.hypot(white, rounding_rms_counts(noise)), noise, 1.0 - kept.mean(axis=0))
+
+
+def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
+    """How far the mean of readings in whole counts lies from the true one, RMS over all values.
+
+    Noise of `noise_counts` (with the rounding's own 1/12) dithers the steps away: the bias of a
+    rounded value x is Σ (−1)^k sin(2πkx) exp(−2π²k²σ²)/(πk) for Gaussian noise σ (Widrow and
+    Kollár, Quantization Noise, 2008); 1/√12 without noise.
+    """
+    variance = np.maximum(np.asarray(noise_counts, dtype=np.float64) ** 2 - 1 / 12, 0.0)
+    orders = np.arange(1, 40)
+    terms = np.exp(-4 * np.pi**2 * orders**2 * variance[..., None]) / (2 * np.pi**2 * orders**2)
+    return np.sqrt(terms.sum(axis=-1))
+
+
+def checked_counts(counts: np.ndarray, *, what: str) -> Float64[np.ndarray, "time 360"]:
+    """Counts as float64.
+
+    Raises:
+        ShapeError: not [T, 360].
+        NonFiniteError: NaN or infinity.
+        InvalidInputError: too few readings.
+    """
+    raw = np.asarray(counts, dtype=np.float64)
+    if raw.ndim != 2 or raw.shape[1] != NUM_RAW_TAXELS:
+        raise ShapeError(f"{what}: got {raw.shape}, expected [T, {NUM_RAW_TAXELS}]")
+    if not np.isfinite(raw).all():
+        raise NonFiniteError(f"{what}: holds NaN or infinity; record it again")
+    if len(raw) < MIN_SAMPLES:
+        raise InvalidInputError(
+            f"{what}: got {len(raw)} readings, expected at least {MIN_SAMPLES}; hold still longer"
+        )
+    return raw
+
+
+def _slow_noise_factor(counts: np.ndarray, noise: np.ndarray) -> float:
+    """By how much means of blocks spread more than independent readings would; at least 1.
+
+    One number for the whole glove: of a single cell's few blocks it would be a guess.
+    """
+    size = len(counts) // NUM_BLOCKS
+    blocks = counts[: size * NUM_BLOCKS].reshape(NUM_BLOCKS, size, -1).mean(axis=1)
+    noisy = noise > 0.5
+    if not noisy.any():
+        return 1.0
+    ratio = blocks.var(axis=0, ddof=1)[noisy] * size / noise[noisy] ** 2
+    return max(1.0, float(np.sqrt(np.median(ratio))))
+
+
+def _restless(counts: Float64[np.ndarray, "time 360"], level: Level) -> Bool[np.ndarray, "360"]:
+    half = len(counts) // 2
+    shift = np.abs(np.median(counts[:half], axis=0) - np.median(counts[half:], axis=0))
+    # Differences of neighbours in time: a step between the halves does not widen them.
+    steps = np.abs(np.diff(counts, axis=0))
+    fast_noise = np.sqrt(np.mean(np.minimum(steps, 5 * steps.mean(axis=0)) ** 2, axis=0) / 2)
+    allowed = np.maximum(MAX_SHIFT_SIGMAS * fast_noise, MIN_SHIFT_COUNTS)
+    return (shift > allowed) | (level.clipped > MAX_CLIPPED)

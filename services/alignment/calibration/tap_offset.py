@@ -1,0 +1,111 @@
+"""Taps seen by a glove and by a tracker in, what their stamps differ by out.
+
+The fallback where no motion is common to two streams: the hand taps a hard table. The glove's
+pressure starts between two samples; the tracker's height falls on a line and stops: a hinge, whose
+bend is the touch. The second difference would show the bend too early, so the hinge is fitted.
+"""
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from services.alignment.calibration.hand_eye import DegenerateMotionError
+from services.alignment.calibration.time_offset import TimeOffset
+
+# The fall before and the rest after a touch that are fitted.
+BEFORE_S, AFTER_S = 0.15, 0.15
+SEARCH_STEP_S = 0.001
+MIN_FALL_M_PER_S = 0.05
+MIN_REST_S = 0.5
+
+
+def estimate_tap_offset(
+    t_pressure_ns: np.ndarray,
+    pressure_kpa: np.ndarray,
+    t_height_ns: np.ndarray,
+    height_m: np.ndarray,
+    *,
+    threshold_kpa: float = 2.0,
+    max_offset_s: float = 0.2,
+) -> TimeOffset:
+    """Offset between a pressure stream and a height stream from taps at least 0.5 s apart.
+
+    Args:
+        t_pressure_ns: stamps [n], int64, strictly increasing.
+        pressure_kpa: the tapping pad's pressure [n]; below the threshold in the air.
+        t_height_ns: stamps [m] of the tracker.
+        height_m: height [m] above the table, of a point of the hand.
+        threshold_kpa: pressure that counts as a touch.
+        max_offset_s: offsets beyond this are not looked for.
+
+    Returns:
+        What must be added to the tracker's stamps to line them up with the glove's.
+
+    Raises:
+        DegenerateMotionError: no tap, or none that falls briskly onto the table.
+        InvalidInputError: stamps out of order.
+        ShapeError, NonFiniteError: values that do not fit or hold NaN.
+    """
+    t_a, pressure = _checked(t_pressure_ns, pressure_kpa, int(t_pressure_ns[0]), "pressure")
+    t_b, height = _checked(t_height_ns, height_m, int(t_pressure_ns[0]), "height")
+    onsets_s, interval_s = _onsets(t_a, pressure, threshold_kpa)
+    pairs = [(onset, _bend_s(t_b, height, onset, max_offset_s)) for onset in onsets_s]
+    offsets_s = np.array([onset - bend for onset, bend in pairs if bend is not None])
+    if not len(offsets_s):
+        raise DegenerateMotionError(
+            f"tap offset: {len(onsets_s)} touches, none of which stops a fall of at least "
+            f"{MIN_FALL_M_PER_S:g} m/s; tap a hard table briskly, half a second apart"
+        )
+    # A touch lies anywhere between two samples of the glove: of such the mean says most, once what
+    # lies farther off (a slip, another object) is out.
+    offsets_s = offsets_s[np.abs(offsets_s - np.median(offsets_s)) <= interval_s]
+    least_s = interval_s / np.sqrt(12)
+    spread_s = max(float(offsets_s.std()), least_s)
+    # Taps at the glove's own rhythm share their place between samples: never below a half.
+    sigma_s = max(spread_s / np.sqrt(len(offsets_s)), least_s / 2)
+    return TimeOffset(round(float(offsets_s.mean()) * 1e9), max(1, round(sigma_s * 1e9)))
+
+
+def _checked(
+    t_ns: np.ndarray, values: np.ndarray, reference_ns: int, name: str
+) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
+    t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(values, dtype=np.float64)
+    if t_ns.ndim != 1 or t_ns.shape != values.shape:
+        raise ShapeError(f"tap offset: {name} has {t_ns.shape} stamps and {values.shape} values")
+    if not np.isfinite(values).all():
+        raise NonFiniteError(f"tap offset: {name} holds NaN or infinity")
+    if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
+        raise InvalidInputError(f"tap offset: stamps of {name} do not increase")
+    return (t_ns - reference_ns) * 1e-9, values
+
+
+def _onsets(t_s: np.ndarray, pressure: np.ndarray, threshold: float) -> tuple[list[float], float]:
+    """Middles of the intervals in which touches began, and the usual interval."""
+    touching = pressure > threshold
+    starts = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
+    onsets: list[float] = []
+    for start in starts.tolist():
+        onset = float(t_s[start] + t_s[start - 1]) / 2
+        if not onsets or onset - onsets[-1] >= MIN_REST_S:
+            onsets.append(onset)
+    return onsets, float(np.median(np.diff(t_s)))
+
+
+def _bend_s(
+    t_s: np.ndarray, height: np.ndarray, onset_s: float, max_offset_s: float
+) -> float | None:
+    """When a fall near a touch stops; None where nothing falls."""
+    bends = np.arange(onset_s - max_offset_s, onset_s + max_offset_s, SEARCH_STEP_S)
+    best, found = np.inf, None
+    for bend in bends.tolist():
+        near = (t_s >= bend - BEFORE_S) & (t_s <= bend + AFTER_S)
+        t_near = t_s[near]
+        if t_near.size < 8 or t_near[0] > bend - BEFORE_S / 2 or t_near[-1] < bend + AFTER_S / 2:
+            continue
+        fall = np.minimum(t_near - bend, 0.0)
+        design = np.stack([fall, np.ones(t_near.size)], axis=1)
+        (speed, level), *_ = np.linalg.lstsq(design, height[near], rcond=None)
+        rest = float(np.mean((height[near] - design @ np.array([speed, level])) ** 2))
+        if speed <= -MIN_FALL_M_PER_S and rest / speed**2 < best:
+            best, found = rest / speed**2, bend
+    return found

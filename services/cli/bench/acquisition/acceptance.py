@@ -1,0 +1,56 @@
+"""What was measured in; what decoders and ports promise, and whether it holds, out."""
+
+from collections.abc import Mapping, Sequence
+
+from services.cli.bench.acquisition.noise import Judgement
+from services.cli.bench.acquisition.speed import WHOLE
+from services.cli.bench.figures import Figure, Requirement
+
+OURS = "ours"
+CHECKED = ("dextouch", "wuji")
+
+
+def requirements(
+    judgements: Sequence[Judgement],
+    speeds: Mapping[tuple[str, str, int], Figure],
+    split_differences: Mapping[str, int],
+    core_share: Figure | None,
+) -> list[Requirement]:
+    """The table of promises; what was not measured in this run says so."""
+    ours = {found.family: found for found in judgements if found.way == OURS}
+    table = []
+    for name in CHECKED:
+        found = ours.get(name)
+        many = "" if found is None else f" of {found.sent}"
+        table += [
+            Requirement(
+                f"wrong packets{many}, {name}",
+                None if found is None else float(found.wrong),
+                "at most",
+                0.0,
+            ),
+            Requirement(
+                f"packets lost untouched{many}, {name}",
+                None if found is None else float(found.collateral),
+                "at most",
+                0.0,
+            ),
+        ]
+    table.append(
+        Requirement(
+            "ways of cutting the stream that change the packets, all families",
+            float(sum(split_differences.values())) if split_differences else None,
+            "at most",
+            0.0,
+        )
+    )
+    for family, way, size in speeds:
+        if way == OURS and size == WHOLE:
+            median_us = speeds[family, way, size].median
+            what = f"processor time a packet in whole reads, {family}"
+            table.append(Requirement(what, median_us, "at most", 15.0, "µs"))
+    share = None if core_share is None else core_share.median
+    table.append(
+        Requirement("core a stream, 8 gloves at 60 Hz on terminals", share, "at most", 1.0, "%")
+    )
+    return table

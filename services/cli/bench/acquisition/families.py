@@ -1,0 +1,182 @@
+"""A packet family's name in; how it makes packets and who decodes them, rivals too, out."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import numpy as np
+
+from dextouch.streams.samples import Sample
+from services.acquisition.drivers.glove_justfloat import TAIL, JustFloatGloveDecoder
+from services.acquisition.drivers.glove_wuji import (
+    CRC_OFFSET,
+    HEAD,
+    MARK,
+    NUM_CELLS,
+    PACKET_BYTES,
+    STAMPS,
+    WujiGloveDecoder,
+)
+from services.acquisition.drivers.packets import HEADER, OVERHEAD, SOURCES, VERSION, Packet
+from services.acquisition.drivers.packets import encode_packet as encode_ours
+from services.acquisition.drivers.tactile_glove import MAGIC, PAYLOAD_BYTES, TactileGloveDecoder
+from services.acquisition.mocks.glove_justfloat import encode_justfloat
+from services.acquisition.mocks.glove_wuji import encode_wuji
+
+NUM_VALUES = 401
+FULL_SCALE = 4095.0
+# What an untouched glove sends most of.
+TOUCHED_SHARE = 0.3
+NO_CELL_SHARE = 0.3
+
+
+@runtime_checkable
+class Feed(Protocol):
+    """Takes bytes, gives the samples (rivals: payloads) of the packets that they complete."""
+
+    def __call__(self, data: bytes, /) -> Sequence[bytes] | Sequence[Sample]:
+        """The next portion."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """One packet family on a serial line.
+
+    `make` gives a packet by its index and a generator; `payload` is where its readings lie;
+    `ways` are our decoder and its rivals, each made anew by a call.
+    """
+
+    name: str
+    has_checksum: bool
+    make: Callable[[int, np.random.Generator], bytes]
+    payload: slice
+    ways: dict[str, Callable[[], Feed]]
+
+
+class FixedLength:
+    """Rival: whatever follows a mark is a packet of the usual length; nothing is checked."""
+
+    def __init__(self, mark: bytes, size: int, payload: slice) -> None:
+        self._mark, self._size, self._payload = mark, size, payload
+        self._buffer = bytearray()
+
+    def __call__(self, data: bytes) -> Sequence[bytes]:
+        """Payloads of what is taken for packets."""
+        buffer = self._buffer
+        buffer += data
+        found: list[bytes] = []
+        position = 0
+        while True:
+            start = buffer.find(self._mark, position)
+            if start < 0 or len(buffer) < start + self._size:
+                position = start if start >= 0 else max(position, len(buffer) - len(self._mark))
+                break
+            found.append(bytes(buffer[start : start + self._size][self._payload]))
+            position = start + self._size
+        del buffer[:position]
+        return found
+
+
+class MarkAlone:
+    """Rival: a packet is what lies between two marks."""
+
+    def __init__(self, mark: bytes, payload: slice) -> None:
+        self._mark, self._payload = mark, payload
+        self._buffer = bytearray()
+
+    def __call__(self, data: bytes) -> Sequence[bytes]:
+        """Payloads of what is taken for packets."""
+        buffer = self._buffer
+        buffer += data
+        found: list[bytes] = []
+        start = 0
+        while (end := buffer.find(self._mark, start + 1)) >= 0:
+            found.append(bytes(buffer[start:end][self._payload]))
+            start = end
+        del buffer[:start]
+        return found
+
+
+class TailAlone:
+    """Rival for packets that end with a mark: whatever stands before it, if the length fits."""
+
+    def __init__(self, mark: bytes) -> None:
+        self._mark = mark
+        self._buffer = bytearray()
+
+    def __call__(self, data: bytes) -> Sequence[bytes]:
+        """Payloads of what is taken for packets."""
+        buffer = self._buffer
+        buffer += data
+        found: list[bytes] = []
+        start = 0
+        while (end := buffer.find(self._mark, start)) >= 0:
+            found.append(bytes(buffer[start:end]))
+            start = end + len(self._mark)
+        del buffer[:start]
+        return found
+
+
+def payload_of(item: bytes | Sample) -> bytes:
+    """The readings of what a way of decoding gave."""
+    return item if isinstance(item, bytes) else item.values.tobytes()
+
+
+def make_families() -> tuple[Family, ...]:
+    """Our own packet, one with CRC-16, one without any check."""
+    ours_payload = slice(HEADER.size, HEADER.size + PAYLOAD_BYTES)
+    ours_size = OVERHEAD + PAYLOAD_BYTES
+    wuji_payload = slice(HEAD.size, CRC_OFFSET - STAMPS.size)
+    return (
+        Family(
+            "dextouch",
+            has_checksum=True,
+            make=_make_ours,
+            payload=ours_payload,
+            ways={
+                "ours": lambda: TactileGloveDecoder("left").feed,
+                "mark and length": lambda: FixedLength(MAGIC, ours_size, ours_payload),
+                "mark alone": lambda: MarkAlone(MAGIC, ours_payload),
+            },
+        ),
+        Family(
+            "wuji",
+            has_checksum=True,
+            make=_make_wuji,
+            payload=wuji_payload,
+            ways={
+                "ours": lambda: WujiGloveDecoder("left").feed,
+                "mark and length": lambda: FixedLength(MARK, PACKET_BYTES, wuji_payload),
+                "mark alone": lambda: MarkAlone(MARK, wuji_payload),
+            },
+        ),
+        Family(
+            "justfloat",
+            has_checksum=False,
+            make=_make_justfloat,
+            payload=slice(0, 4 * NUM_VALUES),
+            ways={"ours": lambda: _justfloat().feed, "tail alone": lambda: TailAlone(TAIL)},
+        ),
+    )
+
+
+def _justfloat() -> JustFloatGloveDecoder:
+    return JustFloatGloveDecoder("left", num_values=NUM_VALUES, full_scale=FULL_SCALE, rate_hz=60.0)
+
+
+def _make_ours(index: int, rng: np.random.Generator) -> bytes:
+    packet = Packet(VERSION, SOURCES["left"], index, index, rng.bytes(PAYLOAD_BYTES))
+    return encode_ours(MAGIC, packet)
+
+
+def _make_wuji(index: int, rng: np.random.Generator) -> bytes:
+    cells = rng.random(NUM_CELLS, dtype=np.float32)
+    cells[: round(NO_CELL_SHARE * NUM_CELLS)] = np.nan
+    return encode_wuji(0, index, 8 * index, cells.tobytes())
+
+
+def _make_justfloat(index: int, rng: np.random.Generator) -> bytes:
+    del index
+    counts = rng.integers(0, round(FULL_SCALE) + 1, NUM_VALUES)
+    counts[rng.random(NUM_VALUES) >= TOUCHED_SHARE] = 0
+    return encode_justfloat(counts.astype(np.float32))

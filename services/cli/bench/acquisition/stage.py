@@ -1,0 +1,107 @@
+"""The stage `acquisition`: its options in, a report out."""
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from dextouch.errors import InvalidInputError
+from services.cli.bench.acquisition.acceptance import requirements
+from services.cli.bench.acquisition.families import make_families
+from services.cli.bench.acquisition.noise import Line, count_split_differences, judge
+from services.cli.bench.acquisition.ptys import NUM_STREAMS, run_ptys
+from services.cli.bench.acquisition.speed import measure_speed
+from services.cli.bench.acquisition.tables import panels, tables
+from services.cli.bench.figures import Figure
+from services.cli.bench.machine import describe_machine
+from services.cli.bench.report import StageReport
+from services.cli.bench.stages import Bar
+
+LINE = Line(bit_error_rate=1e-5, byte_loss_rate=1e-5)
+PACKAGES = ("numpy", "pyserial")
+_QUICK = {"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5}
+_USUAL = {"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60}
+_NUM_PTY_ROUNDS = 3
+_BLOCKS = 500
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this stage."""
+    parser.add_argument(
+        "--packets", type=int, help=f"a family over the bad line ({_USUAL['packets']}; quick 2000)"
+    )
+    parser.add_argument("--rounds", type=int, help=f"of timing ({_USUAL['rounds']}; quick 1)")
+    parser.add_argument(
+        "--seconds", type=float, help=f"of eight gloves, thrice ({_USUAL['seconds']:g}; quick 1)"
+    )
+    parser.add_argument("--splits", type=int, help=f"of a stream ({_USUAL['splits']}; quick 5)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (%(default)s)")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Decode over a bad line, time every way of decoding, read eight gloves.
+
+    Raises:
+        InvalidInputError: a number that measures nothing.
+    """
+    del folder
+    plan = _plan(options)
+    seed = options.seed
+    families = make_families()
+    with bar("bad line", len(families) * -(-plan["packets"] // _BLOCKS)) as step:
+        judgements = [
+            found
+            for family in families
+            for found in judge(
+                family, list(family.ways), LINE, plan["packets"], seed=seed, on_block=step
+            )
+        ]
+    splits = {
+        family.name: count_split_differences(family, LINE, plan["splits"], seed=seed)
+        for family in families
+    }
+    num_subjects = plan["rounds"] * 3 * sum(len(family.ways) for family in families)
+    with bar("timing", num_subjects) as step:
+        speeds = measure_speed(families, plan["rounds"], seed=seed, on_step=step)
+    runs = []
+    num_pty_rounds = 1 if options.quick else _NUM_PTY_ROUNDS
+    with bar("eight gloves", num_pty_rounds) as step:
+        for index in range(num_pty_rounds):
+            step(f"run {index + 1}")
+            runs.append(run_ptys(plan["seconds"]))
+    share = Figure.of([100 * run["cpu_s"] / run["seconds"] / NUM_STREAMS for run in runs])
+    return StageReport(
+        stage="acquisition",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "seed": seed},
+        tables=tables(judgements, speeds, LINE, share),
+        panels=panels(judgements, speeds),
+        requirements=requirements(judgements, speeds, splits, share),
+        data={
+            "line": asdict(LINE),
+            "judgements": [asdict(found) for found in judgements],
+            "split_differences": splits,
+            "us_a_packet": [
+                {"family": family, "way": way, "read_bytes": size, "rounds": list(figure.values)}
+                for (family, way, size), figure in speeds.items()
+            ],
+            "eight_gloves": runs,
+        },
+        notes=[
+            "justfloat has no checksum: errors that leave a possible reading are delivered by any "
+            "decoder; its stream says so in its capabilities"
+        ],
+    )
+
+
+def _plan(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say, else the usual or the quick numbers."""
+    plan: dict[str, Any] = {}
+    for name, default in (_QUICK if options.quick else _USUAL).items():
+        given = getattr(options, name)
+        plan[name] = default if given is None else given
+        if plan[name] <= 0:
+            raise InvalidInputError(f"--{name}: got {plan[name]}, expected more than 0")
+    if plan["packets"] <= 4:
+        raise InvalidInputError(f"--packets: got {plan['packets']}, expected at least 5")
+    return plan

@@ -1,0 +1,122 @@
+"""Scenes that show no mount, and healthy ones, in; whether each method refuses them out."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError
+from services.alignment.calibration.motion import DegenerateMotionError
+from services.cli.bench.calibration.compare import score
+from services.cli.bench.calibration.rivals import METHODS, OURS, Method
+from services.cli.bench.calibration.scenes import Motion, Scene, make_scene
+from services.cli.bench.stages import Bar
+
+Maker = Callable[[int], Scene]
+RIVALS = ("tsai", "park", "daniilidis", "li")
+TURN_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class SceneResult:
+    """One kind of scene.
+
+    Attributes:
+        name: what is wrong with it.
+        is_healthy: whether it should be solved.
+        num_seeds: how often it was made.
+        num_refused: how often ours refused it.
+        num_named: how often the refusal named axes to add.
+        cause: the first refusal's words.
+        rivals: rival → what it does: median error, or that it refuses or gives NaN.
+    """
+
+    name: str
+    is_healthy: bool
+    num_seeds: int
+    num_refused: int
+    num_named: int
+    cause: str
+    rivals: dict[str, str]
+
+
+def scene_makers() -> dict[str, tuple[Maker, bool]]:
+    """Kind of scene → what makes it of a seed, and whether it is healthy."""
+    makers: dict[str, tuple[Maker, bool]] = {"healthy": (make_scene, True)}
+    for axis, axes in TURN_AXES.items():
+        makers[f"turns about the camera's {axis} only"] = (
+            _maker(Motion(tilt_deg=40.0, axes=axes)),
+            False,
+        )
+    makers["turns of 4 degrees at most"] = (_maker(Motion(tilt_deg=4.0)), False)
+    makers["no turns"] = (_maker(Motion(tilt_deg=0.0)), False)
+    makers["one view, repeated"] = (_repeating(1), False)
+    makers["two views, repeated"] = (_repeating(2), False)
+    return makers
+
+
+def try_scenes(num_seeds: int, num_healthy: int, bar: Bar) -> list[SceneResult]:
+    """Every kind of scene with seeds that no other part of the stage uses."""
+    makers = scene_makers()
+    ours = next(method for method in METHODS if method.name == OURS)
+    results = []
+    with bar("refusals", len(makers)) as step:
+        for name, (make, is_healthy) in makers.items():
+            step(name)
+            num = num_healthy if is_healthy else num_seeds
+            scenes = [make(10_000 + seed) for seed in range(num)]
+            results.append(_try(name, scenes, ours, is_healthy=is_healthy))
+    return results
+
+
+def _try(name: str, scenes: list[Scene], ours: Method, *, is_healthy: bool) -> SceneResult:
+    causes = [cause for scene in scenes if (cause := _refusal(ours, scene)) is not None]
+    named = [cause for cause in causes if _names_axes(cause)]
+    return SceneResult(
+        name,
+        is_healthy,
+        len(scenes),
+        num_refused=len(causes),
+        num_named=len(named),
+        cause=causes[0].message if causes else "",
+        rivals={m.name: _what_it_does(m, scenes) for m in METHODS if m.name in RIVALS},
+    )
+
+
+def _names_axes(cause: InvalidInputError) -> bool:
+    return isinstance(cause, DegenerateMotionError) and bool(cause.details["missing_axes"])
+
+
+def _refusal(method: Method, scene: Scene) -> InvalidInputError | None:
+    try:
+        method.solve(scene)
+    except InvalidInputError as refusal:
+        return refusal
+    return None
+
+
+def _what_it_does(method: Method, scenes: list[Scene]) -> str:
+    """Median error where it answers at all; how often it does not."""
+    solved = []
+    for scene in scenes:
+        try:
+            solved.append(score(method, scene))
+        except InvalidInputError:
+            continue
+    silent = len(scenes) - len(solved)
+    told = f"no answer in {silent} of {len(scenes)}" if silent else ""
+    if not solved:
+        return told
+    degrees = np.median([one.error_deg for one in solved])
+    millimetres = np.median([one.error_mm for one in solved])
+    return f"{degrees:.2g} deg, {millimetres:.3g} mm" + (f"; {told}" if told else "")
+
+
+def _maker(motion: Motion) -> Maker:
+    return lambda seed: make_scene(seed, motion)
+
+
+def _repeating(num_views: int) -> Maker:
+    return lambda seed: make_scene(seed, Motion(num_views=4)).repeated(
+        [index % num_views for index in range(20)]
+    )

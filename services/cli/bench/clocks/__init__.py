@@ -1,0 +1,1 @@
+"""The stage `clocks`: device clocks against simulated truth, beside their rivals."""

@@ -1,0 +1,152 @@
+"""The name of a scene and a seed in; device stamps, arrivals and the true times of samples out.
+
+A device samples at its own rate by its own clock; its packets wait in queues and in the polling of
+a bus, never overtake each other, and some get lost. Truth is known, so that every way of dating
+samples can be scored.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.errors import InvalidInputError, UnknownNameError
+
+# What a stamp of one direction can never show; scores are taken after it is subtracted.
+BASE_DELAY_NS = 2_000_000
+# Crystals wander with the room's temperature, over minutes.
+WANDER_PERIOD_S = 120.0
+HOST_ORIGIN_NS = 1_700_000_000_000_000_000
+DEVICE_ORIGIN_NS = 987_654_321_000
+
+
+@dataclass(frozen=True)
+class Scene:
+    """How a device's clock runs and what its packets suffer on their way.
+
+    Attributes:
+        rate_hz: samples a second of the device's clock.
+        skew_ppm: how much faster the host's clock runs.
+        wander_ppm: amplitude of the skew's slow sine.
+        jitter_ms: mean of the exponential queueing delay.
+        outliers: share of samples that wait for `outlier_ms` more, exponential too.
+        grid_ms: arrivals happen at whole multiples of it (polling of a bus, timer of a chip).
+        drops: share of samples that get lost.
+        step_ms: jump of the device's clock in the middle; 0 for none.
+        tick_ns: resolution of the device's stamps.
+    """
+
+    rate_hz: float = 60.0
+    skew_ppm: float = 50.0
+    wander_ppm: float = 0.0
+    jitter_ms: float = 0.8
+    outliers: float = 0.01
+    outlier_ms: float = 20.0
+    grid_ms: float = 1.0
+    drops: float = 0.002
+    step_ms: float = 0.0
+    tick_ns: int = 1
+
+    def without_drops(self) -> "Scene":
+        """The same path without loss."""
+        return replace(self, drops=0.0)
+
+
+@dataclass(frozen=True)
+class Take:
+    """What a host records of a scene, and the truth.
+
+    Attributes:
+        sequence: numbers of the samples that arrived, counted by the device.
+        t_device_ns: the device's stamps.
+        t_host_ns: arrivals on the host's clock.
+        true_ns: when the samples were taken, on the host's clock.
+        step_true_ns: when the device's clock jumped; None where it did not.
+    """
+
+    scene: Scene
+    sequence: Int64[np.ndarray, " n"]
+    t_device_ns: Int64[np.ndarray, " n"]
+    t_host_ns: Int64[np.ndarray, " n"]
+    true_ns: Int64[np.ndarray, " n"]
+    step_true_ns: int | None
+
+    def __len__(self) -> int:
+        return len(self.true_ns)
+
+
+SCENES = {
+    "base": Scene(),
+    "serial timer 16 ms": Scene(grid_ms=16.0),
+    "5 % outliers 50 ms": Scene(outliers=0.05, outlier_ms=50.0),
+    "congestion 5 ms": Scene(jitter_ms=5.0),
+    "step +200 ms": Scene(step_ms=200.0),
+    "step -30 ms": Scene(step_ms=-30.0),
+    "wander 5 ppm": Scene(wander_ppm=5.0),
+}
+# Beyond the seven: coarse stamps, and steps that hide among delays.
+MORE_SCENES = {
+    "stamps of 1 ms": Scene(tick_ns=1_000_000),
+    "step -9 ms": Scene(step_ms=-9.0),
+    "step -3 ms": Scene(step_ms=-3.0),
+    "restart, -5 s": Scene(step_ms=-5000.0),
+}
+# For streams without stamps: only how many samples got lost makes them hard.
+STAMPLESS_SCENES = {
+    "0 % lost": Scene(drops=0.0),
+    "0.2 % lost": Scene(drops=0.002),
+    "2 % lost": Scene(drops=0.02),
+}
+
+
+def find_scene(name: str) -> Scene:
+    """A scene by name.
+
+    Raises:
+        UnknownNameError: there is none of that name.
+    """
+    known = SCENES | MORE_SCENES | STAMPLESS_SCENES
+    if name not in known:
+        raise UnknownNameError("scene", name, list(known))
+    return known[name]
+
+
+def simulate(scene: Scene, *, seconds: float, seed: int) -> Take:
+    """One take of a scene.
+
+    Raises:
+        InvalidInputError: no length of time.
+    """
+    if not seconds > 0:
+        raise InvalidInputError(f"simulated take: got {seconds} s, expected more than 0")
+    rng = np.random.default_rng(seed)
+    sequence = np.arange(int(seconds * scene.rate_hz))
+    sequence = sequence[rng.random(len(sequence)) >= scene.drops]
+    device_s = sequence / scene.rate_hz
+    true_s = _true_times(scene, device_s) + rng.random() * 1e-2
+    arrival_s = _arrivals(scene, true_s, rng)
+    step_s = true_s[len(true_s) // 2] if scene.step_ms else np.inf
+    device_s = device_s + (true_s >= step_s) * scene.step_ms * 1e-3
+    device_ns = np.rint(device_s * 1e9).astype(np.int64) + DEVICE_ORIGIN_NS
+    host_ns, true_ns = (
+        np.rint(t_s * 1e9).astype(np.int64) + HOST_ORIGIN_NS for t_s in (arrival_s, true_s)
+    )
+    step_ns = HOST_ORIGIN_NS + round(step_s * 1e9) if scene.step_ms else None
+    ticks_ns = device_ns // scene.tick_ns * scene.tick_ns
+    return Take(scene, sequence.astype(np.int64), ticks_ns, host_ns, true_ns, step_ns)
+
+
+def _true_times(scene: Scene, device_s: np.ndarray) -> np.ndarray:
+    turns = 2 * np.pi / WANDER_PERIOD_S
+    wander_s = scene.wander_ppm * 1e-6 / turns * np.sin(turns * device_s)
+    return np.asarray(device_s * (1 + scene.skew_ppm * 1e-6) + wander_s)
+
+
+def _arrivals(scene: Scene, true_s: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    num = len(true_s)
+    delay_s = BASE_DELAY_NS * 1e-9 + rng.exponential(scene.jitter_ms * 1e-3, num)
+    waits = rng.random(num) < scene.outliers
+    delay_s += waits * rng.exponential(scene.outlier_ms * 1e-3, num)
+    grid_s = scene.grid_ms * 1e-3
+    # Nothing overtakes: a late packet holds up those behind it.
+    return np.asarray(np.maximum.accumulate(np.ceil((true_s + delay_s) / grid_s) * grid_s))

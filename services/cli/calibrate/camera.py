@@ -1,0 +1,186 @@
+"""`dextouch station calibrate camera`: photos of a board in, K with sigma and pictures out."""
+
+import argparse
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError
+from services.alignment.calibration.board_detection import FoundBoards
+from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
+from services.cli.calibrate.advice import Coverage, camera_coverage
+from services.cli.calibrate.boards import (
+    Board,
+    BoardView,
+    Lens,
+    board_pose,
+    find_board,
+    parse_board,
+    reprojection,
+    usual_pattern,
+)
+from services.cli.calibrate.photos import photo_paths, progress, read_photos
+from services.cli.calibrate.pictures import coverage_picture, residual_picture
+from services.cli.calibrate.record import write_entry, write_picture
+
+CAMERAS = ("head", "wrist_left", "wrist_right")
+# OpenCV counts pixels from the middle of the first one, DexTouch from its corner.
+PIXEL_SHIFT_PX = 0.5
+
+
+@dataclass(frozen=True)
+class Found:
+    """The photos of a folder in which the board was found."""
+
+    views: tuple[BoardView, ...]
+    without_board: tuple[str, ...]
+    size_px: tuple[int, int]
+    board_kind: str
+
+
+def calibrate(options: argparse.Namespace) -> dict[str, object]:
+    """Photos of a folder to K; coverage and advice are written even when they do not suffice.
+
+    Raises:
+        InvalidInputError: too few photos with the board, or they do not show the lens.
+        NotFoundError, CorruptDataError: no photos, or broken ones.
+    """
+    board = parse_board(options.board)
+    found = find_boards(photo_paths(options.photos), board)
+    report = report_coverage(found, options.to, options.camera)
+    if options.check:
+        return report
+    views = found.views
+    result = calibrate_found(corners_of(found))
+    lens = Lens(result.K, result.distortion)
+    residuals = [reprojection(view, lens, board_pose(view, lens)) for view in views]
+    coverage = camera_coverage(views, found.size_px, lens)
+    write_coverage(found, coverage, options.to, options.camera)
+    write_picture(
+        options.to,
+        f"residuals_{options.camera}.svg",
+        residual_picture(views, residuals, found.size_px),
+    )
+    return report | _keep(result, coverage, options, found)
+
+
+def find_boards(paths: Sequence[Path], board: Board) -> Found:
+    """Read photos and find the board in each, with a progress bar.
+
+    Raises:
+        InvalidInputError: photos of different sizes.
+    """
+    photos = read_photos(paths)
+    seen = [
+        find_board(path.name, photo, board)
+        for path, photo in progress(list(zip(paths, photos, strict=True)), "looking for the board")
+    ]
+    pattern = usual_pattern([view for view in seen if view is not None])
+    views = tuple(view for view in seen if view is not None and view.pattern == pattern)
+    names = {view.name for view in views}
+    without = tuple(path.name for path in paths if path.name not in names)
+    height_px, width_px = photos[0].shape
+    return Found(views, without, (width_px, height_px), pattern)
+
+
+def corners_of(found: Found) -> FoundBoards:
+    """The corners in the form of the solver."""
+    return FoundBoards(
+        tuple(view.points_board for view in found.views),
+        tuple(view.pixels for view in found.views),
+        found.size_px,
+        tuple(range(len(found.views))),
+        len(found.views) + len(found.without_board),
+        found.board_kind,
+    )
+
+
+def report_coverage(found: Found, folder: Path, camera: str) -> dict[str, object]:
+    """Print and draw what the photos cover; the same as data."""
+    coverage = camera_coverage(found.views, found.size_px)
+    path = write_coverage(found, coverage, folder, camera)
+    num = len(found.views) + len(found.without_board)
+    print(f"board found in {len(found.views)} of {num} photos ({found.board_kind})")
+    for name in found.without_board:
+        print(f"  not in {name}")
+    for words in coverage.todo:
+        print(f"next: {words}")
+    print(f"coverage: {path}")
+    return {
+        "num_photos": num,
+        "num_with_board": len(found.views),
+        "without_board": list(found.without_board),
+        "board_kind": found.board_kind,
+        "views_by_region": coverage.views_by_region.tolist(),
+        "next": list(coverage.todo),
+    }
+
+
+def write_coverage(found: Found, coverage: Coverage, folder: Path, camera: str) -> Path:
+    """Draw the coverage picture; its path."""
+    picture = coverage_picture(found.views, coverage, found.size_px)
+    return write_picture(folder, f"coverage_{camera}.svg", picture)
+
+
+def _keep(
+    result: CameraCalibration,
+    coverage: Coverage,
+    options: argparse.Namespace,
+    found: Found,
+) -> dict[str, object]:
+    K = result.K.copy()
+    K[:2, 2] += PIXEL_SHIFT_PX
+    name = f"K_{options.camera}"
+    facts: dict[str, object] = {
+        "camera": options.camera,
+        "board": asdict(parse_board(options.board)),
+        "num_views": len(result.used_images),
+        "fx_fy_cx_cy_px": [float(v) for v in K[[0, 1, 0, 1], [0, 1, 2, 2]]],
+        "sigma_fx_fy_cx_cy_px": result.sigma_fxfycxcy_px.tolist(),
+        "distortion_k1_k2_p1_p2_k3": result.distortion.tolist(),
+        "sigma_distortion": result.sigma_distortion.tolist(),
+        "rms_px": result.rms_px,
+        "board_kind": found.board_kind,
+        "image_size_px": list(found.size_px),
+        "next": list(coverage.todo),
+    }
+    write_entry(
+        options.to,
+        entry=name,
+        matrices={
+            name: K,
+            f"{name}_sigma_px": result.sigma_fxfycxcy_px[None],
+            f"distortion_{options.camera}": result.distortion[None],
+            f"image_size_{options.camera}_px": np.array([found.size_px], dtype=np.float64),
+        },
+        facts=facts,
+        now=datetime.now(UTC),
+    )
+    fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]]
+    sigma = result.sigma_fxfycxcy_px
+    print(
+        f"{name}: fx {fx:.2f} ± {sigma[0]:.2f}, fy {fy:.2f} ± {sigma[1]:.2f}, "
+        f"cx {cx:.2f} ± {sigma[2]:.2f}, cy {cy:.2f} ± {sigma[3]:.2f} px "
+        f"({len(result.used_images)} views, residual {result.rms_px:.3f} px RMS)"
+    )
+    return facts
+
+
+def lens_of(matrices: dict[str, np.ndarray], size_px: tuple[int, int]) -> Lens:
+    """OpenCV's lens from the kept matrices K [3, 3], distortion [1, 5] and image size [1, 2].
+
+    Raises:
+        InvalidInputError: the photos have another size than those of the calibration.
+    """
+    calibrated = tuple(int(v) for v in matrices["image_size"][0])
+    if calibrated != size_px:
+        raise InvalidInputError(
+            f"photos: got {size_px[0]} by {size_px[1]} px, but K was measured at "
+            f"{calibrated[0]} by {calibrated[1]}; take the photos in the same mode of the camera"
+        )
+    K = matrices["K"].copy()
+    K[:2, 2] -= PIXEL_SHIFT_PX
+    return Lens(K, matrices["distortion"][0])

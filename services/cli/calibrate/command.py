@@ -1,0 +1,197 @@
+"""The words after `dextouch station calibrate` in; matrices, pictures and an exit status out."""
+
+import argparse
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from dextouch.errors import InvalidInputError
+from services.cli.calibrate.boards import BOARD_HELP, parse_board
+
+Report = dict[str, object]
+EXIT_LEVEL = 1
+
+_ABOUT = """\
+Measure what a station must know of its devices. Everything goes into one folder:
+  calibration.json           the matrices as recordings carry them; give it to the station with
+                             DEXTOUCH_ACQUISITION_CALIBRATION=FOLDER/calibration.json
+  calibration_details.json   sigma, time, software, inputs
+  pictures/                  coverage and residuals, to look at
+
+A whole calibration:
+  1. glove     lay the glove down, record 10 s; put it under known pressures, record each for 5 s
+               dextouch station calibrate glove --side left --rest spool/rest \\
+                 --presses presses.csv --to calibration
+  2. camera    25 photos of a printed board, everywhere in the image, near and far, tilted
+               dextouch station calibrate camera --camera head --photos photos/head \\
+                 --board charuco:5x7:30mm:22mm --to calibration
+  3. hand-eye  20 photos of a fixed board with the tracker's pose at each, turned about all axes
+               dextouch station calibrate hand-eye --camera head --photos photos/mount \\
+                 --poses photos/mount/poses.csv --board charuco:5x7:30mm:22mm --to calibration
+  4. show      age and sigma of everything; warns after seven days
+               dextouch station calibrate show calibration
+
+More: docs/calibration_guide.md"""
+
+_CAMERA = """\
+What good photos are: 25 of them; the board in every ninth of the image, also in the corners;
+near and far; each of its edges once nearer to the camera by 20 to 45 degrees; still and sharp.
+The residual says nothing about accuracy (it is as small for 8 photos as for 40): look at ±.
+
+  --photos FOLDER            calibrate with the photos of a folder
+  --photos FOLDER --watch    look on while photos come in, say what is missing, then calibrate
+  --photos FOLDER --url URL  take still views from a running station into the folder, likewise
+  --check                    only say what the photos cover and what to do next"""
+
+_HAND_EYE = """\
+The board stands still; the tracker with its camera is held still at every photo. Turn it by 30
+degrees and more about at least two of its axes, better three. The camera must be calibrated first
+(--intrinsics says where, when not in the same folder). With poses of the board in the file no
+photos are needed. When poses are refused as inverted, --invert turns that side round."""
+
+_GLOVE = """\
+Takes are folders of the station's spool (or ids of recordings, with --store): this command works
+on takes only, since a station shows pressures live, not counts.
+
+The list of presses is a CSV: take and pressure_kpa, or mass_kg and area_cm2 of a weight; and if
+wanted sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds from the take's start).
+  take,pressure_kpa,sigma_kpa,pads
+  spool/bladder-10,10,0.1,all
+  spool/bladder-30,30,0.3,all
+Without --presses only the tare is measured, which may be done every day; the gain stays."""
+
+
+def main(argv: Sequence[str]) -> int:
+    """Calibrate one thing, or show what is there.
+
+    Returns:
+        0; of `show` 1 where something is missing or wrong (level ERROR).
+    """
+    options = _parser().parse_args(list(argv))
+    report = _WORDS[options.word](options)
+    if options.json is not None:
+        options.json.parent.mkdir(parents=True, exist_ok=True)
+        text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
+        options.json.write_text(text + "\n", encoding="utf-8")
+    return EXIT_LEVEL if report.get("level") == "ERROR" else 0
+
+
+def _camera(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import camera, live
+
+    board = parse_board(options.board)
+    if options.watch and options.url is not None:
+        raise InvalidInputError("got --watch and --url, expected one of the two")
+    if options.watch or options.url is not None:
+        live.run(options, board)
+    return camera.calibrate(options)
+
+
+def _hand_eye(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import hand_eye
+
+    return hand_eye.calibrate(options)
+
+
+def _glove(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import glove
+
+    return glove.calibrate(options)
+
+
+def _show(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import show
+
+    return show.show(options)
+
+
+_WORDS: dict[str, Callable[[argparse.Namespace], Report]] = {
+    "camera": _camera,
+    "hand-eye": _hand_eye,
+    "glove": _glove,
+    "show": _show,
+}
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="dextouch station calibrate",
+        description=_ABOUT,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    words = parser.add_subparsers(dest="word", required=True, metavar="WORD")
+    _add_camera(_word(words, "camera", "photos of a board → K and distortion of a camera", _CAMERA))
+    _add_hand_eye(_word(words, "hand-eye", "photos and poses → camera on its tracker", _HAND_EYE))
+    _add_glove(_word(words, "glove", "rest and pressed takes → tare, gain, faults", _GLOVE))
+    shown = _word(words, "show", "what a calibration holds, how old and how good it is", "")
+    shown.add_argument("folder", type=Path, help="calibration folder or file, or a spooled take")
+    return parser
+
+
+def _word(
+    words: "argparse._SubParsersAction[argparse.ArgumentParser]", name: str, does: str, more: str
+) -> argparse.ArgumentParser:
+    parser = words.add_parser(
+        name,
+        help=does,
+        description=does,
+        epilog=more,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
+    return parser
+
+
+def _add_common(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--to", type=Path, required=True, metavar="FOLDER", help="of the calibration; made if new"
+    )
+
+
+def _add_cameras(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--camera", required=True, choices=("head", "wrist_left", "wrist_right"))
+    parser.add_argument("--check", action="store_true", help="only say what is missing")
+
+
+def _add_camera(parser: argparse.ArgumentParser) -> None:
+    _add_common(parser)
+    _add_cameras(parser)
+    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER", help="of photos")
+    parser.add_argument("--board", required=True, metavar="BOARD", help=BOARD_HELP)
+    parser.add_argument("--watch", action="store_true", help="look on while photos come in")
+    parser.add_argument("--url", metavar="URL", help="take photos from this running station")
+    parser.add_argument("--key", metavar="KEY", help="API key of the station")
+
+
+def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
+    _add_common(parser)
+    _add_cameras(parser)
+    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="CSV or JSON")
+    parser.add_argument("--photos", type=Path, metavar="FOLDER", help="photos that FILE names")
+    parser.add_argument("--board", metavar="BOARD", help=BOARD_HELP)
+    parser.add_argument(
+        "--intrinsics", type=Path, metavar="FOLDER", help="calibration with K (default: --to)"
+    )
+    parser.add_argument("--invert", choices=("tracker", "board"), help="turn this side's poses")
+
+
+def _add_glove(parser: argparse.ArgumentParser) -> None:
+    _add_common(parser)
+    parser.add_argument("--side", required=True, choices=("left", "right"))
+    parser.add_argument("--rest", required=True, metavar="TAKE", help="10 s without contact")
+    parser.add_argument("--presses", type=Path, metavar="CSV", help="list of takes under pressure")
+    parser.add_argument("--store", metavar="URL", help="where recordings named by id are")
+    parser.add_argument(
+        "--pressure-sigma",
+        type=float,
+        default=0.02,
+        metavar="RATIO",
+        help="sigma of pressures without sigma_kpa, as a part of them (%(default)s)",
+    )
+    parser.add_argument(
+        "--full-scale",
+        type=float,
+        default=65535.0,
+        metavar="COUNTS",
+        help="largest count of the glove (%(default)g)",
+    )

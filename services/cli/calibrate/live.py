@@ -1,0 +1,182 @@
+"""Photos that come one by one, from a folder or a running station; a growing set of views out."""
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.clients.http_link import HttpLink
+from dextouch.errors import NotFoundError, StaleDataError
+from services.cli.calibrate.advice import camera_coverage
+from services.cli.calibrate.boards import Board, BoardView, find_board
+from services.cli.calibrate.camera import Found, write_coverage
+from services.cli.calibrate.photos import SUFFIXES, decode_photo
+
+LIVE_PERIOD_S = 0.2
+WATCH_PERIOD_S = 1.0
+# A board that moved more between two live images is blurred along its motion (0.5 px at 6 px).
+MAX_MOTION_PX = 1.5
+# Views nearer to a kept one than this part of the image's diagonal add nothing.
+MIN_NEWS = 0.04
+MAX_VIEWS = 60
+
+Arrivals = Iterator[tuple[str, bytes]]
+Wait = Callable[[float], None]
+
+
+class Session:
+    """Views of one camera as they come, with the picture of what they cover.
+
+    Args:
+        board: to look for.
+        folder: of the calibration; the picture is kept there.
+        camera: name of the camera.
+    """
+
+    def __init__(self, board: Board, folder: Path, camera: str) -> None:
+        self.views: list[BoardView] = []
+        self.todo: tuple[str, ...] = ("hold the board in front of the camera",)
+        self._board, self._folder, self._camera = board, folder, camera
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether nothing is left to do, or no more views are of use."""
+        return not self.todo or len(self.views) >= MAX_VIEWS
+
+    def find(self, name: str, photo: np.ndarray) -> BoardView | None:
+        """The board in a photo; None where it is not seen."""
+        return find_board(name, photo, self._board)
+
+    def is_new(self, view: BoardView, photo: np.ndarray) -> bool:
+        """Whether no kept view shows the board nearly there already."""
+        height_px, width_px = photo.shape
+        needed_px = MIN_NEWS * float(np.hypot(width_px, height_px))
+        return all(motion_px(view, kept) > needed_px for kept in self.views)
+
+    def keep(self, view: BoardView, photo: np.ndarray) -> None:
+        """Add a view, draw the picture and say what is next."""
+        self.views.append(view)
+        size_px = (photo.shape[1], photo.shape[0])
+        coverage = camera_coverage(self.views, size_px)
+        found = Found(tuple(self.views), (), size_px, view.pattern)
+        path = write_coverage(found, coverage, self._folder, self._camera)
+        if coverage.todo != self.todo or len(self.views) == 1:
+            print(f"{len(self.views)} views ({path}); next: {'; '.join(coverage.todo) or 'done'}")
+        self.todo = coverage.todo
+
+
+def motion_px(a: BoardView, b: BoardView) -> float:
+    """Mean distance of the corners that both views show; infinity when they share none."""
+    places = {tuple(place): index for index, place in enumerate(b.points_board.tolist())}
+    pairs = [
+        (index, places[tuple(place)])
+        for index, place in enumerate(a.points_board.tolist())
+        if tuple(place) in places
+    ]
+    if not pairs:
+        return float("inf")
+    mine, other = (np.array(side) for side in zip(*pairs, strict=True))
+    return float(np.linalg.norm(a.pixels[mine] - b.pixels[other], axis=1).mean())
+
+
+def follow_folder(session: Session, arrivals: Arrivals) -> None:
+    """Look at photos as somebody else puts them into a folder, until there are enough."""
+    for name, data in arrivals:
+        photo = decode_photo(data, where=name)
+        view = session.find(name, photo)
+        if view is None:
+            print(f"{name}: no board")
+        else:
+            session.keep(view, photo)
+        if session.is_enough:
+            return
+
+
+def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
+    """Keep live images of a board that stands still somewhere new; their number.
+
+    Args:
+        session: views so far.
+        arrivals: images of the camera, JPEG.
+        photos: folder for those that are kept.
+    """
+    photos.mkdir(parents=True, exist_ok=True)
+    before: BoardView | None = None
+    num_kept = len(list(photos.glob("live_*.jpg")))
+    num_before = num_kept
+    for name, data in arrivals:
+        photo = decode_photo(data, where=name)
+        view = session.find(name, photo)
+        still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
+        before = view
+        if view is None or not still or not session.is_new(view, photo):
+            continue
+        (photos / f"live_{num_kept:04d}.jpg").write_bytes(data)
+        num_kept += 1
+        session.keep(view, photo)
+        if session.is_enough:
+            break
+    return num_kept - num_before
+
+
+def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
+    """Photos of a folder, and each new one after it, for ever.
+
+    Raises:
+        NotFoundError: no such folder.
+    """
+    if not folder.is_dir():
+        raise NotFoundError(f"{folder}: no such folder of photos")
+    seen: set[Path] = set()
+    while True:
+        new = sorted(p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and p not in seen)
+        for path in new:
+            seen.add(path)
+            yield path.name, path.read_bytes()
+        wait(WATCH_PERIOD_S)
+
+
+def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) -> Arrivals:
+    """Newest images of a station's camera, five a second, for ever; repeated ones are skipped.
+
+    Args:
+        newest: asks the station for the newest image, JPEG.
+        wait: passes the time between two questions.
+    """
+    last = b""
+    for number in count():
+        try:
+            data = newest()
+        except StaleDataError:
+            # The camera pauses; an old image would be taken for a board that stands still.
+            data = b""
+        if data and data != last:
+            last = data
+            yield f"live image {number}", data
+        wait(LIVE_PERIOD_S)
+
+
+def run(options: argparse.Namespace, board: Board) -> None:
+    """Collect with `--url`, or look on with `--watch`, until there is enough or Ctrl-C.
+
+    Raises:
+        UnavailableError: the station does not answer.
+    """
+    session = Session(board, options.to, options.camera)
+    print("Ctrl-C ends the collecting and calibrates with what is there")
+    try:
+        if options.url is None:
+            follow_folder(session, folder_arrivals(options.photos))
+            return
+        link = HttpLink(options.url, api_key=options.key)
+        path = f"/v1/live/cameras/camera_{options.camera}"
+
+        def newest() -> bytes:
+            return link.request("GET", path, accept="image/jpeg").body
+
+        collect_live(session, station_arrivals(newest), options.photos)
+    except KeyboardInterrupt:
+        print(f"stopped with {len(session.views)} views")

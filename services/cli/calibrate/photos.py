@@ -1,0 +1,72 @@
+"""A folder of photos in; their names and grey pixels out."""
+
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+from rich.console import Console
+from rich.progress import track
+
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+
+Item = TypeVar("Item")
+SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
+
+
+def photo_paths(folder: Path) -> list[Path]:
+    """Photos of a folder by name.
+
+    Raises:
+        NotFoundError: no folder, or no photo in it.
+    """
+    if not folder.is_dir():
+        raise NotFoundError(f"{folder}: no such folder of photos")
+    paths = sorted(path for path in folder.iterdir() if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise NotFoundError(f"{folder}: holds no photo; expected {', '.join(SUFFIXES)}")
+    return paths
+
+
+def read_photos(paths: Iterable[Path]) -> list[UInt8[np.ndarray, "h w"]]:
+    """Grey pixels of photos of one size.
+
+    Raises:
+        CorruptDataError: a file that is no photo.
+        InvalidInputError: photos of different sizes.
+    """
+    photos, size = [], None
+    for path in progress(list(paths), "reading photos"):
+        photo = decode_photo(path.read_bytes(), where=str(path))
+        if size is not None and photo.shape != size[1]:
+            raise InvalidInputError(
+                f"{path}: got {photo.shape[1]} by {photo.shape[0]} px, expected "
+                f"{size[1][1]} by {size[1][0]} as {size[0]}; photos must come from one camera mode"
+            )
+        size = size or (path.name, photo.shape)
+        photos.append(photo)
+    return photos
+
+
+def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
+    """Grey pixels of an encoded photo.
+
+    Raises:
+        CorruptDataError: bytes that are no image.
+    """
+    import cv2
+
+    bytes_ = np.frombuffer(data, dtype=np.uint8)
+    photo = cv2.imdecode(bytes_, cv2.IMREAD_GRAYSCALE) if data else None
+    if photo is None:
+        raise CorruptDataError(f"{where}: {len(data)} bytes are no image")
+    return np.asarray(photo, dtype=np.uint8)
+
+
+def progress(items: list[Item], what: str) -> Iterator[Item]:
+    """The items, with a bar on stderr where somebody looks at it."""
+    console = Console(stderr=True)
+    yield from track(
+        items, total=len(items), description=what, console=console, disable=not console.is_terminal
+    )

@@ -1,0 +1,260 @@
+"""A calibration folder: named matrices as recordings carry them, and what is known about each.
+
+`calibration.json` is what a station reads (DEXTOUCH_ACQUISITION_CALIBRATION). Sigma and time of a
+matrix are matrices too (`…_sigma…`, `…_calibrated_at_unix_s`), so that they travel with every
+recording.
+"""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+
+from dextouch import __version__
+from dextouch.episodes.files import replace_file
+from dextouch.errors import CorruptDataError, InvalidInputError, NonFiniteError, NotFoundError
+from dextouch.schemas.episodes import Matrix, matrix_rows
+
+MATRICES_FILE = "calibration.json"
+DETAILS_FILE = "calibration_details.json"
+PICTURES = "pictures"
+MAX_AGE_S = 7 * 86_400.0
+
+_MATRICES: TypeAdapter[dict[str, Matrix]] = TypeAdapter(dict[str, Matrix])
+
+# What may be known to no better than this (relative or absolute) before `show` warns.
+SIGMA_LIMITS = {"focal": 0.003, "rotation_rad": np.deg2rad(0.06), "translation_m": 0.8e-3}
+MAX_GAIN_SIGMA = 0.05
+MAX_TAXEL_FAULTS = (0.01, 0.05)
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One calibrated thing: how old, how good.
+
+    `level` is OK, WARN or ERROR; `reasons` say why it is not OK and what to do.
+    """
+
+    name: str
+    shape: str
+    made_at: str | None
+    age_days: float | None
+    sigma: str
+    level: str
+    reasons: tuple[str, ...]
+
+
+def write_entry(
+    folder: Path,
+    *,
+    entry: str,
+    matrices: Mapping[str, np.ndarray],
+    facts: Mapping[str, object],
+    now: datetime,
+) -> None:
+    """Put matrices into a folder's calibration; those of other entries stay.
+
+    Args:
+        folder: made when absent.
+        entry: name of the main thing, such as `K_head`; its time is kept as
+            `<entry>_calibrated_at_unix_s`.
+        matrices: two-dimensional, finite.
+        facts: sigma, inputs and the like, for people; JSON.
+        now: when it was measured, with a time zone.
+
+    Raises:
+        NonFiniteError: NaN or infinity in a matrix.
+        CorruptDataError: what is there already cannot be read.
+    """
+    for name, matrix in matrices.items():
+        if not np.isfinite(matrix).all():
+            raise NonFiniteError(f"calibration {name!r}: NaN or infinity; nothing was written")
+    # Whole seconds: exact in a matrix of float64.
+    stamp = np.array([[float(int(now.timestamp()))]])
+    old = read_matrices(folder) if (folder / MATRICES_FILE).exists() else {}
+    details = read_details(folder)
+    new = {
+        name: matrix_rows(m)
+        for name, m in {**matrices, f"{entry}_calibrated_at_unix_s": stamp}.items()
+    }
+    details[entry] = {
+        **facts,
+        "made_at": now.astimezone(UTC).isoformat(timespec="seconds"),
+        "software": f"dextouch {__version__}",
+        "matrices": sorted(new),
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / DETAILS_FILE, details)
+    _write(folder / MATRICES_FILE, {**old, **new})
+
+
+def read_matrices(folder: Path) -> dict[str, Matrix]:
+    """The matrices of a folder, or of a JSON file of matrices.
+
+    Raises:
+        NotFoundError: none there.
+        CorruptDataError: no JSON of matrices.
+    """
+    path = folder / MATRICES_FILE if folder.is_dir() else folder
+    if not path.is_file():
+        raise NotFoundError(
+            f"{path}: no calibration there; `dextouch station calibrate camera --help` begins one"
+        )
+    try:
+        return _MATRICES.validate_json(path.read_bytes())
+    except ValidationError as error:
+        raise CorruptDataError(f"{path}: no JSON of named matrices ({error})") from error
+
+
+def read_details(folder: Path) -> dict[str, object]:
+    """What is known about each entry; nothing for a folder without that file.
+
+    Raises:
+        CorruptDataError: no JSON object.
+    """
+    path = folder / DETAILS_FILE
+    if not path.is_file():
+        return {}
+    try:
+        details = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise CorruptDataError(f"{path}: no JSON ({error})") from error
+    if not isinstance(details, dict):
+        raise CorruptDataError(f"{path}: got {type(details).__name__}, expected a JSON object")
+    return details
+
+
+def write_picture(folder: Path, name: str, svg: str) -> Path:
+    """Keep a picture beside the matrices; its path."""
+    path = folder / PICTURES / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(svg, encoding="utf-8")
+    return path
+
+
+def named_matrix(matrices: Mapping[str, Matrix], name: str, shape: tuple[int, int]) -> np.ndarray:
+    """One matrix as float64.
+
+    Raises:
+        NotFoundError: missing.
+        InvalidInputError: of another shape.
+    """
+    if name not in matrices:
+        raise NotFoundError(
+            f"calibration: {name!r} is missing; there is {', '.join(sorted(matrices)) or 'nothing'}"
+        )
+    matrix = np.array(matrices[name], dtype=np.float64)
+    if matrix.shape != shape:
+        raise InvalidInputError(f"calibration {name!r}: got {matrix.shape}, expected {shape}")
+    return matrix
+
+
+def judge(matrices: Mapping[str, Matrix], *, now: datetime) -> list[Finding]:
+    """Every calibrated thing among the matrices, with age and sigma."""
+    return [
+        _judge_one(name, matrices, now)
+        for name in sorted(matrices)
+        if not _is_companion(name, matrices)
+    ]
+
+
+def _is_companion(name: str, matrices: Mapping[str, Matrix]) -> bool:
+    """Whether a matrix only tells about another one."""
+    if name.endswith("calibrated_at_unix_s") or "_sigma_" in name:
+        return True
+    side = name.removeprefix("tactile_").split("_")[0]
+    if name in {f"tactile_{side}_noise_counts", f"tactile_{side}_taxel_state"}:
+        return True
+    camera = name.removeprefix("distortion_").removeprefix("image_size_").removesuffix("_px")
+    return camera != name and f"K_{camera}" in matrices
+
+
+def entry_of(name: str) -> str:
+    """The entry that a matrix belongs to: its name without the unit."""
+    for unit in ("_counts_per_kpa", "_counts", "_ns"):
+        name = name.removesuffix(unit)
+    return name
+
+
+def _judge_one(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Finding:
+    entry, reasons = entry_of(name), []
+    made_at = age_days = None
+    if f"{entry}_calibrated_at_unix_s" in matrices:
+        made = datetime.fromtimestamp(
+            float(matrices[f"{entry}_calibrated_at_unix_s"][0][0]), tz=UTC
+        )
+        made_at, age_s = made.isoformat(timespec="seconds"), (now - made).total_seconds()
+        age_days = age_s / 86_400
+        if age_s > MAX_AGE_S:
+            reasons.append(f"{age_days:.0f} days old, expected at most 7; calibrate again")
+        if age_s < -60:
+            reasons.append("made in the future; set the clock of one of the two machines")
+    else:
+        reasons.append("age unknown; calibrate again with this command")
+    sigma, sigma_reasons = _sigma(name, matrices)
+    reasons += sigma_reasons
+    level = "WARN" if reasons else "OK"
+    if any(reason.startswith("ERROR ") for reason in reasons):
+        level = "ERROR"
+    shape = "x".join(str(n) for n in np.shape(matrices[name]))
+    told = tuple(reason.removeprefix("ERROR ") for reason in reasons)
+    return Finding(name, shape, made_at, age_days, sigma, level, told)
+
+
+def _sigma(name: str, matrices: Mapping[str, Matrix]) -> tuple[str, list[str]]:
+    """The sigma in words, and what is wrong with it."""
+    found = {
+        suffix: np.array(matrices[f"{entry_of(name)}_sigma_{suffix}"])
+        for suffix in ("px", "rad", "m", "counts", "counts_per_kpa", "ns")
+        if f"{entry_of(name)}_sigma_{suffix}" in matrices
+    }
+    if not found:
+        return "unknown", ["sigma unknown"]
+    if "px" in found:
+        relative = float((found["px"][0, :2] / np.diag(matrices[name])[:2]).max())
+        limit = SIGMA_LIMITS["focal"]
+        wrong = f"focal length known to {relative:.2%}, expected {limit:.1%}; add views"
+        return f"focal length {relative:.2%}", [wrong] if relative > limit else []
+    if "rad" in found and "m" in found:
+        return _mount_sigma(float(found["rad"].max()), float(found["m"].max()))
+    if "counts_per_kpa" in found:
+        return _gain_sigma(name, found["counts_per_kpa"], matrices)
+    if "ns" in found:
+        return f"{found['ns'].max() * 1e-6:.2f} ms", []
+    return f"{np.median(found['counts']):.2f} counts", []
+
+
+def _mount_sigma(rotation_rad: float, translation_m: float) -> tuple[str, list[str]]:
+    told = f"{np.rad2deg(rotation_rad):.3f}°, {translation_m * 1e3:.2f} mm"
+    good = (
+        rotation_rad <= SIGMA_LIMITS["rotation_rad"]
+        and translation_m <= SIGMA_LIMITS["translation_m"]
+    )
+    return told, [] if good else ["expected 0.06° and 0.8 mm; add views, turned further"]
+
+
+def _gain_sigma(
+    name: str, sigma: np.ndarray, matrices: Mapping[str, Matrix]
+) -> tuple[str, list[str]]:
+    known = sigma > 0
+    if not known.any():
+        return "unknown", ["sigma unknown"]
+    relative = float(np.median(sigma[known] / np.array(matrices[name])[known]))
+    reasons = []
+    if relative > MAX_GAIN_SIGMA:
+        reasons.append(f"gain known to {relative:.1%}, expected {MAX_GAIN_SIGMA:.0%}; press harder")
+    state = np.array(matrices.get(f"{entry_of(name).removesuffix('_gain')}_taxel_state", [[0.0]]))
+    share = np.count_nonzero(state) / 320
+    if share > MAX_TAXEL_FAULTS[0]:
+        worst = "ERROR " if share > MAX_TAXEL_FAULTS[1] else ""
+        reasons.append(f"{worst}{np.count_nonzero(state)} of 320 taxels faulty")
+    return f"gain {relative:.2%}", reasons
+
+
+def _write(path: Path, content: object) -> None:
+    text = json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
+    replace_file(path, text.encode())

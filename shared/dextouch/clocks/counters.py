@@ -1,0 +1,168 @@
+"""A sample's stamps as a device sent them in, one straight device time in nanoseconds out."""
+
+from typing import Literal, Protocol, runtime_checkable
+
+from dextouch.errors import InvalidInputError
+
+ABSENT = -1
+# Stamps coarser than this share of the sample period say less than counting samples does.
+COARSE_SHARE = 0.25
+
+Source = Literal["device", "sequence", "arrival"]
+
+
+@runtime_checkable
+class Capabilities(Protocol):
+    """What `dextouch.streams.descriptors.ClockCapabilities` tells about a device's counters."""
+
+    @property
+    def sequence_bits(self) -> int:
+        """Width of the sequence number."""
+
+    @property
+    def tick_ns(self) -> int:
+        """Resolution of the device's stamp."""
+
+    @property
+    def device_time_bits(self) -> int:
+        """Width of the device's stamp, in ticks."""
+
+
+@runtime_checkable
+class ClockSource(Protocol):
+    """The part of a stream's descriptor that a clock needs."""
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """Counters of the device."""
+
+    def period_ns(self) -> int:
+        """Nominal distance of two samples."""
+
+
+class TickCounter:
+    """A wrapping counter of ticks that are no whole nanoseconds (48 MHz), made straight.
+
+    Args:
+        bits: width of the counter.
+        ticks_per_s: its rate.
+    """
+
+    def __init__(self, bits: int, ticks_per_s: int) -> None:
+        if not 8 <= bits <= 62 or ticks_per_s < 1:
+            raise InvalidInputError(
+                f"tick counter: got {bits} bits at {ticks_per_s} ticks a second, expected 8 … 62 "
+                "bits and at least 1 tick a second"
+            )
+        self._modulus = 2**bits
+        self._ticks_per_s = ticks_per_s
+        self._last: tuple[int, int] | None = None
+
+    def to_ns(self, count: int, t_host_ns: int) -> int:
+        """Device time in ns, exact and without wraps, of a count that arrived at a host time.
+
+        Raises:
+            InvalidInputError: a count that the counter cannot hold.
+        """
+        if not 0 <= count < self._modulus:
+            raise InvalidInputError(
+                f"tick counter: got a count of {count}, expected 0 … {self._modulus - 1}"
+            )
+        straight = count
+        if self._last is not None:
+            waited_ticks = (t_host_ns - self._last[1]) * self._ticks_per_s // 10**9
+            straight = nearest_congruent(count, self._last[0] + waited_ticks, self._modulus)
+        self._last = (straight, t_host_ns)
+        return straight * 10**9 // self._ticks_per_s
+
+
+class DeviceCounter:
+    """What a device says of time, made straight: its stamps, else its numbers times its period.
+
+    Which of them is decided by the first sample: the stamp where there is one, unless it is
+    coarser than a quarter of the period and samples are numbered.
+
+    Args:
+        descriptor: the stream's descriptor; needed for counters that wrap, for the resolution
+            of stamps, and for streams that have only a sequence number.
+    """
+
+    def __init__(self, descriptor: ClockSource | None) -> None:
+        self._descriptor = descriptor
+        self._period_ns = 0 if descriptor is None else descriptor.period_ns()
+        self._resolution_ns = 0
+        self._modulus_ns: int | None = None
+        self._last: tuple[int, int] | None = None
+        self._source: Source | None = None
+
+    @property
+    def source(self) -> Source | None:
+        """What device time is made of; None before the first sample."""
+        return self._source
+
+    @property
+    def resolution_ns(self) -> int:
+        """How coarse the straight device time is: it is cut down to multiples of this."""
+        return self._resolution_ns
+
+    def straighten(
+        self, t_host_ns: int, t_device_ns: int | None, sequence: int | None
+    ) -> int | None:
+        """Device time of one sample, in ns; None where the device tells nothing.
+
+        Raises:
+            InvalidInputError: a stamp or number that earlier samples had is missing.
+        """
+        t_device_ns = None if t_device_ns == ABSENT else t_device_ns
+        sequence = None if sequence == ABSENT else sequence
+        if self._source is None:
+            self._choose(has_time=t_device_ns is not None, has_sequence=sequence is not None)
+        if self._source == "arrival":
+            return None
+        if self._source == "device" and t_device_ns is not None:
+            return self._unwrap(t_device_ns, t_host_ns)
+        if self._source == "sequence" and sequence is not None:
+            return self._unwrap(sequence * self._period_ns, t_host_ns)
+        raise InvalidInputError(
+            f"online clock: a sample at {t_host_ns} ns came without its {self._source} stamp, "
+            "which earlier samples had; expected the same fields in every sample of a stream"
+        )
+
+    def _choose(self, *, has_time: bool, has_sequence: bool) -> None:
+        if self._descriptor is None:
+            self._source = "device" if has_time else "arrival"
+            return
+        device = self._descriptor.capabilities
+        if has_time and not (has_sequence and prefers_sequence(device.tick_ns, self._period_ns)):
+            self._source = "device"
+            self._resolution_ns = device.tick_ns
+            self._modulus_ns = _modulus(device.device_time_bits, device.tick_ns)
+        elif has_sequence:
+            self._source = "sequence"
+            self._modulus_ns = _modulus(device.sequence_bits, self._period_ns)
+        else:
+            self._source = "arrival"
+
+    def _unwrap(self, count_ns: int, t_host_ns: int) -> int:
+        straight = count_ns
+        if self._modulus_ns is not None and self._last is not None:
+            expected_ns = self._last[0] + t_host_ns - self._last[1]
+            straight = nearest_congruent(count_ns, expected_ns, self._modulus_ns)
+        self._last = (straight, t_host_ns)
+        return straight
+
+
+def nearest_congruent(count: int, expected: int, modulus: int) -> int:
+    """The number nearest to the expected one that leaves the count when it wraps."""
+    half = modulus // 2
+    return expected + (count - expected + half) % modulus - half
+
+
+def prefers_sequence(tick_ns: int, period_ns: int) -> bool:
+    """Whether stamps are so coarse that numbering samples dates them better."""
+    return tick_ns > COARSE_SHARE * period_ns
+
+
+def _modulus(bits: int, unit_ns: int) -> int | None:
+    """Nanoseconds after which the device's counter starts again, if ever."""
+    return None if bits > 62 else 2**bits * unit_ns

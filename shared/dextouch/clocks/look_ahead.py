@@ -1,0 +1,221 @@
+"""Arrivals of samples without stamps in; how many got lost between them, and their times, out.
+
+Such a device's clock is its sample count. Whether a late sample is late, or the one before it was
+lost, only the samples behind it tell: the earliest of the next ten has hardly waited.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.clocks.online_clock import COUNTED_SLOPE_SPAN_S
+from dextouch.clocks.running_envelope import RunningEnvelope
+from dextouch.errors import InvalidInputError
+
+LOOK_AHEAD = 10
+# A sample counts as lost where everything behind is later by nearly a period: delays are common,
+# losses are rare.
+LOST_SHARE = 0.75
+# While a queue drains the answer may have to wait for so many times more samples.
+MAX_WAIT = 6
+# Provisional times believe in a loss after so many late samples.
+LOOK_BACK = 3
+
+
+class CountedSample(NamedTuple):
+    """One sample without a stamp.
+
+    Attributes:
+        number: as the device must have counted, 0 for the first.
+        t_host_ns: when it left the device, on the host's clock.
+    """
+
+    number: int
+    t_host_ns: int
+
+
+class LookAheadUpdate(NamedTuple):
+    """What an arrival brings: its own provisional time, and final ones of older samples."""
+
+    provisional_ns: int
+    final: tuple[CountedSample, ...]
+
+
+class LookAheadClock:
+    """Dates the samples of a steady device that sends neither time nor sequence numbers.
+
+    Final times come `look_ahead` samples later, or once a queue has drained; a provisional one
+    comes at once.
+
+    Args:
+        period_ns: nominal distance of two samples, right within a few percent.
+        look_ahead: samples to wait for.
+    """
+
+    def __init__(self, period_ns: int, *, look_ahead: int = LOOK_AHEAD) -> None:
+        if period_ns < 1 or look_ahead < 1:
+            raise InvalidInputError(
+                f"look-ahead clock: got a period of {period_ns} ns and {look_ahead} samples, "
+                "expected at least 1 each"
+            )
+        self._period_ns = period_ns
+        self._look_ahead = look_ahead
+        self._waiting: deque[int] = deque()
+        self._envelope = RunningEnvelope(min_slope_span_s=COUNTED_SLOPE_SPAN_S)
+        self._start_ns: int | None = None
+        self._index = -1
+        self._num_lost = 0
+        self._last_final_ns: int | None = None
+        self._last_provisional_ns: int | None = None
+
+    @property
+    def num_lost(self) -> int:
+        """Samples that never arrived, as far as final times go."""
+        return self._num_lost
+
+    @property
+    def num_steps(self) -> int:
+        """Restarts of the device, and losses that were miscounted and mended."""
+        return self._envelope.num_steps
+
+    @property
+    def skew_ppm(self) -> float:
+        """How much longer a sample period is than the nominal one."""
+        return self._envelope.slope_ns_per_s * 1e-3
+
+    def update(self, t_host_ns: int) -> LookAheadUpdate:
+        """Take in one arrival on the host's monotonic clock.
+
+        Raises:
+            InvalidInputError: it lies before the one before.
+        """
+        final = self.advance(t_host_ns)
+        return LookAheadUpdate(self._provisional_ns(t_host_ns), final)
+
+    def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
+        """As `update`, for those who need final times only.
+
+        Raises:
+            InvalidInputError: the arrival lies before the one before.
+        """
+        if self._waiting and t_host_ns < self._waiting[-1]:
+            raise InvalidInputError(
+                f"look-ahead clock: got an arrival at {t_host_ns} ns after one at "
+                f"{self._waiting[-1]} ns, expected the order of arrival"
+            )
+        if self._start_ns is None:
+            self._start_ns = t_host_ns
+        self._waiting.append(t_host_ns)
+        final: list[CountedSample] = []
+        while len(self._waiting) > self._look_ahead and (sample := self._decide()) is not None:
+            final.append(sample)
+        return tuple(final)
+
+    def flush(self) -> tuple[CountedSample, ...]:
+        """Final times of the samples that still wait, with what little lies ahead of them."""
+        decided = (self._decide(is_last_chance=True) for _ in range(len(self._waiting)))
+        return tuple(sample for sample in decided if sample is not None)
+
+    def _lateness_ns(self, first: int, last: int) -> list[float]:
+        """How much later some waiting samples came than they could have, were none lost."""
+        start_ns = self._start_ns if self._start_ns is not None else 0
+        period_ns = self._period_ns * (1 + self._envelope.slope_ns_per_s * 1e-9)
+        x_ns = (self._index + 1) * self._period_ns
+        origin_ns = start_ns + x_ns + round(self._envelope.at(x_ns * 1e-9))
+        waiting = self._waiting
+        return [waiting[k] - origin_ns - k * period_ns for k in range(first, last)]
+
+    def _num_lost_before(self, *, is_last_chance: bool) -> int | None:
+        """Samples lost before the oldest that waits; None while that cannot be told."""
+        if self._index < 0:
+            return 0
+        threshold_ns = LOST_SHARE * self._period_ns
+        if self._lateness_ns(0, 1)[0] < threshold_ns:
+            return 0
+        late_ns = self._lateness_ns(0, len(self._waiting))
+        least_ns = min(late_ns)
+        if least_ns < threshold_ns:
+            return 0
+        # A queue that still drains: what comes next will have waited less.
+        draining = late_ns[-1] <= least_ns
+        if draining and not is_last_chance and len(late_ns) < MAX_WAIT * self._look_ahead:
+            return None
+        return int(least_ns / self._period_ns + 1.0 - LOST_SHARE)
+
+    def _decide(self, *, is_last_chance: bool = False) -> CountedSample | None:
+        num_lost = self._num_lost_before(is_last_chance=is_last_chance)
+        if num_lost is None or self._start_ns is None:
+            return None
+        self._num_lost += num_lost
+        self._index += 1 + num_lost
+        since_ns = self._waiting.popleft() - self._start_ns
+        x_ns = self._index * self._period_ns
+        offset_ns = self._envelope.add(x_ns * 1e-9, float(since_ns - x_ns), since_ns * 1e-9)
+        final_ns = self._start_ns + x_ns + round(offset_ns)
+        if self._last_final_ns is not None:
+            final_ns = max(final_ns, self._last_final_ns + 1)
+        self._last_final_ns = final_ns
+        return CountedSample(self._index, final_ns)
+
+    def _provisional_ns(self, t_host_ns: int) -> int:
+        """When the newest sample left if the last few tell of losses, without looking ahead."""
+        estimate_ns = t_host_ns
+        if self._index >= 0 and self._waiting:
+            num = len(self._waiting)
+            late_ns = self._lateness_ns(max(0, num - LOOK_BACK), num)
+            num_lost = max(0, int(min(late_ns) / self._period_ns + 1.0 - LOST_SHARE))
+            waited_ns = late_ns[-1] - num_lost * self._period_ns
+            estimate_ns = t_host_ns - max(0, round(waited_ns))
+        if self._last_provisional_ns is not None:
+            estimate_ns = max(estimate_ns, self._last_provisional_ns + 1)
+        self._last_provisional_ns = estimate_ns
+        return estimate_ns
+
+
+@dataclass(frozen=True)
+class CountedTake:
+    """A whole take of samples without stamps, dated.
+
+    Attributes:
+        number: of each sample as the device must have counted, 0 for the first.
+        t_host_ns: when each left the device, on the host's clock, strictly increasing.
+        skew_ppm: how much longer a sample period is than the nominal one, at the end.
+        num_lost: samples that never arrived.
+        num_steps: restarts of the device, and losses that were miscounted and mended.
+    """
+
+    number: Int64[np.ndarray, " n"]
+    t_host_ns: Int64[np.ndarray, " n"]
+    skew_ppm: float
+    num_lost: int
+    num_steps: int
+
+
+def date_by_counting(
+    t_host_ns: np.ndarray, *, period_ns: int, look_ahead: int = LOOK_AHEAD
+) -> CountedTake:
+    """Date the samples of a steady device by their arrivals alone.
+
+    Args:
+        t_host_ns: arrivals [n] in order, int64.
+        period_ns: nominal distance of two samples, right within a few percent.
+        look_ahead: samples to look ahead.
+
+    Raises:
+        InvalidInputError: arrivals out of order.
+    """
+    clock = LookAheadClock(period_ns, look_ahead=look_ahead)
+    counted: list[CountedSample] = []
+    for arrival_ns in np.asarray(t_host_ns, dtype=np.int64).tolist():
+        counted.extend(clock.advance(arrival_ns))
+    counted.extend(clock.flush())
+    return CountedTake(
+        number=np.array([sample.number for sample in counted], dtype=np.int64),
+        t_host_ns=np.array([sample.t_host_ns for sample in counted], dtype=np.int64),
+        skew_ppm=clock.skew_ppm,
+        num_lost=clock.num_lost,
+        num_steps=clock.num_steps,
+    )

@@ -1,0 +1,197 @@
+"""Questions and answers between two clocks in, the offset between them with its sigma out.
+
+The way there bounds the offset from above, the way back from below: remote minus local lies
+between (answer sent - answer received) and (question received - question sent). Over many exchanges
+the quickest ways of either direction leave a narrow band (as NTP does with the least round trip,
+here with drift: Zhang, Liu, Xia 2002). Where in the band the offset lies, the exchanges cannot
+show, since the two ways may differ; the sigma says so.
+"""
+
+import math
+from dataclasses import dataclass
+
+from dextouch.clocks.lower_hull import LowerHull
+from dextouch.errors import ClockFitError, InvalidInputError
+
+WINDOW_S = 600.0
+# Two crystals differ by less; a slope of their own needs a stretch of exchanges.
+MAX_SKEW_PPM = 100.0
+MIN_SLOPE_SPAN_S = 30.0
+MIN_SLOPE_EXCHANGES = 10
+# A number anywhere in a band is known with its half width over the root of three.
+BAND_SIGMA = 1 / math.sqrt(12)
+
+
+@dataclass(frozen=True)
+class RoundTrip:
+    """One exchange: question sent and answer received by the local clock, the rest by the remote.
+
+    A device that only tells its time has both remote stamps equal.
+    """
+
+    sent_ns: int
+    remote_received_ns: int
+    remote_sent_ns: int
+    received_ns: int
+
+    @property
+    def delay_ns(self) -> int:
+        """Time on the way, both ways together."""
+        return self.received_ns - self.sent_ns - (self.remote_sent_ns - self.remote_received_ns)
+
+
+@dataclass(frozen=True)
+class ClockOffset:
+    """Remote clock minus local clock at one local time.
+
+    Attributes:
+        sigma_ns: standard deviation; the two ways may differ by anything.
+        delay_ns: least time on the way, both ways together: the offset's band.
+        skew_ppm: how much faster the remote clock runs.
+    """
+
+    at_local_ns: int
+    offset_ns: int
+    sigma_ns: float
+    delay_ns: float
+    skew_ppm: float
+
+
+@dataclass(frozen=True)
+class PathLatency:
+    """Constant delay between a sample and its stamp on the host's clock."""
+
+    latency_ns: int
+    sigma_ns: float
+
+
+class RoundTripClock:
+    """Offset between the local clock and a remote one that answers.
+
+    For a device (its stamps minus the host's clock) as for another host (its clock against the
+    station's reference clock). A remote clock that is stepped by more than the band is found at
+    once and starts the estimate anew; memory is bounded.
+
+    Args:
+        resolution_ns: of the remote stamps.
+    """
+
+    def __init__(self, *, resolution_ns: int = 1) -> None:
+        self._resolution_ns = resolution_ns
+        self._num_steps = 0
+        self._num_exchanges = 0
+        self._reference: tuple[int, int] | None = None
+        self._last_ns = 0
+        self._start()
+
+    @property
+    def num_steps(self) -> int:
+        """How often the remote clock was stepped."""
+        return self._num_steps
+
+    @property
+    def num_exchanges(self) -> int:
+        """Exchanges since the last step."""
+        return self._num_exchanges
+
+    def _start(self) -> None:
+        self._upper, self._lower = LowerHull(), LowerHull()
+        self._num_exchanges = 0
+
+    def add(self, exchange: RoundTrip) -> None:
+        """Take in one exchange; they come in the order of their questions.
+
+        Raises:
+            InvalidInputError: an answer before its question, or out of order.
+        """
+        if exchange.received_ns < exchange.sent_ns or exchange.sent_ns < self._last_ns:
+            raise InvalidInputError(
+                f"round trip: got a question at {exchange.sent_ns} ns and its answer at "
+                f"{exchange.received_ns} ns after one at {self._last_ns} ns; expected answers "
+                "after their questions, in order, all by the same local clock"
+            )
+        if exchange.delay_ns < -self._resolution_ns:
+            raise InvalidInputError(
+                f"round trip: {exchange.delay_ns} ns on the way; the remote held the question "
+                "longer than the exchange took: check the remote stamps' unit"
+            )
+        above_ns = exchange.remote_received_ns + self._resolution_ns - exchange.sent_ns
+        below_ns = exchange.remote_sent_ns - exchange.received_ns
+        if self._reference is None:
+            self._reference = (exchange.sent_ns, below_ns)
+        self._last_ns = exchange.sent_ns
+        x_s = self._x_s(exchange.sent_ns)
+        high, low = (float(value - self._reference[1]) for value in (above_ns, below_ns))
+        if self._num_exchanges and self._contradicts(x_s, high, low):
+            self._num_steps += 1
+            self._start()
+        self._upper.add(x_s, high)
+        self._lower.add(x_s, -low)
+        self._num_exchanges += 1
+        for hull in (self._upper, self._lower):
+            hull.forget_before(x_s - WINDOW_S)
+
+    def estimate(self, at_local_ns: int | None = None) -> ClockOffset:
+        """The offset at a local time; without one, at the last exchange.
+
+        Raises:
+            ClockFitError: no exchange yet (`details["cause"]` is "too_few").
+        """
+        if self._reference is None:
+            raise ClockFitError("round trip clock: no exchange yet", cause="too_few")
+        at_local_ns = self._last_ns if at_local_ns is None else at_local_ns
+        x_s = self._x_s(at_local_ns)
+        slope, doubt = self._slope()
+        high_ns, low_ns = self._band_ns(x_s, slope)
+        width_ns = max(0.0, high_ns - low_ns)
+        drift_ns = doubt * self._age_s(x_s, slope)
+        return ClockOffset(
+            at_local_ns=at_local_ns,
+            offset_ns=self._reference[1] + round((high_ns + low_ns) / 2),
+            sigma_ns=math.hypot(width_ns * BAND_SIGMA, drift_ns),
+            delay_ns=width_ns,
+            skew_ppm=slope * 1e-3,
+        )
+
+    def latency(self, *, t_remote_ns: int, t_estimated_ns: int) -> PathLatency:
+        """The path delay that is still in a device's corrected times.
+
+        Args:
+            t_remote_ns: a sample's device time.
+            t_estimated_ns: the same sample's time by `OnlineClock` or `fit_clock`.
+        """
+        offset = self.estimate(t_estimated_ns)
+        true_ns = t_remote_ns - offset.offset_ns
+        return PathLatency(t_estimated_ns - true_ns, offset.sigma_ns)
+
+    def _x_s(self, at_local_ns: int) -> float:
+        start_ns = 0 if self._reference is None else self._reference[0]
+        return (at_local_ns - start_ns) * 1e-9
+
+    def _slope(self) -> tuple[float, float]:
+        """Drift in ns per second, and how well it is known."""
+        span_s = min(self._upper.span_s, self._lower.span_s)
+        if span_s < MIN_SLOPE_SPAN_S or self._num_exchanges < MIN_SLOPE_EXCHANGES:
+            return 0.0, MAX_SKEW_PPM * 1e3 * BAND_SIGMA * 2
+        middle_s = self._x_s(self._last_ns) - span_s / 2
+        above = self._upper.supporting_line(middle_s).slope_ns_per_s
+        below = -self._lower.supporting_line(middle_s).slope_ns_per_s
+        return (above + below) / 2, abs(above - below) / 2
+
+    def _band_ns(self, x_s: float, slope: float) -> tuple[float, float]:
+        """Highest and lowest offset that the exchanges allow."""
+        high_ns = self._upper.line_of_slope(slope).at(x_s)
+        low_ns = -self._lower.line_of_slope(-slope).at(x_s)
+        return high_ns, low_ns
+
+    def _age_s(self, x_s: float, slope: float) -> float:
+        """How far from the exchanges that hold the band."""
+        held = (self._upper.line_of_slope(slope), self._lower.line_of_slope(-slope))
+        return max(abs(x_s - line.x_at_s) for line in held)
+
+    def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
+        """Whether an exchange lies wholly outside the band that the others allow."""
+        slope, doubt = self._slope()
+        band_high_ns, band_low_ns = self._band_ns(x_s, slope)
+        slack_ns = 2 * doubt * self._age_s(x_s, slope) + self._resolution_ns
+        return high_ns < band_low_ns - slack_ns or low_ns > band_high_ns + slack_ns

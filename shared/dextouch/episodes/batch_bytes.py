@@ -1,0 +1,83 @@
+"""Samples of one stream ↔ the body of a record in a spool's log.
+
+Little endian, n samples: t_host_ns int64 [n], t_device_ns int64 [n], sequence int64 [n], then of a
+numeric stream the values as they lie in memory, of an encoded one the length of each image as
+u32 [n] and the images end to end.
+"""
+
+from collections.abc import Iterable
+from itertools import accumulate, pairwise
+
+import numpy as np
+
+from dextouch.errors import CorruptDataError
+from dextouch.streams.checks import ENCODED_UNITS
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import SampleBatch, encoded_values
+
+_STAMP_BYTES = 8
+
+
+def batch_bytes(descriptor: StreamDescriptor, batch: SampleBatch) -> bytes:
+    """The body that holds a batch, which fits the descriptor (checked by the caller)."""
+    stamps = (batch.t_host_ns, batch.t_device_ns, batch.sequence)
+    parts = [np.ascontiguousarray(column, dtype="<i8").tobytes() for column in stamps]
+    if descriptor.unit in ENCODED_UNITS:
+        parts.append(np.array([len(image) for image in batch.values], dtype="<u4").tobytes())
+        parts.extend(batch.values)
+    else:
+        dtype = descriptor.numpy_dtype().newbyteorder("<")
+        parts.append(np.ascontiguousarray(batch.values, dtype=dtype).tobytes())
+    return b"".join(parts)
+
+
+def batch_of_bytes(
+    descriptor: StreamDescriptor, bodies: Iterable[bytes], counts: Iterable[int], *, what: str
+) -> SampleBatch:
+    """Consecutive bodies of one stream as one batch, the inverse of `batch_bytes`.
+
+    Args:
+        descriptor: of the stream.
+        bodies: of the records.
+        counts: samples in each.
+        what: names the log in errors.
+
+    Raises:
+        CorruptDataError: a body is not that of so many samples of this stream.
+    """
+    columns: list[list[bytes]] = [[], [], []]
+    values: list[bytes] = []
+    encoded = descriptor.unit in ENCODED_UNITS
+    sample_bytes = int(np.prod(descriptor.shape)) * descriptor.numpy_dtype().itemsize
+    for body, count in zip(bodies, counts, strict=True):
+        size = count * _STAMP_BYTES
+        for number, column in enumerate(columns):
+            column.append(body[number * size : (number + 1) * size])
+        rest = body[3 * size :]
+        got = _images(rest, count) if encoded else [rest]
+        if got is None or (not encoded and len(rest) != count * sample_bytes):
+            raise CorruptDataError(
+                f"{what}: a record of {len(body)} bytes is not that of {count} samples of "
+                f"{descriptor.name!r}; it was written for another stream"
+            )
+        values += got
+    hosts, devices, sequence = (
+        np.frombuffer(b"".join(column), dtype="<i8").astype(np.int64) for column in columns
+    )
+    if encoded:
+        return SampleBatch(hosts, devices, sequence, encoded_values(values))
+    numbers = np.frombuffer(b"".join(values), dtype=descriptor.numpy_dtype().newbyteorder("<"))
+    numbers = numbers.astype(descriptor.numpy_dtype(), copy=False)
+    return SampleBatch(hosts, devices, sequence, numbers.reshape(-1, *descriptor.shape))
+
+
+def _images(data: bytes, count: int) -> list[bytes] | None:
+    """The images behind their lengths; None where these do not fit."""
+    start = 4 * count
+    if len(data) < start:
+        return None
+    lengths = np.frombuffer(data, dtype="<u4", count=count).tolist()
+    bounds = list(accumulate(lengths, initial=start))
+    if bounds[-1] != len(data):
+        return None
+    return [data[low:high] for low, high in pairwise(bounds)]

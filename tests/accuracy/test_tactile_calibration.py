@@ -1,0 +1,307 @@
+"""Tare, gain and fault maps of simulated gloves against the ones they were made with."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from dextouch.episodes.log import SpoolReader
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.tactile.layout import NUM_TAXELS, expand_taxels, raw_indices, select_taxels
+from services.acquisition.clock import VirtualClock
+from services.acquisition.devices import load_calibration
+from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.station import MockStation
+from services.acquisition.mocks.tactile_glove import GloveCalibration as MockGlove
+from services.acquisition.schemas import TakePrompt
+from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_faults import STATES, judge_taxels
+from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
+from services.alignment.calibration.tactile_glove_calibration import (
+    calibrate_glove,
+    filled_gain,
+    pad_taxels,
+)
+from services.alignment.calibration.tactile_tare import measure_tare, rounding_rms_counts
+from services.cli.calibrate.command import main as calibrate
+
+PRESSURES_KPA = (5.0, 10.0, 20.0, 30.0)
+EVERYWHERE = np.ones(NUM_TAXELS, dtype=bool)
+
+
+class Glove:
+    """A simulated glove with known zero and gain, noise of a cell, slow drift and faults."""
+
+    def __init__(self, seed, *, side="left", noise=2.0, drift=0.0, faults=None):
+        self.truth = MockGlove.seeded(side, seed)
+        self.side, self.noise, self.drift = side, noise, drift
+        self.rng = np.random.default_rng(seed)
+        self.faults = faults or {}
+
+    def take(self, taxels_kpa, num=600):
+        kpa = np.broadcast_to(np.asarray(taxels_kpa, dtype=float), (num, NUM_TAXELS))
+        counts = self.truth.tare_counts + self.truth.gain_counts_per_kpa * expand_taxels(
+            kpa, side=self.side
+        )
+        walk = np.cumsum(self.rng.normal(scale=self.drift, size=counts.shape), axis=0)
+        counts = np.rint(counts + walk + self.rng.normal(scale=self.noise, size=counts.shape))
+        counts = np.clip(counts, 0, 65535).astype(np.uint16)
+        for taxel, value in self.faults.items():
+            cell = int(raw_indices(side=self.side)[taxel])
+            if value is None:  # dead, but its amplifier still hisses
+                counts[:, cell] = np.rint(100 + self.rng.normal(scale=self.noise, size=num))
+            else:
+                counts[:, cell] = value
+        return counts
+
+    def presses(self, pressures=PRESSURES_KPA, sigma=0.01, **options):
+        return [
+            TaxelPress(
+                p, sigma * p, self.take(p * (1 + sigma * self.rng.normal()), **options), EVERYWHERE
+            )
+            for p in pressures
+        ]
+
+    @property
+    def tare(self):
+        return self.truth.tare_counts
+
+    @property
+    def gain(self):
+        return select_taxels(self.truth.gain_counts_per_kpa, side=self.side)
+
+
+def named(state):
+    return {int(t): STATES[state[t]] for t in np.flatnonzero(state)}
+
+
+@pytest.mark.parametrize(("noise", "bound_counts"), [(0.0, 0.30), (0.3, 0.20), (2.0, 0.12)])
+def test_tare_is_found_as_well_as_its_sigma_says(noise, bound_counts, capsys):
+    errors, ratios = [], []
+    for seed in range(4):
+        glove = Glove(seed, noise=noise)
+        found = measure_tare(glove.take(0.0), side="left").level
+        errors.append(found.mean_counts - glove.tare)
+        ratios.append(errors[-1] / found.sigma_counts)
+    rms, normalised = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, ratios))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\ntare, noise {noise:g} counts, 10 s: {rms:.3f} counts RMS, bound {bound_counts} | "
+            f"error in sigmas {normalised:.2f}, bounds 0.7 … 1.4"
+        )
+    assert rms <= bound_counts
+    assert 0.7 <= normalised <= 1.4
+
+
+def test_knocks_and_slow_noise_do_not_fool_the_tare():
+    take = Glove(5).take(0.0)
+    quiet = measure_tare(take, side="left").level
+    slow = measure_tare(Glove(5, drift=0.15).take(0.0), side="left").level
+    assert np.median(slow.sigma_counts) > 2 * np.median(quiet.sigma_counts)
+    take[100:130] += 4000
+    knocked = measure_tare(take, side="left").level
+    # A twentieth of the readings is four thousand too high: a mean would be off by 200.
+    assert np.abs(knocked.mean_counts - quiet.mean_counts).max() < 0.5
+    assert knocked.clipped.min() >= 0.05
+
+
+def test_rest_takes_that_are_none_are_refused():
+    glove = Glove(6)
+    pressed = np.concatenate([glove.take(0.0, 300), glove.take(1.0, 300)])
+    with pytest.raises(InvalidInputError, match="320 of 320 taxels moved"):
+        measure_tare(pressed, side="left")
+    with pytest.raises(InvalidInputError, match="got 59 readings"):
+        measure_tare(glove.take(0.0, 59), side="left")
+    with pytest.raises(ShapeError, match=r"\(60, 320\)"):
+        measure_tare(np.zeros((60, 320)), side="left")
+    with pytest.raises(NonFiniteError):
+        measure_tare(np.full((60, 360), np.nan), side="left")
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.2, 0.4, 1.0])
+def test_rounding_error_is_that_of_rounded_readings(noise):
+    rng = np.random.default_rng(7)
+    true = rng.uniform(0, 1, 400)
+    readings = np.rint(true + rng.normal(scale=noise, size=(20_000, 400)))
+    rms = np.sqrt(np.mean((readings.mean(axis=0) - true) ** 2))
+    predicted = rounding_rms_counts(np.array([np.hypot(noise, np.sqrt(1 / 12))]))[0]
+    sampling = np.hypot(noise, 0.29 * (noise > 0)) / np.sqrt(20_000)
+    assert abs(rms - predicted) <= 0.25 * predicted + 1.5 * sampling
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_gain_is_found_as_well_as_its_sigma_says(side, capsys):
+    errors, ratios = [], []
+    for seed in range(30):
+        glove = Glove(seed, side=side)
+        found = fit_gain(measure_tare(glove.take(0.0, 240), side=side), glove.presses(num=120))
+        assert named(found.state) == {}
+        errors.append(found.gain_counts_per_kpa / glove.gain - 1)
+        ratios.append((found.gain_counts_per_kpa - glove.gain) / found.sigma_counts_per_kpa)
+    # Pressures are known to 1 % each and their errors are common to all taxels of a glove:
+    # the spread is that of seeds.
+    rms, normalised = (float(np.sqrt(np.mean(np.square(x)))) for x in (errors, ratios))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\ngain {side}, 4 presses known to 1 %: {rms:.2%} RMS, bound 1 % | error in sigmas "
+            f"{normalised:.2f}, bounds 0.6 … 1.6"
+        )
+    assert rms <= 0.01
+    assert 0.6 <= normalised <= 1.6
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_every_fault_gets_its_name_and_no_other_taxel_does(seed):
+    rng = np.random.default_rng(seed)
+    taxels = rng.choice(NUM_TAXELS, 12, replace=False)
+    faults = dict(zip(taxels.tolist(), [0] * 3 + [None] * 3 + [777] * 3 + [65535] * 3, strict=True))
+    kinds = ["dead"] * 6 + ["stuck"] * 3 + ["saturated"] * 3
+    glove = Glove(seed, side="right", faults=faults)
+    tare = measure_tare(glove.take(0.0), side="right")
+    found = calibrate_glove(tare, glove.presses())
+    assert named(found.gain.state) == dict(zip(taxels.tolist(), kinds, strict=True))
+    healthy = calibrate_glove(
+        measure_tare(Glove(seed).take(0.0), side="left"), Glove(seed).presses()
+    )
+    assert healthy.num_by_state() == {"ok": 320}
+    matrices = found.matrices()
+    record = {name: matrix.tolist() for name, matrix in matrices.items()}
+    kpa = TactileCalibration.from_record(record, "right").to_kpa(glove.take(20.0))
+    good = np.setdiff1d(np.arange(NUM_TAXELS), taxels)
+    assert np.abs(kpa[:, good].mean(axis=0) / 20 - 1).max() < 0.03
+    assert kpa[:, taxels].max() < 0.5
+
+
+def test_a_dead_row_and_a_dead_pad_are_seen():
+    row = {80 + 16 * 3 + column: 0 for column in range(16)}
+    # The pad still hisses: a line through its noise would have some slope.
+    glove = Glove(8, faults={**row, **dict.fromkeys(range(16))})
+    found = fit_gain(measure_tare(glove.take(0.0), side="left"), glove.presses())
+    assert named(found.state) == dict.fromkeys([*row, *range(16)], "dead")
+    assert set(filled_gain(found)[:16]) == {np.median(found.gain_counts_per_kpa[found.state == 0])}
+
+
+def test_a_wandering_touch_shows_the_still_taxels_among_the_moving():
+    """No pressure is known here: a bump goes over the palm, as in any take."""
+    rows, columns = np.mgrid[0:15, 0:16]
+    turn = np.linspace(0, 2 * np.pi, 900)[:, None, None]
+    palm = 25 * np.exp(
+        -((rows - 7 - 4 * np.cos(turn)) ** 2 + (columns - 7.5 - 5 * np.sin(2 * turn)) ** 2) / 12
+    )
+    kpa = np.zeros((900, NUM_TAXELS))
+    kpa[:, 80:] = palm.reshape(900, 240)
+    deads = {80 + 16 * 7 + 4: 0, 80 + 16 * 10 + 10: None, 80 + 16 * 4 + 9: 500}
+    glove = Glove(9, faults=deads)
+    tare = measure_tare(glove.take(0.0), side="left")
+    states = named(judge_taxels([glove.take(kpa, 900)], tare))
+    kinds = {t: s for t, s in states.items() if s != "unproven"}
+    assert kinds == dict(zip(deads, ["dead", "dead", "stuck"], strict=True))
+    # Fingertips were not touched: nobody knows.
+    assert all(states[taxel] == "unproven" for taxel in range(80))
+
+
+def test_weak_saturated_bent_and_missing_presses_are_refused():
+    glove = Glove(10)
+    tare = measure_tare(glove.take(0.0), side="left")
+    with pytest.raises(InvalidInputError, match="320 imprecise"):
+        calibrate_glove(tare, glove.presses((2.0,)))
+    with pytest.raises(InvalidInputError, match="full scale"):
+        calibrate_glove(tare, glove.presses((2000.0, 3000.0)))
+    with pytest.raises(InvalidInputError, match="do not belong"):
+        calibrate_glove(
+            tare,
+            [
+                TaxelPress(p, 0.01 * p, press.counts, EVERYWHERE)
+                for p, press in zip((30.0, 5.0, 20.0, 10.0), glove.presses(), strict=True)
+            ],
+        )
+    with pytest.raises(InvalidInputError, match="no pressed taxel moved"):
+        calibrate_glove(tare, [TaxelPress(20.0, 0.1, glove.take(0.0), EVERYWHERE)])
+    pressed, thumb = measure_tare(glove.take(20.0), side="left"), pad_taxels("thumb")
+    with pytest.raises(InvalidInputError, match="counts fall"):
+        calibrate_glove(pressed, [TaxelPress(20.0, 0.1, glove.take(0.0), EVERYWHERE)])
+    with pytest.raises(InvalidInputError, match="304 unproven"):
+        calibrate_glove(tare, [TaxelPress(20.0, 0.1, glove.take(20.0 * thumb), thumb)])
+    coming = np.concatenate([glove.take(0.0, 300), glove.take(20.0, 300)])
+    with pytest.raises(InvalidInputError, match="changed while it lay"):
+        calibrate_glove(tare, [TaxelPress(20.0, 0.1, coming, EVERYWHERE)])
+    with pytest.raises(InvalidInputError, match="expected above 0"):
+        TaxelPress(0.0, 0.1, glove.take(0.0), EVERYWHERE)
+    with pytest.raises(NonFiniteError):
+        TaxelPress(np.nan, 0.1, glove.take(0.0), EVERYWHERE)
+    with pytest.raises(UnknownNameError, match="palm"):
+        pad_taxels("toe")
+
+
+def test_one_saturated_press_does_not_spoil_the_others():
+    glove = Glove(11)
+    presses = glove.presses((10.0, 20.0, 30.0, 5000.0))
+    tare = measure_tare(glove.take(0.0), side="left")
+    found = calibrate_glove(tare, presses)
+    assert found.num_by_state() == {"ok": 320}
+    assert np.abs(found.gain.gain_counts_per_kpa / glove.gain - 1).max() < 0.04
+
+
+def test_pads_pressed_one_after_the_other_give_the_whole_glove():
+    glove = Glove(12)
+    presses = [
+        TaxelPress(p, 0.01 * p, glove.take(p * pad_taxels(pad)), pad_taxels(pad))
+        for pad in ("thumb+index", "middle", "ring+little", "palm")
+        for p in (8.0, 25.0)
+    ]
+    found = calibrate_glove(measure_tare(glove.take(0.0), side="left"), presses)
+    assert found.num_by_state() == {"ok": 320}
+    assert np.abs(found.gain.gain_counts_per_kpa / glove.gain - 1).max() < 0.02
+
+
+def constant_touch(kpa, seconds=1.5):
+    """What a glove under one pressure everywhere would feel."""
+    num = round(60 * seconds)
+    descriptor = StreamDescriptor(
+        name="tactile_left",
+        kind="tactile",
+        shape=(NUM_TAXELS,),
+        dtype="float32",
+        unit="kPa",
+        nominal_rate_hz=60.0,
+        side="left",
+    )
+    t_ns = np.rint(np.arange(num) * 1e9 / 60).astype(np.int64)
+    return ReplayStream(descriptor, t_ns, np.full((num, NUM_TAXELS), kpa, dtype=np.float32))
+
+
+def test_a_recorded_mock_glove_is_calibrated_and_its_next_take_carries_it(tmp_path, capsys):
+    """Real packets with losses and bit errors, the recorder, the spool, the command, and back."""
+    cell = int(raw_indices(side="left")[100])
+    glove = DeviceFaults(bit_error_rate=1e-6, drop_probability=0.01, dead_taxels=(cell,))
+    faults, prompt = FaultScript(others=glove), TakePrompt(task="calibrate", instruction="press")
+
+    def record(name, kpa, **options):
+        station = MockStation(
+            [constant_touch(kpa)], faults, 3, VirtualClock(), spool_root=tmp_path, **options
+        )
+        with station:
+            return station.run_take(prompt, recording_id=name).spool_path
+
+    paths = {f"at-{kpa:g}": record(f"at-{kpa:g}", kpa) for kpa in (0.0, 8.0, 16.0, 32.0)}
+    rows = [f"{name},{name.removeprefix('at-')},0.01" for name in list(paths)[1:]]
+    (tmp_path / "presses.csv").write_text("\n".join(["take,pressure_kpa,sigma_kpa", *rows]))
+    folder = tmp_path / "calibration"
+    arguments = ["glove", "--side", "left", "--rest", str(paths["at-0"]), "--to", str(folder)]
+    assert calibrate([*arguments, "--presses", str(tmp_path / "presses.csv")]) == 0
+    matrices = load_calibration(folder / "calibration.json")
+    assert np.flatnonzero(matrices["tactile_left_taxel_state"]).tolist() == [cell]
+    truth = MockGlove.seeded("left", 3)
+    good = np.delete(raw_indices(side="left"), 100)
+    gain = np.array(matrices["tactile_left_gain_counts_per_kpa"])[0]
+    worst = np.abs(gain / truth.gain_counts_per_kpa - 1)[good].max()
+    with capsys.disabled():
+        sys.stdout.write(f"\ngain from recorded takes: worst taxel {worst:.3%}, bound 0.2 %")
+    assert worst <= 2e-3
+    spool = SpoolReader(record("after", 20.0, calibration=matrices))
+    carried = TactileCalibration.from_record(spool.attributes.calibration, "left")
+    kpa = carried.to_kpa(spool.read("tactile_left").values)
+    assert np.abs(np.delete(kpa, 100, axis=1) - 20.0).max() <= 0.1
+    assert spool.attributes.calibration.keys() >= matrices.keys()

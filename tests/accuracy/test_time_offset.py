@@ -1,0 +1,96 @@
+"""A hundred seeds of brisk motion about three axes: error and sigma of the time offset."""
+
+import sys
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from services.alignment.calibration.hand_eye import DegenerateMotionError
+from services.alignment.calibration.tap_offset import estimate_tap_offset
+from services.alignment.calibration.time_offset import estimate_time_offset
+
+BASE_NS = 1_700_000_000_000_000_000
+
+
+def motion(t_s, seed, max_hz):
+    rng = np.random.default_rng(seed)
+    rate_hz, phase = rng.uniform(0.3, max_hz, (3, 8)), rng.uniform(0, 2 * np.pi, (3, 8))
+    return np.sin(2 * np.pi * rate_hz * t_s[:, None, None] + phase).sum(axis=2)
+
+
+def streams(seed, *, max_hz=6.0, noise=0.2, seconds=10.0):
+    rng = np.random.default_rng(seed)
+    offset_s = rng.uniform(-0.3, 0.3)
+    t_a, t_b = np.arange(0, seconds, 1 / 60) + 0.003, np.arange(0, seconds, 1 / 90)
+    a, b = motion(t_a, seed, max_hz), 2.5 * motion(t_b, seed, max_hz) + 1.0
+    a, b = (x + noise * x.std() * rng.normal(size=x.shape) for x in (a, b))
+    stamps = [np.rint(t * 1e9).astype(np.int64) + BASE_NS for t in (t_a, t_b - offset_s)]
+    return (stamps[0], a, stamps[1], b), offset_s
+
+
+@pytest.mark.slow
+def test_offset_of_a_hundred_seeds(capsys):
+    errors_ms, sigmas_ms = [], []
+    for seed in range(100):
+        taken, offset_s = streams(seed)
+        found = estimate_time_offset(*taken)
+        errors_ms.append(abs(found.offset_ns * 1e-6 - offset_s * 1e3))
+        sigmas_ms.append(found.sigma_ns * 1e-6)
+    errors_ms, sigmas_ms = np.array(errors_ms), np.array(sigmas_ms)
+    good = np.mean((errors_ms <= 2) & (errors_ms <= 2 * sigmas_ms))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\ntime offset, 100 seeds: {np.sqrt(np.mean(errors_ms**2)):.2f} ms RMS | "
+            f"within 2 ms and 2 sigma: {100 * good:.0f} %, bound 95"
+        )
+    assert good >= 0.95
+
+
+def test_motion_lost_in_noise_is_refused():
+    for seed in range(3):
+        taken, _ = streams(seed, noise=4.0)
+        with pytest.raises(InvalidInputError, match="time offset"):
+            estimate_time_offset(*taken)
+
+
+def taps(seed, *, num=8, speed_m_per_s=0.4):
+    """A hand that falls onto a table and rests there, seen by a glove and by a tracker."""
+    rng = np.random.default_rng(seed)
+    offset_s = rng.uniform(-0.05, 0.05)
+    touches_s = 1.0 + np.cumsum(rng.uniform(1.0, 1.3, num))
+    t_a, t_b = np.arange(0, touches_s[-1] + 1, 1 / 60), np.arange(0, touches_s[-1] + 1, 1 / 100)
+    since_a, since_b = (t[:, None] - touches_s for t in (t_a, t_b))
+    pressure = np.where((since_a >= 0) & (since_a < 0.3), 20.0, 0.0).max(axis=1)
+    falling = np.where((since_b > -0.25) & (since_b < 0), -speed_m_per_s * since_b, 0.0)
+    rising = np.where(since_b >= 0.3, np.minimum(speed_m_per_s * (since_b - 0.3), 0.1), 0.0)
+    height = np.where(since_b <= -0.25, 0.1, 0.0).min(axis=1) + (falling + rising).sum(axis=1)
+    height = height + 0.0005 * rng.normal(size=len(t_b))
+    stamps = [np.rint(t * 1e9).astype(np.int64) + BASE_NS for t in (t_a, t_b - offset_s)]
+    return (stamps[0], pressure, stamps[1], height), offset_s
+
+
+def test_taps_are_the_fallback(capsys):
+    errors_ms, ratios = [], []
+    for seed in range(6):
+        taken, offset_s = taps(seed)
+        found = estimate_tap_offset(*taken)
+        errors_ms.append(found.offset_ns * 1e-6 - offset_s * 1e3)
+        ratios.append(abs(errors_ms[-1]) / (found.sigma_ns * 1e-6))
+    rms_ms = float(np.sqrt(np.mean(np.square(errors_ms))))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\ntap offset, 8 taps: {rms_ms:.2f} ms RMS, bound 3 | {max(ratios):.1f} sigma, bound 3"
+        )
+    assert rms_ms <= 3
+    assert max(ratios) <= 3
+
+
+def test_what_is_no_tap_is_refused():
+    (t_a, pressure, t_b, height), _ = taps(0)
+    with pytest.raises(DegenerateMotionError, match="tap"):
+        estimate_tap_offset(t_a, 0 * pressure, t_b, height)
+    with pytest.raises(DegenerateMotionError, match="tap"):
+        estimate_tap_offset(t_a, pressure, t_b, 0 * height)
+    with pytest.raises(InvalidInputError, match="NaN"):
+        estimate_tap_offset(t_a, pressure, t_b, height * np.nan)

@@ -1,0 +1,80 @@
+"""`dextouch bench clocks`: one short run as users start it; scores; options that mean nothing.
+
+What a run says of speed is not judged here: that is for a quiet machine.
+"""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError, UnknownNameError
+from services.cli.bench.clocks import stage
+from services.cli.bench.clocks.rivals import OFFLINE, ONLINE
+from services.cli.bench.clocks.scenes import BASE_DELAY_NS, Scene, simulate
+from services.cli.bench.clocks.scores import score
+from services.cli.bench.command import stage_parser
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A quick run in a process of its own, as shape checks must not be timed."""
+    folder = tmp_path_factory.mktemp("bench")
+    command = [sys.executable, "-m", "services.cli.main", "bench", "clocks", "--quick"]
+    options = ["--scenes", "base,step -30 ms", "--seconds", "30", "--out", str(folder)]
+    done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout, folder
+
+
+def test_a_quick_run_measures_every_way(run):
+    text, folder = run
+    figures = json.loads((folder / "bench_clocks.json").read_text())
+    found = {(r["scene"], r["way"]): r["rounds"][0]["rms_ms"] for r in figures["results"]}
+    for scene in ("base", "step -30 ms"):
+        assert all((scene, way) in found for way in (*ONLINE, *OFFLINE))
+        assert found[scene, "ours, online"] < 0.3 < found[scene, "arrival stamps"]
+    verdicts = {r["what"]: r["verdict"] for r in figures["requirements"]}
+    assert verdicts["online RMS, seven scenes"] == "pass"
+    assert verdicts["online RMS, stamps of 1 ms"] == "not measured"
+    assert "least squares" in text
+    assert "No step" in (folder / "bench_clocks.svg").read_text()
+
+
+def shifted(take, error_ns):
+    return take.true_ns + BASE_DELAY_NS + error_ns
+
+
+def test_scores_leave_out_what_no_online_clock_can_know():
+    take = simulate(Scene(step_ms=-30.0), seconds=40.0, seed=0)
+    since_s = (take.true_ns - take.step_true_ns) * 1e-9
+    hurt = (since_s >= 0) & (since_s < 1.0)
+    wrong_ns = shifted(take, np.where(hurt, 9_000_000, 100_000))
+    online, offline = (score(wrong_ns, take, is_online=kind) for kind in (True, False))
+    assert online.rms_ms == pytest.approx(0.1)
+    assert online.recovery_s == pytest.approx(1.0, abs=0.05)
+    assert offline.rms_ms > 1
+    assert offline.recovery_s is None
+    slow_ns = shifted(take, np.where(since_s >= 0, 400_000, 0))
+    assert score(slow_ns, take, is_online=True).recovery_s > 5
+
+
+def test_a_scene_is_what_it_says():
+    take = simulate(Scene(drops=0.1, grid_ms=16.0, step_ms=200.0), seconds=60.0, seed=1)
+    assert len(take) == pytest.approx(0.9 * 3600, rel=0.03)
+    assert (take.t_host_ns - take.true_ns >= BASE_DELAY_NS - 1).all()
+    assert (np.diff(take.t_host_ns) >= 0).all()
+    jumps = np.diff(take.t_device_ns) - np.diff(take.sequence) * 1e9 / 60
+    assert np.flatnonzero(np.abs(jumps) > 1e8).size == 1
+
+
+@pytest.mark.parametrize("words", [["--seconds", "5"], ["--rounds", "0"]])
+def test_options_that_mean_nothing_are_refused(words, tmp_path):
+    parser = stage_parser("clocks")
+    stage.add_options(parser)
+    with pytest.raises(InvalidInputError, match=words[0]):
+        stage.measure(parser.parse_args(words), tmp_path, pytest.fail)
+    with pytest.raises(UnknownNameError, match="wander"):
+        stage.measure(parser.parse_args(["--scenes", "storm"]), tmp_path, pytest.fail)

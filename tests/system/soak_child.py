@@ -1,0 +1,117 @@
+"""A whole station that records and uploads take after take on a simulated clock until killed."""
+
+import json
+import sys
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.clients.episode_store import EpisodeStoreClient
+from services.acquisition.clock import VirtualClock
+from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.station import MockStation
+from services.acquisition.schemas import TakePrompt
+from services.acquisition.uploader import Uploader, recover_spool
+from tests.integration.recording_streams import human_streams, robot_streams
+
+CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
+# A human's hands and a robot's state in turn: the wrists are streams of both.
+NAMES = (
+    *(f"{kind}_{side}" for kind in ("glove", "finger_tracker") for side in ("left", "right")),
+    *(f"pose_tracker_{stream}" for stream in ("head", "wrist_left", "wrist_right")),
+    *CAMERAS,
+    "robot_state",
+)
+
+
+PROMPT = TakePrompt(task="soak", instruction="soak")
+
+
+def streams_of(kind, seconds):
+    """Everything that a station of this kind can have."""
+    human = human_streams(seconds, CAMERAS)
+    if kind == "human":
+        return human
+    wrists = [s for s in human if s.descriptor.name.startswith("camera_wrist")]
+    return [*robot_streams(seconds), *wrists]
+
+
+def random_faults(seed, seconds):
+    """Something ordinary everywhere and something bad on a third of the devices."""
+    rng = np.random.default_rng(seed)
+    at = float(rng.uniform(0.2, 0.6)) * seconds
+    bad = [
+        {"unplugged_s": ((at, at + 0.3 * seconds),)},
+        {"stalls_s": ((at, at + 0.1 * seconds),)},
+        {"drop_probability": 0.02},
+        {"duplicate_probability": 0.02},
+        {"reorder_probability": 0.02},
+        {"half_packet_probability": 0.01},
+        {"clock_step_at_s": at, "clock_step_s": 0.2},
+        {"burst_ms": 40.0},
+        {"first_sequence": 2**32 - 200},
+        {"bit_error_rate": 1e-5, "byte_loss_rate": 1e-5},
+    ]
+    base = {"skew_ppm": 50.0, "path_delay_ms": 2.0, "jitter_ms": 0.8, "drop_probability": 0.002}
+    devices = {}
+    for name in NAMES:
+        fault = bad[rng.integers(len(bad))] if rng.random() < 1 / 3 else {}
+        devices[name] = DeviceFaults.model_validate({**base, **fault})
+    return FaultScript(devices=devices, others=DeviceFaults(**base))
+
+
+def rss_bytes():
+    """Memory of this process."""
+    return int(Path("/proc/self/statm").read_text().split()[1]) * 4096
+
+
+def tell(**facts):
+    """One line of JSON for the parent."""
+    print(json.dumps(facts), flush=True)  # noqa: T201
+
+
+def acknowledge(recorder, done):
+    """Say again and again what the recorder has acknowledged of the running take."""
+    while not done.wait(0.05):
+        status = recorder.status()
+        if status.state == "recording":
+            tell(event="spooled", take=status.recording_id, counts=status.num_samples)
+
+
+def record(root, number, seed, seconds):
+    """One take of the next kind of station."""
+    streams = streams_of("robot" if number % 3 == 2 else "human", seconds)
+    faults = random_faults(seed * 1000 + number, seconds)
+    done = threading.Event()
+    with MockStation(streams, faults, number, VirtualClock(), spool_root=root) as mock:
+        teller = threading.Thread(target=acknowledge, args=(mock.station.recorder, done))
+        teller.start()
+        try:
+            take = mock.run_take(PROMPT, recording_id=f"take-{number:03d}")
+        finally:
+            done.set()
+            teller.join()
+    counts = {stream.stream: stream.num_samples for stream in take.check.streams}
+    tell(event="saved", take=take.recording_id, counts=counts, rss_bytes=rss_bytes())
+
+
+def main(spool, store_url, seed, first_take, num_takes, seconds):
+    """Record the takes first … num_takes − 1, human and robot in turn, and upload everything."""
+    root, seconds = Path(spool), float(seconds)
+    recover_spool(root)
+    for number in range(int(first_take), int(num_takes)):
+        record(root, number, int(seed), seconds)
+        with EpisodeStoreClient(store_url) as client:
+            Uploader(root, client, period_s=1.0).upload_all()
+    with EpisodeStoreClient(store_url) as client:
+        uploader = Uploader(root, client, period_s=1.0)
+        for _ in range(50):
+            uploader.upload_all()
+            if all(status.uploaded for status in uploader.status()):
+                break
+    tell(event="done")
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])

@@ -1,0 +1,116 @@
+"""A whole station for long, with random faults and two kill -9: all that was said is in the store.
+
+The clock is simulated, so that a take passes as fast as the processor allows.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.log import SpoolReader
+from services.episode_store.app import create_app
+from services.episode_store.settings import EpisodeStoreSettings
+from tests.unit.worlds.running import served
+
+CHILD = Path(__file__).with_name("soak_child.py")
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.system
+
+
+class Soak:
+    """Runs the station until all takes are made, killing it in the middle of some."""
+
+    def __init__(self, spool, url, *, num_takes, seconds):
+        self.acknowledged = {}
+        self.rss_bytes = []
+        self._spool, self._url = spool, url
+        self._num_takes, self._seconds = num_takes, seconds
+
+    def run(self, first_take, seed, kill_in=None):
+        """From a take on to the end, or until the kill; whether it came to its end."""
+        arguments = [self._spool, self._url, seed, first_take, self._num_takes, self._seconds]
+        child = subprocess.Popen(
+            [sys.executable, str(CHILD), *map(str, arguments)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'shared'}"},
+        )
+        log, is_done = [], False
+        self.rss_bytes = []
+        for line in child.stdout:
+            log.append(line)
+            if not line.startswith("{"):
+                continue
+            fact = json.loads(line)
+            is_done = is_done or fact["event"] == "done"
+            if "counts" in fact:
+                self.acknowledged[fact["take"]] = fact["counts"]
+            if fact["event"] == "saved":
+                self.rss_bytes.append(fact["rss_bytes"])
+            elif (
+                kill_in is not None
+                and fact.get("take") == kill_in
+                and max(fact["counts"].values()) >= 20
+            ):
+                os.kill(child.pid, signal.SIGKILL)
+                break
+        child.stdout.close()
+        code = child.wait()
+        assert code == (0 if kill_in is None else -signal.SIGKILL), "".join(log[-30:])
+        return is_done
+
+
+def rss_slope_mb_per_hour(rss_bytes, seconds):
+    """Growth by simulated time, the first two takes left out as warm-up."""
+    kept = np.array(rss_bytes[2:]) / 1e6
+    return float(np.polyfit(np.arange(len(kept)) * seconds / 3600, kept, 1)[0])
+
+
+def soak(tmp_path, *, num_takes, seconds, kills):
+    settings = EpisodeStoreSettings(store_url=str(tmp_path / "store"), sync_uploads=False)
+    spool = tmp_path / "spool"
+    spool.mkdir()
+    with served(create_app(settings)) as url, EpisodeStoreClient(url) as client:
+        station = Soak(spool, url, num_takes=num_takes, seconds=seconds)
+        first = 0
+        for seed, number in enumerate(kills):
+            assert not station.run(first, seed, kill_in=f"take-{number:03d}")
+            first = number + 1
+        assert station.run(first, len(kills))
+        ids = [recording.recording_id for recording in client.recordings().recordings]
+    assert sorted(ids) == [f"take-{number:03d}" for number in range(num_takes)]
+    store = EpisodeStore(settings.store_url)
+    for recording_id, counts in station.acknowledged.items():
+        spooled, recording = SpoolReader(spool / recording_id), store.recording(recording_id)
+        for stream, count in counts.items():
+            kept, sent = spooled.read(stream), recording.read(stream)
+            assert len(sent) >= count, (recording_id, stream)
+            for field in ("sequence", "t_host_ns", "t_device_ns"):
+                np.testing.assert_array_equal(getattr(sent, field), getattr(kept, field))
+            assert len(set(zip(sent.sequence, sent.t_device_ns, strict=True))) == len(sent)
+    killed = {f"take-{number:03d}" for number in kills}
+    for recording_id in killed:
+        events = {entry.event for entry in store.recording(recording_id).attributes.ledger}
+        assert "interrupted" in events
+    return station.rss_bytes
+
+
+def test_a_short_soak(tmp_path):
+    soak(tmp_path, num_takes=3, seconds=1.0, kills=(0, 1))
+
+
+@pytest.mark.slow
+def test_half_an_hour_of_a_whole_station(tmp_path):
+    rss_bytes = soak(tmp_path, num_takes=30, seconds=60.0, kills=(3, 11))
+    slope = rss_slope_mb_per_hour(rss_bytes, 60.0)
+    print(f"RSS growth after warm-up: {slope:.2f} MB an hour of simulated time")  # noqa: T201
+    assert slope < 1.0

@@ -1,0 +1,90 @@
+"""Trackers under a supervisor in real time: loss within 300 ms, back within 2 s of replugging."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from services.acquisition.clock import RealClock
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.bridge_tracker import BridgeDriver, BridgePoseTrackerDecoder
+from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
+from services.acquisition.mocks.bridge_server import BridgePort
+from services.acquisition.mocks.bridge_sources import BridgePoseSource
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.mocks.ports import HidPort
+from services.acquisition.mocks.pose_tracker import PoseTrackerSource
+from services.acquisition.mocks.usb_backend import UsbPort
+from services.acquisition.supervisor import DeviceSupervisor
+
+FLAG_WITHIN_S = 0.3
+BACK_WITHIN_S = 2.0
+STREAM = next(s for s in pattern_streams(1.0) if s.descriptor.name == "wrist_left")
+
+
+class Rig:
+    """A pose tracker behind a port, and the supervisor that reads it."""
+
+    def __init__(self, link):
+        source_class = BridgePoseSource if link == "bridge" else PoseTrackerSource
+        self.source = source_class(STREAM, faults=DeviceFaults(), rng=np.random.default_rng(1))
+        clock = RealClock()
+        if link == "bridge":
+            self.port = BridgePort("LHR-left", self.source.hello)
+            decoder = BridgePoseTrackerDecoder("wrist_left", serial_number="LHR-left")
+            driver = BridgeDriver(
+                "pose", transport=self.port.transport, decoder=decoder, clock=clock
+            )
+        else:
+            self.port = (UsbPort if link == "usb" else HidPort)("LHR-left")
+            decoder = PoseTrackerDecoder("wrist_left")
+            driver = Driver("pose", transport=self.port.transport, decoder=decoder, clock=clock)
+        self.sequences = []
+        self.arrived = threading.Condition()
+        self.supervisor = DeviceSupervisor(driver, sink=self._accept, clock=clock)
+
+    def _accept(self, _, readings):
+        with self.arrived:
+            self.sequences += [sample.sequence for sample in readings["wrist_left"]]
+            self.arrived.notify_all()
+
+    def send(self, sequences):
+        """Send samples and wait until they are through."""
+        for sequence in sequences:
+            for unit in self.source.units(sequence, sequence, int(STREAM.t_ns[sequence])):
+                assert self.port.send(unit)
+        with self.arrived:
+            last = sequences[-1]
+            assert self.arrived.wait_for(lambda: last in self.sequences, 10.0)
+
+
+@pytest.fixture(params=["hid", "usb", "bridge"])
+def rig(request, monkeypatch):
+    # A busy machine may be slower with the next sample than a bridge may be silent.
+    monkeypatch.setattr("services.acquisition.drivers.bridge_tracker.SILENCE_NS", 10**10)
+    built = Rig(request.param)
+    built.port.plug()
+    built.supervisor.start()
+    assert built.supervisor.connected.wait(10.0)
+    yield built
+    built.supervisor.stop()
+    built.port.unplug()
+
+
+def test_unplugged_and_replugged(rig):
+    rig.send(range(5))
+    start_s = time.monotonic()
+    rig.port.unplug()
+    rig.port.link.wait_closed()
+    assert time.monotonic() - start_s <= FLAG_WITHIN_S
+    assert not rig.supervisor.connected.is_set()
+    assert rig.supervisor.counters.last_error
+    start_s = time.monotonic()
+    rig.port.plug()
+    assert rig.supervisor.connected.wait(10.0)
+    assert time.monotonic() - start_s <= BACK_WITHIN_S
+    rig.send(range(8, 12))
+    assert rig.sequences == [*range(5), *range(8, 12)]
+    assert rig.supervisor.driver.statistics.lost == 3

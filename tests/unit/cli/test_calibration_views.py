@@ -1,0 +1,161 @@
+"""What `dextouch station calibrate` makes of each view: advice, poses, live images, boards."""
+
+import re
+from itertools import count
+
+import cv2
+import numpy as np
+import pytest
+
+from dextouch.errors import (
+    InvalidInputError,
+    StaleDataError,
+    UnknownNameError,
+)
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import invert, transform
+from services.alignment.calibration.hand_eye import mount_difference
+from services.cli.calibrate import advice, boards, live
+from tests.unit.cli.rendered_boards import (
+    BOARD,
+    SIZE,
+    K,
+    board_at,
+    good_views,
+    render,
+    write_photos,
+)
+
+
+@pytest.mark.parametrize(
+    ("views", "words"),
+    [
+        ([], "in front of the camera"),
+        ([board_at([-0.15, -0.1, 0.5], [0, 0, 0])] * 2, "lower right"),
+        ([board_at([0, 0, 0.5], [0, 0.5, 0])] * 2, "left edge nearer|right edge nearer"),
+    ],
+)
+def test_advice_names_what_is_missing(views, words):
+    board = boards.parse_board(BOARD)
+    found = [boards.find_board(str(i), render(view), board) for i, view in enumerate(views)]
+    todo = "; ".join(advice.camera_coverage(found, SIZE).todo)
+    assert re.search(words, todo)
+
+
+def test_advice_asks_for_the_edges_and_for_more_only_when_all_else_is_there():
+    board = boards.parse_board(BOARD)
+    views = [boards.find_board(str(i), render(T), board) for i, T in enumerate(good_views())]
+    assert advice.camera_coverage(views, SIZE).todo == ()
+    assert advice.camera_coverage(views[:24], SIZE).todo == (
+        "take 1 more photos, each from another direction",
+    )
+    inner = [v for v in views if v.pixels[:, 0].max() < 0.84 * SIZE[0]]
+    todo = advice.camera_coverage(inner, SIZE).todo
+    assert any("right" in words and "left," not in words for words in todo)
+
+
+@pytest.mark.parametrize(
+    ("turn", "nearer"),
+    [
+        ([0, 0.5, 0], "right"),
+        ([0, -0.5, 0], "left"),
+        ([0.5, 0, 0], "upper"),
+        ([-0.5, 0, 0], "lower"),
+    ],
+)
+def test_tilts_are_told_apart(turn, nearer):
+    """Which edge is nearer follows from the depth of the board's own edges."""
+    T = board_at([0, 0, 0.5], turn)
+    edges = {
+        "left": [0, 0.06, 0],
+        "right": [0.2, 0.06, 0],
+        "upper": [0.1, 0, 0],
+        "lower": [0.1, 0.125, 0],
+    }
+    depth = {name: (T[:3, :3] @ np.array(p) + T[:3, 3])[2] for name, p in edges.items()}
+    really = min(depth, key=depth.get)
+    view = boards.find_board("", render(T), boards.parse_board(BOARD))
+    tilt = advice.camera_coverage([view], SIZE).tilts_rad[0]
+    said = max(advice.TILTS, key=lambda words: float(tilt @ np.array(advice.TILTS[words])))
+    assert really in said
+    assert really == nearer
+    assert abs(np.linalg.norm(tilt) - 0.5) < 0.05
+
+
+@pytest.mark.parametrize("roll_rad", [0.0, 1.5, np.pi, -2.5])
+def test_a_chessboard_is_never_taken_for_its_half_turn(roll_rad):
+    T = board_at([0, 0, 0.5], [0, 0, 0])
+    about = transform(np.eye(3), np.array([0, 0, 0.5]))
+    turn = transform(rotation_from_vector(np.array([0.3, 0.0, 0.0])), np.zeros(3)) @ transform(
+        rotation_from_vector(np.array([0.0, 0.0, roll_rad])), np.zeros(3)
+    )
+    T = about @ turn @ invert(about) @ T
+    view = boards.find_board("", render(T), boards.parse_board(BOARD))
+    middle = K - np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+    angle, distance = mount_difference(boards.board_pose(view, boards.Lens(middle, np.zeros(5))), T)
+    assert np.rad2deg(angle) < 0.3
+    assert distance < 1e-3
+
+
+def jpeg(T):
+    return cv2.imencode(".jpg", render(T), [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+
+
+def test_live_views_are_kept_only_when_still_and_new(tmp_path):
+    here, there = board_at([-0.1, 0, 0.5], [0, 0.4, 0]), board_at([0.1, 0, 0.5], [0, -0.4, 0])
+    moving = board_at([0, 0, 0.5], [0, 0, 0])
+    images = [jpeg(T) for T in (here, here, here, moving, there, there)]
+    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    arrivals = ((f"live {index}", data) for index, data in enumerate(images))
+    num_kept = live.collect_live(session, arrivals, tmp_path / "photos")
+    assert num_kept == 2
+    kept = sorted((tmp_path / "photos").glob("*.jpg"))
+    assert [path.read_bytes() for path in kept] == [images[1], images[5]]
+    assert not session.is_enough
+    assert (tmp_path / "to/pictures/coverage_head.svg").is_file()
+
+
+def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path):
+    views = good_views()
+    photos = write_photos(tmp_path / "photos", views[:10])
+    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    waits, later = count(), iter(range(10, 25))
+
+    def wait(_):
+        next(waits)
+        index = next(later)
+        cv2.imwrite(str(photos / f"photo_{index:02d}.png"), render(views[index]))
+
+    live.follow_folder(session, live.folder_arrivals(photos, wait=wait))
+    assert session.is_enough
+    assert [view.name for view in session.views] == [f"photo_{i:02d}.png" for i in range(25)]
+    assert next(waits) == 15
+
+
+def test_station_images_come_once_each_and_pauses_are_no_images():
+    bodies = iter([b"a", b"a", None, b"b"])
+
+    def newest():
+        if (body := next(bodies)) is None:
+            raise StaleDataError("the newest image is 1 s old")
+        return body
+
+    arrivals = live.station_arrivals(newest, wait=lambda _: None)
+    assert [next(arrivals)[1], next(arrivals)[1]] == [b"a", b"b"]
+
+
+@pytest.mark.parametrize(
+    ("text", "error"),
+    [
+        ("chessboard:9x6", InvalidInputError),
+        ("chessboard:9:25mm", InvalidInputError),
+        ("chessboard:9x6:25", InvalidInputError),
+        ("charuco:5x7:30mm", InvalidInputError),
+        ("dots:5x7:30mm", UnknownNameError),
+        ("charuco:5x7:30mm:22mm:DICT_1", UnknownNameError),
+    ],
+)
+def test_board_descriptions_are_checked(text, error):
+    with pytest.raises(error):
+        boards.parse_board(text)
+    assert boards.parse_board("charuco:5x7:3cm:22mm").square_m == pytest.approx(0.03)
