@@ -1,5 +1,6 @@
 """A whole station that records and uploads take after take on a simulated clock until killed."""
 
+import itertools
 import json
 import sys
 import threading
@@ -16,7 +17,7 @@ from services.acquisition.uploader import Uploader, recover_spool
 from tests.integration.recording_streams import human_streams, robot_streams
 
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
-# A human's hands and a robot's state in turn: the wrists are streams of both.
+# A human's hands or a robot's state: the wrists are streams of both.
 NAMES = (
     *(f"{kind}_{side}" for kind in ("glove", "finger_tracker") for side in ("left", "right")),
     *(f"pose_tracker_{stream}" for stream in ("head", "wrist_left", "wrist_right")),
@@ -29,21 +30,19 @@ PROMPT = TakePrompt(task="soak", instruction="soak")
 
 
 def streams_of(kind, seconds):
-    """Everything that a station of this kind can have."""
+    """Everything that a station can have of a human's hands (h) or of a robot's state (r)."""
     human = human_streams(seconds, CAMERAS)
-    if kind == "human":
+    if kind == "h":
         return human
     wrists = [s for s in human if s.descriptor.name.startswith("camera_wrist")]
     return [*robot_streams(seconds), *wrists]
 
 
-def random_faults(seed, seconds):
-    """Something ordinary everywhere and something bad on a third of the devices."""
+def random_faults(seed, seconds, num_takes):
+    """Ordinary faults everywhere, a bad one on a third of the devices, unplugging in each take."""
     rng = np.random.default_rng(seed)
     at = float(rng.uniform(0.2, 0.6)) * seconds
     bad = [
-        {"unplugged_s": ((at, at + 0.3 * seconds),)},
-        {"stalls_s": ((at, at + 0.1 * seconds),)},
         {"drop_probability": 0.02},
         {"duplicate_probability": 0.02},
         {"reorder_probability": 0.02},
@@ -57,7 +56,15 @@ def random_faults(seed, seconds):
     devices = {}
     for name in NAMES:
         fault = bad[rng.integers(len(bad))] if rng.random() < 1 / 3 else {}
-        devices[name] = DeviceFaults.model_validate({**base, **fault})
+        unplugged_s, stalls_s = [], []
+        for take in range(num_takes):
+            start = (take + float(rng.uniform(0.2, 0.6))) * seconds
+            if rng.random() < 0.1:
+                unplugged_s.append((start, start + 0.3 * seconds))
+            elif rng.random() < 0.1:
+                stalls_s.append((start, start + 0.1 * seconds))
+        timed = {"unplugged_s": tuple(unplugged_s), "stalls_s": tuple(stalls_s)}
+        devices[name] = DeviceFaults.model_validate({**base, **fault, **timed})
     return FaultScript(devices=devices, others=DeviceFaults(**base))
 
 
@@ -79,37 +86,49 @@ def acknowledge(recorder, done):
             tell(event="spooled", take=status.recording_id, counts=status.num_samples)
 
 
-def record(root, number, seed, seconds):
-    """One take of the next kind of station."""
-    streams = streams_of("robot" if number % 3 == 2 else "human", seconds)
-    faults = random_faults(seed * 1000 + number, seconds)
+def record(mock, number):
+    """One more take of a running station."""
     done = threading.Event()
-    with MockStation(streams, faults, number, VirtualClock(), spool_root=root) as mock:
-        teller = threading.Thread(target=acknowledge, args=(mock.station.recorder, done))
-        teller.start()
-        try:
-            take = mock.run_take(PROMPT, recording_id=f"take-{number:03d}")
-        finally:
-            done.set()
-            teller.join()
+    teller = threading.Thread(target=acknowledge, args=(mock.station.recorder, done))
+    teller.start()
+    try:
+        take = mock.run_take(PROMPT, recording_id=f"take-{number:03d}")
+    finally:
+        done.set()
+        teller.join()
     counts = {stream.stream: stream.num_samples for stream in take.check.streams}
-    tell(event="saved", take=take.recording_id, counts=counts, rss_bytes=rss_bytes())
+    tell(event="saved", take=take.recording_id, counts=counts)
 
 
-def main(spool, store_url, seed, first_take, num_takes, seconds):
-    """Record the takes first … num_takes − 1, human and robot in turn, and upload everything."""
-    root, seconds = Path(spool), float(seconds)
-    recover_spool(root)
-    for number in range(int(first_take), int(num_takes)):
-        record(root, number, int(seed), seconds)
-        with EpisodeStoreClient(store_url) as client:
-            Uploader(root, client, period_s=1.0).upload_all()
+def upload(root, store_url):
+    """Everything that is finished."""
     with EpisodeStoreClient(store_url) as client:
         uploader = Uploader(root, client, period_s=1.0)
         for _ in range(50):
             uploader.upload_all()
             if all(status.uploaded for status in uploader.status()):
-                break
+                return
+
+
+def main(spool, store_url, seed, first_take, kinds, seconds):
+    """Record the takes from the first one on, `kinds` telling of each: one station a kind."""
+    root, seconds, number = Path(spool), float(seconds), int(first_take)
+    recover_spool(root)
+    for kind, takes in itertools.groupby(kinds[number:]):
+        num_takes = len(list(takes))
+        with MockStation(
+            streams_of(kind, seconds),
+            random_faults(int(seed) * 1000 + number, seconds, num_takes),
+            number,
+            VirtualClock(),
+            spool_root=root,
+        ) as mock:
+            for _ in range(num_takes):
+                record(mock, number)
+                upload(root, store_url)
+                tell(event="uploaded", kind=kind, rss_bytes=rss_bytes())
+                number += 1
+    upload(root, store_url)
     tell(event="done")
 
 

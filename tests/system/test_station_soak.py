@@ -28,15 +28,15 @@ pytestmark = pytest.mark.system
 class Soak:
     """Runs the station until all takes are made, killing it in the middle of some."""
 
-    def __init__(self, spool, url, *, num_takes, seconds):
+    def __init__(self, spool, url, *, kinds, seconds):
         self.acknowledged = {}
         self.rss_bytes = []
         self._spool, self._url = spool, url
-        self._num_takes, self._seconds = num_takes, seconds
+        self._kinds, self._seconds = kinds, seconds
 
     def run(self, first_take, seed, kill_in=None):
         """From a take on to the end, or until the kill; whether it came to its end."""
-        arguments = [self._spool, self._url, seed, first_take, self._num_takes, self._seconds]
+        arguments = [self._spool, self._url, seed, first_take, self._kinds, self._seconds]
         child = subprocess.Popen(
             [sys.executable, str(CHILD), *map(str, arguments)],
             stdout=subprocess.PIPE,
@@ -54,7 +54,7 @@ class Soak:
             is_done = is_done or fact["event"] == "done"
             if "counts" in fact:
                 self.acknowledged[fact["take"]] = fact["counts"]
-            if fact["event"] == "saved":
+            if fact["event"] == "uploaded":
                 self.rss_bytes.append(fact["rss_bytes"])
             elif (
                 kill_in is not None
@@ -70,24 +70,25 @@ class Soak:
 
 
 def rss_slope_mb_per_hour(rss_bytes, seconds):
-    """Growth by simulated time, the first two takes left out as warm-up."""
-    kept = np.array(rss_bytes[2:]) / 1e6
+    """Growth of one station by simulated time, the first three takes left out as warm-up."""
+    kept = np.array(rss_bytes[3:]) / 1e6
     return float(np.polyfit(np.arange(len(kept)) * seconds / 3600, kept, 1)[0])
 
 
-def soak(tmp_path, *, num_takes, seconds, kills):
+def soak(tmp_path, *, kinds, seconds, kills):
+    """All takes, `kinds` telling of each, with a kill in some; memory of the last process."""
     settings = EpisodeStoreSettings(store_url=str(tmp_path / "store"), sync_uploads=False)
     spool = tmp_path / "spool"
     spool.mkdir()
     with served(create_app(settings)) as url, EpisodeStoreClient(url) as client:
-        station = Soak(spool, url, num_takes=num_takes, seconds=seconds)
+        station = Soak(spool, url, kinds=kinds, seconds=seconds)
         first = 0
         for seed, number in enumerate(kills):
             assert not station.run(first, seed, kill_in=f"take-{number:03d}")
             first = number + 1
         assert station.run(first, len(kills))
         ids = [recording.recording_id for recording in client.recordings().recordings]
-    assert sorted(ids) == [f"take-{number:03d}" for number in range(num_takes)]
+    assert sorted(ids) == [f"take-{number:03d}" for number in range(len(kinds))]
     store = EpisodeStore(settings.store_url)
     for recording_id, counts in station.acknowledged.items():
         spooled, recording = SpoolReader(spool / recording_id), store.recording(recording_id)
@@ -105,12 +106,14 @@ def soak(tmp_path, *, num_takes, seconds, kills):
 
 
 def test_a_short_soak(tmp_path):
-    soak(tmp_path, num_takes=3, seconds=1.0, kills=(0, 1))
+    soak(tmp_path, kinds="hhr", seconds=1.0, kills=(0, 1))
 
 
 @pytest.mark.slow
 def test_half_an_hour_of_a_whole_station(tmp_path):
-    rss_bytes = soak(tmp_path, num_takes=30, seconds=60.0, kills=(3, 11))
+    # The last process is one station that lives for 18 minutes.
+    rss_bytes = soak(tmp_path, kinds=4 * "h" + 6 * "r" + 20 * "h", seconds=60.0, kills=(3, 11))
     slope = rss_slope_mb_per_hour(rss_bytes, 60.0)
-    print(f"RSS growth after warm-up: {slope:.2f} MB an hour of simulated time")  # noqa: T201
+    shown = " ".join(f"{size / 1e6:.1f}" for size in rss_bytes)
+    print(f"RSS after each take (MB): {shown}\ngrowth {slope:.2f} MB an hour of simulated time")  # noqa: T201
     assert slope < 1.0
