@@ -4,6 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
+STAGE ?= store loader acquisition clocks calibration
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test check slow vm fuzz fix clean bench bench-lerobot check-lerobot-export
@@ -40,8 +41,10 @@ check: $(VENV)/.dev      ## format, lint, types, import contracts
 	$(BIN)/mypy -p dextouch -p services
 	PYTHONPATH=.:shared $(BIN)/lint-imports
 
-bench: $(VENV)/.dev      ## time the stages against their errors; results in runs/bench
-	$(BIN)/dextouch bench store --out runs/bench $(ARGS)
+bench: $(VENV)/.dev      ## time the stages against their errors, one after another; STAGE=clocks ARGS="--quick" for one
+	@missed=; for stage in $(STAGE); do echo "== $$stage"; \
+	$(BIN)/dextouch bench $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
+	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
 
 fix: $(VENV)/.dev        ## let the tools mend what they can
 	$(BIN)/ruff format .
