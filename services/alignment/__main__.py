@@ -3,7 +3,7 @@
 import argparse
 import json
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from dextouch.episodes import EpisodeStore
@@ -16,6 +16,8 @@ from services.alignment.report import AlignmentReport
 from services.alignment.settings import AlignmentSettings
 
 EXIT_REFUSED = 3
+# Taxels of one reason that a line tells; the report has all.
+MAX_TOLD = 12
 USAGE = """usage: python -m services.alignment [serve] [--SETTING VALUE …]
        python -m services.alignment run RECORDING_ID … [--store FOLDER] [--json PATH]
 
@@ -73,9 +75,20 @@ def _line(report: AlignmentReport) -> str:
     verb = "aligned" if report.created else "was aligned already"
     lost = sum(clock.num_dropped for clock in report.clocks)
     absent = f"; absent: {', '.join(report.absent)}" if report.absent else ""
+    refused = "".join(
+        f"; {stream}: taxels not measured and zero: {_by_reason(reasons)}"
+        for stream, reasons in report.refused_taxels.items()
+    )
     return (
         f"{report.recording_id} {verb}: {report.episode_id}, {report.num_steps} steps, "
-        f"{len(report.streams)} streams, {lost} samples lost{absent}"
+        f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}"
+    )
+
+
+def _by_reason(reasons: Mapping[str, Sequence[int]]) -> str:
+    return ", ".join(
+        f"{reason} {' '.join(map(str, taxels[:MAX_TOLD]))}{' …' * (len(taxels) > MAX_TOLD)}"
+        for reason, taxels in reasons.items()
     )
 
 

@@ -17,7 +17,7 @@ from services.alignment.synchronization.episode_builder import (
 logger = structlog.get_logger(__name__)
 
 # Raised whenever alignment gives other numbers for the same recording and options.
-ALIGNMENT_VERSION = 1
+ALIGNMENT_VERSION = 2
 MAX_STEM = 100
 
 

@@ -1,9 +1,13 @@
 """An aligned episode in, the short account of it that people and programs read out."""
 
+from collections.abc import Mapping
+
+import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from dextouch.episodes import EpisodeReader
-from dextouch.schemas.episodes import ClockReport, Domain
+from dextouch.schemas.episodes import ClockReport, Domain, Matrix
+from services.alignment.calibration.tactile_baseline import REASONS
 
 EXPECTED_STREAMS = (
     "tactile_left",
@@ -18,7 +22,8 @@ class AlignmentReport(BaseModel):
     """What became of a recording.
 
     `created` is False where the same recording had been aligned with the same options before.
-    `absent` lists streams that an episode may have and this one has not.
+    `absent` lists streams that an episode may have and this one has not; `refused_taxels` names, by
+    stream and reason, taxels (anatomical order) that are zero since nobody measured them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -32,6 +37,7 @@ class AlignmentReport(BaseModel):
     absent: tuple[str, ...]
     clocks: tuple[ClockReport, ...]
     quality: dict[str, FiniteFloat]
+    refused_taxels: dict[str, dict[str, tuple[int, ...]]] = {}
     content_sha256: str
 
 
@@ -48,5 +54,19 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
         absent=tuple(name for name in EXPECTED_STREAMS if name not in episode.streams),
         clocks=attributes.clocks,
         quality=attributes.quality,
+        refused_taxels=refused_taxels(attributes.calibration),
         content_sha256=episode.content_sha256,
     )
+
+
+def refused_taxels(
+    calibration: Mapping[str, Matrix],
+) -> dict[str, dict[str, tuple[int, ...]]]:
+    """Taxels that an episode's calibration marks as not measured, by stream and reason."""
+    found: dict[str, dict[str, tuple[int, ...]]] = {}
+    for name in ("tactile_left", "tactile_right"):
+        states = np.array(calibration.get(f"{name}_refused_taxels", ()), dtype=np.int64).ravel()
+        for code in np.unique(states[states > 0]).tolist():
+            taxels = tuple(np.flatnonzero(states == code).tolist())
+            found.setdefault(name, {})[REASONS[code]] = taxels
+    return found

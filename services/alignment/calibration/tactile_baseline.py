@@ -1,97 +1,199 @@
-"""Raw counts of a glove and its calibration record in, pressures in kPa and dead taxels out."""
+"""Raw counts of a glove and its calibration record in, pressures in kPa and refused taxels out."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64
+from jaxtyping import Float32, Float64, Int64, Shaped, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.tactile.layout import NUM_RAW_TAXELS, Side, select_taxels
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, raw_indices
+from services.alignment.calibration.tactile_faults import DEAD, OK, STATES, STUCK
 
+# Why a taxel of a take is not measured: what the calibration says, or that it has no reading.
+REASONS = (*STATES, "absent")
+ABSENT = len(STATES)
 # A cell that never moves is dead if it rests further than this from its tare.
 DEAD_OFFSET_KPA = 1.0
 MIN_SAMPLES_TO_JUDGE = 30
+# A cell without a reading in more samples than this is refused; else those samples are left out.
+MAX_MISSING = 0.1
+NO_CELL = -1
+
+Record = Mapping[str, Sequence[Sequence[float]]]
 
 
 @dataclass(frozen=True)
 class TactileCalibration:
-    """counts = tare + gain · pressure for each of the 360 raw cells of one glove.
+    """counts = tare + gain · pressure for each of the raw cells of one glove of any maker.
+
+    Attributes:
+        side: of the glove.
+        tare_counts: of each raw cell, in the unit in which the glove sends its readings.
+        gain_counts_per_kpa: of each raw cell; above 0 where a measured taxel sits.
+        cells: raw cell of each taxel in anatomical order, −1 where the glove has none.
+        state: why a taxel is not measured, index into `REASONS`; 0 where it is.
 
     Raises:
         NonFiniteError: NaN or infinity.
-        InvalidInputError: a gain that is not positive.
+        InvalidInputError: a gain that is not positive, or not one taxel that is measured.
     """
 
     side: Side
-    tare_counts: Float64[np.ndarray, "360"]
-    gain_counts_per_kpa: Float64[np.ndarray, "360"]
+    tare_counts: Float64[np.ndarray, " cells"]
+    gain_counts_per_kpa: Float64[np.ndarray, " cells"]
+    cells: Int64[np.ndarray, "320"]
+    state: UInt8[np.ndarray, "320"]
 
     def __post_init__(self) -> None:
         for name in ("tare_counts", "gain_counts_per_kpa"):
             if not np.isfinite(getattr(self, name)).all():
                 raise NonFiniteError(f"tactile calibration {self.side}: {name} is not finite")
-        if not (self.gain_counts_per_kpa > 0).all():
+        measured = self.state == OK
+        if not measured.any():
             raise InvalidInputError(
-                f"tactile calibration {self.side}: got a gain of "
-                f"{self.gain_counts_per_kpa.min():g} counts/kPa, expected all above 0"
+                f"tactile calibration {self.side}: refuses all 320 taxels; calibrate the glove "
+                "again, or leave its stream out"
+            )
+        gains = self.gain_counts_per_kpa[self.cells[measured]]
+        if not (gains > 0).all():
+            raise InvalidInputError(
+                f"tactile calibration {self.side}: got a gain of {gains.min():g} counts/kPa, "
+                "expected all above 0"
             )
 
     @classmethod
     def from_record(
-        cls, record: Mapping[str, Sequence[Sequence[float]]], side: Side
+        cls, record: Record, side: Side, *, num_cells: int = NUM_RAW_TAXELS
     ) -> "TactileCalibration":
         """From a recording's calibration matrices.
 
+        Args:
+            record: `tactile_<side>_tare_counts` and `…_gain_counts_per_kpa` (1 × cells); if there
+                are any `…_taxel_state` (1 × cells) and `…_cells` (1 × 320), which a glove of
+                another number of cells must have.
+            side: of the glove.
+            num_cells: numbers that the glove sends in each sample.
+
         Raises:
-            InvalidInputError: the tare or gain of this side is missing or not 1 × 360.
+            InvalidInputError: a matrix of this side is missing, of the wrong shape, or holds
+                what it cannot.
         """
-        names = (f"tactile_{side}_tare_counts", f"tactile_{side}_gain_counts_per_kpa")
-        rows = []
-        for name in names:
-            if name not in record:
-                raise InvalidInputError(
-                    f"calibration: {name!r} is missing, so counts of the {side} glove cannot "
-                    f"become kPa; expected it beside: {', '.join(sorted(record)) or 'nothing'}"
-                )
-            matrix = np.array(record[name], dtype=np.float64)
-            if matrix.shape != (1, NUM_RAW_TAXELS):
-                raise InvalidInputError(
-                    f"calibration {name!r}: got {matrix.shape}, expected (1, {NUM_RAW_TAXELS})"
-                )
-            rows.append(matrix[0])
-        return cls(side, *rows)
+        tare, gain = (
+            _row(record, f"tactile_{side}_{name}", num_cells)
+            for name in ("tare_counts", "gain_counts_per_kpa")
+        )
+        cells = _cells(record, side, num_cells)
+        state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
+        has_cell = cells != NO_CELL
+        state[has_cell] = _states(record, f"tactile_{side}_taxel_state", num_cells)[cells[has_cell]]
+        return cls(side, tare, gain, cells, state)
 
-    def dead_taxels(self, counts: np.ndarray) -> Bool[np.ndarray, "320"]:
-        """Taxels that stand still over a whole take although not at their tare."""
-        raw = _checked(counts, self.side)
-        if len(raw) < MIN_SAMPLES_TO_JUDGE:
-            return np.zeros(320, dtype=bool)
-        still = raw.min(axis=0) == raw.max(axis=0)
-        offset_kpa = np.abs(raw[0] - self.tare_counts) / self.gain_counts_per_kpa
-        return select_taxels(still & (offset_kpa > DEAD_OFFSET_KPA), side=self.side)
+    def refused_taxels(self, counts: np.ndarray) -> UInt8[np.ndarray, "320"]:
+        """Why each taxel is not measured in a whole take, index into `REASONS`; 0: it is.
 
-    def to_kpa(
-        self, counts: np.ndarray, *, dead: np.ndarray | None = None
-    ) -> Float32[np.ndarray, "time 320"]:
-        """Pressures in anatomical order; below the tare they are zero.
+        Beside what the calibration refuses: cells that stand still although not at their tare
+        (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the samples.
 
         Args:
-            counts: [T, 360] raw readings of the glove.
-            dead: bool [320], taxels to set to zero.
+            counts: [T, cells] raw readings of the glove; NaN where it sent none.
+        """
+        taxels, reasons = self._taxels(counts), self.state.copy()
+        if len(taxels) < MIN_SAMPLES_TO_JUDGE:
+            return reasons
+        missing = 1.0 - np.isfinite(taxels).mean(axis=0)
+        reasons[(reasons == OK) & (missing > MAX_MISSING)] = ABSENT
+        first = taxels[0].astype(np.float64)
+        still = taxels.min(axis=0) == taxels.max(axis=0)
+        offset_kpa = np.abs(first - self.tare_counts[self.cells]) / self._gains()
+        silent = (reasons == OK) & still & (offset_kpa > DEAD_OFFSET_KPA)
+        reasons[silent] = np.where(first[silent] == 0, DEAD, STUCK)
+        return reasons
+
+    def to_kpa(
+        self, counts: np.ndarray, *, refused: np.ndarray | None = None
+    ) -> Float32[np.ndarray, "time 320"]:
+        """Pressures in anatomical order; zero below the tare, NaN where the reading is.
+
+        Args:
+            counts: [T, cells] raw readings of the glove.
+            refused: uint8 [320] from `refused_taxels`, taxels that are set to zero; by default
+                those that the calibration refuses.
 
         Raises:
-            ShapeError: not [T, 360].
+            ShapeError: not [T, cells].
         """
-        pressures = (_checked(counts, self.side) - self.tare_counts) / self.gain_counts_per_kpa
-        taxels = np.maximum(select_taxels(pressures, side=self.side), 0.0)
-        if dead is not None:
-            taxels[:, dead] = 0.0
+        offsets = self._taxels(counts).astype(np.float64) - self.tare_counts[self.cells]
+        taxels = np.maximum(offsets / self._gains(), 0.0)
+        taxels[:, (self.state if refused is None else refused) != OK] = 0.0
         return taxels.astype(np.float32)
 
+    def _taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time 320"]:
+        """Readings by taxel; where there is no cell, those of any other."""
+        raw = np.asarray(counts)
+        if raw.ndim != 2 or raw.shape[1] != len(self.tare_counts):
+            raise ShapeError(
+                f"counts of the {self.side} glove: got {raw.shape}, expected "
+                f"[T, {len(self.tare_counts)}]"
+            )
+        return raw[:, self.cells]
 
-def _checked(counts: np.ndarray, side: Side) -> Float64[np.ndarray, "time 360"]:
-    raw = np.asarray(counts)
-    if raw.ndim != 2 or raw.shape[1] != NUM_RAW_TAXELS:
-        raise ShapeError(f"counts of the {side} glove: got {raw.shape}, expected [T, 360]")
-    return raw.astype(np.float64)
+    def _gains(self) -> Float64[np.ndarray, "320"]:
+        """Gains by taxel; 1 where the taxel is refused and its gain says nothing."""
+        return np.where(self.state == OK, self.gain_counts_per_kpa[self.cells], 1.0)
+
+
+def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
+    if name not in record:
+        raise InvalidInputError(
+            f"calibration: {name!r} is missing, so counts of that glove cannot become kPa; "
+            f"expected it beside: {', '.join(sorted(record)) or 'nothing'}"
+        )
+    matrix = np.array(record[name], dtype=np.float64)
+    if matrix.shape != (1, size):
+        raise InvalidInputError(f"calibration {name!r}: got {matrix.shape}, expected (1, {size})")
+    return matrix[0]
+
+
+def _cells(record: Record, side: Side, num_cells: int) -> Int64[np.ndarray, "320"]:
+    """The map that comes with the calibration, else that of our own gloves."""
+    name = f"tactile_{side}_cells"
+    if name not in record:
+        if num_cells == NUM_RAW_TAXELS:
+            return raw_indices(side=side)
+        raise InvalidInputError(
+            f"calibration: the {side} glove sends {num_cells} numbers a sample, so it is not ours, "
+            f"and {name!r} is missing: expected 1 x {NUM_TAXELS}, for each taxel in anatomical "
+            f"order the raw cell 0 … {num_cells - 1} that measures it, -1 for none"
+        )
+    cells = _row(record, name, NUM_TAXELS)
+    used = cells[cells != NO_CELL]
+    wrong = (cells != np.rint(cells)) | (cells < NO_CELL) | (cells >= num_cells)
+    if wrong.any():
+        taxel = int(np.argmax(wrong))
+        raise InvalidInputError(
+            f"calibration {name!r}: got {cells[taxel]:g} for taxel {taxel}, expected a whole "
+            f"number -1 … {num_cells - 1}"
+        )
+    found, counts = np.unique(used, return_counts=True)
+    if (counts > 1).any():
+        cell = found[np.argmax(counts)]
+        raise InvalidInputError(
+            f"calibration {name!r}: names cell {cell:g} {counts.max()} times (taxels "
+            f"{np.flatnonzero(cells == cell).tolist()}), expected each cell at most once"
+        )
+    return cells.astype(np.int64)
+
+
+def _states(record: Record, name: str, num_cells: int) -> UInt8[np.ndarray, " cells"]:
+    """States of the raw cells; a calibration without them refuses none."""
+    if name not in record:
+        return np.full(num_cells, OK, dtype=np.uint8)
+    states = _row(record, name, num_cells)
+    unknown = ~np.isin(states, np.arange(len(STATES)))
+    if unknown.any():
+        raise InvalidInputError(
+            f"calibration {name!r}: got {states[np.argmax(unknown)]:g} for raw cell "
+            f"{int(np.argmax(unknown))}, expected 0 … {len(STATES) - 1} ({', '.join(STATES)})"
+        )
+    return states.astype(np.uint8)

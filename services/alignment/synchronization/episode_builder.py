@@ -1,7 +1,7 @@
 """A recording in, an episode on one reference clock out, not yet written anywhere."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Int64, Shaped
@@ -13,6 +13,7 @@ from dextouch.schemas.episodes import (
     StoredAnchor,
 )
 from dextouch.streams.descriptors import StreamDescriptor
+from services.alignment.calibration.lens_record import check_lenses
 from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
@@ -132,7 +133,8 @@ def _episode_attributes(
         success=source.success,
         recovered=source.recovered,
         lineage=(*source.lineage, origin),
-        calibration=source.calibration,
+        calibration=source.calibration
+        | {name: rows for stream in streams.values() for name, rows in stream.calibration.items()},
         clocks=tuple(stream.timing.report for stream in streams.values()),
         # What the station measured, too; of two figures with one name the aligned one counts.
         quality=source.quality | quality,
@@ -144,7 +146,7 @@ def check_complete(recording: Recording) -> None:
     """Refuse a recording from which no episode can be made.
 
     Raises:
-        InvalidInputError: names the streams or the calibration that are missing.
+        InvalidInputError: names the streams or the calibration that are missing or do not fit.
     """
     attributes = recording.attributes
     missing = [name for name in REQUIRED[attributes.domain] if name not in recording.streams]
@@ -160,6 +162,8 @@ def check_complete(recording: Recording) -> None:
             f"missing; it has {sorted(attributes.calibration)}",
             missing=["K_head"],
         )
+    where = f"recording {attributes.recording_id!r}"
+    check_lenses(attributes.calibration, recording.streams, where=where)
 
 
 def _seen(stream: AlignedStream) -> AlignedStream:
@@ -167,13 +171,7 @@ def _seen(stream: AlignedStream) -> AlignedStream:
     if stream.descriptor.kind != "keypoints":
         return stream.complete()
     anything = np.isfinite(stream.values).all(axis=-1).any(axis=-1)
-    return AlignedStream(
-        stream.descriptor,
-        stream.t_ns[anything],
-        stream.values[anything],
-        stream.timing,
-        stream.quality,
-    )
+    return replace(stream, t_ns=stream.t_ns[anything], values=stream.values[anything])
 
 
 def _common_stretch(
@@ -198,9 +196,7 @@ def _common_stretch(
 
 
 def _moved(stream: AlignedStream, origin_ns: int) -> AlignedStream:
-    return AlignedStream(
-        stream.descriptor, stream.t_ns - origin_ns, stream.values, stream.timing, stream.quality
-    )
+    return replace(stream, t_ns=stream.t_ns - origin_ns)
 
 
 def _slice(gridded: GriddedStreams, run: tuple[int, int]) -> GriddedStreams:

@@ -1,6 +1,6 @@
 """A recording in, its streams dated on the host's clock and converted to episode units out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -8,12 +8,12 @@ from jaxtyping import Int64, Shaped
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas.episodes import Matrix, matrix_rows
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS
-from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_baseline import REASONS, TactileCalibration
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 
 # Where the tracked body sits in what the tracker follows, by stream.
@@ -48,7 +48,8 @@ class Recording(Protocol):
 class AlignedStream:
     """One stream on a common clock, in the units of an episode.
 
-    `values` may hold NaN (keypoints that were not seen); `quality` are figures for the record.
+    `values` may hold NaN (keypoints that were not seen); `quality` are figures for the record, and
+    `calibration` matrices that the episode carries beside those of the recording.
     """
 
     descriptor: StreamDescriptor
@@ -56,6 +57,7 @@ class AlignedStream:
     values: Shaped[np.ndarray, "n ..."]
     timing: TimedStream
     quality: dict[str, float]
+    calibration: dict[str, Matrix] = field(default_factory=dict)
 
     @property
     def name(self) -> str:
@@ -67,9 +69,7 @@ class AlignedStream:
         if self.values.dtype.kind != "f":
             return self
         whole = np.isfinite(self.values).reshape(len(self.values), -1).all(axis=1)
-        return AlignedStream(
-            self.descriptor, self.t_ns[whole], self.values[whole], self.timing, self.quality
-        )
+        return replace(self, t_ns=self.t_ns[whole], values=self.values[whole])
 
 
 def read_stream(recording: Recording, name: str) -> AlignedStream:
@@ -84,17 +84,17 @@ def read_stream(recording: Recording, name: str) -> AlignedStream:
     calibration = recording.attributes.calibration
     timing = time_stream(batch, descriptor, latency_ns=_latency_ns(calibration, name))
     values = batch.values[timing.kept]
-    quality: dict[str, float] = {}
-    if descriptor.kind == "tactile" and descriptor.unit == "counts":
-        descriptor, values, quality = _pressures(descriptor, values, calibration)
-    elif descriptor.kind == "keypoints":
+    if descriptor.kind == "tactile" and descriptor.unit != "kPa":
+        raw = AlignedStream(descriptor, timing.t_host_ns, values, timing, {})
+        return _pressures(raw, calibration)
+    if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
         values = values.astype(np.float64)
     elif descriptor.kind == "pose" and MOUNTS.get(name) in calibration:
         values = _move_to_body(values, calibration[MOUNTS[name]])
     elif descriptor.kind == "image":
         descriptor = descriptor.model_copy(update={"unit": "rgb8"})
-    return AlignedStream(descriptor, timing.t_host_ns, values, timing, quality)
+    return AlignedStream(descriptor, timing.t_host_ns, values, timing, {})
 
 
 def _latency_ns(calibration: dict[str, Matrix], name: str) -> int:
@@ -106,18 +106,33 @@ def _latency_ns(calibration: dict[str, Matrix], name: str) -> int:
     return round(matrix[0][0])
 
 
-def _pressures(
-    descriptor: StreamDescriptor, counts: np.ndarray, calibration: dict[str, Matrix]
-) -> tuple[StreamDescriptor, np.ndarray, dict[str, float]]:
-    if descriptor.side is None:
-        raise InvalidInputError(f"stream {descriptor.name!r}: has no side, expected left or right")
-    glove = TactileCalibration.from_record(calibration, descriptor.side)
-    dead = glove.dead_taxels(counts)
-    converted = descriptor.model_copy(
-        update={"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
+def _pressures(stream: AlignedStream, calibration: dict[str, Matrix]) -> AlignedStream:
+    """Raw readings of any maker's glove as kPa; what is not measured is zero, named and counted."""
+    name, side = stream.name, stream.descriptor.side
+    if side is None:
+        raise InvalidInputError(f"stream {name!r}: has no side, expected left or right")
+    if len(stream.descriptor.shape) != 1:
+        raise InvalidInputError(
+            f"stream {name!r}: got samples of {stream.descriptor.shape}, expected a row of cells"
+        )
+    num_cells = stream.descriptor.shape[0]
+    glove = TactileCalibration.from_record(calibration, side, num_cells=num_cells)
+    refused = glove.refused_taxels(stream.values)
+    numbers = np.bincount(refused, minlength=len(REASONS)).tolist()
+    counted = {
+        f"{name}_num_{reason}_taxels": float(number)
+        for reason, number in zip(REASONS[1:], numbers[1:], strict=True)
+        if number
+    }
+    return replace(
+        stream,
+        descriptor=stream.descriptor.model_copy(
+            update={"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
+        ),
+        values=glove.to_kpa(stream.values, refused=refused),
+        quality={f"{name}_num_refused_taxels": float(np.count_nonzero(refused))} | counted,
+        calibration={f"{name}_refused_taxels": matrix_rows(refused[None].astype(np.float64))},
     )
-    quality = {f"{descriptor.name}_num_dead_taxels": float(dead.sum())}
-    return converted, glove.to_kpa(counts, dead=dead), quality
 
 
 def _move_to_body(poses: np.ndarray, mount: Matrix) -> np.ndarray:

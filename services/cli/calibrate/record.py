@@ -30,6 +30,8 @@ _MATRICES: TypeAdapter[dict[str, Matrix]] = TypeAdapter(dict[str, Matrix])
 SIGMA_LIMITS = {"focal": 0.003, "rotation_rad": np.deg2rad(0.06), "translation_m": 0.8e-3}
 MAX_GAIN_SIGMA = 0.05
 MAX_TAXEL_FAULTS = (0.01, 0.05)
+# Matrices of a glove that are no measurement of their own, or that an episode brings with it.
+_ABOUT_GLOVES = ("noise_counts", "taxel_state", "cells", "refused_taxels")
 
 
 @dataclass(frozen=True)
@@ -167,7 +169,7 @@ def _is_companion(name: str, matrices: Mapping[str, Matrix]) -> bool:
     if name.endswith("calibrated_at_unix_s") or "_sigma_" in name:
         return True
     side = name.removeprefix("tactile_").split("_")[0]
-    if name in {f"tactile_{side}_noise_counts", f"tactile_{side}_taxel_state"}:
+    if name in {f"tactile_{side}_{about}" for about in _ABOUT_GLOVES}:
         return True
     camera = name.removeprefix("distortion_").removeprefix("image_size_").removesuffix("_px")
     return camera != name and f"K_{camera}" in matrices

@@ -54,7 +54,7 @@ def pose_raster(
     Args:
         actions: [B, T, 67] relative to the anchors.
         anchors: [B, 3, 4, 4] T_world of left wrist, right wrist and head camera at step 0.
-        K_head: [B, 3, 3] in pixels of the image.
+        K_head: [B, 3, 3] in pixels of the image; the lens's distortion is not applied.
         image_px: side of the square image.
         cells: side of the raster.
 

@@ -123,6 +123,7 @@ class _Export:
         return num_samples
 
     def _log_pinhole(self) -> None:
+        # Rerun's pinhole knows no lens: what is drawn into the image is off by the distortion.
         camera = self._reader.streams.get(HEAD_CAMERA)
         K = self._reader.attributes.calibration.get("K_head")
         if isinstance(self._reader, EpisodeReader):

@@ -20,7 +20,8 @@ def project(
 ) -> tuple[Float64[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
     """Pixels [..., 2] of points [..., 3] in metres, and whether each lies in front of the camera.
 
-    Points nearer than `min_depth_m` are projected as if at that depth and marked False.
+    Points nearer than `min_depth_m` are projected as if at that depth and marked False. A lens is
+    not modelled: on an image of a real camera, points are off by its `distortion_<camera>`.
     """
     points = np.asarray(points_camera, dtype=np.float64)
     in_front = points[..., 2] >= min_depth_m

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.schemas.episodes import matrix_rows
 from dextouch.tactile.layout import expand_taxels, raw_indices
-from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_baseline import REASONS, TactileCalibration
 
 RNG = np.random.default_rng(0)
 TARE, GAIN = RNG.uniform(110, 130, 360), RNG.uniform(38, 42, 360)
@@ -24,18 +25,86 @@ def test_pressures_come_back(side):
     counts = np.rint(TARE + GAIN * expand_taxels(true_kpa, side=side)).astype(np.uint16)
     glove = TactileCalibration.from_record(record(side), side)
     np.testing.assert_allclose(glove.to_kpa(counts), true_kpa, atol=0.5 / 38 + 1e-4)
-    assert not glove.dead_taxels(counts).any()
+    assert not glove.refused_taxels(counts).any()
 
 
-def test_dead_taxels_are_found_and_silenced():
+@pytest.mark.parametrize(("kept", "reason"), [(4000, "stuck"), (0, "dead")])
+def test_taxels_that_stand_still_off_their_tare_are_silenced(kept, reason):
     cell = int(raw_indices(side="right")[7])
-    counts = np.rint(np.broadcast_to(TARE, (40, 360))).astype(np.uint16)
-    counts[:, cell] = 4000
+    counts = np.rint(np.broadcast_to(TARE + 200, (40, 360))).astype(np.uint16)
+    counts[20:] += 1
+    counts[:, cell] = kept
     glove = TactileCalibration.from_record(record("right"), "right")
-    dead = glove.dead_taxels(counts)
-    assert np.flatnonzero(dead).tolist() == [7]
-    assert glove.to_kpa(counts)[0, 7] > 50
-    assert (glove.to_kpa(counts, dead=dead) < 0.1).all()
+    refused = glove.refused_taxels(counts)
+    assert np.flatnonzero(refused).tolist() == [7]
+    assert REASONS[refused[7]] == reason
+    pressures = glove.to_kpa(counts, refused=refused)
+    assert (pressures[:, 7] == 0).all()
+    assert (np.delete(pressures, 7, axis=1) > 4).all()
+    # A few samples say nothing.
+    assert not glove.refused_taxels(counts[:20]).any()
+
+
+def test_what_the_calibration_refuses_is_zero_and_its_gain_does_not_matter():
+    cells = raw_indices(side="left")[[3, 200]]
+    state, gain = np.zeros(360), GAIN.copy()
+    state[cells], gain[cells] = (1, 6), 0.0
+    counts = np.rint(np.broadcast_to(TARE + 800, (40, 360))).astype(np.uint16)
+    refusing = record("left", gain=gain) | {"tactile_left_taxel_state": [list(state)]}
+    glove = TactileCalibration.from_record(refusing, "left")
+    refused = glove.refused_taxels(counts)
+    assert np.flatnonzero(glove.to_kpa(counts)[0] == 0).tolist() == [3, 200]
+    assert [REASONS[refused[taxel]] for taxel in (3, 200)] == ["dead", "imprecise"]
+
+
+def test_another_map_selects_its_cells():
+    cells = np.r_[np.arange(319)[::-1], -1]
+    other = {
+        "tactile_left_cells": matrix_rows(cells[None].astype(float)),
+        "tactile_left_tare_counts": [[1.0] * 400],
+        "tactile_left_gain_counts_per_kpa": [[2.0] * 400],
+    }
+    glove = TactileCalibration.from_record(other, "left", num_cells=400)
+    counts = np.full((40, 400), np.nan, dtype=np.float32)
+    counts[:, :319] = 1 + 2 * np.arange(319) + np.arange(40)[:, None] / 64
+    # One reading of one cell is missing now and then, all of another.
+    counts[5, 100], counts[3:9, 200] = np.nan, np.nan
+    refused = glove.refused_taxels(counts)
+    assert np.flatnonzero(refused).tolist() == [318 - 200, 319]
+    assert {REASONS[code] for code in refused[refused > 0]} == {"absent"}
+    pressures = glove.to_kpa(counts, refused=refused)
+    np.testing.assert_allclose(pressures[0, :118], np.arange(318, 200, -1))
+    assert np.flatnonzero(np.isnan(pressures).any(axis=1)).tolist() == [5]
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"cells": None}, "sends 400 numbers.*tactile_left_cells"),
+        ({"cells": np.arange(319)}, r"tactile_left_cells.*\(1, 319\)"),
+        ({"cells": np.arange(320) + 100}, "got 400 for taxel 300"),
+        ({"cells": np.arange(320) - 2}, "got -2 for taxel 0"),
+        ({"cells": np.arange(320) + 0.5}, "whole"),
+        ({"cells": np.r_[np.arange(319), 7]}, r"cell 7 2 times \(taxels \[7, 319\]"),
+        ({"cells": np.full(320, -1)}, "refuses all 320"),
+        ({"tare_counts": np.ones(360)}, r"tare_counts.*\(1, 360\).*\(1, 400\)"),
+        ({"taxel_state": np.full(400, 7)}, "got 7 for raw cell 0"),
+        ({"taxel_state": np.ones(400)}, "refuses all 320"),
+    ],
+)
+def test_maps_that_cannot_be_are_refused(change, words):
+    rows = {
+        "cells": np.arange(320),
+        "tare_counts": np.ones(400),
+        "gain_counts_per_kpa": np.ones(400),
+    } | change
+    other = {
+        f"tactile_left_{name}": matrix_rows(np.array([row], dtype=float))
+        for name, row in rows.items()
+        if row is not None
+    }
+    with pytest.raises(InvalidInputError, match=words):
+        TactileCalibration.from_record(other, "left", num_cells=400)
 
 
 def test_below_the_tare_is_zero_not_negative():

@@ -14,6 +14,7 @@ from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import encoded_values
 
 K_HEAD = np.array([[60.0, 0, 32], [0, 61, 31.5], [0, 0, 1]])
+DISTORTION = (-0.1, 0.02, 0.001, -0.002, 0.003)
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
 
 
@@ -153,7 +154,7 @@ def write_recording(store, recording_id="take-0001", *, count=70):
         station="bench-2",
         operator="p17",
         consent=True,
-        calibration={"K_head": matrix_rows(K_HEAD)},
+        calibration={"K_head": matrix_rows(K_HEAD), "distortion_head": (DISTORTION,)},
         ledger=(LedgerEntry(stream="wrist_left", event="lost", count=2),),
     )
     with store.writer(kind="recording", attributes=attributes) as writer:

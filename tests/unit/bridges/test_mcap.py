@@ -22,6 +22,7 @@ from dextouch.errors import (
     StorageError,
 )
 from tests.unit.bridges.takes import (
+    DISTORTION,
     K_HEAD,
     descriptor,
     differing_streams,
@@ -111,6 +112,10 @@ def test_poses_carry_their_frames_and_the_camera_its_matrix(store, tmp_path):
     assert list(calibration.K) == K_HEAD.ravel().tolist()
     assert (calibration.height, calibration.width) == (64, 64)
     assert list(calibration.P) == np.hstack([K_HEAD, np.zeros((3, 1))]).ravel().tolist()
+    assert list(calibration.D) == [0.0] * 5
+    export_mcap(write_recording(store), tmp_path / "raw.mcap")
+    lens = messages_of(tmp_path / "raw.mcap")["/camera_head/calibration"][1][0][1]
+    assert (list(lens.D), lens.distortion_model) == (list(DISTORTION), "plumb_bob")
 
 
 def test_a_recording_keeps_the_devices_own_words(store, tmp_path):

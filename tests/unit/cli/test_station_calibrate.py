@@ -298,7 +298,10 @@ def test_show_reads_what_a_take_carries(tmp_path):
         instruction="",
         domain="human",
         station="s",
-        calibration={"K_head": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))},
+        calibration={
+            "K_head": ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)),
+            "tactile_left_cells": (tuple(map(float, range(320))),),
+        },
         streams=(descriptor,),
     )
     SpoolWriter(tmp_path / "take", attributes, sync=False).close()

@@ -180,12 +180,13 @@ def _nanoseconds(values: Values) -> int:
 
 
 def calibration_message(
-    K: np.ndarray, *, t_ns: int, frame: str, shape_px: tuple[int, int]
+    K: np.ndarray, distortion: np.ndarray, *, t_ns: int, frame: str, shape_px: tuple[int, int]
 ) -> bytes:
-    """A foxglove.CameraCalibration of a pinhole camera without distortion.
+    """A foxglove.CameraCalibration of a camera whose images are as the lens gave them.
 
     Args:
         K: camera matrix in pixels, 3×3.
+        distortion: k1 k2 p1 p2 k3; zeros of a pinhole.
         t_ns: from when it holds.
         frame: of the camera.
         shape_px: height and width of its images.
@@ -200,7 +201,7 @@ def calibration_message(
             "height": shape_px[0],
             "width": shape_px[1],
             "distortion_model": "plumb_bob",
-            "D": np.zeros(5),
+            "D": np.asarray(distortion, dtype=np.float64),
             "K": K.ravel(),
             "R": np.eye(3).ravel(),
             "P": np.hstack([K, np.zeros((3, 1))]).ravel(),

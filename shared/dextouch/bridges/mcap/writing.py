@@ -166,8 +166,10 @@ class _Export:
             return 0
         first_ns = int(self._reader.stamps_ns(HEAD_CAMERA)[0])
         height_px, width_px = camera.shape[:2]
+        distortion = self._calibration().get("distortion_head", np.zeros((1, 5)))
         data = calibration_message(
             np.array(K),
+            np.array(distortion, dtype=np.float64).ravel(),
             t_ns=first_ns,
             frame=camera.frame or HEAD_CAMERA,
             shape_px=(height_px, width_px),
