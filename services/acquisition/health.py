@@ -9,8 +9,10 @@ from typing import Protocol, runtime_checkable
 
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
+from services.acquisition.drivers.base import Driver
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_camera import CameraJudge
+from services.acquisition.health_cells import CellJudge, cells_of
 from services.acquisition.health_clock import ClockJudge
 from services.acquisition.health_levels import Board, EventLog, Verdict, worst
 from services.acquisition.health_link import LinkJudge
@@ -24,7 +26,13 @@ from services.acquisition.health_tracking import (
     TrackingJudge,
 )
 from services.acquisition.live import LiveView
-from services.acquisition.schemas import HealthEvent, HealthEvents, StationHealth, StreamHealth
+from services.acquisition.schemas import (
+    HealthEvent,
+    HealthEvents,
+    StaleCode,
+    StationHealth,
+    StreamHealth,
+)
 from services.acquisition.supervisor import DeviceSupervisor
 
 TICK_NS = 100_000_000
@@ -55,7 +63,7 @@ class _Watched:
     figures: dict[str, float] = field(default_factory=dict)
     evaluated_ns: int = 0
     is_suspicious: bool = False
-    stale: str | None = None
+    stale: StaleCode | None = None
 
 
 class HealthMonitor:
@@ -139,7 +147,7 @@ class HealthMonitor:
         now_ns = self._clock.now_ns()
         with self._lock:
             streams = tuple(self._stream_health(watched, now_ns) for watched in self._streams)
-            findings, figures = self._board.active(), dict(self._figures)
+            findings, figures = self._board.active(now_ns), dict(self._figures)
         levels = [stream.level for stream in streams] + [finding.level for finding in findings]
         return StationHealth(
             station=self._station,
@@ -176,7 +184,7 @@ class HealthMonitor:
         verdicts = [judge.judge(block, now_ns) for judge in watched.judges]
         findings = [finding for verdict in verdicts for finding in verdict.findings]
         with self._lock:
-            changes = watched.board.update(findings, confirming=confirming)
+            changes = watched.board.update(findings, now_ns, confirming=confirming)
             watched.figures = {k: v for verdict in verdicts for k, v in verdict.figures.items()}
             watched.is_suspicious = any(verdict.suspicious for verdict in verdicts)
             watched.evaluated_ns = now_ns
@@ -189,7 +197,7 @@ class HealthMonitor:
             verdicts.append(self._disk.judge(now_ns))
         findings = [finding for verdict in verdicts for finding in verdict.findings]
         with self._lock:
-            changes = self._board.update(findings)
+            changes = self._board.update(findings, now_ns)
             self._figures = {k: v for verdict in verdicts for k, v in verdict.figures.items()}
             self._figures["unjudged_samples"] = float(self.num_unjudged)
         for code, level in changes:
@@ -213,7 +221,7 @@ class HealthMonitor:
             watched.supervisor,
             watched.descriptor,
             now_ns,
-            findings=watched.board.active(),
+            findings=watched.board.active(now_ns),
             figures=watched.figures,
         )
 
@@ -251,18 +259,25 @@ def watch(supervisor: DeviceSupervisor, live: LiveView) -> list[_Watched]:
             judges.append(clock)
         elif descriptor.capabilities.device_time and clock is not None:
             judges.append(_SameAs(clock))
-        glove = live.glove(descriptor.name)
-        if descriptor.kind == "tactile" and glove is not None:
-            judges.append(TaxelJudge(descriptor, glove))
-        if descriptor.kind == "tactile":
-            judges.append(FiniteJudge("nan", "taxels are no numbers"))
-        elif descriptor.kind == "keypoints":
-            judges.append(FiniteJudge("tracking", "nodes are not seen"))
-        elif descriptor.kind == "pose":
-            judges.append(PoseJudge(descriptor))
-        elif descriptor.kind == "image":
-            judges.append(CameraJudge(driver))
+        judges += _value_judges(driver, descriptor, live)
         if isinstance(driver.decoder, TellsTracking):
             judges.append(TrackingJudge(driver))
         watched.append(_Watched(supervisor, descriptor, judges))
     return watched
+
+
+def _value_judges(driver: Driver, descriptor: StreamDescriptor, live: LiveView) -> list[Judge]:
+    """Judges of what the samples say, by the kind of the stream."""
+    if descriptor.kind == "tactile":
+        glove, cells = live.glove(descriptor.name), cells_of(driver.decoder)
+        judges: list[Judge] = [FiniteJudge("nan", "taxels are no numbers")]
+        if glove is not None:
+            judges.append(TaxelJudge(descriptor, glove))
+        elif cells is not None:
+            judges.append(CellJudge(cells))
+        return judges
+    if descriptor.kind == "keypoints":
+        return [FiniteJudge("tracking", "nodes are not seen")]
+    if descriptor.kind == "pose":
+        return [PoseJudge(descriptor)]
+    return [CameraJudge(driver)] if descriptor.kind == "image" else []

@@ -5,7 +5,7 @@ from typing import Literal, Protocol, runtime_checkable
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_levels import Verdict
-from services.acquisition.schemas import HealthFinding
+from services.acquisition.schemas import Code, HealthFinding
 
 CLIPPED_LIMIT = 0.2
 ERROR_AFTER_NS = 1_000_000_000
@@ -56,7 +56,7 @@ class CameraJudge:
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
-        self._since_ns: dict[str, int] = {}
+        self._since_ns: dict[Code, int] = {}
 
     def judge(self, block: Block, now_ns: int) -> Verdict:
         """One evaluation."""
@@ -66,20 +66,21 @@ class CameraJudge:
             return Verdict()
         quality = driver.quality
         clipped = quality.clipped_ratio
-        flags = {
-            "frozen": (quality.frozen, "the same image again and again"),
-            "blurred": (quality.blurred, "much less sharp than usual"),
-            "gap": (quality.gap, "its own stamps leave out images"),
-            "clipped": (clipped > CLIPPED_LIMIT, f"{clipped:.0%} of the image black or white"),
+        too_much = f"{clipped:.0%} of the image black or white"
+        flags: dict[Code, tuple[bool, str]] = {
+            "image_frozen": (quality.frozen, "the same image again and again"),
+            "image_blurred": (quality.blurred, "much less sharp than usual"),
+            "image_gap": (quality.gap, "its own stamps leave out images"),
+            "image_clipped": (clipped > CLIPPED_LIMIT, too_much),
         }
         findings = []
-        for name, (is_raised, text) in flags.items():
+        for code, (is_raised, text) in flags.items():
             if not is_raised:
-                self._since_ns.pop(name, None)
+                self._since_ns.pop(code, None)
                 continue
-            lasted_ns = now_ns - self._since_ns.setdefault(name, now_ns)
+            lasted_ns = now_ns - self._since_ns.setdefault(code, now_ns)
             level: Literal["WARN", "ERROR"] = "ERROR" if lasted_ns >= ERROR_AFTER_NS else "WARN"
-            findings.append(HealthFinding(code=f"image_{name}", level=level, message=text))
+            findings.append(HealthFinding(code=code, level=level, message=text))
         figures = {
             "image_clipped_ratio": clipped,
             "image_frozen": float(quality.frozen),

@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from services.acquisition.schemas import HealthEvent, HealthFinding, Level
+from services.acquisition.health_advice import ADVICE
+from services.acquisition.schemas import Code, HealthEvent, HealthFinding, Level, RaisedFinding
 
 RAISE_AFTER = 2
 CLEAR_AFTER = 5
@@ -34,7 +35,7 @@ class Verdict:
 
 
 def above(
-    code: str, value: float, limits: tuple[float, float], message: str
+    code: Code, value: float, limits: tuple[float, float], message: str
 ) -> tuple[HealthFinding, ...]:
     """A finding when `value` lies above the first limit, an ERROR from the second one on."""
     if not value > limits[0]:
@@ -77,8 +78,9 @@ class Board:
     """The findings of one stream (or of the station), each code with a hysteresis of its own."""
 
     def __init__(self) -> None:
-        self._codes: dict[str, Hysteresis] = {}
-        self._messages: dict[str, str] = {}
+        self._codes: dict[Code, Hysteresis] = {}
+        self._messages: dict[Code, str] = {}
+        self._since_ns: dict[Code, int] = {}
 
     @property
     def is_rising(self) -> bool:
@@ -86,20 +88,21 @@ class Board:
         return any(hysteresis.is_rising for hysteresis in self._codes.values())
 
     def update(
-        self, findings: Sequence[HealthFinding], *, confirming: bool = False
-    ) -> list[tuple[str, Judgement]]:
+        self, findings: Sequence[HealthFinding], now_ns: int, *, confirming: bool = False
+    ) -> list[tuple[Code, Judgement]]:
         """One evaluation; codes whose level changed, with the new level.
 
         Args:
             findings: at most one a code counts: the gravest.
+            now_ns: of the evaluation.
             confirming: an evaluation between the regular ones. It may raise, never clear.
         """
-        judged: dict[str, Judgement] = {}
+        judged: dict[Code, Judgement] = {}
         for finding in sorted(findings, key=lambda item: _rank(item.level)):
             judged[finding.code] = finding.level
             self._messages[finding.code] = finding.message
             self._codes.setdefault(finding.code, Hysteresis())
-        changes: list[tuple[str, Judgement]] = []
+        changes: list[tuple[Code, Judgement]] = []
         for code, hysteresis in list(self._codes.items()):
             judgement = judged.get(code, "OK")
             before = hysteresis.level
@@ -107,15 +110,23 @@ class Board:
                 continue
             if hysteresis.update(judgement) != before:
                 changes.append((code, hysteresis.level))
+                if before == "OK":
+                    self._since_ns[code] = now_ns
         return changes
 
-    def active(self) -> tuple[HealthFinding, ...]:
+    def active(self, now_ns: int) -> tuple[RaisedFinding, ...]:
         """What is raised now, gravest first."""
-        raised = []
-        for code, hysteresis in self._codes.items():
-            level = hysteresis.level
-            if level != "OK":
-                raised.append(HealthFinding(code=code, level=level, message=self._messages[code]))
+        raised = [
+            RaisedFinding(
+                code=code,
+                level=hysteresis.level,
+                message=self._messages[code],
+                advice=ADVICE[code],
+                lasted_s=max(0, now_ns - self._since_ns[code]) / 1e9,
+            )
+            for code, hysteresis in self._codes.items()
+            if hysteresis.level != "OK"
+        ]
         return tuple(sorted(raised, key=lambda item: -_rank(item.level)))
 
 
@@ -126,7 +137,7 @@ class EventLog:
         self._events: deque[HealthEvent] = deque(maxlen=MAX_EVENTS)
         self._raised: dict[tuple[str, str], int] = {}
 
-    def add(self, t_host_ns: int, stream: str, code: str, level: Level) -> None:
+    def add(self, t_host_ns: int, stream: str, code: Code, level: Level) -> None:
         """A code of a stream has reached a level; OK is its end."""
         event = HealthEvent(t_host_ns=t_host_ns, stream=stream, code=code, level=level)
         self._events.append(event)

@@ -10,7 +10,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.health_blocks import Block, Rolling
 from services.acquisition.health_camera import ChecksImages
 from services.acquisition.health_levels import Verdict, above
-from services.acquisition.schemas import HealthFinding
+from services.acquisition.schemas import Code, HealthFinding
 from services.acquisition.supervisor import DeviceSupervisor
 
 WINDOW_NS = 10_000_000_000
@@ -40,6 +40,7 @@ class _Counts:
     lost: int
     damaged: int
     resync_bytes: int
+    skipped_bytes: int
     refused: int
     suspects: int
     repeated: int
@@ -57,7 +58,9 @@ class LinkJudge:
     def __init__(self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor) -> None:
         self._supervisor = supervisor
         self._descriptor = descriptor
-        self._counts = deque([self._count(0)])
+        self._is_settled = False
+        self._counts: deque[_Counts] = deque()
+        self._counts.append(self._count(0))
         self._steps = Rolling(WINDOW_NS)
         self._latencies = Rolling(WINDOW_NS)
         self._last_ns: int | None = None
@@ -75,13 +78,17 @@ class LinkJudge:
     def _count(self, now_ns: int) -> _Counts:
         statistics, counters = self._supervisor.driver.statistics, self._supervisor.counters
         driver, events = self._supervisor.driver, self._supervisor.events()
+        samples = counters.streams[self._descriptor.name].num_samples
         return _Counts(
             t_ns=now_ns,
-            samples=counters.streams[self._descriptor.name].num_samples,
+            samples=samples,
             packets=statistics.packets,
             lost=statistics.lost,
             damaged=statistics.crc_errors + statistics.length_errors,
             resync_bytes=statistics.resync_bytes,
+            skipped_bytes=self._skipped_bytes(
+                statistics.resync_bytes, samples, counters.reconnects
+            ),
             refused=statistics.refused,
             suspects=statistics.suspects,
             # The guard of the order sees repetitions that lie further back; both see the others.
@@ -94,6 +101,18 @@ class LinkJudge:
             wrong_version=events.get("wrong_version", 0),
         )
 
+    def _skipped_bytes(self, resync_bytes: int, samples: int, reconnects: int) -> int:
+        """Bytes skipped so far, without those of the search that each opening begins with."""
+        before = self._counts[-1] if self._counts else None
+        if before is None:
+            return 0
+        is_settled = self._is_settled
+        if reconnects != before.reconnects:
+            self._is_settled = is_settled = False
+        elif samples > before.samples:
+            self._is_settled = True
+        return before.skipped_bytes + (resync_bytes - before.resync_bytes if is_settled else 0)
+
     def _judge_counts(
         self, first: _Counts, last: _Counts
     ) -> tuple[tuple[HealthFinding, ...], dict[str, float]]:
@@ -101,14 +120,16 @@ class LinkJudge:
         packets = max(expected, last.packets - first.packets + last.lost - first.lost)
         lost = (last.lost - first.lost) / packets
         damaged = last.damaged - first.damaged
-        refused = last.refused + last.suspects - first.refused - first.suspects
+        refused = last.refused - first.refused
+        suspects = last.suspects - first.suspects
         late = last.late - first.late
         dropped = last.dropped - first.dropped
-        resync = last.resync_bytes - first.resync_bytes
+        resync = last.skipped_bytes - first.skipped_bytes
         findings = (
             *above("loss", lost, LOSS_LIMITS, f"{lost:.1%} of packets lost"),
             *above("damage", damaged / packets, LOSS_LIMITS, f"{damaged} packets damaged"),
             *above("refused", refused / packets, LOSS_LIMITS, f"{refused} samples are no samples"),
+            *above("suspect", suspects / packets, LOSS_LIMITS, f"{suspects} packets held back"),
             *above("queue", dropped / packets, LOSS_LIMITS, f"{dropped} fell out of a queue"),
             *_events("repeated", last.repeated - first.repeated, "packets came twice"),
             *_events("reordered", late, "packets came behind later ones and were left out"),
@@ -122,11 +143,13 @@ class LinkJudge:
             "drop_ratio": lost,
             "damaged_ratio": damaged / packets,
             "refused_ratio": refused / packets,
+            "suspect_ratio": suspects / packets,
         }
 
     def _judge_connection(self, first: _Counts, last: _Counts) -> tuple[HealthFinding, ...]:
         reason = self._supervisor.counters.last_error or "the driver refuses what it sends"
         reconnects = last.reconnects - first.reconnects
+        code: Code
         stream = self._supervisor.counters.streams[self._descriptor.name]
         is_heard = stream.last_t_host_ns is not None and (
             last.t_ns - stream.last_t_host_ns < SILENT_NS
@@ -187,7 +210,7 @@ def _steps_s(t_ns: np.ndarray, last_ns: int | None) -> np.ndarray:
     return np.diff(np.concatenate([[last_ns], t_ns])) * 1e-9
 
 
-def _events(code: str, count: int, words: str) -> tuple[HealthFinding, ...]:
+def _events(code: Code, count: int, words: str) -> tuple[HealthFinding, ...]:
     if count <= 0:
         return ()
     return (HealthFinding(code=code, level="WARN", message=f"{count} {words}"),)

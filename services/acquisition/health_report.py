@@ -6,9 +6,10 @@ Silence is judged here, whenever someone asks: a stream that is not heard tells 
 from collections.abc import Mapping, Sequence
 
 from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.health_advice import ADVICE
 from services.acquisition.health_levels import worst
 from services.acquisition.health_link import queue_dropped
-from services.acquisition.schemas import DeviceHealth, HealthFinding, Level, StreamHealth
+from services.acquisition.schemas import DeviceHealth, RaisedFinding, StaleCode, StreamHealth
 from services.acquisition.supervisor import DeviceSupervisor
 
 STALE_AFTER_NS = {"image": 500_000_000}
@@ -24,7 +25,7 @@ def stale_after_ns(descriptor: StreamDescriptor) -> int:
 
 def stale_code(
     supervisor: DeviceSupervisor, descriptor: StreamDescriptor, now_ns: int
-) -> str | None:
+) -> StaleCode | None:
     """Why a stream is stale, None when it is not.
 
     "unplugged" when the device is not open, "silent" when it is and nothing comes.
@@ -43,7 +44,7 @@ def stream_health(
     descriptor: StreamDescriptor,
     now_ns: int,
     *,
-    findings: Sequence[HealthFinding],
+    findings: Sequence[RaisedFinding],
     figures: Mapping[str, float],
 ) -> StreamHealth:
     """One stream at this moment."""
@@ -52,22 +53,19 @@ def stream_health(
     age_ns = None
     if stream.last_t_host_ns is not None:
         age_ns = max(0, now_ns - stream.last_t_host_ns)
-    level: Level = worst([finding.level for finding in findings])
-    reasons = [finding.message for finding in findings]
     stale = stale_code(supervisor, descriptor, now_ns)
     if stale is not None:
-        level, figures = "STALE", {}
-        reasons.insert(0, _words(supervisor, stale, age_ns))
-    elif age_ns is not None and age_ns > LATE_PERIODS * descriptor.period_ns() and level == "OK":
-        level, reasons = "WARN", ["late"]
+        findings, figures = (_stale_finding(supervisor, stale, age_ns), *findings), {}
+    elif not findings and age_ns is not None and age_ns > LATE_PERIODS * descriptor.period_ns():
+        findings = (_late_finding(age_ns),)
     skew, residual_s = figures.get("clock_skew_ratio"), figures.get("clock_residual_p95_seconds")
     return StreamHealth(
         stream=descriptor.name,
         device=supervisor.driver.name,
         hand=descriptor.side,
-        level=level,
+        level=worst([finding.level for finding in findings]),
         stale=stale,
-        reasons=tuple(reasons),
+        reasons=tuple(finding.message for finding in findings),
         findings=tuple(findings),
         figures=dict(figures),
         rate_hz=figures.get("rate_hz"),
@@ -97,6 +95,7 @@ def device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
         length_errors=statistics.length_errors,
         resync_bytes=statistics.resync_bytes,
         refused=statistics.refused,
+        suspects=statistics.suspects,
         repeated=statistics.repeated,
         restarts=statistics.restarts,
         queue_dropped=queue_dropped(driver),
@@ -106,7 +105,26 @@ def device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
     )
 
 
-def _words(supervisor: DeviceSupervisor, stale: str, age_ns: int | None) -> str:
+def _stale_finding(
+    supervisor: DeviceSupervisor, stale: StaleCode, age_ns: int | None
+) -> RaisedFinding:
+    return RaisedFinding(
+        code=stale,
+        level="STALE",
+        message=_words(supervisor, stale, age_ns),
+        advice=ADVICE[stale],
+        lasted_s=None if age_ns is None else age_ns / 1e9,
+    )
+
+
+def _late_finding(age_ns: int) -> RaisedFinding:
+    lasted_s = age_ns / 1e9
+    return RaisedFinding(
+        code="late", level="WARN", message="late", advice=ADVICE["late"], lasted_s=lasted_s
+    )
+
+
+def _words(supervisor: DeviceSupervisor, stale: StaleCode, age_ns: int | None) -> str:
     error = supervisor.counters.last_error
     if error is not None:
         return error

@@ -4,32 +4,29 @@ A taxel that never changes says nothing by itself: a hand at rest looks the same
 its neighbours, which move while it does not, or by a reading that no load explains.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
+from jaxtyping import Bool, Float64
 
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
 from services.acquisition.drivers.tactile_glove import FULL_SCALE_COUNTS
 from services.acquisition.health_blocks import Block
+from services.acquisition.health_cells import (
+    SATURATED_SHARE,
+    SHARE_LIMITS,
+    STRONG_SHARE,
+    CellHistory,
+    sum_around,
+)
 from services.acquisition.health_levels import Verdict, above
-from services.acquisition.schemas import HealthFinding
+from services.acquisition.schemas import Code, HealthFinding
 
-RECENT_NS = 500_000_000
-MIN_RECENT_SPAN_NS = 400_000_000
-QUIET_NS = 5_000_000_000
-SATURATED_NS = 1_000_000_000
-SATURATED_SHARE = 0.995
-# Any taxel is worth a word; 5 % of them, or a whole pad or scan line, is an error.
-SHARE_LIMITS = (0.0, 0.05)
 MOVED_KPA = 1.0
 # About as much, where the glove's gain is not known.
 MOVED_COUNTS = 40
-# So many of the neighbours must move: at once for a quick verdict, within 5 s for a slow one.
-STRONG_SHARE = 0.75
-WEAK_SHARE = 0.5
 NOTHING_SHARE = 0.5
 MIN_TARE_COUNTS = 20.0
 DRIFT_LIMITS = (3.0, 10.0)
@@ -49,26 +46,6 @@ class GloveRecord:
     tare_sigma_counts: Float64[np.ndarray, "320"]
 
 
-@dataclass
-class _Memory:
-    """What is known of each taxel from earlier blocks."""
-
-    last_counts: Int64[np.ndarray, "320"]
-    changed_ns: Int64[np.ndarray, "320"]
-    around_ns: Int64[np.ndarray, "320"]
-    saturated_ns: Int64[np.ndarray, "320"]
-    silent: Bool[np.ndarray, "320"] = field(
-        default_factory=lambda: np.zeros(NUM_TAXELS, dtype=np.bool_)
-    )
-
-    @staticmethod
-    def of(counts: np.ndarray, t_ns: int) -> "_Memory":
-        """Nothing but the first reading."""
-        start = np.full(NUM_TAXELS, t_ns, dtype=np.int64)
-        never = np.full(NUM_TAXELS, np.iinfo(np.int64).max)
-        return _Memory(counts.astype(np.int64), start, np.zeros_like(start), never)
-
-
 class TaxelJudge:
     """Judges the 320 taxels of one glove from its raw counts."""
 
@@ -78,29 +55,26 @@ class TaxelJudge:
         self._indices = raw_indices(side=glove.side)
         self._lines = self._indices // _SCAN_COLUMNS, self._indices % _SCAN_COLUMNS
         self._moved_counts = MOVED_KPA * glove.gain_counts_per_kpa
-        self._memory: _Memory | None = None
-        self._recent_ns = np.empty(0, dtype=np.int64)
-        self._recent = np.empty((0, NUM_TAXELS), dtype=np.int64)
+        self._history = CellHistory(float(FULL_SCALE_COUNTS))
 
     def judge(self, block: Block, now_ns: int) -> Verdict:
         """One evaluation."""
         del now_ns
+        history = self._history
         if block.values is not None and len(block):
             counts = block.values[:, self._indices].astype(np.int64)
-            self._remember(counts, block.t_host_ns)
-        memory = self._memory
-        if memory is None or self._recent_ns[-1] - self._recent_ns[0] < MIN_RECENT_SPAN_NS:
+            history.add(counts, block.t_host_ns)
+        if not history.is_enough:
             return Verdict()
-        t_ns = int(self._recent_ns[-1])
-        low, high = self._recent.min(axis=0), self._recent.max(axis=0)
-        self._find_silent(memory, low, high, t_ns)
+        low, high = history.extremes()
+        history.find_silent(neighbour_share(high - low >= self._moved_counts))
         at_top = low >= SATURATED_SHARE * FULL_SCALE_COUNTS
-        saturated = memory.saturated_ns <= t_ns - SATURATED_NS
+        saturated = history.saturated()
         tare = self._glove.tare_counts
         nothing = (tare >= MIN_TARE_COUNTS) & (high < NOTHING_SHARE * tare)
-        loaded = memory.last_counts > tare + self._moved_counts
-        dead = nothing | (memory.silent & ~loaded)
-        stuck = memory.silent & loaded & ~at_top
+        loaded = history.last > tare + self._moved_counts
+        dead = nothing | (history.silent & ~loaded)
+        stuck = history.silent & loaded & ~at_top
         findings = (
             *self._finding("taxels_dead", dead, "dead"),
             *self._finding("taxels_stuck", stuck, "stuck"),
@@ -115,37 +89,7 @@ class TaxelJudge:
         waiting = bool((at_top & ~saturated).any())
         return Verdict(findings + drift.findings, {**figures, **drift.figures}, waiting)
 
-    def _remember(self, counts: np.ndarray, t_ns: np.ndarray) -> None:
-        memory = self._memory or _Memory.of(counts[0], int(t_ns[0]))
-        self._memory = memory
-        changed = np.diff(counts, axis=0, prepend=memory.last_counts[None]) != 0
-        last = t_ns[len(t_ns) - 1 - np.argmax(changed[::-1], axis=0)]
-        memory.changed_ns = np.where(changed.any(axis=0), last, memory.changed_ns)
-        memory.silent &= ~changed.any(axis=0)
-        memory.last_counts = counts[-1]
-        below = counts < SATURATED_SHARE * FULL_SCALE_COUNTS
-        # Where the present run at the top began: after the last reading below it.
-        index = len(t_ns) - np.argmax(below[::-1], axis=0)
-        began = t_ns[np.minimum(index, len(t_ns) - 1)]
-        whole_block = np.minimum(memory.saturated_ns, t_ns[0])
-        never = np.iinfo(np.int64).max
-        began = np.where(below.any(axis=0), began, whole_block)
-        memory.saturated_ns = np.where(below[-1], never, began)
-        all_ns = np.concatenate([self._recent_ns, t_ns])
-        rows = np.concatenate([self._recent, counts])
-        kept = all_ns >= all_ns[-1] - RECENT_NS
-        self._recent_ns, self._recent = all_ns[kept], rows[kept]
-
-    def _find_silent(self, memory: _Memory, low: np.ndarray, high: np.ndarray, t_ns: int) -> None:
-        around = neighbour_share(high - low >= self._moved_counts)
-        memory.around_ns = np.where(around >= WEAK_SHARE, t_ns, memory.around_ns)
-        still = high == low
-        quick = still & (around >= STRONG_SHARE)
-        quiet = memory.changed_ns <= t_ns - QUIET_NS
-        slow = quiet & (memory.around_ns >= memory.changed_ns + RECENT_NS)
-        memory.silent |= quick | slow
-
-    def _finding(self, code: str, taxels: np.ndarray, word: str) -> tuple[HealthFinding, ...]:
+    def _finding(self, code: Code, taxels: np.ndarray, word: str) -> tuple[HealthFinding, ...]:
         part = whole_part(taxels, self._lines)
         if part is not None:
             return (HealthFinding(code=code, level="ERROR", message=f"{part} {word}"),)
@@ -155,7 +99,7 @@ class TaxelJudge:
     def _judge_drift(self) -> Verdict:
         """Common offset of the taxels at rest; none while much of the hand is touched."""
         glove = self._glove
-        offsets = self._recent.mean(axis=0) - glove.tare_counts
+        offsets = self._history.recent.mean(axis=0) - glove.tare_counts
         drift_counts = float(np.median(offsets))
         touched = np.abs(offsets - drift_counts) > (
             CONTACT_THRESHOLD_KPA * glove.gain_counts_per_kpa
@@ -201,8 +145,8 @@ def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"
     """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
     shares = []
     for grid in split_pads(moved.astype(np.float64)):
-        around = _sum_around(grid) - grid
-        count = _sum_around(np.ones_like(grid)) - 1.0
+        around = sum_around(grid) - grid
+        count = sum_around(np.ones_like(grid)) - 1.0
         shares.append(around / count)
     return join_pads(shares[0], shares[1])
 
@@ -220,15 +164,3 @@ def whole_part(taxels: Bool[np.ndarray, "320"], lines: tuple[np.ndarray, np.ndar
         if len(empty):
             return f"scan {word} {empty[0]} is"
     return None
-
-
-def _sum_around(grid: np.ndarray) -> np.ndarray:
-    """Sum of the 3 by 3 cells around each of a grid [..., rows, columns], itself included."""
-    rows, columns = grid.shape[-2:]
-    padded = np.zeros((*grid.shape[:-2], rows + 2, columns + 2))
-    padded[..., 1:-1, 1:-1] = grid
-    total = np.zeros_like(grid)
-    for row in range(3):
-        for column in range(3):
-            total += padded[..., row : row + rows, column : column + columns]
-    return total

@@ -11,6 +11,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.pose_tracker import TrackingEvents
 from services.acquisition.health_blocks import Block, Rolling
 from services.acquisition.health_levels import Verdict, above
+from services.acquisition.schemas import Code
 
 WINDOW_NS = 10_000_000_000
 LOST_LIMITS = (0.01, 0.05)
@@ -139,7 +140,7 @@ class FiniteJudge:
     What never held a number is no part of the device (a glove model's empty cells).
     """
 
-    def __init__(self, code: str, word: str) -> None:
+    def __init__(self, code: Code, word: str) -> None:
         self._code, self._word = code, word
         self._shares = Rolling(WINDOW_NS)
         self._ever: np.ndarray | None = None

@@ -43,7 +43,7 @@ class LiveView:
                 calibration_row(calibration, f"{name}_gain_counts_per_kpa"),
             )
             for name, d in self._descriptors.items()
-            if d.kind == "tactile" and d.shape == (NUM_RAW_TAXELS,)
+            if d.kind == "tactile" and d.unit == "counts"
         }
 
     def accept(self, device: str, readings: Readings) -> None:
@@ -58,7 +58,7 @@ class LiveView:
             self.blocks.add(name, samples)
 
     def glove(self, stream: str) -> GloveRecord | None:
-        """Tare and gain of a glove's 320 taxels; None for other streams."""
+        """Tare and gain of the 320 taxels of a glove of ours; None for other streams."""
         if stream not in self._gloves:
             return None
         side = _side(self._descriptors[stream])

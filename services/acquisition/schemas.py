@@ -7,6 +7,48 @@ from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 from dextouch.schemas.episodes import Domain, StoreId
 
 Level = Literal["OK", "WARN", "ERROR", "STALE"]
+StaleCode = Literal["unplugged", "silent"]
+# What can be wrong with a stream or the station; a code never changes its meaning.
+Code = Literal[
+    "unplugged",
+    "silent",
+    "late",
+    "rate",
+    "loss",
+    "damage",
+    "refused",
+    "suspect",
+    "queue",
+    "repeated",
+    "reordered",
+    "restart",
+    "reconnect",
+    "wrong_side",
+    "wrong_version",
+    "rejected",
+    "jitter",
+    "latency",
+    "gap",
+    "clock_skew",
+    "clock_residual",
+    "clock_step",
+    "clock_stamps",
+    "taxels_dead",
+    "taxels_stuck",
+    "taxels_saturated",
+    "baseline",
+    "nan",
+    "tracking",
+    "jump",
+    "pose_jitter",
+    "image_frozen",
+    "image_blurred",
+    "image_clipped",
+    "image_gap",
+    "disk",
+    "calibration_missing",
+    "calibration_age",
+]
 State = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 Action = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
 
@@ -93,20 +135,36 @@ class RecorderStatus(BaseModel):
 
 
 class HealthFinding(BaseModel):
-    """Something wrong with a stream or the station, by a code that never changes its meaning."""
+    """What one evaluation found wrong with a stream or the station."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    code: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
+    code: Code
     level: Literal["WARN", "ERROR"]
     message: str
+
+
+class RaisedFinding(BaseModel):
+    """Something that is wrong now, since when, and what to do about it.
+
+    `lasted_s` is None where nothing was ever heard of a stream.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    code: Code
+    level: Literal["WARN", "ERROR", "STALE"]
+    message: str
+    advice: str
+    lasted_s: float | None
 
 
 class StreamHealth(BaseModel):
     """One stream at this moment; `lost` and `received` count its device's packets since start.
 
-    `stale` says why nothing is known ("unplugged", "silent"); `figures` are the numbers behind
-    the findings by their Prometheus names, none while the stream is stale.
+    `stale` says why nothing is known; it is the first of the findings then. `reasons` are their
+    messages. `figures` are the numbers behind them by their Prometheus names, none while the
+    stream is stale.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -115,9 +173,9 @@ class StreamHealth(BaseModel):
     device: str
     hand: Literal["left", "right"] | None = None
     level: Level
-    stale: str | None = None
+    stale: StaleCode | None = None
     reasons: tuple[str, ...]
-    findings: tuple[HealthFinding, ...] = ()
+    findings: tuple[RaisedFinding, ...] = ()
     figures: dict[str, FiniteFloat] = {}
     rate_hz: float | None
     nominal_rate_hz: float
@@ -144,6 +202,7 @@ class DeviceHealth(BaseModel):
     length_errors: int
     resync_bytes: int
     refused: int
+    suspects: int = 0
     repeated: int = 0
     restarts: int = 0
     queue_dropped: int = 0
@@ -162,7 +221,7 @@ class StationHealth(BaseModel):
 
     station: str
     level: Level
-    findings: tuple[HealthFinding, ...] = ()
+    findings: tuple[RaisedFinding, ...] = ()
     figures: dict[str, FiniteFloat] = {}
     streams: tuple[StreamHealth, ...]
     devices: tuple[DeviceHealth, ...]
@@ -175,7 +234,7 @@ class HealthEvent(BaseModel):
 
     t_host_ns: int
     stream: str
-    code: str
+    code: Code
     level: Level
 
 

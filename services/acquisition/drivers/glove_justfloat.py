@@ -151,6 +151,7 @@ class JustFloatGloveDecoder:
 
     def __init__(self, side: Side, *, num_values: int, full_scale: float, rate_hz: float) -> None:
         self._frames = JustFloatFrames(num_values, full_scale)
+        self.full_scale = full_scale
         self._descriptor = justfloat_descriptor(side, num_values=num_values, rate_hz=rate_hz)
 
     @property

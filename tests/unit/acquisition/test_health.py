@@ -1,3 +1,6 @@
+from pathlib import Path
+from typing import get_args
+
 import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
@@ -9,14 +12,16 @@ from services.acquisition.drivers.camera import camera_descriptor
 from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
 from services.acquisition.health import HealthMonitor
+from services.acquisition.health_advice import ADVICE
 from services.acquisition.health_levels import Board, Hysteresis
 from services.acquisition.health_metrics import HealthCollector
 from services.acquisition.health_station import CalibrationJudge, DiskJudge
 from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import HidPort, PtyPort
-from services.acquisition.schemas import HealthFinding
+from services.acquisition.schemas import Code, HealthFinding
 from services.acquisition.supervisor import DeviceSupervisor
 
+DOCS = Path(__file__).parents[3] / "docs" / "health.md"
 CALIBRATION = {
     "tactile_left_tare_counts": ((100.0,) * 360,),
     "tactile_left_gain_counts_per_kpa": ((40.0,) * 360,),
@@ -106,6 +111,8 @@ def test_silence_shows_within_300_ms(bench):
     bench.second()
     bench.wait(0.1)
     assert bench.levels()["tactile_left"] == "WARN"
+    (late,) = bench.monitor.report().streams[0].findings
+    assert (late.code, late.lasted_s) == ("late", pytest.approx(0.1))
     bench.wait(0.15)
     assert set(bench.levels().values()) == {"STALE"}
 
@@ -170,24 +177,79 @@ def finding(level, code="loss"):
 
 def test_a_code_rises_to_the_milder_of_two_and_falls_to_the_graver_of_five():
     board = Board()
-    assert board.update([finding("ERROR")]) == []
+    assert board.update([finding("ERROR")], 1) == []
     assert board.is_rising
-    assert board.update([finding("WARN")]) == [("loss", "WARN")]
-    assert board.update([finding("ERROR")]) == []
-    assert board.update([finding("ERROR"), finding("WARN")]) == [("loss", "ERROR")]
+    assert board.update([finding("WARN")], 2) == [("loss", "WARN")]
+    assert board.update([finding("ERROR")], 3) == []
+    assert board.update([finding("ERROR"), finding("WARN")], 4) == [("loss", "ERROR")]
     assert not board.is_rising
-    changes = [board.update([finding("WARN")]) for _ in range(5)]
+    changes = [board.update([finding("WARN")], t_ns) for t_ns in range(5, 10)]
     assert changes == [[], [], [], [], [("loss", "WARN")]]
-    assert board.active() == (finding("WARN"),)
+    (active,) = board.active(10)
+    assert (active.code, active.level, active.message) == ("loss", "WARN", "WARN")
+
+
+def test_what_is_raised_says_since_when_and_what_to_do():
+    board = Board()
+    for second in range(3):
+        board.update([finding("WARN")], second * 10**9)
+    for second in range(3, 8):
+        board.update([finding("ERROR")], second * 10**9)
+    (active,) = board.active(8 * 10**9)
+    assert (active.level, active.lasted_s) == ("ERROR", 7.0), "since it was first raised"
+    assert active.advice == ADVICE["loss"]
+
+
+def test_every_code_has_one_line_of_advice_and_a_row_in_the_docs():
+    assert set(ADVICE) == set(get_args(Code))
+    text = DOCS.read_text(encoding="utf-8")
+    for code, line in ADVICE.items():
+        assert line.endswith("."), code
+        assert len(line) <= 90, code
+        assert "\n" not in line, code
+        assert f"| `{code}` | {line} |" in text, code
 
 
 def test_an_evaluation_in_between_raises_and_never_clears():
     board = Board()
-    board.update([finding("WARN")])
-    assert board.update([finding("WARN"), finding("WARN", "rate")], confirming=True)
+    board.update([finding("WARN")], 1)
+    assert board.update([finding("WARN"), finding("WARN", "rate")], 2, confirming=True)
     for _ in range(20):
-        assert board.update([], confirming=True) == []
-    assert [item.code for item in board.active()] == ["loss"]
+        assert board.update([], 3, confirming=True) == []
+    assert [item.code for item in board.active(4)] == ["loss"]
+
+
+def test_packets_held_back_are_a_finding_a_metric_and_a_count_of_the_device(bench):
+    for _ in range(3):
+        bench.supervisors[0].driver.statistics.suspects += 2
+        bench.second()
+    report = bench.monitor.report()
+    (found,) = report.streams[0].findings
+    assert (found.code, found.level, found.message) == ("suspect", "WARN", "6 packets held back")
+    assert report.streams[0].figures["suspect_ratio"] == pytest.approx(0.01)
+    assert [device.suspects for device in report.devices] == [6, 0]
+    registry = CollectorRegistry()
+    registry.register(HealthCollector(bench.monitor.report, bench.monitor.raised))
+    text = generate_latest(registry).decode()
+    assert 'dextouch_suspect_packets_total{device="glove_left",hand="left"} 6.0' in text
+
+
+def test_bytes_skipped_after_an_opening_are_no_damage(bench):
+    glove = bench.supervisors[0]
+
+    def skip(num_bytes):
+        glove.driver.statistics.resync_bytes += num_bytes
+        bench.second()
+        bench.second()
+        return bench.levels()["tactile_left"]
+
+    assert skip(300) == "OK", "it was joined in the middle of a packet"
+    glove.counters.reconnects += 1
+    bench.second()
+    assert skip(300) == "WARN"
+    assert bench.reasons()["tactile_left"] == ("1 reconnects",)
+    assert skip(300) == "WARN"
+    assert "300 bytes between packets skipped" in bench.reasons()["tactile_left"]
 
 
 def test_a_stale_stream_tells_no_figures(bench):
@@ -210,6 +272,7 @@ def test_a_lost_device_is_stale_at_once(bench):
     bench.supervisors[0].counters.last_error = "port vanished"
     stream = bench.monitor.report().streams[0]
     assert (stream.stale, stream.reasons) == ("unplugged", ("port vanished",))
+    assert (stream.findings[0].level, stream.findings[0].advice) == ("STALE", ADVICE["unplugged"])
     assert bench.levels()["head"] == "OK"
 
 

@@ -15,6 +15,7 @@ from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, pose_d
 from services.acquisition.drivers.tactile_glove import glove_descriptor
 from services.acquisition.health_blocks import Block, SampleBlocks
 from services.acquisition.health_camera import CameraJudge
+from services.acquisition.health_cells import CellJudge, Cells
 from services.acquisition.health_clock import ClockJudge
 from services.acquisition.health_taxels import (
     GloveRecord,
@@ -238,6 +239,87 @@ def test_values_that_are_no_numbers_are_counted_where_numbers_were():
     verdict = judge.judge(block(1 + np.arange(100) / 100, values), 2 * SECOND_NS)
     assert codes(verdict) == {"tracking": "ERROR"}
     assert verdict.figures["missing_ratio"] == pytest.approx(5 / 24 / 2)
+
+
+class Sheet:
+    """Cells of another maker's glove under a wave; the test changes single ones."""
+
+    def __init__(self, cells, num_cells, *, full_scale=1.0):
+        self.judge = CellJudge(cells)
+        self.num_cells, self.full_scale, self.second = num_cells, full_scale, 0
+        self.rng = np.random.default_rng(2)
+
+    def __call__(self, change=None, *, pressed=True):
+        t_s = self.second + np.arange(1, 61) / 60
+        self.second += 1
+        phase = 0.02 * np.arange(self.num_cells)
+        wave = 0.3 * (1 + np.sin(2 * np.pi * t_s[:, None] + phase)) * pressed
+        noise = self.rng.normal(0.01, 0.001, (60, self.num_cells))
+        values = (self.full_scale * np.clip(wave + noise, 0, 1)).astype(np.float32)
+        values[:, 5:8] = self.absent
+        if change is not None:
+            change(values)
+        return self.judge.judge(block(t_s, values), self.second * SECOND_NS)
+
+
+class GridSheet(Sheet):
+    absent = np.nan
+
+    def __init__(self):
+        super().__init__(Cells(1.0, (24, 32)), 768)
+
+
+class BareSheet(Sheet):
+    absent = 0.0
+
+    def __init__(self):
+        super().__init__(Cells(4095.0, None), 401, full_scale=4095.0)
+
+
+@pytest.mark.parametrize("kind", [GridSheet, BareSheet])
+def test_healthy_gloves_of_other_makers_raise_nothing(kind):
+    sheet = kind()
+    for second in range(20):
+        assert sheet(pressed=second % 4 != 0).findings == ()
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "code", "seconds"),
+    [
+        (GridSheet, 0.0, "taxels_dead", 1),
+        (GridSheet, 0.5, "taxels_stuck", 1),
+        (GridSheet, 1.0, "taxels_saturated", 2),
+        (GridSheet, np.nan, "nan", 1),
+        (BareSheet, 2000.0, "taxels_stuck", 6),
+        (BareSheet, 4095.0, "taxels_saturated", 2),
+    ],
+)
+def test_a_cell_out_of_order_is_found_without_a_tare(kind, value, code, seconds):
+    sheet = kind()
+
+    def change(values):
+        values[:, 200] = value
+
+    sheet()
+    verdicts = [sheet(change) for _ in range(seconds)]
+    assert codes(verdicts[-1]) == {code: "WARN"}
+    for _ in range(2):
+        verdict = sheet()
+    assert verdict.findings == ()
+
+
+def test_a_hand_that_holds_still_on_a_glove_of_unknown_layout_is_no_fault():
+    sheet = BareSheet()
+    sheet()
+
+    first = {}
+
+    def held(values):
+        first.setdefault("row", values[0, :300].copy())
+        values[:, :300] = first["row"]
+
+    for _ in range(8):
+        assert sheet(held).findings == ()
 
 
 @dataclass
