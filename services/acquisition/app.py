@@ -13,6 +13,7 @@ from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.routes import recorder_router, station_router
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
+from services.acquisition.supervisor import SpoolSafety
 from services.acquisition.uploader import Uploader, recover_spool
 
 
@@ -27,6 +28,7 @@ class _RealStation:
             spool_root=settings.spool,
             clock=clock,
             calibration=load_calibration(settings.calibration),
+            safety=_spool_safety(settings),
         )
 
     def start(self) -> None:
@@ -66,6 +68,8 @@ class _MockStation:
             spool_root=settings.spool,
             name=settings.station,
             calibration=calibration,
+            links=settings.mock_links,
+            safety=_spool_safety(settings),
         )
         self.station = self._mock.station
 
@@ -77,6 +81,10 @@ class _MockStation:
     def stop(self) -> None:
         """Stop."""
         self._mock.stop()
+
+
+def _spool_safety(settings: AcquisitionSettings) -> SpoolSafety:
+    return SpoolSafety(settings.flush_period_s, settings.min_free_bytes)
 
 
 def _make_uploader(settings: AcquisitionSettings) -> Uploader:

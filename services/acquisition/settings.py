@@ -7,6 +7,8 @@ from pydantic import BaseModel, ConfigDict, Field, SecretStr, model_validator
 
 from dextouch.serving.settings import ServiceSettings, service_config
 from dextouch.tactile.layout import Side
+from services.acquisition.mocks.links import MockLinks
+from services.acquisition.supervisor import SpoolSafety
 
 POSE_STREAMS = Literal["wrist_left", "wrist_right", "head"]
 CAMERAS = Literal["camera_head", "camera_wrist_left", "camera_wrist_right"]
@@ -159,18 +161,25 @@ class AcquisitionSettings(ServiceSettings):
     """One station.
 
     With `mock` the devices are simulated: they play the episode `mock_episode_id` of the local
-    store `mock_store` round and round, or a made-up pattern when no episode is named. Otherwise
-    `devices` names the real ones, and `calibration` a JSON file of named matrices.
+    store `mock_store` round and round, or a made-up pattern when no episode is named, connected
+    as `mock_links` says. Otherwise `devices` names the real ones, and `calibration` a JSON file of
+    named matrices.
+
+    Takes reach the disk every `flush_period_s`, which is what a power loss costs at most. One ends
+    when less than `min_free_bytes` are left on the disk of the `spool`, and none begins then.
     """
 
     model_config = service_config("acquisition")
 
     station: str = Field(default="station", min_length=1, max_length=128)
     spool: Path = Path("spool")
+    flush_period_s: float = Field(default=SpoolSafety.flush_period_s, gt=0, le=3600)
+    min_free_bytes: int = Field(default=SpoolSafety.min_free_bytes, ge=0)
     mock: bool = False
     mock_store: str | None = None
     mock_episode_id: str | None = None
     mock_faults: Literal["none", "first_light"] = "first_light"
+    mock_links: MockLinks = MockLinks()
     seed: int = Field(default=0, ge=0)
     devices: tuple[DeviceSettings, ...] = ()
     calibration: Path | None = None

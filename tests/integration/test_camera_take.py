@@ -19,6 +19,7 @@ from services.acquisition.clock import VirtualClock
 from services.acquisition.drivers.image_encoding import begin_take, take_gates
 from services.acquisition.drivers.station_camera import CameraTiming
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.mocks.station import MockStation
 from services.acquisition.mocks.video_camera import video_camera
@@ -235,7 +236,7 @@ def test_a_bridge_that_sends_h264_reaches_the_store_in_whole_groups(tmp_path):
         2,
         VirtualClock(),
         spool_root=tmp_path / "spool",
-        image_encoding="h264",
+        links=MockLinks(images="h264"),
     )
     with station:
         take = station.run_take(PROMPT, recording_id="take")

@@ -9,6 +9,7 @@ from dextouch.tactile.layout import select_taxels
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate, Ledger
+from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.station import LEDGER_FILE, MockStation
 from services.acquisition.schemas import TakePrompt
 from tests.integration.recording_streams import human_streams, robot_streams
@@ -163,7 +164,9 @@ def test_dead_taxels_read_zero(tmp_path):
 
 
 def test_jpeg_cameras_stay_compressed(tmp_path):
-    _, spool, _ = record(human_streams(0.5), FaultScript(), tmp_path, image_encoding="jpeg")
+    _, spool, _ = record(
+        human_streams(0.5), FaultScript(), tmp_path, links=MockLinks(images="jpeg")
+    )
     assert spool.streams["camera_head"].unit == "jpeg"
     assert spool.read("camera_head").values[0][:2] == b"\xff\xd8"
 

@@ -32,15 +32,40 @@ class _HelloTransport(WatchedTransport):
 class BridgePort(SocketPort):
     """A mock device's end of a bridge: a socket pair whose connections begin with the hello.
 
-    It sends no signs of life of its own, so a host on a real clock finds it silent while the
-    device says nothing.
+    While it is plugged it calls `show_life`, if that is set, as often as a bridge says that it
+    lives. Without it a host on a real clock finds it silent while the device says nothing.
     """
 
     def __init__(self, name: str, hello: Callable[[], bytes]) -> None:
         super().__init__(name)
+        self.show_life: Callable[[], None] | None = None
         self._hello = hello
+        self._unplugged = threading.Event()
+        self._life: threading.Thread | None = None
         transport = SocketTransport(self._connect, address=f"mock:{name}")
         self._transport = _HelloTransport(transport, self.link, hello)
+
+    def plug(self) -> None:
+        """Accept connections, and show that the bridge lives."""
+        super().plug()
+        if self.show_life is not None:
+            self._unplugged.clear()
+            self._life = threading.Thread(
+                target=self._live, args=(self.show_life,), name="bridge-life", daemon=True
+            )
+            self._life.start()
+
+    def unplug(self) -> None:
+        """Close the connection and refuse new ones."""
+        self._unplugged.set()
+        if self._life is not None:
+            self._life.join()
+            self._life = None
+        super().unplug()
+
+    def _live(self, show_life: Callable[[], None]) -> None:
+        while not self._unplugged.wait(LIFE_PERIOD_NS / 1e9):
+            show_life()
 
     def _connect(self) -> socket.socket:
         host_end = super()._connect()

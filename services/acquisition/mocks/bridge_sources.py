@@ -22,6 +22,8 @@ from services.acquisition.drivers.finger_tracker import MAGIC as FINGER_MAGIC
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.pose_tracker import TrackingState, source_of
 from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.finger_tracker import seen_nodes
+from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.pose_tracker import TrackedPoses, TrackingFault
 from services.acquisition.mocks.replay import ReplayStream
 
@@ -76,8 +78,9 @@ class BridgeFingerTrackerSource:
     Args:
         stream: [n, 25, 3] in m, wrist frame.
         side: which hand.
-        rng: of the order of the nodes.
+        rng: of the order of the nodes and of the noise.
         frame: the SDK's coordinates.
+        faults: position noise, and when the thumb is not seen.
     """
 
     magic = FINGER_MAGIC
@@ -89,12 +92,16 @@ class BridgeFingerTrackerSource:
         side: Side,
         rng: np.random.Generator,
         frame: FrameConvention = LEFT_HANDED,
+        faults: DeviceFaults | None = None,
     ) -> None:
+        faults = faults or DeviceFaults()
         self._stream = stream
         self._side = side
         self._order = rng.permutation(NUM_KEYPOINTS)
         theirs_from_ours = frame.ours_from_theirs().T
-        points_cm = 100.0 * stream.values[:, self._order] @ theirs_from_ours.T
+        self._seen = seen_nodes(stream.t_ns, self._order, faults)
+        noise_m = faults.position_noise_m * rng.standard_normal(stream.values.shape)
+        points_cm = 100.0 * (stream.values + noise_m)[:, self._order] @ theirs_from_ours.T
         self._points = points_cm.astype("<f4")
         self._hello = BridgeHello(
             protocol=PROTOCOL,
@@ -116,9 +123,13 @@ class BridgeFingerTrackerSource:
         """Who is there, and the order of the nodes."""
         return hello_line(self._hello)
 
+    def fate(self, index: int) -> Fate:
+        """Whether all nodes are seen."""
+        return Fate.SENT if self._seen[index] == ALL_SEEN else Fate.MARKED
+
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""
-        payload = VALIDITY.pack(ALL_SEEN) + self._points[index].tobytes()
+        payload = VALIDITY.pack(int(self._seen[index])) + self._points[index].tobytes()
         packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
         return [encode_packet(FINGER_MAGIC, packet)]
 
@@ -128,7 +139,7 @@ class BridgePoseSource:
 
     Args:
         stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis.
+        faults: position and rotation noise, per axis; occlusions and jumps.
         rng: of the noise.
         tracking: occlusions and jumps.
         frame: the source's coordinates.
@@ -168,6 +179,10 @@ class BridgePoseSource:
     def hello(self) -> bytes:
         """Who is there."""
         return hello_line(self._hello)
+
+    def fate(self, index: int) -> Fate:
+        """Whether this pose is occluded or jumps."""
+        return self.tracked.fate(index)
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; its pose is flagged valid whatever the result says."""

@@ -1,23 +1,27 @@
 """Streams of an episode come in; mock devices and the drivers that read them go out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+
+import numpy as np
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import Matrix, matrix_rows
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.camera import CameraDecoder, ImageEncoding
-from services.acquisition.drivers.finger_tracker import FingerTracker
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
+from services.acquisition.drivers.camera import CameraDecoder, CameraDriver
+from services.acquisition.drivers.glove_wuji import NOMINAL_RATE_HZ as WUJI_RATE_HZ
 from services.acquisition.drivers.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.mocks.finger_tracker import FingerTrackerSource
-from services.acquisition.mocks.glove_devices import mock_glove
-from services.acquisition.mocks.ports import HidPort, MockPort, SocketPort
-from services.acquisition.mocks.pose_tracker import PoseTrackerSource
+from services.acquisition.mocks.glove_devices import (
+    mock_glove,
+    mock_justfloat_glove,
+    mock_wuji_glove,
+)
+from services.acquisition.mocks.links import MockLinks
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.ports import MockPort, SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
     PacketSource,
@@ -26,16 +30,14 @@ from services.acquisition.mocks.replay import (
 )
 from services.acquisition.mocks.robot_state import RobotStateSource
 from services.acquisition.mocks.tactile_glove import GloveCalibration
+from services.acquisition.mocks.tracker_devices import (
+    TrackerPlace,
+    mock_finger_tracker,
+    mock_pose_tracker,
+)
+from services.acquisition.mocks.video_camera import video_camera
 
 LATENCY_SIGMA_MS = 0.2
-
-
-@dataclass(frozen=True)
-class MockPair:
-    """A simulated device and the real driver on its other end."""
-
-    device: MockDevice
-    driver: Driver
 
 
 class MockFactory:
@@ -46,7 +48,7 @@ class MockFactory:
         faults: what disturbs the devices.
         seed: of noise, calibration and faults.
         clock: of the station.
-        image_encoding: of the cameras on the wire.
+        links: how the devices are connected, and what they speak.
     """
 
     def __init__(
@@ -56,7 +58,7 @@ class MockFactory:
         faults: FaultScript,
         seed: int,
         clock: StationClock,
-        image_encoding: ImageEncoding = "rgb8",
+        links: MockLinks | None = None,
     ) -> None:
         self._streams = {stream.descriptor.name: stream for stream in streams}
         if len(self._streams) != len(streams):
@@ -64,7 +66,7 @@ class MockFactory:
         self._faults = faults
         self._seed = seed
         self._clock = clock
-        self._encoding: ImageEncoding = image_encoding
+        self._links = links or MockLinks()
         self._gloves = {side: GloveCalibration.seeded(side, seed) for side in SIDES}
 
     def build(self) -> list[MockPair]:
@@ -76,14 +78,20 @@ class MockFactory:
         pairs = [pair for side in SIDES for pair in self._hand(side)]
         if "joints_measured" in self._streams:
             parts = {name: s for name, s in self._streams.items() if name in STREAM_SIZES}
-            decoder = RobotStateDecoder()
-            pairs.append(
-                self._pair("robot_state", RobotStateSource(parts), SocketPort("robot"), decoder)
+            port, decoder = SocketPort("robot"), RobotStateDecoder()
+            driver = Driver(
+                "robot_state", transport=port.transport, decoder=decoder, clock=self._clock
             )
+            device = self._device("robot_state", RobotStateSource(parts), port)
+            pairs.append(MockPair(device, driver))
             trackers = ["head"]
         else:
             trackers = ["wrist_left", "wrist_right", "head"]
-        pairs += [self._pose_tracker(name) for name in trackers if name in self._streams]
+        pairs += [
+            mock_pose_tracker(self._streams[name], self._place(f"pose_tracker_{name}"))
+            for name in trackers
+            if name in self._streams
+        ]
         pairs += [self._camera(name) for name in self._streams if name.startswith("camera_")]
         if not pairs:
             raise InvalidInputError(
@@ -93,8 +101,13 @@ class MockFactory:
         return pairs
 
     def calibration(self) -> dict[str, Matrix]:
-        """What a calibrated station knows of its gloves: tare and gain of the 360 cells."""
+        """What a calibrated station knows of its gloves: tare and gain of the 360 cells.
+
+        Gloves of others have no such record.
+        """
         record: dict[str, Matrix] = {}
+        if self._links.gloves != "dextouch":
+            return record
         for side in SIDES:
             if f"tactile_{side}" in self._streams:
                 glove = self._gloves[side]
@@ -120,59 +133,69 @@ class MockFactory:
     def _hand(self, side: Side) -> list[MockPair]:
         pairs = []
         if f"tactile_{side}" in self._streams:
-            pair = mock_glove(
+            pairs.append(self._glove(side))
+        if f"keypoints_{side}" in self._streams:
+            place = self._place(f"finger_tracker_{side}")
+            pairs.append(mock_finger_tracker(side, self._streams[f"keypoints_{side}"], place))
+        return pairs
+
+    def _place(self, name: str) -> TrackerPlace:
+        return TrackerPlace(self._links.trackers, self._faults.of(name), self._seed, self._clock)
+
+    def _glove(self, side: Side) -> MockPair:
+        stream, faults = self._streams[f"tactile_{side}"], self._faults.of(f"glove_{side}")
+        if self._links.gloves == "wuji":
+            fast = at_rate(stream, WUJI_RATE_HZ)
+            glove = mock_wuji_glove(side, fast, faults=faults, seed=self._seed, clock=self._clock)
+        elif self._links.gloves == "justfloat":
+            glove = mock_justfloat_glove(
+                side, stream, faults=faults, seed=self._seed, clock=self._clock
+            )
+        else:
+            glove = mock_glove(
                 side,
-                self._streams[f"tactile_{side}"],
+                stream,
                 calibration=self._gloves[side],
-                faults=self._faults.of(f"glove_{side}"),
+                faults=faults,
                 seed=self._seed,
                 clock=self._clock,
             )
-            pairs.append(MockPair(*pair))
-        if f"keypoints_{side}" in self._streams:
-            pairs.append(self._finger_tracker(side))
-        return pairs
-
-    def _finger_tracker(self, side: Side) -> MockPair:
-        name = f"finger_tracker_{side}"
-        source = FingerTrackerSource(
-            self._streams[f"keypoints_{side}"],
-            side=side,
-            noise_m=self._faults.of(name).position_noise_m,
-            rng=device_rng(self._seed, f"noise_{name}"),
-        )
-        port = HidPort(name, answer=source.answer)
-        driver = FingerTracker(name, side, transport=port.transport, clock=self._clock)
-        return MockPair(self._device(name, source, port), driver)
-
-    def _pose_tracker(self, stream: str) -> MockPair:
-        name = f"pose_tracker_{stream}"
-        rng = device_rng(self._seed, f"noise_{name}")
-        source = PoseTrackerSource(self._streams[stream], faults=self._faults.of(name), rng=rng)
-        return self._pair(name, source, HidPort(name), PoseTrackerDecoder(stream))
+        return MockPair(*glove)
 
     def _camera(self, stream: str) -> MockPair:
-        replay = self._streams[stream]
+        replay, images = self._streams[stream], self._links.images
+        if self._links.cameras == "station":
+            camera = video_camera(
+                replay,
+                faults=self._faults.of(stream),
+                seed=self._seed,
+                clock=self._clock,
+                encoding=images,
+            )
+            return MockPair(camera.device, camera.driver)
         height_px, width_px = replay.descriptor.shape[:2]
-        decoder = CameraDecoder(
-            stream, height_px=height_px, width_px=width_px, encoding=self._encoding
-        )
-        source = CameraSource(replay, encoding=self._encoding)
-        return self._pair(stream, source, SocketPort(stream), decoder)
-
-    def _pair(
-        self,
-        name: str,
-        source: PacketSource,
-        port: MockPort,
-        decoder: PoseTrackerDecoder | CameraDecoder | RobotStateDecoder,
-    ) -> MockPair:
-        driver = Driver(name, transport=port.transport, decoder=decoder, clock=self._clock)
-        return MockPair(self._device(name, source, port), driver)
+        decoder = CameraDecoder(stream, height_px=height_px, width_px=width_px, encoding=images)
+        port = SocketPort(stream)
+        driver = CameraDriver(stream, transport=port.transport, decoder=decoder, clock=self._clock)
+        return MockPair(self._device(stream, CameraSource(replay, encoding=images), port), driver)
 
     def _device(self, name: str, source: PacketSource, port: MockPort) -> MockDevice:
         faults = self._faults.of(name)
         return MockDevice(name, source=source, port=port, faults=faults, seed=self._seed)
+
+
+def at_rate(stream: ReplayStream, rate_hz: float) -> ReplayStream:
+    """The stream as a device of another rate shows it: interpolated between its samples."""
+    ratio = rate_hz / stream.descriptor.nominal_rate_hz
+    index = np.arange(round(len(stream.t_ns) * ratio)) / ratio
+    # Behind the last sample the last value stands until the round begins again.
+    before = np.minimum(index.astype(np.int64), len(stream.t_ns) - 1)
+    after = np.minimum(before + 1, len(stream.t_ns) - 1)
+    share = (index - before)[:, None]
+    values = (1.0 - share) * stream.values[before] + share * stream.values[after]
+    t_ns = stream.t_ns[0] + np.rint(index * (1e9 / stream.descriptor.nominal_rate_hz))
+    descriptor = stream.descriptor.model_copy(update={"nominal_rate_hz": rate_hz})
+    return ReplayStream(descriptor, t_ns.astype(np.int64), values.astype(stream.values.dtype))
 
 
 def duration_ns(streams: Mapping[str, ReplayStream]) -> int:

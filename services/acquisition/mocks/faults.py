@@ -1,40 +1,16 @@
 """A seeded script of faults: true sample times come in, what happens to packets goes out."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Int64
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.packets import (
-    CRC,
-    HEADER,
-    MAGIC_SIZE,
-    SOURCES,
-    VERSION,
-    Packet,
-    encode_packet,
-)
-from services.acquisition.drivers.reports import (
-    REPORT_BYTES,
-    REPORT_HEADER,
-    ReportReassembler,
-    split_into_reports,
-)
-
 MILLISECOND_NS = 1_000_000
 MAX_BOOT_NS = 10**12
-OUR_MAGIC = b"DX"
-STUCK_COUNTS = 1_000
-SATURATED_COUNTS = 65_535
-# Where the numbers of a payload begin, and what they are.
-FLOATS = {b"DXFT": (4, "<f4"), b"DXPT": (4, "<f4"), b"DXRS": (0, "<f8")}
-OTHER_SIDE = {SOURCES["left"]: SOURCES["right"], SOURCES["right"]: SOURCES["left"]}
-
-Edit = Callable[[bytes, Packet], Packet]
+WINDOWS = ("stalls_s", "unplugged_s", "occluded_s", "not_running_s", "jumped_s")
 
 
 class DeviceFaults(BaseModel):
@@ -51,6 +27,11 @@ class DeviceFaults(BaseModel):
     of another packet version. The counter starts at `first_sequence` and wraps at 2^32.
     `dead_taxels` are raw cells that always read zero, stuck ones a constant, saturated ones full
     scale. `nan_probability` puts a NaN into a packet of numbers.
+
+    Trackers only, counted from the start of every round: during `occluded_s` a pose tracker says
+    that it is out of range and drifts, a finger tracker does not see the thumb; during
+    `not_running_s` a pose tracker has no tracking at all; during `jumped_s` it says that it runs,
+    but its pose is elsewhere.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,6 +53,9 @@ class DeviceFaults(BaseModel):
     dead_taxels: tuple[int, ...] = ()
     stuck_taxels: tuple[int, ...] = ()
     saturated_taxels: tuple[int, ...] = ()
+    occluded_s: tuple[tuple[float, float], ...] = ()
+    not_running_s: tuple[tuple[float, float], ...] = ()
+    jumped_s: tuple[tuple[float, float], ...] = ()
     first_sequence: int = Field(default=0, ge=0, lt=2**32)
     wrong_side_from_s: float | None = None
     version_from_s: float | None = None
@@ -81,7 +65,8 @@ class DeviceFaults(BaseModel):
 
     @model_validator(mode="after")
     def _windows_in_order(self) -> "DeviceFaults":
-        for name, windows in (("unplugged_s", self.unplugged_s), ("stalls_s", self.stalls_s)):
+        for name in WINDOWS:
+            windows: tuple[tuple[float, float], ...] = getattr(self, name)
             edges = [edge for window in windows for edge in window]
             if any(later <= earlier for earlier, later in pairwise(edges)):
                 raise ValueError(f"{name}: got {windows}, expected growing times")
@@ -192,76 +177,3 @@ def lose_bytes(data: bytes, rate: float, rng: np.random.Generator) -> tuple[byte
         return data, 0
     rest = np.delete(np.frombuffer(data, np.uint8), rng.choice(len(data), num_lost, replace=False))
     return rest.tobytes(), num_lost
-
-
-def edit_units(units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
-    """The units of one packet after some edits, each given the magic and the packet.
-
-    Raises:
-        InvalidInputError: no packet of ours.
-    """
-    if not edits:
-        return list(units)
-    if units[0].startswith(OUR_MAGIC):
-        return [_edit_packet(b"".join(units), edits)]
-    reports = ReportReassembler()
-    messages = [m for m in map(reports.feed, units) if m is not None]
-    if len(messages) != 1:
-        raise InvalidInputError(f"mock fault: got {len(units)} units, expected one of our packets")
-    report_id, data = messages[0]
-    counter = REPORT_HEADER.unpack_from(units[0])[1]
-    return split_into_reports(report_id, counter, _edit_packet(data, edits))
-
-
-def halve_units(units: Sequence[bytes]) -> list[bytes]:
-    """The first half of a packet's bytes, or of its reports."""
-    if len(units) > 1:
-        return list(units[: len(units) // 2])
-    whole = units[0]
-    is_report = len(whole) == REPORT_BYTES and not whole.startswith(OUR_MAGIC)
-    return [whole[: REPORT_BYTES // 2 if is_report else len(whole) // 2]]
-
-
-def other_version(_: bytes, packet: Packet) -> Packet:
-    """The packet of a device with newer firmware."""
-    return replace(packet, version=VERSION + 1)
-
-
-def other_side(_: bytes, packet: Packet) -> Packet:
-    """The packet of the other hand's device."""
-    return replace(packet, source=OTHER_SIDE.get(packet.source, SOURCES["left"]))
-
-
-def pin_taxels(cells: Sequence[int], counts: int) -> Edit:
-    """Raw cells of a glove that show the same counts whatever presses them."""
-
-    def edit(magic: bytes, packet: Packet) -> Packet:
-        if magic != b"DXTG":
-            raise InvalidInputError(f"mock fault: pinned taxels on a {magic!r}, expected a glove")
-        values = np.frombuffer(packet.payload, dtype="<u2").copy()
-        values[list(cells)] = counts
-        return replace(packet, payload=values.tobytes())
-
-    return edit
-
-
-def put_nan(magic: bytes, packet: Packet) -> Packet:
-    """The first number is none."""
-    if magic not in FLOATS:
-        raise InvalidInputError(f"mock fault: a {magic!r} packet has no number that could be NaN")
-    start, dtype = FLOATS[magic]
-    values = np.frombuffer(packet.payload, dtype=dtype, offset=start).copy()
-    values[0] = np.nan
-    return replace(packet, payload=packet.payload[:start] + values.tobytes())
-
-
-def _edit_packet(data: bytes, edits: Sequence[Edit]) -> bytes:
-    magic = data[:MAGIC_SIZE]
-    if not magic.startswith(OUR_MAGIC):
-        raise InvalidInputError(f"mock fault: got a {magic!r} packet, expected one of ours")
-    _, version, source, length, sequence, t_device_ns = HEADER.unpack_from(data)
-    payload = data[HEADER.size : len(data) - CRC.size]
-    packet = Packet(version, source, sequence, t_device_ns, payload[:length])
-    for edit in edits:
-        packet = edit(magic, packet)
-    return encode_packet(magic, packet)

@@ -3,9 +3,10 @@
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS
+from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import Side
 from services.acquisition.drivers.finger_tracker import (
+    ALL_SEEN,
     CHAIN_IDS,
     DESCRIPTOR_MAGIC,
     JOINT_IDS,
@@ -18,9 +19,12 @@ from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.replay import ReplayStream
 
-ALL_VALID = (1 << NUM_KEYPOINTS) - 1
+# What an occluded tracker does not see.
+_HIDDEN = chain_indices("thumb")
 
 
 class FingerTrackerSource:
@@ -31,14 +35,22 @@ class FingerTrackerSource:
         side: which hand.
         noise_m: standard deviation of each coordinate.
         rng: of the noise and of the device's node order.
+        faults: when the thumb is not seen.
     """
 
     def __init__(
-        self, stream: ReplayStream, *, side: Side, noise_m: float, rng: np.random.Generator
+        self,
+        stream: ReplayStream,
+        *,
+        side: Side,
+        noise_m: float,
+        rng: np.random.Generator,
+        faults: DeviceFaults | None = None,
     ) -> None:
         self._stream = stream
         self._side = side
         self._order = rng.permutation(NUM_KEYPOINTS)
+        self._seen = seen_nodes(stream.t_ns, self._order, faults or DeviceFaults())
         noise = noise_m * rng.standard_normal(stream.values.shape)
         self._points = (stream.values + noise)[:, self._order].astype("<f4")
 
@@ -47,9 +59,13 @@ class FingerTrackerSource:
         """When each sample is taken."""
         return self._stream.t_ns
 
+    def fate(self, index: int) -> Fate:
+        """Whether all nodes are seen."""
+        return Fate.SENT if self._seen[index] == ALL_SEEN else Fate.MARKED
+
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet, split into reports."""
-        payload = VALIDITY.pack(ALL_VALID) + self._points[index].tobytes()
+        payload = VALIDITY.pack(int(self._seen[index])) + self._points[index].tobytes()
         packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
         return split_into_reports(DATA_REPORT, sequence, encode_packet(MAGIC, packet))
 
@@ -64,3 +80,20 @@ class FingerTrackerSource:
         )
         packet = Packet(VERSION, SOURCES[self._side], 0, 0, payload)
         return split_into_reports(DESCRIPTOR_REPORT, 0, encode_packet(DESCRIPTOR_MAGIC, packet))
+
+
+def seen_nodes(
+    t_ns: np.ndarray, order: np.ndarray, faults: DeviceFaults
+) -> Int64[np.ndarray, " n"]:
+    """For each sample one bit a node, in the device's order: whether the device sees it.
+
+    Args:
+        t_ns: of the samples, from the start of the stream.
+        order: our index of each of the device's nodes.
+        faults: when the thumb is hidden.
+    """
+    hidden = sum(1 << int(place) for place in np.flatnonzero(np.isin(order, _HIDDEN)))
+    seen = np.full(len(t_ns), ALL_SEEN, dtype=np.int64)
+    for start_s, stop_s in faults.occluded_s:
+        seen[(t_ns >= start_s * 1e9) & (t_ns < stop_s * 1e9)] &= ~hidden
+    return seen

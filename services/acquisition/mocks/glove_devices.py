@@ -72,7 +72,7 @@ def mock_wuji_glove(
     side: Side, stream: ReplayStream, *, faults: DeviceFaults, seed: int, clock: StationClock
 ) -> MockGlove:
     """A Wuji glove: CRC-16, a number of 16 bits, milliseconds."""
-    source = WujiGloveSource(stream, side=side)
+    source = WujiGloveSource(stream, side=side, dead_taxels=faults.dead_taxels)
     return _pair(side, source, WujiGloveDecoder(side), (faults, seed, clock))
 
 
@@ -81,7 +81,10 @@ def mock_justfloat_glove(
 ) -> MockGlove:
     """A glove that sends bare float32s at the rate of the stream."""
     source = JustFloatGloveSource(
-        stream, num_values=JUSTFLOAT_VALUES, full_scale=JUSTFLOAT_FULL_SCALE
+        stream,
+        num_values=JUSTFLOAT_VALUES,
+        full_scale=JUSTFLOAT_FULL_SCALE,
+        dead_taxels=faults.dead_taxels,
     )
     decoder = JustFloatGloveDecoder(
         side,

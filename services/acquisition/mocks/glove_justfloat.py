@@ -1,5 +1,7 @@
 """Pressures of one hand come in; a glove that sends bare float32s and a tail goes out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float32, Int64
 
@@ -18,15 +20,24 @@ class JustFloatGloveSource:
         stream: float32 [n, 320] in kPa.
         num_values: float32s of a packet, at least 320.
         full_scale: the largest reading.
+        dead_taxels: places in the packet that read zero.
     """
 
-    def __init__(self, stream: ReplayStream, *, num_values: int, full_scale: float) -> None:
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        num_values: int,
+        full_scale: float,
+        dead_taxels: Sequence[int] = (),
+    ) -> None:
         if num_values < NUM_TAXELS:
             raise InvalidInputError(f"num_values: got {num_values}, expected at least {NUM_TAXELS}")
         counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, full_scale)
         self._stream = stream
         self._values = np.zeros((len(counts), num_values), dtype="<f4")
         self._values[:, :NUM_TAXELS] = counts
+        self._values[:, list(dead_taxels)] = 0.0
 
     @property
     def t_ns(self) -> Int64[np.ndarray, " n"]:

@@ -1,5 +1,7 @@
 """Pressures of one hand come in; a Wuji glove's data packets go out."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float32, Int64
 
@@ -32,14 +34,21 @@ class WujiGloveSource:
         stream: float32 [n, 320] in kPa.
         side: which hand.
         scale_kpa: the pressure that reads 1.
+        dead_taxels: cells of the grid, row by row, that read zero.
     """
 
     def __init__(
-        self, stream: ReplayStream, *, side: Side, scale_kpa: float = FULL_SCALE_KPA
+        self,
+        stream: ReplayStream,
+        *,
+        side: Side,
+        scale_kpa: float = FULL_SCALE_KPA,
+        dead_taxels: Sequence[int] = (),
     ) -> None:
         self._stream = stream
         self._hand = {name: number for number, name in HANDS.items()}[side]
         self._cells = grid_of(np.clip(stream.values / scale_kpa, 0.0, 1.0).astype(np.float32))
+        self._cells.reshape(len(self._cells), -1)[:, list(dead_taxels)] = 0.0
 
     @property
     def t_ns(self) -> Int64[np.ndarray, " n"]:

@@ -19,7 +19,9 @@ class Fate(StrEnum):
 
     `sent` arrived whole and in order, `repeated` also a second time, `late` behind its successor;
     of a `half` one the rest never came; a `refused` one arrived whole with something in it that a
-    driver must not take (version, side, NaN).
+    driver must not take (version, side, NaN); of a `marked` one a part is missing and must be
+    marked in the sample (nodes not seen, cells that are no numbers). In an `occluded` one the
+    tracker says that it does not track, in a `jumped` one it is elsewhere and does not say so.
     """
 
     SENT = "sent"
@@ -27,20 +29,28 @@ class Fate(StrEnum):
     LATE = "late"
     HALF = "half"
     REFUSED = "refused"
+    MARKED = "marked"
+    OCCLUDED = "occluded"
+    JUMPED = "jumped"
     DROPPED = "dropped"
     CORRUPTED = "corrupted"
     UNPLUGGED = "unplugged"
     OVERRUN = "overrun"
 
 
-ACCEPTED = (Fate.SENT, Fate.REPEATED)
+ACCEPTED = (Fate.SENT, Fate.REPEATED, Fate.MARKED)
 
 
 @dataclass
 class DeviceLedger:
-    """One device's packets, column by column; times on the host's clock except `t_device_ns`."""
+    """One device's packets, column by column; times on the host's clock except `t_device_ns`.
+
+    `script` names the faults that the device was given and their settings: what no single packet
+    shows (skew, noise, pinned taxels) is told there.
+    """
 
     path_delay_ns: int = 0
+    script: dict[str, object] = field(default_factory=dict)
     sequence: list[int] = field(default_factory=list)
     t_true_ns: list[int] = field(default_factory=list)
     t_device_ns: list[int] = field(default_factory=list)

@@ -15,9 +15,12 @@ from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encod
 from services.acquisition.drivers.pose_tracker import MAGIC, PAYLOAD, TrackingState
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.replay import ReplayStream
 
 DRIFT_M_PER_S = 0.5
+# Further than a body moves between two samples of any tracker.
+JUMP_M = (1.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -42,14 +45,24 @@ class Jump:
 TrackingFault = Occlusion | Jump
 
 
+def tracking_faults(faults: DeviceFaults) -> list[TrackingFault]:
+    """The occlusions and jumps of a device's script."""
+    return [
+        *(Occlusion(*window_s) for window_s in faults.occluded_s),
+        *(Occlusion(*window_s, TrackingState.UNINITIALIZED) for window_s in faults.not_running_s),
+        *(Jump(*window_s, JUMP_M) for window_s in faults.jumped_s),
+    ]
+
+
 class TrackedPoses:
     """What a tracker says of a body: poses with noise and tracking faults, and the truth of these.
 
     Args:
         stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis.
+        faults: position and rotation noise, per axis; occlusions and jumps.
         rng: of the noise.
-        tracking: occlusions and jumps; times count from the start of the stream.
+        tracking: occlusions and jumps besides those of `faults`; times count from the start of
+            the stream.
     """
 
     def __init__(
@@ -65,7 +78,7 @@ class TrackedPoses:
         self.states = np.full(len(self.t_ns), int(TrackingState.RUNNING_OK))
         # The ledger of this source: what is wrong with each sample, "" where nothing is.
         self.labels = np.full(len(self.t_ns), "", dtype="<U8")
-        for fault in tracking:
+        for fault in (*tracking_faults(faults), *tracking):
             during = (self.t_ns >= fault.start_s * 1e9) & (self.t_ns < fault.stop_s * 1e9)
             if isinstance(fault, Occlusion):
                 self.states[during] = int(fault.state)
@@ -79,13 +92,17 @@ class TrackedPoses:
                 turned = rotation_from_vector(np.array(fault.turn_rad)) @ R_world_body
                 self.poses[during, 3:] = quaternion_from_rotation(turned)
 
+    def fate(self, index: int) -> Fate:
+        """What becomes of one sample if its packet arrives."""
+        return Fate(str(self.labels[index]) or Fate.SENT)
+
 
 class PoseTrackerSource:
     """Reports of one pose tracker.
 
     Args:
         stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis.
+        faults: position and rotation noise, per axis; occlusions and jumps.
         rng: of the noise.
         tracking: occlusions and jumps.
     """
@@ -105,6 +122,10 @@ class PoseTrackerSource:
     def t_ns(self) -> Int64[np.ndarray, " n"]:
         """When each sample is taken."""
         return self.tracked.t_ns
+
+    def fate(self, index: int) -> Fate:
+        """Whether this pose is occluded or jumps."""
+        return self.tracked.fate(index)
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet in one report."""

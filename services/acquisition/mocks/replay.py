@@ -11,22 +11,24 @@ from jaxtyping import Int64, Shaped
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
-from services.acquisition.mocks.faults import (
-    SATURATED_COUNTS,
-    STUCK_COUNTS,
-    DeviceFaults,
+from services.acquisition.mocks.edits import (
     Edit,
-    Schedule,
-    boot_time_ns,
     edit_units,
-    flip_bits,
+    family_of,
     halve_units,
-    lose_bytes,
-    make_schedule,
+    is_marked_when_nan,
     other_side,
     other_version,
     pin_taxels,
     put_nan,
+)
+from services.acquisition.mocks.faults import (
+    DeviceFaults,
+    Schedule,
+    boot_time_ns,
+    flip_bits,
+    lose_bytes,
+    make_schedule,
 )
 from services.acquisition.mocks.ledger import DeviceLedger, Fate
 from services.acquisition.mocks.ports import MockPort
@@ -75,16 +77,13 @@ class PacketSource(Protocol):
         ...
 
 
-class _Edits(NamedTuple):
-    """What is changed in one packet; a driver must refuse one that `refused` changed."""
+@runtime_checkable
+class LabelledSource(Protocol):
+    """A source that knows which of its samples are wrong in themselves."""
 
-    harmless: list[Edit]
-    refused: list[Edit]
-
-    @property
-    def all(self) -> list[Edit]:
-        """Both."""
-        return [*self.harmless, *self.refused]
+    def fate(self, index: int) -> Fate:
+        """What becomes of sample `index` if its packet arrives: SENT of a good one."""
+        ...
 
 
 class _Event(NamedTuple):
@@ -117,14 +116,11 @@ class MockDevice:
         self._boot_ns = boot_time_ns(self._rng)
         self._bit_error_rate = faults.bit_error_rate if port.has_bit_errors else 0.0
         self._byte_loss_rate = faults.byte_loss_rate if port.has_bit_errors else 0.0
-        self._taxel_edits = [
-            pin_taxels(cells, counts)
-            for cells, counts in (
-                (faults.stuck_taxels, STUCK_COUNTS),
-                (faults.saturated_taxels, SATURATED_COUNTS),
-            )
-            if cells
-        ]
+        self._taxel_edits: list[Edit] = []
+        if faults.stuck_taxels:
+            self._taxel_edits.append(pin_taxels(faults.stuck_taxels, "stuck"))
+        if faults.saturated_taxels:
+            self._taxel_edits.append(pin_taxels(faults.saturated_taxels, "saturated"))
         self._next_sequence = faults.first_sequence
         # The place in the ledger and the units of a packet that the next one overtakes.
         self._held: tuple[int, list[bytes]] | None = None
@@ -200,8 +196,11 @@ class MockDevice:
         elif schedule.is_dropped[index]:
             fate = Fate.DROPPED
         else:
+            if isinstance(self.source, LabelledSource):
+                fate = self.source.fate(index)
             units = self.source.units(index, sequence, t_device_ns)
-            fate, flips = self._deliver(units, int(schedule.t_true_ns[index]))
+            units, fate = self._edit(units, int(schedule.t_true_ns[index]), fate)
+            fate, flips = self._deliver(units, fate)
         times_ns = (
             self._start_host_ns + int(schedule.t_true_ns[index]),
             t_device_ns,
@@ -209,13 +208,8 @@ class MockDevice:
         )
         self.ledger.note(sequence, times_ns, fate, flips)
 
-    def _deliver(self, units: list[bytes], t_true_ns: int) -> tuple[Fate, int]:
+    def _deliver(self, units: list[bytes], fate: Fate) -> tuple[Fate, int]:
         """Send a packet through everything that can happen to it on its way."""
-        fate = Fate.SENT
-        edits = self._edits_of(t_true_ns)
-        if edits.refused:
-            fate = Fate.REFUSED
-        units = edit_units(units, edits.all)
         if self._happens(self.faults.half_packet_probability):
             units, fate = halve_units(units), Fate.HALF
         elif self._may_wait(fate) and self._happens(self.faults.reorder_probability):
@@ -253,21 +247,29 @@ class MockDevice:
         # what another one does.
         return probability > 0 and bool(self._rng.random() < probability)
 
-    def _edits_of(self, t_true_ns: int) -> "_Edits":
+    def _edit(self, units: list[bytes], t_true_ns: int, fate: Fate) -> tuple[list[bytes], Fate]:
+        """What the device says instead, with what is wrong in itself."""
         faults = self.faults
-        refused: list[Edit] = []
+        edits = list(self._taxel_edits)
         for from_s, edit in (
             (faults.version_from_s, other_version),
             (faults.wrong_side_from_s, other_side),
         ):
             if from_s is not None and t_true_ns >= from_s * 1e9:
-                refused.append(edit)
+                edits.append(edit)
+                fate = Fate.REFUSED
         if self._happens(faults.nan_probability):
-            refused.append(put_nan)
-        return _Edits(self._taxel_edits, refused)
+            edits.append(put_nan)
+            if fate is Fate.SENT:
+                is_marked = is_marked_when_nan(family_of(units))
+                fate = Fate.MARKED if is_marked else Fate.REFUSED
+        return edit_units(units, edits), fate
 
     def _new_ledger(self) -> DeviceLedger:
-        return DeviceLedger(path_delay_ns=round(self.faults.path_delay_ms * 1e6))
+        return DeviceLedger(
+            path_delay_ns=round(self.faults.path_delay_ms * 1e6),
+            script=self.faults.model_dump(mode="json", exclude_defaults=True),
+        )
 
 
 def device_rng(seed: int, name: str) -> np.random.Generator:

@@ -10,10 +10,11 @@ from types import TracebackType
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas.episodes import Matrix
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
-from services.acquisition.drivers.camera import ImageEncoding
-from services.acquisition.mocks.devices import MockFactory, MockPair, duration_ns
+from services.acquisition.mocks.devices import MockFactory, duration_ns
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Ledger
+from services.acquisition.mocks.links import MockLinks
+from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.schemas import SaveTake, TakeCheck, TakePrompt
 from services.acquisition.station import Station
@@ -46,7 +47,7 @@ class MockStation:
         spool_root: folder of the takes.
         name: of the station.
         calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
-        image_encoding: of the cameras on the wire.
+        links: how the devices are connected, and what they speak.
         safety: of the spool.
     """
 
@@ -60,12 +61,10 @@ class MockStation:
         spool_root: Path,
         name: str = "mock_station",
         calibration: Mapping[str, Matrix] | None = None,
-        image_encoding: ImageEncoding = "rgb8",
+        links: MockLinks | None = None,
         safety: SpoolSafety | None = None,
     ) -> None:
-        factory = MockFactory(
-            streams, faults=faults, seed=seed, clock=clock, image_encoding=image_encoding
-        )
+        factory = MockFactory(streams, faults=faults, seed=seed, clock=clock, links=links)
         self.pairs = factory.build()
         self._clock = clock
         self._seed = seed

@@ -9,10 +9,13 @@ from services.acquisition.settings import AcquisitionSettings
 OPTIONS = {
     "station",
     "spool",
+    "flush_period_s",
+    "min_free_bytes",
     "mock",
     "mock_store",
     "mock_episode_id",
     "mock_faults",
+    "mock_links",
     "seed",
     "devices",
     "calibration",
