@@ -1,5 +1,6 @@
 """The acquisition service's answers in, the station as the page shows it out."""
 
+from collections.abc import Sequence
 from typing import TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -30,13 +31,22 @@ class _Answer(BaseModel):
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
+class HealthFinding(_Answer):
+    """Something wrong with a stream, or with the station itself: its disk, its calibration."""
+
+    level: Level
+    message: str
+    advice: str = ""
+    lasted_s: float | None = None
+
+
 class StreamHealth(_Answer):
     """One stream as acquisition judges it; clock figures only where a clock is being fitted."""
 
     stream: str
     device: str
     level: Level
-    reasons: tuple[str, ...] = ()
+    findings: tuple[HealthFinding, ...] = ()
     rate_hz: float | None = None
     nominal_rate_hz: float | None = None
     age_s: float | None = None
@@ -51,14 +61,8 @@ class DeviceHealth(_Answer):
 
     device: str
     reconnects: int = 0
+    suspects: int = 0
     last_error: str | None = None
-
-
-class HealthFinding(_Answer):
-    """Something wrong with the station itself: its disk, its calibration."""
-
-    level: Level
-    message: str
 
 
 class StationHealth(_Answer):
@@ -125,13 +129,16 @@ def station_view(health: object, recorder: object) -> StationView:
     station = _read(StationHealth, health)
     devices = {device.device: device for device in station.devices}
     streams = tuple(_stream_view(item, devices.get(item.device)) for item in station.streams)
-    levels = [stream.level for stream in streams]
-    notes = [finding.message for finding in station.findings]
+    found = [finding.level for finding in station.findings]
+    notes = [f"{finding.message} → {finding.advice}" for finding in station.findings]
+    if not streams:
+        found, notes = ["STALE", *found], ["No devices are connected.", *notes]
     return StationView(
         reachable=True,
-        level=worst([*levels, *(finding.level for finding in station.findings)]),
-        summary=_summary(levels),
-        note=" · ".join(notes if streams else ["No devices are connected.", *notes]),
+        level=worst([*(stream.level for stream in streams), *found]),
+        summary=_summary(streams),
+        note=" · ".join(notes),
+        note_level=worst(found) if found else "OK",
         streams=streams,
         recorder=recorder_view(recorder),
     )
@@ -165,16 +172,22 @@ def camera_views(answer: object) -> list[CameraView]:
 
 
 def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
-    words = list(item.reasons)
+    words = [finding.message for finding in item.findings]
+    first = item.findings[0] if item.findings else None
     if device is not None and device.reconnects:
         words.append(f"{device.reconnects} reconnects")
+    if device is not None and device.suspects:
+        words.append(f"{device.suspects} packets held back")
     if device is not None and device.last_error and item.level in {"ERROR", "STALE"}:
         words.append(device.last_error)
     offered = (item.received or 0) + (item.lost or 0)
     return StreamView(
         name=item.stream,
+        device=item.device,
         level=item.level,
         message=" · ".join(dict.fromkeys(words)),
+        advice=first.advice if first is not None else "",
+        lasted_s=first.lasted_s if first is not None else None,
         rate_hz=item.rate_hz,
         nominal_rate_hz=item.nominal_rate_hz,
         dropped=item.lost,
@@ -185,9 +198,15 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
     )
 
 
-def _summary(levels: list[Level]) -> str:
-    counts = [(level, levels.count(level)) for level in ("ERROR", "STALE", "WARN", "OK")]
-    return " · ".join(f"{count} {level}" for level, count in counts if count) or "no streams"
+def _summary(streams: Sequence[StreamView]) -> str:
+    """How many streams are at each level, and which devices are in trouble."""
+    parts = []
+    for level in ("ERROR", "STALE", "WARN", "OK"):
+        devices = [stream.device for stream in streams if stream.level == level]
+        names = "" if level == "OK" else f" ({', '.join(dict.fromkeys(devices))})"
+        if devices:
+            parts.append(f"{len(devices)} {level}{names}")
+    return " · ".join(parts) or "no streams"
 
 
 def _read(model: type[ModelT], answer: object) -> ModelT:

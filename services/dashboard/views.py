@@ -17,13 +17,19 @@ TAXEL_MESSAGE = 1
 
 
 class StreamView(BaseModel):
-    """One row of the device table; None where nothing was measured."""
+    """One row of the device table; None where nothing was measured.
+
+    `advice` is what to do about the gravest of what `message` tells, which lasts since `lasted_s`.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
+    device: str
     level: Level
     message: str = ""
+    advice: str = ""
+    lasted_s: float | None = None
     rate_hz: float | None = None
     nominal_rate_hz: float | None = None
     dropped: int | None = None
@@ -55,6 +61,7 @@ class StationView(BaseModel):
     level: Level
     summary: str
     note: str
+    note_level: Level
     streams: tuple[StreamView, ...]
     recorder: RecorderView
 
@@ -104,6 +111,7 @@ def unreachable_station(reason: str) -> StationView:
         level="ERROR",
         summary="acquisition does not answer",
         note=reason,
+        note_level="ERROR",
         streams=(),
         recorder=RecorderView(state="unknown", level="ERROR"),
     )

@@ -20,11 +20,18 @@ function drops(stream) {
   return stream.drop_percent === null ? counted : `${counted} (${number(stream.drop_percent, 2)} %)`;
 }
 
+function trouble(stream) {
+  const lasted = stream.lasted_s === null ? "" : ` · for ${age(stream.lasted_s)}`;
+  return [
+    stream.message ? element("span", { class: "why" }, stream.message + lasted) : null,
+    stream.advice ? element("span", { class: "to_do" }, stream.advice) : null,
+  ];
+}
+
 function row(stream) {
-  return element("tr", {},
+  return element("tr", { "data-level": stream.level },
     element("td", {}, levelBadge(stream.level)),
-    element("td", { class: "name" }, stream.name,
-      stream.message ? element("span", { class: "why" }, stream.message) : null),
+    element("td", { class: "name" }, stream.name, ...trouble(stream)),
     rateCell(stream),
     element("td", { class: "number" }, drops(stream)),
     element("td", { class: "number" }, age(stream.age_s)),
@@ -36,7 +43,7 @@ function row(stream) {
 export function showDevices(body, note, station) {
   note.hidden = station.note === "";
   note.textContent = station.note;
-  note.dataset.level = station.reachable ? "OK" : "ERROR";
+  note.dataset.level = station.note_level;
   const clocks = station.streams.some((stream) => stream.skew_ppm !== null || stream.clock_error_ms !== null);
   body.closest("table").classList.toggle("no_clocks", !clocks);
   body.replaceChildren(...station.streams.map(row));

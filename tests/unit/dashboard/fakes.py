@@ -51,7 +51,7 @@ class FakeServices:
 
     def __init__(self):
         self.stream = {"stream": "tactile_left", "device": "glove_left", "level": "OK"}
-        self.stream |= {"reasons": [], "rate_hz": 59.9, "nominal_rate_hz": 60.0, "age_s": 0.01}
+        self.stream |= {"findings": [], "rate_hz": 59.9, "nominal_rate_hz": 60.0, "age_s": 0.01}
         self.stream |= {"received": 998, "lost": 2}
         self.device = {"device": "glove_left", "reconnects": 0, "last_error": None}
         self.health = {"streams": [self.stream], "devices": [self.device]}

@@ -27,23 +27,34 @@ async def test_station(feeds):
 
 async def test_worst_level_leads(feeds, services):
     levels = ("OK", "STALE", "WARN")
-    services.health["streams"] = [services.stream | {"level": it} for it in levels]
+    devices = ("head", "glove_left", "camera_head")
+    streams = zip(levels, devices, strict=True)
+    services.health["streams"] = [services.stream | {"level": a, "device": b} for a, b in streams]
     view = await feeds.station()
-    assert (view.level, view.summary) == ("STALE", "1 STALE · 1 WARN · 1 OK")
+    summary = "1 STALE (glove_left) · 1 WARN (camera_head) · 1 OK"
+    assert (view.level, view.summary) == ("STALE", summary)
 
 
 async def test_what_ails_a_device_is_said(feeds, services):
-    services.stream |= {"level": "STALE", "reasons": ["no sample for 2.0 s"]}
-    services.device |= {"reconnects": 3, "last_error": "gone"}
+    silent = {"code": "silent", "level": "STALE", "message": "no sample for 2.0 s"}
+    loss = {"code": "loss", "level": "WARN", "message": "1 % lost", "advice": "Move."}
+    services.stream |= {
+        "level": "STALE",
+        "findings": [silent | {"advice": "Switch it off and on.", "lasted_s": 2.0}, loss],
+    }
+    services.device |= {"reconnects": 3, "last_error": "gone", "suspects": 4}
     (stream,) = (await feeds.station()).streams
-    assert stream.message == "no sample for 2.0 s · 3 reconnects · gone"
+    words = "no sample for 2.0 s · 1 % lost · 3 reconnects · 4 packets held back · gone"
+    assert stream.message == words
+    assert (stream.advice, stream.lasted_s) == ("Switch it off and on.", 2.0)
 
 
 async def test_what_ails_the_station_itself_is_said(feeds, services):
     full = {"code": "disk", "level": "ERROR", "message": "the disk is full in 4 minutes"}
-    services.health["findings"] = [full]
+    services.health["findings"] = [full | {"advice": "Delete takes.", "lasted_s": 9.0}]
     view = await feeds.station()
-    assert (view.level, view.note) == ("ERROR", "the disk is full in 4 minutes")
+    assert (view.level, view.note_level) == ("ERROR", "ERROR")
+    assert view.note == "the disk is full in 4 minutes → Delete takes."
     assert view.streams[0].level == "OK"
 
 
