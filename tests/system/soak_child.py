@@ -7,6 +7,7 @@ import threading
 from pathlib import Path
 
 import numpy as np
+import structlog
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from services.acquisition.clock import VirtualClock
@@ -112,6 +113,8 @@ def upload(root, store_url):
 
 def main(spool, store_url, seed, first_take, kinds, seconds):
     """Record the takes from the first one on, `kinds` telling of each: one station a kind."""
+    # Facts go out alone, or a warning of another thread could end up inside of one.
+    structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
     root, seconds, number = Path(spool), float(seconds), int(first_take)
     recover_spool(root)
     for kind, takes in itertools.groupby(kinds[number:]):

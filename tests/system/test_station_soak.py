@@ -37,19 +37,18 @@ class Soak:
     def run(self, first_take, seed, kill_in=None):
         """From a take on to the end, or until the kill; whether it came to its end."""
         arguments = [self._spool, self._url, seed, first_take, self._kinds, self._seconds]
-        child = subprocess.Popen(
-            [sys.executable, str(CHILD), *map(str, arguments)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'shared'}"},
-        )
-        log, is_done = [], False
+        log = self._spool.with_name(f"station-{first_take}.log")
+        with log.open("w") as errors:
+            child = subprocess.Popen(
+                [sys.executable, str(CHILD), *map(str, arguments)],
+                stdout=subprocess.PIPE,
+                stderr=errors,
+                text=True,
+                env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'shared'}"},
+            )
+        is_done = False
         self.rss_bytes = []
         for line in child.stdout:
-            log.append(line)
-            if not line.startswith("{"):
-                continue
             fact = json.loads(line)
             is_done = is_done or fact["event"] == "done"
             if "counts" in fact:
@@ -65,7 +64,7 @@ class Soak:
                 break
         child.stdout.close()
         code = child.wait()
-        assert code == (0 if kill_in is None else -signal.SIGKILL), "".join(log[-30:])
+        assert code == (0 if kill_in is None else -signal.SIGKILL), log.read_text()[-3000:]
         return is_done
 
 
