@@ -5,6 +5,7 @@ row, as its users do: two tactile samples, four of keypoints, three of poses. Th
 of the 100 Hz poses and every native time stamp, which spares LeRobot bytes, not us.
 """
 
+import ctypes.util
 import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -66,10 +67,12 @@ class LeRobotDesign:
     reads: str | None = None
 
     def missing(self) -> str | None:
-        """The package that is not there; None where all are."""
+        """What its packages need and is not there; None where all is."""
         for package in ("lerobot", "torchcodec", "datasets"):
             if importlib.util.find_spec(package) is None:
                 return f"package {package} (make bench-lerobot installs it)"
+        if ctypes.util.find_library("avutil") is None:
+            return "FFmpeg's libraries for torchcodec (Debian: apt-get install ffmpeg)"
         return None
 
     def write(self, workload: Workload, folder: Path) -> None:
