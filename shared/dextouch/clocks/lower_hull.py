@@ -7,6 +7,7 @@ that stays below every point.
 """
 
 from collections import deque
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -36,6 +37,16 @@ class LowerHull:
 
     def __len__(self) -> int:
         return len(self._vertices)
+
+    def __iter__(self) -> Iterator[tuple[float, float]]:
+        """Vertices in order of x."""
+        return iter(self._vertices)
+
+    def moved(self, x_s: float, y_ns: float) -> "LowerHull":
+        """A hull of the same points, all of them moved by as much."""
+        hull = LowerHull()
+        hull._vertices = deque((x + x_s, y + y_ns) for x, y in self._vertices)
+        return hull
 
     @property
     def span_s(self) -> float:

@@ -4,7 +4,11 @@ The line looks back only. It tells delays from steps of the device's clock: a de
 and ends; a step may go either way and stays.
 """
 
+import math
+from typing import NamedTuple
+
 from dextouch.clocks.lower_hull import Line, LowerHull
+from dextouch.clocks.rhythm import Rhythm
 
 WINDOW_S = 60.0
 # Below this span the slope of before the last step is kept (at the start: 0).
@@ -28,6 +32,57 @@ MIN_CONFIRM_SAMPLES = 30
 # Samples that were merely late may have come before the step itself.
 DOUBTFUL_S = 0.4
 SPREAD_RATE = 0.005
+# Which whole number of periods a step left out shows only where samples wait less than a period.
+MIN_PERIOD_SPREADS = 4.0
+MAX_PERIODS = 100
+# A moved line may lie so much of a period above the first point.
+BELOW_SHARE = 0.1
+# A line that was moved by what the stamps tell must soon be met by points, and undercut by none.
+TRIAL_SAMPLES = 1000
+MIN_TRIAL_SAMPLES = 2
+TRIAL_NS = 100_000.0
+TRIAL_ABOVE_SPREADS = 3.0
+TRIAL_BELOW_SPREADS = 0.1
+
+
+class _Trial:
+    """Whether a line that was moved at a step lies where the points since then want it.
+
+    A device that was restarted samples at other moments than before; then it does not, and the
+    points since the step are all that is known.
+
+    Args:
+        hull: of the points since the step.
+        num: of these points.
+        least_ns: how near they come to the moved line.
+    """
+
+    def __init__(self, hull: LowerHull, num: int = 0, least_ns: float = math.inf) -> None:
+        self.hull = hull
+        self._num = num
+        self._least_ns = least_ns
+
+    @property
+    def is_over(self) -> bool:
+        """Whether enough points agree."""
+        return self._num >= TRIAL_SAMPLES
+
+    def fails(self, x_s: float, y_ns: float, residual_ns: float, spread_ns: float) -> bool:
+        """Take in a point; whether the moved line is refuted: the nearest of n lies near."""
+        self.hull.add(x_s, y_ns)
+        self._num += 1
+        self._least_ns = min(self._least_ns, residual_ns)
+        if self._least_ns < -TRIAL_NS - TRIAL_BELOW_SPREADS * spread_ns:
+            return True
+        near_ns = TRIAL_NS + TRIAL_ABOVE_SPREADS * spread_ns / math.sqrt(self._num)
+        return self._num >= MIN_TRIAL_SAMPLES and self._least_ns > near_ns
+
+
+class _Odd(NamedTuple):
+    """Two stamps that are no whole number of periods apart: device time of the later, distance."""
+
+    x_s: float
+    distance_s: float
 
 
 class RunningEnvelope:
@@ -36,6 +91,10 @@ class RunningEnvelope:
     A point far below the line cannot be a delay: the clock was stepped and the line starts anew
     at once. Points that all lie above it for a second, by the device's time and by the host's, are
     a step too (a burst of packets after a stall is a second of device time only).
+
+    A device that samples regularly shows in the distance of its stamps by how much its clock was
+    stepped, but for whole periods. Then the line and what it hangs on are moved by as much, instead
+    of waiting for samples that hardly waited; points that disagree make it start anew after all.
 
     Args:
         resolution_ns: of the device's stamps; steps below it do not show.
@@ -53,6 +112,8 @@ class RunningEnvelope:
         self._slope_ns_per_s = 0.0
         self._slope_span_s = 0.0
         self._last_x_s = 0.0
+        self._rhythm = Rhythm()
+        self._odd: _Odd | None = None
         self._start(LowerHull())
 
     @property
@@ -82,10 +143,15 @@ class RunningEnvelope:
             y_ns: apparent offset, arrival minus device time.
             now_s: arrival.
         """
-        if self._line is not None and self._is_pending(self._line, x_s, y_ns, now_s):
-            offset_ns = self._line.at(x_s)
-        else:
+        if self._line is None:
             offset_ns = self._follow(x_s, y_ns)
+        else:
+            distance_s = x_s - self._last_x_s
+            if self._rhythm.is_odd(distance_s):
+                self._odd = _Odd(x_s, distance_s)
+            self._rhythm.add(distance_s)
+            is_pending = self._is_pending(self._line, x_s, y_ns, now_s)
+            offset_ns = self._line.at(x_s) if is_pending else self._follow(x_s, y_ns)
         self._last_x_s = x_s
         return offset_ns
 
@@ -96,6 +162,8 @@ class RunningEnvelope:
         self._num_pending = 0
         self._pending_since: tuple[float, float] = (0.0, 0.0)
         self._pending = LowerHull()
+        self._trial: _Trial | None = None
+        self._odd = None
 
     def _is_pending(self, line: Line, x_s: float, y_ns: float, now_s: float) -> bool:
         """Sort out steps; whether the point awaits confirmation and must not move the line."""
@@ -103,18 +171,63 @@ class RunningEnvelope:
         early_ns, late_ns = self._thresholds_ns()
         settled = self._hull.span_s >= SETTLED_S
         if x_s < self._last_x_s or (settled and residual_ns < -early_ns):
-            self._num_steps += 1
-            self._start(LowerHull())
+            self._num_steps += self._trial is None
+            step_s = self._step_s(line, x_s - self._last_x_s, (x_s, y_ns))
+            self._start_after(step_s, _Trial(LowerHull()))
             return False
         self._measure_spread(residual_ns)
+        if self._trial is not None and self._trial.fails(x_s, y_ns, residual_ns, self._spread_ns):
+            self._start(self._trial.hull)
+            return False
         if residual_ns <= late_ns or not settled:
             self._num_pending = 0
             return False
         if not self._has_lasted(x_s, y_ns, now_s):
             return True
         self._num_steps += 1
-        self._start(self._pending)
+        self._confirm(line)
         return False
+
+    def _confirm(self, line: Line) -> None:
+        """The points that waited were above the line because of a step."""
+        odd, pending = self._odd, self._pending
+        if odd is None or odd.x_s < self._pending_since[0]:
+            self._start(pending)
+            return
+        lowest = pending.line_of_slope(line.slope_ns_per_s)
+        step_s = self._step_s(line, odd.distance_s, (lowest.x_at_s, lowest.y_at_ns))
+        self._start_after(step_s, _Trial(pending))
+
+    def _step_s(self, line: Line, distance_s: float, point: tuple[float, float]) -> float | None:
+        """By how much the device's clock jumped; None where its stamps do not tell.
+
+        Args:
+            line: of before.
+            distance_s: of the stamps before and after the step.
+            point: device time and apparent offset of one after the step that hardly waited.
+        """
+        period_s = self._rhythm.period_s
+        if period_s is None or period_s * 1e9 < MIN_PERIOD_SPREADS * self._spread_ns:
+            return None
+        step_s = distance_s - period_s
+        residual_s = (point[1] - line.at(point[0] - step_s)) * 1e-9 + step_s
+        num_more = math.floor(residual_s / period_s + BELOW_SHARE)
+        # A sample that waited for longer than a period at the step itself hides whole periods of
+        # it; the next ones show them.
+        if abs(num_more) > MAX_PERIODS or (num_more < 0 and self._trial is None):
+            return None
+        return step_s - num_more * period_s
+
+    def _start_after(self, step_s: float | None, trial: _Trial) -> None:
+        """Go on after a step of known size with the moved line, of unknown size with new points."""
+        if step_s is None:
+            self._start(trial.hull)
+            return
+        hull, num_followed = self._hull.moved(step_s, -step_s * 1e9), self._num_followed
+        for x_s, y_ns in trial.hull:
+            hull.add(x_s, y_ns)
+        self._start(hull)
+        self._num_followed, self._trial = num_followed, trial
 
     def _has_lasted(self, x_s: float, y_ns: float, now_s: float) -> bool:
         """Take in a point above the line; whether they have all been above it long enough."""
@@ -157,4 +270,6 @@ class RunningEnvelope:
             self._slope_ns_per_s = line.slope_ns_per_s
             self._slope_span_s = span_s
         self._line = line
+        if self._trial is not None and self._trial.is_over:
+            self._trial = None
         return line.at(x_s)
