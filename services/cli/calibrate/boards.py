@@ -15,6 +15,7 @@ from services.alignment.calibration.board_detection import (
     Chessboard,
     find_boards,
 )
+from services.alignment.calibration.sharpness import MAX_EDGE_WIDTH_PX, edge_width_px
 
 Board = Chessboard | CharucoBoard
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -29,13 +30,19 @@ class BoardView:
     """Corners of the board in one photo.
 
     `points_board` are places on the board (m), `pixels` OpenCV's: the middle of the first is 0, 0.
-    `pattern` says how the board is printed.
+    `pattern` says how the board is printed, `edge_width_px` how blurred its edges are.
     """
 
     name: str
     points_board: Float32[np.ndarray, "n 3"]
     pixels: Float32[np.ndarray, "n 2"]
     pattern: str
+    edge_width_px: float
+
+    @property
+    def is_blurred(self) -> bool:
+        """Whether camera or board moved: corners of such a photo are off along the motion."""
+        return self.edge_width_px > MAX_EDGE_WIDTH_PX
 
 
 @dataclass(frozen=True)
@@ -90,7 +97,8 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
     pixels = found.pixels_px[0]
     if isinstance(board, Chessboard):
         pixels = _dark_first(photo, pixels, board)
-    return BoardView(name, found.points_board[0], pixels, found.pattern)
+    width_px = edge_width_px(photo, found.points_board[0], pixels)
+    return BoardView(name, found.points_board[0], pixels, found.pattern, width_px)
 
 
 def usual_pattern(views: Sequence[BoardView]) -> str:

@@ -33,12 +33,18 @@ PIXEL_SHIFT_PX = 0.5
 
 @dataclass(frozen=True)
 class Found:
-    """The photos of a folder in which the board was found."""
+    """The photos of a folder in which the board was found; blurred ones are left out by name."""
 
     views: tuple[BoardView, ...]
     without_board: tuple[str, ...]
+    blurred: tuple[str, ...]
     size_px: tuple[int, int]
     board_kind: str
+
+    @property
+    def num_photos(self) -> int:
+        """All that were looked at."""
+        return len(self.views) + len(self.without_board) + len(self.blurred)
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
@@ -79,11 +85,16 @@ def find_boards(paths: Sequence[Path], board: Board) -> Found:
         for path, photo in progress(list(zip(paths, photos, strict=True)), "looking for the board")
     ]
     pattern = usual_pattern([view for view in seen if view is not None])
-    views = tuple(view for view in seen if view is not None and view.pattern == pattern)
-    names = {view.name for view in views}
-    without = tuple(path.name for path in paths if path.name not in names)
+    found = [view for view in seen if view is not None and view.pattern == pattern]
+    names = {view.name for view in found}
     height_px, width_px = photos[0].shape
-    return Found(views, without, (width_px, height_px), pattern)
+    return Found(
+        tuple(view for view in found if not view.is_blurred),
+        tuple(path.name for path in paths if path.name not in names),
+        tuple(view.name for view in found if view.is_blurred),
+        (width_px, height_px),
+        pattern,
+    )
 
 
 def corners_of(found: Found) -> FoundBoards:
@@ -93,7 +104,7 @@ def corners_of(found: Found) -> FoundBoards:
         tuple(view.pixels for view in found.views),
         found.size_px,
         tuple(range(len(found.views))),
-        len(found.views) + len(found.without_board),
+        found.num_photos,
         found.board_kind,
     )
 
@@ -102,21 +113,28 @@ def report_coverage(found: Found, folder: Path, camera: str) -> dict[str, object
     """Print and draw what the photos cover; the same as data."""
     coverage = camera_coverage(found.views, found.size_px)
     path = write_coverage(found, coverage, folder, camera)
-    num = len(found.views) + len(found.without_board)
-    print(f"board found in {len(found.views)} of {num} photos ({found.board_kind})")
-    for name in found.without_board:
-        print(f"  not in {name}")
+    print(f"board found in {len(found.views)} of {found.num_photos} photos ({found.board_kind})")
+    tell_left_out(found)
     for words in coverage.todo:
         print(f"next: {words}")
     print(f"coverage: {path}")
     return {
-        "num_photos": num,
+        "num_photos": found.num_photos,
         "num_with_board": len(found.views),
         "without_board": list(found.without_board),
+        "blurred": list(found.blurred),
         "board_kind": found.board_kind,
         "views_by_region": coverage.views_by_region.tolist(),
         "next": list(coverage.todo),
     }
+
+
+def tell_left_out(found: Found) -> None:
+    """Name the photos that do not count, and why."""
+    for name in found.without_board:
+        print(f"  no board in {name}: left out")
+    for name in found.blurred:
+        print(f"  {name} is blurred: left out; hold camera and board still, or give it more light")
 
 
 def write_coverage(found: Found, coverage: Coverage, folder: Path, camera: str) -> Path:

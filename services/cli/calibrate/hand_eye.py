@@ -3,7 +3,7 @@
 import argparse
 import csv
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from services.alignment.calibration.board_views import BoardViews
 from services.alignment.calibration.hand_eye import solve_hand_eye
 from services.cli.calibrate.advice import turn_coverage
 from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board
-from services.cli.calibrate.camera import find_boards, lens_of
+from services.cli.calibrate.camera import find_boards, lens_of, tell_left_out
 from services.cli.calibrate.pictures import turns_picture
 from services.cli.calibrate.record import (
     named_matrix,
@@ -39,13 +39,15 @@ POSES_HELP = (
 class PosedViews:
     """Poses of the tracker and of the board at the same moments, and what each is called.
 
-    `corners` are what the board's poses were found from, where there are photos.
+    `corners` are what the board's poses were found from, where there are photos; `blurred` names
+    photos that are none of the views for that reason.
     """
 
     names: tuple[str, ...]
     Ts_world_tracker: Float64[np.ndarray, "n 4 4"]
     Ts_camera_board: Float64[np.ndarray, "n 4 4"]
     corners: BoardViews | None = None
+    blurred: tuple[str, ...] = ()
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
@@ -74,13 +76,19 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     result = solve_hand_eye(views.Ts_world_tracker, views.Ts_camera_board, views=views.corners)
     X = result.T_tracker_camera
     off_mm = board_scatter_mm(views, X)
+    left_out = [views.names[index] for index in result.left_out_views]
+    for view in left_out:
+        print(f"  {view} is far off: left out; did the tracker stand still, and is it its pose?")
+    kept = np.delete(off_mm, result.left_out_views)
     write_picture(options.to, picture, turns_picture(turns, views.names, off_mm))
     name = f"T_tracker_{TRACKERS[options.camera]}_camera_{options.camera}"
     facts = report | {
         "camera": options.camera,
         "sigma_rotation_deg": float(np.rad2deg(result.sigma_rotation_rad)),
         "sigma_translation_mm": result.sigma_translation_m * 1e3,
-        "board_scatter_rms_mm": float(np.sqrt(np.mean(off_mm**2))),
+        "board_scatter_rms_mm": float(np.sqrt(np.mean(kept**2))),
+        "left_out": left_out,
+        "blurred": list(views.blurred),
         "translation_mm": (X[:3, 3] * 1e3).tolist(),
     }
     write_entry(
@@ -121,7 +129,7 @@ def read_views(options: argparse.Namespace) -> PosedViews:
         board = invert(board)
     if len(views.names) < 2:
         raise InvalidInputError(f"hand-eye: got {len(views.names)} views, expected at least 4")
-    return PosedViews(views.names, tracker, board, views.corners)
+    return replace(views, Ts_world_tracker=tracker, Ts_camera_board=board)
 
 
 def board_scatter_mm(views: PosedViews, T_tracker_camera: np.ndarray) -> Float64[np.ndarray, " n"]:
@@ -217,12 +225,14 @@ def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> P
         raise NotFoundError(f"{options.photos}: has no photo {', '.join(absent[:5])}")
     lens_matrices = _lens_matrices(options)
     found = find_boards(paths, board)
-    for name in found.without_board:
-        print(f"  no board in {name}: left out")
+    tell_left_out(found)
     lens = lens_of(lens_matrices, found.size_px)
     names = tuple(view.name for view in found.views)
     if not names:
-        raise InvalidInputError(f"{options.photos}: the board is in none of {len(paths)} photos")
+        raise InvalidInputError(
+            f"{options.photos}: none of {len(paths)} photos shows the board sharply "
+            f"({len(found.blurred)} are blurred)"
+        )
     return PosedViews(
         names,
         np.stack([poses[name] for name in names]),
@@ -233,6 +243,7 @@ def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> P
             lens.K,
             lens.distortion,
         ),
+        found.blurred,
     )
 
 

@@ -61,7 +61,7 @@ class Session:
         self.views.append(view)
         size_px = (photo.shape[1], photo.shape[0])
         coverage = camera_coverage(self.views, size_px)
-        found = Found(tuple(self.views), (), size_px, view.pattern)
+        found = Found(tuple(self.views), (), (), size_px, view.pattern)
         path = write_coverage(found, coverage, self._folder, self._camera)
         if coverage.todo != self.todo or len(self.views) == 1:
             print(f"{len(self.views)} views ({path}); next: {'; '.join(coverage.todo) or 'done'}")
@@ -89,6 +89,8 @@ def follow_folder(session: Session, arrivals: Arrivals) -> None:
         view = session.find(name, photo)
         if view is None:
             print(f"{name}: no board")
+        elif view.is_blurred:
+            print(f"{name}: blurred, left out")
         else:
             session.keep(view, photo)
         if session.is_enough:
@@ -112,7 +114,7 @@ def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
         view = session.find(name, photo)
         still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
         before = view
-        if view is None or not still or not session.is_new(view, photo):
+        if view is None or not still or view.is_blurred or not session.is_new(view, photo):
             continue
         (photos / f"live_{num_kept:04d}.jpg").write_bytes(data)
         num_kept += 1

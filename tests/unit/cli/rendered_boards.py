@@ -60,3 +60,84 @@ def write_photos(folder, views):
     for index, view in enumerate(views):
         cv2.imwrite(str(folder / f"photo_{index:02d}.png"), render(view))
     return folder
+
+
+CHARUCO = "charuco:5x7:30mm:22mm"
+CHARUCO_SIZE = (960, 540)
+CHARUCO_K = np.array([[683.0, 0.0, 481.2], [0.0, 679.0, 268.9], [0.0, 0.0, 1.0]])
+DISTORTION = np.array([0.05, -0.1, 0.001, -0.0005, 0.02])
+_SQUARE_M, _MARKER_M, _CHARUCO_SQUARE_PX, _FINER = 0.03, 0.022, 120, 2
+
+
+class CharucoCamera:
+    """Renders a ChArUco board of 5 by 7 squares through a lens with distortion."""
+
+    def __init__(self):
+        dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_5X5_250)
+        board = cv2.aruco.CharucoBoard((5, 7), _SQUARE_M, _MARKER_M, dictionary)
+        size = (5 * _CHARUCO_SQUARE_PX, 7 * _CHARUCO_SQUARE_PX)
+        print_ = np.clip(board.generateImage(size, marginSize=0), 30, 225).astype(np.uint8)
+        # A white rim of a square, as paper has it.
+        rim = _CHARUCO_SQUARE_PX
+        self._print = cv2.copyMakeBorder(print_, *[rim] * 4, cv2.BORDER_CONSTANT, value=225)
+        width, height = CHARUCO_SIZE[0] * _FINER, CHARUCO_SIZE[1] * _FINER
+        x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+        pixels = np.stack([x.ravel(), y.ravel()], axis=-1) / _FINER
+        rays = cv2.undistortPoints(pixels[:, None], CHARUCO_K, DISTORTION)[:, 0]
+        rays = np.column_stack([rays, np.ones(len(rays))])
+        self._rays = rays.astype(np.float32)
+        self._shape = (height, width)
+
+    def render(self, T_camera_board):
+        """A sharp photo, grey."""
+        to_board = np.linalg.inv(T_camera_board[:3, [0, 1, 3]]).astype(np.float32)
+        x, y, w = to_board @ self._rays.T
+        scale = _CHARUCO_SQUARE_PX / _SQUARE_M
+        # OpenCV's picture of the board: the middle of its first pixel is 0, 0.
+        across, down = (scale * v / w + _CHARUCO_SQUARE_PX - 0.5 for v in (x, y))
+        fine = cv2.remap(
+            self._print,
+            across.reshape(self._shape),
+            down.reshape(self._shape),
+            cv2.INTER_LINEAR,
+            borderMode=cv2.BORDER_CONSTANT,
+            borderValue=120,
+        )
+        photo = cv2.resize(fine, CHARUCO_SIZE, interpolation=cv2.INTER_AREA)
+        return cv2.GaussianBlur(photo, (0, 0), 0.7)
+
+
+def smeared(photo, shift_px):
+    """A photo during which all moved by `shift_px` (x, y), from where it was on."""
+    steps = np.linspace(0, 1, 25)
+    moved = [
+        cv2.warpAffine(
+            photo,
+            np.array([[1, 0, share * shift_px[0]], [0, 1, share * shift_px[1]]]),
+            photo.shape[::-1],
+            borderMode=cv2.BORDER_REPLICATE,
+        ).astype(np.float64)
+        for share in steps
+    ]
+    return np.rint(np.mean(moved, axis=0)).astype(np.uint8)
+
+
+def charuco_views(rng, num):
+    """Poses T_camera_board that show the whole board, turned about all axes, near and far."""
+    outline = np.array([[x, y, 0.0] for x in (0, 0.15) for y in (0, 0.21)])
+    views = []
+    while len(views) < num:
+        R = rotation_from_vector(np.deg2rad(35) * rng.uniform(-1, 1, 3))
+        middle = np.array([*rng.uniform(-0.08, 0.08, 2), rng.uniform(0.42, 0.7)])
+        T = transform(R, middle - R @ outline.mean(axis=0))
+        seen = (outline @ R.T + T[:3, 3]) @ CHARUCO_K.T
+        seen = seen[:, :2] / seen[:, 2:]
+        if (seen > 15).all() and (seen < np.array(CHARUCO_SIZE) - 15).all():
+            views.append(T)
+    return views
+
+
+def board_filling_the_image(turn_rad):
+    """A near view, on which the board is found even when it moved by six pixels."""
+    R = rotation_from_vector(np.array([turn_rad, 2 * turn_rad, np.pi / 2]))
+    return transform(R, np.array([0.0, 0.0, 0.31]) - R @ np.array([0.075, 0.105, 0.0]))

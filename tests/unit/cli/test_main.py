@@ -21,6 +21,17 @@ def test_unknown_command_names_the_valid_ones(capsys):
     assert "'dance'" in capsys.readouterr().err
 
 
+def test_a_misspelt_inner_command_names_the_valid_ones(capsys):
+    assert main.main(["station", "calibrat"]) == main.EXIT_REFUSED
+    assert "dextouch station: unknown word 'calibrat'; valid: calibrate" in capsys.readouterr().err
+
+
+def test_help_of_a_command_tells_of_its_inner_ones(capsys):
+    with pytest.raises(SystemExit):
+        main.main(["station", "--help"])
+    assert capsys.readouterr().out.startswith("also: dextouch station calibrate --help\n")
+
+
 @pytest.mark.parametrize("name", sorted(main.COMMANDS))
 def test_every_command_can_be_loaded_and_explains_itself(name, capsys):
     try:
