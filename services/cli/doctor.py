@@ -1,6 +1,7 @@
 """This machine in; a table of what DexTouch can do on it, and what to install for the rest, out."""
 
 import argparse
+import ctypes.util
 import importlib.util
 import json
 import os
@@ -25,6 +26,7 @@ _PACKAGES = {
     "zstandard": ("episodes", "store"),
     "serial": ("gloves over serial", "station"),
     "hid": ("trackers over HID", "station"),
+    "usb": ("trackers over USB", "station"),
     "cv2": ("cameras and calibration", "station"),
     "fastapi": ("HTTP services", "serve"),
     "redis": ("the Redis bus", "serve"),
@@ -56,10 +58,18 @@ def examine() -> list[Finding]:
     findings.append(
         Finding("redis-server (optional)", redis or "no: the memory bus is used instead")
     )
-    for folder, pattern in (("/dev", "ttyACM*"), ("/dev", "hidraw*"), ("/dev", "video*")):
-        found = sorted(path.name for path in Path(folder).glob(pattern))
+    libusb = ctypes.util.find_library("usb-1.0")
+    findings.append(Finding("libusb (optional)", libusb or "no: trackers by link usb need it"))
+    for pattern in ("ttyACM*", "ttyUSB*", "hidraw*", "video*"):
+        found = [_with_access(path) for path in sorted(Path("/dev").glob(pattern))]
         findings.append(Finding(f"devices {pattern}", ", ".join(found) or "none"))
     return findings
+
+
+def _with_access(device: Path) -> str:
+    if os.access(device, os.R_OK | os.W_OK):
+        return device.name
+    return f"{device.name} (no access: deploy/udev/60-dextouch.rules)"
 
 
 def main(argv: Sequence[str]) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from dextouch import __version__
-from dextouch.errors import DexTouchError
+from dextouch.errors import DexTouchError, UnknownNameError
 
 
 class Command(NamedTuple):
@@ -62,8 +62,8 @@ EXIT_REFUSED = 3
 
 def usage() -> str:
     """The text of `dextouch --help`."""
-    rows = [f"  {name:<10}{command.does}" for name, command in COMMANDS.items()]
-    rows += [f"  {' '.join(words)}: {inner.does}" for words, inner in INNER_COMMANDS.items()]
+    named = {**COMMANDS, **{" ".join(words): inner for words, inner in INNER_COMMANDS.items()}}
+    rows = [f"  {name:<19}{command.does}" for name, command in named.items()]
     return "\n".join(
         [
             "usage: dextouch COMMAND [options]",
@@ -72,10 +72,35 @@ def usage() -> str:
             "",
             *rows,
             "",
-            "Every command explains itself with --help and writes its result with --json PATH.",
+            "Every command explains itself with --help; those that end write their result with",
+            "--json PATH. A service (station, serve, …) takes its flags as variables too.",
             "Start with: dextouch demo",
         ]
     )
+
+
+def find_command(name: str, rest: Sequence[str]) -> tuple[str, Command, list[str]]:
+    """The command that words mean.
+
+    Args:
+        name: of `COMMANDS`.
+        rest: what stands behind it.
+
+    Returns:
+        The words of the command, what does it, and what is left for it.
+
+    Raises:
+        UnknownNameError: a word behind a command that takes flags and a few words only.
+    """
+    inner = {word: command for (outer, word), command in INNER_COMMANDS.items() if outer == name}
+    first = rest[0] if rest else ""
+    if first in inner:
+        return f"{name} {first}", inner[first], list(rest[1:])
+    if inner and first and not first.startswith("-"):
+        raise UnknownNameError("word", first, list(inner))
+    if inner and {"-h", "--help"} & set(rest):
+        print("\n".join(f"also: dextouch {name} {word} --help" for word in inner), end="\n\n")
+    return name, COMMANDS[name], list(rest)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -95,11 +120,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"dextouch: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return EXIT_USAGE
-    command = COMMANDS[name]
-    if (name, *rest[:1]) in INNER_COMMANDS:
-        command = INNER_COMMANDS[name, rest[0]]
-        name, rest = f"{name} {rest[0]}", rest[1:]
     try:
+        name, command, rest = find_command(name, rest)
         module = importlib.import_module(command.module)
         status = module.main([*command.before, *rest])
     except DexTouchError as error:

@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
 
 def usage() -> str:
     """The text of `dextouch bench --help`."""
-    rows = [f"  {name:<10}{entry.does}" for name, entry in STAGES.items()]
+    rows = [f"  {name:<13}{entry.does}" for name, entry in STAGES.items()]
     return "\n".join(
         [
             "usage: dextouch bench STAGE [options]",

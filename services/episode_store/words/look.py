@@ -23,9 +23,9 @@ from dextouch.episodes.inspection import (
     unfinished,
 )
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.errors import StorageError
+from dextouch.errors import InvalidInputError, NotFoundError, StorageError
 from dextouch.schemas.episodes import json_ready
-from services.episode_store.catalog import Catalog, EpisodeFilter
+from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
 from services.episode_store.words.context import (
     EXIT_DAMAGED,
     Context,
@@ -42,9 +42,17 @@ def list_items(context: Context) -> Outcome:
     options, say = context.options, context.say
     if options.trash:
         return _list_trash(context)
+    root = context.local_root()
+    if root is not None and not root.is_dir():
+        raise NotFoundError(f"store {root}: no such folder; name another with --store")
     catalog = Catalog(context.store)
     if options.kind == "recording":
-        recordings = catalog.recordings(limit=sys.maxsize)
+        if options.origin is not None:
+            raise InvalidInputError(
+                "list --kind recording: takes no --origin, recordings have none"
+            )
+        taken = RecordingFilter(task=options.task, domain=options.domain)
+        recordings = catalog.recordings(taken, limit=sys.maxsize)
         for take in recordings.recordings:
             num_samples = sum(take.num_samples.values())
             say(f"{take.recording_id}  {take.task}  {take.domain}  {num_samples} samples")

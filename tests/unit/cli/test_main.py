@@ -3,11 +3,13 @@
 import json
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from dextouch.errors import UnavailableError
 from services.cli import doctor, main
+from services.cli.bench.stages import STAGES
 
 
 def test_help_lists_every_command(capsys):
@@ -56,6 +58,19 @@ def test_doctor_writes_its_findings(tmp_path, capsys):
     findings = json.loads((tmp_path / "doctor.json").read_text())
     assert status == (0 if all(f["ok"] for f in findings) else 1)
     assert len(capsys.readouterr().out.splitlines()) == len(findings)
+
+
+def test_doctor_tells_devices_that_may_not_be_opened(monkeypatch):
+    monkeypatch.setattr(doctor.os, "access", lambda path, mode: path.name != "ttyACM0")
+    assert doctor._with_access(Path("/dev/ttyACM1")) == "ttyACM1"
+    assert "ttyACM0 (no access" in doctor._with_access(Path("/dev/ttyACM0"))
+
+
+def test_names_in_lists_of_commands_stand_apart(capsys):
+    for arguments, names in ((["--help"], main.COMMANDS), (["bench"], STAGES)):
+        main.main(arguments)
+        lines = capsys.readouterr().out.splitlines()
+        assert set(names) <= {line.split()[0] for line in lines if line.startswith("  ")}
 
 
 def test_the_nouns_cannot_be_imported_twice():

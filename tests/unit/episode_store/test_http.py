@@ -218,6 +218,10 @@ def test_command_line(store, capsys, tmp_path):
     assert run(store, "show", "e-2") == 3
     assert "not in the store" in capsys.readouterr().err
     assert run(store, "list", "--kind", "recording") == 0
+    assert run(store, "list", "--kind", "recording", "--origin", "twin") == 3
+    assert "--origin" in capsys.readouterr().err
+    assert main(["list", "--store", str(tmp_path / "nowhere")]) == 3
+    assert "no such folder" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["list", "--colour"])
 

@@ -123,6 +123,8 @@ def test_show_is_a_table(store, word):
 def test_delete_list_restore_purge(store, word, tmp_path):
     assert word("delete", "e-1") == (0, "e-1  in the trash\n", "")
     assert word("list")[1] == ""
+    assert word("list", "--kind", "recording")[1].startswith("r-1  stand_bottle  ")
+    assert word("list", "--kind", "recording", "--task", "stack_bowls")[1] == ""
     status, out, _ = word("list", "--trash", "--json", str(tmp_path / "trash.json"))
     assert out.startswith("e-1  episode  deleted 20")
     (entry,) = json.loads((tmp_path / "trash.json").read_text())["trash"]
