@@ -194,6 +194,10 @@ def test_an_inverted_side_is_named():
 
 def test_bad_views_are_named():
     scene = make_scene(7)
+    with pytest.raises(InvalidInputError):
+        solve_hand_eye(scene.Ts_world_tracker[:3], scene.Ts_camera_board[:3])
+    with pytest.raises(InvalidInputError):
+        solve_hand_eye(scene.Ts_world_tracker, scene.Ts_camera_board[:-1])
     tracker = scene.Ts_world_tracker.copy()
     tracker[4, 0, 3] = np.nan
     with pytest.raises(NonFiniteError, match=r"\[4\]"):
@@ -221,3 +225,19 @@ def test_recorded_poses_put_the_board_in_one_place(capsys):
     with pytest.raises(InvalidInputError) as refusal:
         solve_hand_eye(tracker, samples[:, 1])
     assert refusal.value.details["inverted"] == "Ts_camera_board"
+
+
+@pytest.mark.skipif(not RECORDED_POSES.is_file(), reason="no recordings in ../shared/data")
+def test_halves_of_the_recorded_poses_agree(capsys):
+    samples = np.array(json.loads(RECORDED_POSES.read_text()))
+    tracker, board = samples[:, 0], invert(samples[:, 1])
+    halves = [solve_hand_eye(tracker[k::2], board[k::2]) for k in (0, 1)]
+    angle_rad, distance_m = mount_difference(*(half.T_tracker_camera for half in halves))
+    sigma_m = np.hypot(*(half.sigma_translation_m for half in halves))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\nhand-eye, recorded halves: {np.rad2deg(angle_rad):.3f} deg, bound 0.2 | "
+            f"{distance_m * 1e3:.1f} mm, bound {3e3 * sigma_m:.1f} (3 sigma)"
+        )
+    assert np.rad2deg(angle_rad) <= 0.2
+    assert distance_m <= 3 * sigma_m

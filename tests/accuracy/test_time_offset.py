@@ -1,4 +1,4 @@
-"""A hundred seeds of brisk motion about three axes: error and sigma of the time offset."""
+"""Time offsets of brisk motion and of taps against known ones: error, sigma, refusals."""
 
 import sys
 
@@ -13,17 +13,18 @@ from services.alignment.calibration.time_offset import estimate_time_offset
 BASE_NS = 1_700_000_000_000_000_000
 
 
-def motion(t_s, seed, max_hz):
+def motion(t_s, seed, num_axes, max_hz=6.0):
     rng = np.random.default_rng(seed)
-    rate_hz, phase = rng.uniform(0.3, max_hz, (3, 8)), rng.uniform(0, 2 * np.pi, (3, 8))
+    shape = (num_axes, 8)
+    rate_hz, phase = rng.uniform(0.3, max_hz, shape), rng.uniform(0, 2 * np.pi, shape)
     return np.sin(2 * np.pi * rate_hz * t_s[:, None, None] + phase).sum(axis=2)
 
 
-def streams(seed, *, max_hz=6.0, noise=0.2, seconds=10.0):
+def streams(seed, *, num_axes=3, noise=0.2, seconds=10.0):
     rng = np.random.default_rng(seed)
     offset_s = rng.uniform(-0.3, 0.3)
     t_a, t_b = np.arange(0, seconds, 1 / 60) + 0.003, np.arange(0, seconds, 1 / 90)
-    a, b = motion(t_a, seed, max_hz), 2.5 * motion(t_b, seed, max_hz) + 1.0
+    a, b = motion(t_a, seed, num_axes), 2.5 * motion(t_b, seed, num_axes) + 1.0
     a, b = (x + noise * x.std() * rng.normal(size=x.shape) for x in (a, b))
     stamps = [np.rint(t * 1e9).astype(np.int64) + BASE_NS for t in (t_a, t_b - offset_s)]
     return (stamps[0], a, stamps[1], b), offset_s
@@ -47,11 +48,52 @@ def test_offset_of_a_hundred_seeds(capsys):
     assert good >= 0.95
 
 
+@pytest.mark.parametrize(("num_axes", "bound_ms"), [(1, 2.5), (3, 1.0)])
+def test_offset_of_a_few_seeds(num_axes, bound_ms, capsys):
+    errors_ms, sigmas = [], []
+    for seed in range(4):
+        taken, offset_s = streams(seed, num_axes=num_axes)
+        found = estimate_time_offset(*taken)
+        errors_ms.append(found.offset_ns * 1e-6 - offset_s * 1e3)
+        sigmas.append(abs(errors_ms[-1]) / (found.sigma_ns * 1e-6))
+    rms_ms = float(np.sqrt(np.mean(np.square(errors_ms))))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\ntime offset, {num_axes} axes, 10 s: {rms_ms:.2f} ms, bound {bound_ms} | "
+            f"error in sigmas {max(sigmas):.1f}, bound 3"
+        )
+    assert rms_ms <= bound_ms
+    assert max(sigmas) <= 3
+
+
 def test_motion_lost_in_noise_is_refused():
     for seed in range(3):
         taken, _ = streams(seed, noise=4.0)
         with pytest.raises(InvalidInputError, match="time offset"):
             estimate_time_offset(*taken)
+
+
+def test_motion_that_shows_no_offset_is_refused():
+    (t_a, a, t_b, b), _ = streams(1)
+    with pytest.raises(DegenerateMotionError, match="same brisk motion"):
+        estimate_time_offset(t_a, a * 0, t_b, b)
+    with pytest.raises(DegenerateMotionError, match="same brisk motion"):
+        estimate_time_offset(t_a, a, t_b, np.random.default_rng(0).normal(size=b.shape))
+    repeating = [np.sin(2 * np.pi * 2 * (t - t_a[0]) * 1e-9) for t in (t_a, t_b)]
+    with pytest.raises(DegenerateMotionError, match="repeats"):
+        estimate_time_offset(t_a, repeating[0], t_b, repeating[1])
+
+
+def test_bad_signals_are_refused():
+    (t_a, a, t_b, b), _ = streams(2)
+    with pytest.raises(InvalidInputError):
+        estimate_time_offset(t_a[::-1], a, t_b, b)
+    with pytest.raises(InvalidInputError):
+        estimate_time_offset(t_a, a * np.nan, t_b, b)
+    with pytest.raises(InvalidInputError):
+        estimate_time_offset(t_a, a, t_b, b[:, :2])
+    with pytest.raises(InvalidInputError, match="lasts"):
+        estimate_time_offset(t_a[:30], a[:30], t_b, b)
 
 
 def taps(seed, *, num=8, speed_m_per_s=0.4):
