@@ -82,7 +82,13 @@ def read_stream(recording: Recording, name: str) -> AlignedStream:
     """
     descriptor, batch = recording.streams[name], recording.read(name)
     calibration = recording.attributes.calibration
-    timing = time_stream(batch, descriptor, latency_ns=_latency_ns(calibration, name))
+    latency_ns = _nanoseconds(calibration, f"{name}_latency_ns")
+    timing = time_stream(
+        batch,
+        descriptor,
+        latency_ns=round(latency_ns or 0.0),
+        latency_sigma_ns=_nanoseconds(calibration, f"{name}_latency_sigma_ns"),
+    )
     values = batch.values[timing.kept]
     if descriptor.kind == "tactile" and descriptor.unit != "kPa":
         raw = AlignedStream(descriptor, timing.t_host_ns, values, timing, {})
@@ -97,13 +103,14 @@ def read_stream(recording: Recording, name: str) -> AlignedStream:
     return AlignedStream(descriptor, timing.t_host_ns, values, timing, {})
 
 
-def _latency_ns(calibration: dict[str, Matrix], name: str) -> int:
-    matrix = calibration.get(f"{name}_latency_ns", ((0.0,),))
+def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
+    """A number of the calibration; None where it is not known."""
+    matrix = calibration.get(name)
+    if matrix is None:
+        return None
     if np.shape(matrix) != (1, 1):
-        raise InvalidInputError(
-            f"calibration '{name}_latency_ns': got {np.shape(matrix)}, expected (1, 1)"
-        )
-    return round(matrix[0][0])
+        raise InvalidInputError(f"calibration {name!r}: got {np.shape(matrix)}, expected (1, 1)")
+    return float(matrix[0][0])
 
 
 def _pressures(stream: AlignedStream, calibration: dict[str, Matrix]) -> AlignedStream:

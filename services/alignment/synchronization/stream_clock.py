@@ -1,7 +1,6 @@
 """One stream's stamps in, the times of its samples on the host's clock and a clock report out."""
 
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Int64
@@ -9,7 +8,7 @@ from jaxtyping import Int64
 from dextouch.clocks import date_by_counting, find_lost_samples, fit_clock, unwrap_counter
 from dextouch.clocks.counters import prefers_sequence
 from dextouch.errors import ClockFitError
-from dextouch.schemas.episodes import ClockReport
+from dextouch.schemas.episodes import ClockMethod, ClockReport
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
 
@@ -21,8 +20,6 @@ MAX_COUNTED_LOSS = 0.1
 MAX_STEPS_PER_SAMPLE = 0.001
 MIN_COUNTED_SAMPLES = 60
 
-Method = Literal["device", "sequence", "counting", "arrival"]
-
 
 @dataclass(frozen=True)
 class TimedStream:
@@ -33,15 +30,14 @@ class TimedStream:
         t_host_ns: their times on the host's clock, strictly increasing.
         report: of the clock fit.
         num_steps: how often the device's clock was stepped.
-        method: what dates the samples: the device's stamps, its sequence numbers, the count of
-            samples that must have been sent, or the arrivals as they are.
+        method: what dates the samples, as in the report.
     """
 
     kept: Int64[np.ndarray, " n"]
     t_host_ns: Int64[np.ndarray, " n"]
     report: ClockReport
     num_steps: int
-    method: Method
+    method: ClockMethod
 
 
 @dataclass(frozen=True)
@@ -49,7 +45,7 @@ class _Dated:
     """Times on the host's clock, the path's delay still in them, and what is known of the clock."""
 
     t_host_ns: Int64[np.ndarray, " n"]
-    method: Method
+    method: ClockMethod
     num_lost: int = 0
     num_steps: int = 0
     skew_ppm: float | None = None
@@ -57,7 +53,11 @@ class _Dated:
 
 
 def time_stream(
-    batch: SampleBatch, descriptor: StreamDescriptor, *, latency_ns: int = 0
+    batch: SampleBatch,
+    descriptor: StreamDescriptor,
+    *,
+    latency_ns: int = 0,
+    latency_sigma_ns: float | None = None,
 ) -> TimedStream:
     """Fit the device's clock and date every sample.
 
@@ -69,6 +69,7 @@ def time_stream(
         batch: the whole take of one stream.
         descriptor: widths and ticks of its counters.
         latency_ns: calibrated constant path delay, taken away from all times.
+        latency_sigma_ns: how well it is known; None where nobody measured it.
 
     Raises:
         ClockFitError: too few samples, or stamps that no clock gives; names the stream.
@@ -86,8 +87,10 @@ def time_stream(
     rms_ns = dated.residual_rms_ns
     report = ClockReport(
         stream=descriptor.name,
+        method=dated.method,
         skew_ppm=dated.skew_ppm,
         latency_ms=latency_ns / NS_PER_MS,
+        latency_sigma_ms=None if latency_sigma_ns is None else latency_sigma_ns / NS_PER_MS,
         residual_rms_ms=None if rms_ns is None else rms_ns / NS_PER_MS,
         num_samples=len(kept),
         num_dropped=dated.num_lost + len(batch) - len(kept),
@@ -115,7 +118,7 @@ def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:
 
 
 def _fitted(
-    device_ns: np.ndarray, batch: SampleBatch, descriptor: StreamDescriptor, method: Method
+    device_ns: np.ndarray, batch: SampleBatch, descriptor: StreamDescriptor, method: ClockMethod
 ) -> _Dated:
     model = fit_clock(device_ns, batch.t_host_ns)
     return _Dated(

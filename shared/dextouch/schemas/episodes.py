@@ -12,6 +12,9 @@ from dextouch.streams.descriptors import StreamDescriptor
 FORMAT_VERSION: Final = 1
 ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
 
+# What dates a stream's samples: the device's stamps, its sequence numbers, the count of those that
+# it must have sent, or the arrivals as they are.
+ClockMethod = Literal["device", "sequence", "counting", "arrival"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 Domain = Literal["human", "robot"]
 Origin = Literal["recorded", "twin", "imagined"]
@@ -77,13 +80,20 @@ class LineageEntry(BaseModel):
 
 
 class ClockReport(BaseModel):
-    """How well one stream's clock was fitted to the reference clock."""
+    """How well one stream's clock was fitted to the reference clock.
+
+    `method` is what dates the samples, None where the episode does not say. `latency_ms` is the
+    constant path delay that was taken away; `latency_sigma_ms` says how well it is known, None
+    where nobody measured it.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
+    method: ClockMethod | None = None
     skew_ppm: FiniteFloat | None = None
     latency_ms: FiniteFloat | None = None
+    latency_sigma_ms: FiniteFloat | None = Field(default=None, ge=0)
     residual_rms_ms: FiniteFloat | None = None
     num_samples: int = Field(ge=0)
     num_dropped: int = Field(default=0, ge=0)
