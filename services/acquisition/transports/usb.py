@@ -51,7 +51,8 @@ class UsbTransport:
     Args:
         address: of the device.
         interface: the number of the interface that sends the reports.
-        backend: of pyusb; libusb if None.
+        backend: of pyusb; a new context of libusb at every opening if None, since an older one
+            learns of what is plugged in only by udev, which does not speak inside containers.
     """
 
     def __init__(
@@ -60,6 +61,8 @@ class UsbTransport:
         self._address = address
         self._interface = interface
         self._backend = backend
+        # Outlives the devices found in it: libusb wants them given back before its context ends.
+        self._context: IBackend | None = None
         self._opened: _Opened | None = None
         self._detached = False
 
@@ -78,6 +81,7 @@ class UsbTransport:
 
         self.close()
         try:
+            self._context = self._backend or _new_context()
             device = self._find()
             try:
                 self._opened = self._take(device)
@@ -162,7 +166,7 @@ class UsbTransport:
         candidates = list(
             usb.core.find(
                 find_all=True,
-                backend=self._backend,
+                backend=self._context,
                 idVendor=self._address.vendor_id,
                 idProduct=self._address.product_id,
             )
@@ -218,6 +222,14 @@ class UsbTransport:
         read_bytes = max(REPORT_BYTES, packet_bytes)
         endpoint_out = outs[0][0] if outs else None
         return _Opened(device, self._interface, endpoint_in, endpoint_out, read_bytes)
+
+
+def _new_context() -> "IBackend | None":
+    """Another context of libusb, which looks at the bus now; None where there is no libusb."""
+    from usb.backend import libusb1
+
+    first = libusb1.get_backend()
+    return None if first is None else type(first)(first.lib)
 
 
 def _interrupt_endpoints(interface: "Interface", direction: int) -> Iterator[tuple[int, int]]:

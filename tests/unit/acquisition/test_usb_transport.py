@@ -88,6 +88,32 @@ def test_a_dead_handle_stays_dead_after_replugging(device, opened):
     assert opened.read() == REPORT
 
 
+class ContextWithoutEvents(MockUsbBackend):
+    """A context of libusb that nobody tells of changes: it knows what it saw when it was made."""
+
+    def __init__(self, lib):
+        super().__init__(*(device for device in lib if device.is_plugged))
+        self.lib = lib
+
+
+def test_what_is_plugged_in_later_is_found_where_udev_is_silent(monkeypatch, device):
+    device.set_plugged(plugged=False)
+    first = ContextWithoutEvents([device])
+    monkeypatch.setattr("usb.backend.libusb1.get_backend", lambda: first)
+    link = UsbTransport(UsbAddress(*IDS, "A1"))
+    with pytest.raises(DeviceError, match="not plugged in; present: none"):
+        link.open()
+    for _ in range(2):
+        device.set_plugged(plugged=True)
+        link.open()
+        device.push(REPORT)
+        assert link.read() == REPORT
+        device.set_plugged(plugged=False)
+        with pytest.raises(DeviceError, match="unplugged"):
+            link.read()
+    link.close()
+
+
 def test_found_by_serial_number_whatever_else_is_plugged_in():
     others = [model("B2"), model("C3")]
     wanted = model("A1")
