@@ -5,12 +5,11 @@ A driver here is for one device of a bridge. What is stale, occluded or jumps is
 
 import math
 import struct
-from dataclasses import replace
 from enum import IntEnum
 from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Int64
 
 from dextouch.errors import DeviceError, PacketError, StaleDataError
 from dextouch.streams.descriptors import StreamDescriptor
@@ -28,12 +27,12 @@ from services.acquisition.drivers.finger_tracker import (
 )
 from services.acquisition.drivers.packets import SOURCES, DecoderStatistics, Packet, PacketDecoder
 from services.acquisition.drivers.pose_tracker import (
-    NORM_TOLERANCE,
     PoseStream,
     TrackingEvents,
     pose_descriptor,
     source_of,
 )
+from services.acquisition.drivers.sender_frame import SenderFrame
 from services.acquisition.transports.base import Transport
 
 POSE_MAGIC = b"DXPM"
@@ -55,67 +54,6 @@ class TrackingResult(IntEnum):
     FALLBACK_ROTATION_ONLY = 300
 
 
-def pose_in_our_frame(
-    matrix: Float64[np.ndarray, "3 4"],
-    ours_from_theirs: Float64[np.ndarray, "3 3"],
-    scale_m: float,
-) -> Float64[np.ndarray, " 7"]:
-    """Pose x y z (m) qw qx qy qz of a sender's 3×4 matrix [R | t].
-
-    With p_ours = M p_theirs for the world and for the body, R_ours = M R Mᵀ and t_ours = s M t.
-    This holds for a left-handed sender too: both mirrors cancel in the rotation.
-
-    Args:
-        matrix: [R | t], sender's frame and unit of length.
-        ours_from_theirs: M, orthogonal, det +1 or −1.
-        scale_m: s, metres of the sender's unit.
-
-    Raises:
-        PacketError: not finite, or R is no rotation (by more than 1e-3).
-    """
-    R = matrix[:, :3]
-    if not np.all(np.isfinite(matrix)):
-        raise PacketError("pose matrix: NaN or infinity")
-    _check_rotation(R.tolist())
-    R_ours = ours_from_theirs @ R @ ours_from_theirs.T
-    t_ours_m = scale_m * (ours_from_theirs @ matrix[:, 3])
-    return np.array([*t_ours_m.tolist(), *quaternion_of_one(R_ours.tolist())])
-
-
-def quaternion_of_one(R: list[list[float]]) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z), w ≥ 0, of one rotation matrix given as rows.
-
-    Shepperd's method, as in `dextouch.geometry.rotations.quaternion_from_rotation`, for a single
-    matrix: numpy's cost for nine numbers would be most of a packet's.
-    """
-    (a, b, c), (d, e, f), (g, h, i) = R
-    # 4·(w², x², y², z²); the largest one is the safe divisor.
-    squares = (1 + a + e + i, 1 + a - e - i, 1 - a + e - i, 1 - a - e + i)
-    best = squares.index(max(squares))
-    rows = (
-        (squares[0], h - f, c - g, d - b),
-        (h - f, squares[1], b + d, c + g),
-        (c - g, b + d, squares[2], f + h),
-        (d - b, c + g, f + h, squares[3]),
-    )
-    w, x, y, z = rows[best]
-    scale = math.copysign(1.0, w) / math.hypot(w, x, y, z)
-    return w * scale, x * scale, y * scale, z * scale
-
-
-def _check_rotation(R: list[list[float]]) -> None:
-    x, y, z = R
-    pairs = ((x, x), (y, y), (z, z), (x, y), (y, z), (z, x))
-    error = max(abs(u[0] * v[0] + u[1] * v[1] + u[2] * v[2] - (u is v)) for u, v in pairs)
-    determinant = (
-        x[0] * (y[1] * z[2] - y[2] * z[1])
-        - x[1] * (y[0] * z[2] - y[2] * z[0])
-        + x[2] * (y[0] * z[1] - y[1] * z[0])
-    )
-    if error > NORM_TOLERANCE or determinant < 0:
-        raise PacketError(f"pose matrix: no rotation (R Rᵀ is off by {error:.1e})")
-
-
 class BridgeFingerTrackerDecoder:
     """Keypoints (float32 [25, 3], m, wrist frame) of one hand behind a finger tracker's SDK.
 
@@ -127,6 +65,7 @@ class BridgeFingerTrackerDecoder:
     def __init__(self, side: Side, *, serial_number: str | None = None) -> None:
         self._side = side
         self._device = f"finger_tracker_{side}"
+        self._stream = keypoints_descriptor(side)
         self.connection = BridgeConnection(
             "finger_tracker",
             device=self._device,
@@ -137,7 +76,7 @@ class BridgeFingerTrackerDecoder:
         )
         self.freshness = FreshnessGate()
         self.tracking = TrackingEvents()
-        self._order: list[int] = []
+        self._order: Int64[np.ndarray, 25] | None = None
         self._ours_m = np.eye(3)
         self.unseen_nodes = 0
 
@@ -149,14 +88,14 @@ class BridgeFingerTrackerDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The keypoint stream."""
-        return (keypoints_descriptor(self._side),)
+        return (self._stream,)
 
     def reset(self) -> None:
         """The connection was lost."""
         self.connection.reset()
         self.freshness.reset()
         self.tracking.end()
-        self._order = []
+        self._order = None
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Keypoints completed by `data`.
@@ -165,21 +104,21 @@ class BridgeFingerTrackerDecoder:
             DeviceError: no bridge for this hand, or nodes we do not know.
         """
         packets = self.connection.feed(data)
-        if not self._order:
+        if self._order is None:
             self._learn_nodes()
         samples = []
         for packet in packets:
             sample = self._sample(packet, t_host_ns)
             if sample is not None:
                 samples.append(sample)
-        return {f"keypoints_{self._side}": samples} if samples else {}
+        return {self._stream.name: samples} if samples else {}
 
     def _learn_nodes(self) -> None:
         hello = self.connection.hello
         if hello is None or hello.nodes is None:
             return
         try:
-            self._order = resolve_nodes(hello.nodes)
+            self._order = np.array(resolve_nodes(hello.nodes))
         except PacketError as error:
             raise DeviceError(
                 f"{self._device}: {error.message}", device=self._device, event="wrong_nodes"
@@ -187,10 +126,12 @@ class BridgeFingerTrackerDecoder:
         self._ours_m = hello.scale_m() * hello.frame.ours_from_theirs()
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
-        hello = self.connection.hello
+        hello, order = self.connection.hello, self._order
+        if hello is None or order is None:
+            return None
         if packet.source != SOURCES[self._side]:
             # The other hand of the same bridge is none of ours; one it did not announce is a fault.
-            announced = [SOURCES[device.source] for device in hello.devices] if hello else []
+            announced = [SOURCES[device.source] for device in hello.devices]
             if packet.source not in announced:
                 check_packet(packet, device=self._device, source=self._side)
             return None
@@ -198,7 +139,7 @@ class BridgeFingerTrackerDecoder:
             self.tracking.leave_out("stale", state=0, sequence=packet.sequence, t_host_ns=t_host_ns)
             return None
         self.tracking.end()
-        theirs, num_unseen = unpack_keypoints(packet.payload, self._order)
+        theirs, num_unseen = unpack_keypoints(packet.payload, order)
         self.unseen_nodes += num_unseen
         keypoints = (theirs.astype(np.float64) @ self._ours_m.T).astype(np.float32)
         return Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence)
@@ -228,8 +169,8 @@ class BridgePoseTrackerDecoder:
         )
         self.freshness = FreshnessGate()
         self.poses = PoseStream()
-        self._ours_from_theirs = np.eye(3)
-        self._scale_m = 1.0
+        self._descriptor = pose_descriptor(stream)
+        self._frame: SenderFrame | None = None
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -239,7 +180,7 @@ class BridgePoseTrackerDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The pose stream."""
-        return (pose_descriptor(self._stream),)
+        return (self._descriptor,)
 
     @property
     def tracking(self) -> TrackingEvents:
@@ -263,8 +204,7 @@ class BridgePoseTrackerDecoder:
         packets = self.connection.feed(data)
         hello = self.connection.hello
         if hello is not known and hello is not None:
-            self._ours_from_theirs = hello.frame.ours_from_theirs()
-            self._scale_m = hello.scale_m()
+            self._frame = SenderFrame(hello.frame, hello.scale_m())
         for packet in packets:
             sample = self._sample(packet, t_host_ns)
             if sample is not None:
@@ -272,31 +212,31 @@ class BridgePoseTrackerDecoder:
         return {self._stream: samples} if samples else {}
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
-        chosen = self.connection.chosen
+        chosen, frame = self.connection.chosen, self._frame
         index, flag, result, seconds, *numbers = POSE_PAYLOAD.unpack(packet.payload)
-        if chosen is None or index != chosen.index:
+        if chosen is None or frame is None or index != chosen.index:
             return None
         check_packet(packet, device=self._device, source=chosen.source)
         if not (math.isfinite(seconds) and 0 <= seconds < MAX_SECONDS):
             self.statistics.refused += 1
             return None
-        packet = replace(packet, t_device_ns=round(seconds * 1e9))
-        if not self.freshness.admits(packet.t_device_ns, t_host_ns):
-            self.tracking.leave_out(
-                "stale", state=result, sequence=packet.sequence, t_host_ns=t_host_ns
-            )
+        sequence, t_device_ns = packet.sequence, round(seconds * 1e9)
+        if not self.freshness.admits(t_device_ns, t_host_ns):
+            self.tracking.leave_out("stale", state=result, sequence=sequence, t_host_ns=t_host_ns)
             return None
         if result != TrackingResult.RUNNING_OK or not flag:
-            self.poses.occlude(packet, state=result, t_host_ns=t_host_ns)
+            self.poses.occlude(
+                state=result, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
+            )
             return None
         try:
-            pose = pose_in_our_frame(
-                np.array(numbers).reshape(3, 4), self._ours_from_theirs, self._scale_m
-            )
+            pose = frame.pose(numbers)
         except PacketError:
             self.statistics.refused += 1
             return None
-        return self.poses.take(pose, packet, state=result, t_host_ns=t_host_ns)
+        return self.poses.take(
+            pose, state=result, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
+        )
 
 
 class _BridgeDecoder(Decoder, Protocol):

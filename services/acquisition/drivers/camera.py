@@ -62,9 +62,11 @@ class CameraDecoder:
         self._packets = PacketDecoder(
             MAGIC, min_payload=PAYLOAD_HEADER.size + 1, max_payload=MAX_PAYLOAD_BYTES
         )
-        descriptor = self.descriptors[0]
+        self._descriptor = camera_descriptor(
+            stream, height_px=height_px, width_px=width_px, encoding=encoding
+        )
         self._groups = WholeGroups()
-        self._checker = ImageChecker(period_ns=descriptor.period_ns())
+        self._checker = ImageChecker(period_ns=self._descriptor.period_ns())
         self.damaged_images = 0
         self._num_images = 0
 
@@ -81,14 +83,7 @@ class CameraDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The image stream."""
-        return (
-            camera_descriptor(
-                self._stream,
-                height_px=self._size[0],
-                width_px=self._size[1],
-                encoding=self._encoding,
-            ),
-        )
+        return (self._descriptor,)
 
     def reset(self) -> None:
         """Forget half a packet, and a group that was begun."""
@@ -124,21 +119,24 @@ class CameraDecoder:
                 f"{self._size[1]} by {self._size[0]} in {ENCODING_CODES[self._encoding]} "
                 f"({self._encoding}); set the camera or the station"
             )
-        body = payload[PAYLOAD_HEADER.size :]
-        image = self._raw(body) if self._encoding == "rgb8" else self._encoded(body)
+        if self._encoding == "rgb8":
+            image = self._raw(payload)
+        else:
+            image = self._encoded(payload[PAYLOAD_HEADER.size :])
         if image is None:
             self.statistics.refused += 1
         return image
 
-    def _raw(self, body: bytes) -> np.ndarray | None:
-        if len(body) != self._size[0] * self._size[1] * 3:
+    def _raw(self, payload: bytes) -> np.ndarray | None:
+        if len(payload) - PAYLOAD_HEADER.size != self._size[0] * self._size[1] * 3:
             return None
-        return np.frombuffer(body, dtype=np.uint8).reshape(*self._size, 3)
+        pixels = np.frombuffer(payload, np.uint8, offset=PAYLOAD_HEADER.size)
+        return pixels.reshape(*self._size, 3)
 
     def _encoded(self, body: bytes) -> np.ndarray | None:
         try:
             if self._encoding == "h264":
-                check_encoded_image(self.descriptors[0], body, where=self._stream)
+                check_encoded_image(self._descriptor, body, where=self._stream)
             elif jpeg_size(body, where=self._stream) != self._size:
                 return None
         except (CorruptDataError, InvalidInputError):

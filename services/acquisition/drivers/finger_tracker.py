@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Int64
 
 from dextouch.errors import DeviceError, PacketError
 from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, NODE_INDEX, NUM_KEYPOINTS, WRIST
@@ -34,6 +34,7 @@ PAYLOAD_BYTES = VALIDITY.size + NUM_KEYPOINTS * 12
 DESCRIPTOR_BYTES = 2 * NUM_KEYPOINTS
 DESCRIPTOR_READS = 200
 ALL_SEEN = (1 << NUM_KEYPOINTS) - 1
+_COORDINATE = np.dtype("<f4")
 
 
 def keypoints_descriptor(side: Side) -> StreamDescriptor:
@@ -86,17 +87,19 @@ def parse_node_order(payload: bytes) -> list[int]:
     )
 
 
-def unpack_keypoints(payload: bytes, order: list[int]) -> tuple[Float32[np.ndarray, "25 3"], int]:
+def unpack_keypoints(
+    payload: bytes, order: Int64[np.ndarray, "25"]
+) -> tuple[Float32[np.ndarray, "25 3"], int]:
     """Keypoints of a `DXFT` payload in our order, and how many nodes are not seen (NaN).
 
     A node that the device calls seen but sends as NaN or infinity is not seen either.
     """
     (valid_bits,) = VALIDITY.unpack_from(payload)
-    points = np.frombuffer(payload, dtype="<f4", offset=VALIDITY.size).reshape(-1, 3)
+    points = np.frombuffer(payload, _COORDINATE, offset=VALIDITY.size).reshape(-1, 3)
     keypoints = np.empty((NUM_KEYPOINTS, 3), dtype=np.float32)
     keypoints[order] = points
     is_seen = valid_bits & ALL_SEEN == ALL_SEEN
-    if is_seen and np.isfinite(points).all():
+    if is_seen and np.count_nonzero(np.isfinite(points)) == points.size:
         return keypoints, 0
     if not is_seen:
         keypoints[[order[i] for i in range(NUM_KEYPOINTS) if not valid_bits >> i & 1]] = np.nan
@@ -111,12 +114,13 @@ class FingerTrackerDecoder:
     def __init__(self, side: Side) -> None:
         self._side = side
         self._device = f"finger_tracker_{side}"
+        self._stream = keypoints_descriptor(side)
         self.reports = ReportReassembler()
         self._data = PacketDecoder(MAGIC, min_payload=PAYLOAD_BYTES, max_payload=PAYLOAD_BYTES)
         self._descriptor = PacketDecoder(
             DESCRIPTOR_MAGIC, min_payload=DESCRIPTOR_BYTES, max_payload=DESCRIPTOR_BYTES
         )
-        self._order: list[int] | None = None
+        self._order: Int64[np.ndarray, 25] | None = None
         self.order = OrderFilter()
         self.undescribed = 0
         self.unseen_nodes = 0
@@ -129,7 +133,7 @@ class FingerTrackerDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The keypoint stream."""
-        return (keypoints_descriptor(self._side),)
+        return (self._stream,)
 
     @property
     def described(self) -> bool:
@@ -168,13 +172,13 @@ class FingerTrackerDecoder:
             keypoints, num_unseen = unpack_keypoints(packet.payload, self._order)
             self.unseen_nodes += num_unseen
             samples.append(Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence))
-        return {f"keypoints_{self._side}": samples} if samples else {}
+        return {self._stream.name: samples} if samples else {}
 
     def _describe(self, body: bytes) -> None:
         for packet in self._descriptor.feed(body):
             check_packet(packet, device=self._device, source=self._side)
             try:
-                self._order = parse_node_order(packet.payload)
+                self._order = np.array(parse_node_order(packet.payload))
             except PacketError as error:
                 raise DeviceError(f"{self._device}: {error.message}") from error
 

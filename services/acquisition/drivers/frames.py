@@ -56,8 +56,49 @@ class SequenceCounter:
         self._last = sequence
 
 
-class FrameSearch(ABC, Generic[Found]):
-    """Looks for frames that begin with a mark; the result does not depend on the portions.
+class PortionedSearch(ABC, Generic[Found]):
+    """Gathers portions until a search can go on; the result does not depend on the portions.
+
+    What was read at once is searched as it came, without a copy. `_needed` is the length that the
+    bytes must have before looking again can find more.
+    """
+
+    def __init__(self) -> None:
+        self.statistics = DecoderStatistics()
+        self._portions: list[bytes] = []
+        self._num_waiting = 0
+        self._needed = 0
+
+    def reset(self) -> None:
+        """Forget half a frame (the link was lost); counters and sequence stay."""
+        self.statistics.resync_bytes += self._num_waiting
+        self._keep(b"")
+        self._needed = 0
+
+    def feed(self, data: bytes) -> list[Found]:
+        """Frames completed by `data`."""
+        self._portions.append(data)
+        self._num_waiting += len(data)
+        if self._num_waiting < self._needed:
+            return []
+        self._needed = 0
+        data = b"".join(self._portions)
+        found, position = self._search(data)
+        self._keep(data[position:])
+        self._needed = max(0, self._needed - position)
+        return found
+
+    def _keep(self, rest: bytes) -> None:
+        self._portions = [rest] if rest else []
+        self._num_waiting = len(rest)
+
+    @abstractmethod
+    def _search(self, data: bytes) -> tuple[list[Found], int]:
+        """What was found in all bytes that wait, and how many of them are done with."""
+
+
+class FrameSearch(PortionedSearch[Found]):
+    """Looks for frames that begin with a mark.
 
     Where a frame does not hold, the search goes on one byte further, never behind the claimed
     frame, so that a damaged one costs only itself.
@@ -67,53 +108,31 @@ class FrameSearch(ABC, Generic[Found]):
     """
 
     def __init__(self, mark: bytes) -> None:
-        self.statistics = DecoderStatistics()
+        super().__init__()
         self._mark = mark
-        self._buffer = bytearray()
-        self._needed = 0
 
-    def reset(self) -> None:
-        """Forget half a frame (the link was lost); counters and sequence stay."""
-        self.statistics.resync_bytes += len(self._buffer)
-        self._buffer.clear()
-        self._needed = 0
-
-    def feed(self, data: bytes) -> list[Found]:
-        """Frames completed by `data`."""
-        buffer = self._buffer
-        buffer += data
-        if len(buffer) < self._needed:
-            return []
-        self._needed = 0
+    def _search(self, data: bytes) -> tuple[list[Found], int]:
         found: list[Found] = []
         position = 0
-        while True:
-            position = self._seek(position)
-            if len(buffer) < position + len(self._mark):
-                break
-            taken = self._take(position)
+        while (start := data.find(self._mark, position)) >= 0:
+            self.statistics.resync_bytes += start - position
+            taken = self._take(data, start)
             if taken is not None:
                 found.append(taken[0])
-                position += taken[1]
+                position = start + taken[1]
             elif self._needed:
-                break
+                return found, start
             else:
-                position += 1
+                position = start + 1
                 self.statistics.resync_bytes += 1
-        del buffer[:position]
-        self._needed = max(0, self._needed - position)
-        return found
-
-    def _seek(self, position: int) -> int:
-        found = self._buffer.find(self._mark, position)
-        if found < 0:
-            found = max(position, len(self._buffer) - len(self._mark) + 1)
-        self.statistics.resync_bytes += found - position
-        return found
+        # The last bytes may be the first ones of a mark.
+        rest = max(position, len(data) - len(self._mark) + 1)
+        self.statistics.resync_bytes += rest - position
+        return found, rest
 
     @abstractmethod
-    def _take(self, position: int) -> tuple[Found, int] | None:
+    def _take(self, data: bytes, position: int) -> tuple[Found, int] | None:
         """The frame at `position` and its size; None when there is none, or not yet.
 
-        In the latter case `_needed` is set to the length that the buffer must have first.
+        In the latter case `_needed` is set to the length that `data` must have first.
         """

@@ -14,7 +14,7 @@ from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import Side
 from services.acquisition.drivers.base import Readings
-from services.acquisition.drivers.frames import DecoderStatistics
+from services.acquisition.drivers.frames import DecoderStatistics, PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
 FLOAT_BYTES = 4
@@ -26,8 +26,8 @@ _ONE = np.uint32(1)
 _VALUE = np.dtype("<f4")
 
 
-class JustFloatFrames:
-    """Finds packets between tails; the result does not depend on the portions.
+class JustFloatFrames(PortionedSearch[bytes]):
+    """Finds the payloads of packets between tails.
 
     Args:
         num_values: float32s of a packet.
@@ -37,68 +37,57 @@ class JustFloatFrames:
     def __init__(self, num_values: int, full_scale: float) -> None:
         if not 1 <= num_values <= MAX_VALUES:
             raise InvalidInputError(f"num_values: got {num_values}, expected 1 … {MAX_VALUES}")
-        self.statistics = DecoderStatistics()
+        super().__init__()
         self._payload = FLOAT_BYTES * num_values
         self._size = self._payload + len(TAIL)
         self._largest_bits = bits_of(full_scale)
-        self._buffer = bytearray()
-        self._needed = 0
         self._is_after_tail = False
         self._foreign = (0, 0)
 
     def reset(self) -> None:
         """Forget half a packet (the link was lost); counters stay."""
-        self.statistics.resync_bytes += len(self._buffer)
-        self._buffer.clear()
-        self._needed = 0
+        super().reset()
         self._is_after_tail = False
         self._foreign = (0, 0)
 
-    def feed(self, data: bytes) -> list[bytes]:
-        """Payloads completed by `data`.
+    def _search(self, data: bytes) -> tuple[list[bytes], int]:
+        """Payloads, and how many bytes are done with.
 
         Raises:
             DeviceError: packets of another length, three in a row.
         """
-        buffer = self._buffer
-        buffer += data
-        if len(buffer) < self._needed:
-            return []
-        self._needed = 0
         found: list[bytes] = []
         position = 0
         while True:
             if not self._is_after_tail:
-                position = self._seek(position)
+                position = self._seek(data, position)
                 if not self._is_after_tail:
                     break
             end = position + self._payload
-            if len(buffer) < end + len(TAIL):
+            if len(data) < end + len(TAIL):
                 self._needed = end + len(TAIL)
                 break
-            if buffer[end : end + len(TAIL)] == TAIL:
-                position = self._release(position, found)
-            elif len(buffer) < end + len(TAIL) + self._size:
+            if data.startswith(TAIL, end):
+                position = self._release(data, position, found)
+            elif len(data) < end + len(TAIL) + self._size:
                 self._needed = end + len(TAIL) + self._size
                 break
             else:
-                position = self._pass_over(position)
-        del buffer[:position]
-        self._needed = max(0, self._needed - position)
-        return found
+                position = self._pass_over(data, position)
+        return found, position
 
-    def _seek(self, position: int) -> int:
+    def _seek(self, data: bytes, position: int) -> int:
         """The place behind the next tail, or where to look on when more has come."""
-        tail = self._buffer.find(TAIL, position)
+        tail = data.find(TAIL, position)
         self._is_after_tail = tail >= 0
-        unread = max(position, len(self._buffer) - len(TAIL) + 1)
+        unread = max(position, len(data) - len(TAIL) + 1)
         after = unread if tail < 0 else tail + len(TAIL)
         self.statistics.resync_bytes += after - position
         return after
 
-    def _release(self, position: int, found: list[bytes]) -> int:
+    def _release(self, data: bytes, position: int, found: list[bytes]) -> int:
         """A tail stands on either side: give the packet if its numbers can be readings."""
-        payload = bytes(self._buffer[position : position + self._payload])
+        payload = data[position : position + self._payload]
         if not are_readings(np.frombuffer(payload, _VALUE), self._largest_bits):
             self.statistics.suspects += 1
             self._is_after_tail = False
@@ -108,7 +97,7 @@ class JustFloatFrames:
         found.append(payload)
         return position + self._size
 
-    def _pass_over(self, position: int) -> int:
+    def _pass_over(self, data: bytes, position: int) -> int:
         """No tail where one belongs: its bits are wrong, or bytes are missing.
 
         If the tail after it is in place, only this packet is lost; otherwise the next tail is
@@ -116,10 +105,10 @@ class JustFloatFrames:
         """
         self.statistics.length_errors += 1
         next_tail = position + self._size + self._payload
-        if self._buffer[next_tail : next_tail + len(TAIL)] == TAIL:
+        if data.startswith(TAIL, next_tail):
             self.statistics.resync_bytes += self._size
             return position + self._size
-        self._note_length(self._buffer.find(TAIL, position) - position)
+        self._note_length(data.find(TAIL, position) - position)
         self._is_after_tail = False
         return position
 

@@ -1,10 +1,10 @@
 """Wuji tactile glove: bytes of its data packet come in, 24 × 32 pressures of full scale go out."""
 
-import binascii
 import math
 import struct
 from typing import NamedTuple
 
+import fastcrc
 import numpy as np
 from jaxtyping import Float32
 
@@ -24,7 +24,6 @@ HEAD = struct.Struct("<2sHB3x")
 # after the cells: sequence, milliseconds since the device started
 STAMPS = struct.Struct("<HI")
 CRC = struct.Struct("<H")
-CRC_START = 0xFFFF
 CRC_OFFSET = PACKET_BYTES - CRC.size
 HANDS: dict[int, Side] = {0: "left", 1: "right"}
 SEQUENCE_BITS = 16
@@ -55,20 +54,20 @@ class WujiFrames(FrameSearch[WujiPacket]):
         self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
         self._last_ms: int | None = None
 
-    def _take(self, position: int) -> tuple[WujiPacket, int] | None:
-        buffer = self._buffer
-        if len(buffer) < position + HEAD.size:
+    def _take(self, data: bytes, position: int) -> tuple[WujiPacket, int] | None:
+        if len(data) < position + HEAD.size:
             self._needed = position + HEAD.size
             return None
-        _, length, hand = HEAD.unpack_from(buffer, position)
+        _, length, hand = HEAD.unpack_from(data, position)
         if length != PACKET_BYTES:
             self.statistics.length_errors += 1
             return None
-        if len(buffer) < position + PACKET_BYTES:
+        if len(data) < position + PACKET_BYTES:
             self._needed = position + PACKET_BYTES
             return None
-        # A copy of its own, in which the cells lie at a multiple of their size.
-        packet = bytes(buffer[position : position + PACKET_BYTES])
+        # Bytes of its own (no copy if it came alone), in which the cells lie at a multiple of their
+        # size.
+        packet = data[position : position + PACKET_BYTES]
         if CRC.unpack_from(packet, CRC_OFFSET)[0] != crc16(packet[len(MARK) : CRC_OFFSET]):
             self.statistics.crc_errors += 1
             return None
@@ -96,6 +95,7 @@ class WujiGloveDecoder:
     def __init__(self, side: Side | None = None) -> None:
         self._frames = WujiFrames()
         self._side: Side | None = side
+        self._descriptor = wuji_descriptor(side or "left")
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -105,7 +105,7 @@ class WujiGloveDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The raw stream (named for the left hand when the side is open)."""
-        return (wuji_descriptor(self._side or "left"),)
+        return (self._descriptor,)
 
     def reset(self) -> None:
         """Forget half a packet."""
@@ -131,7 +131,7 @@ class WujiGloveDecoder:
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """The same by stream name."""
         samples = self.feed(data, t_host_ns)
-        return {self.descriptors[0].name: samples} if samples else {}
+        return {self._descriptor.name: samples} if samples else {}
 
     def _check_hand(self, hand: int) -> None:
         side = HANDS.get(hand)
@@ -167,7 +167,7 @@ def wuji_descriptor(side: Side) -> StreamDescriptor:
 
 def crc16(data: bytes) -> int:
     """CRC-16-CCITT: polynomial 0x1021, start 0xFFFF, most significant bit first."""
-    return binascii.crc_hqx(data, CRC_START)
+    return fastcrc.crc16.ibm_3740(data)
 
 
 def are_pressures(cells: Float32[np.ndarray, " n"]) -> bool:

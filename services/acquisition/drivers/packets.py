@@ -33,9 +33,9 @@ __all__ = [
 ]
 
 
-@dataclass(frozen=True)
+@dataclass(slots=True)
 class Packet:
-    """One packet whose checksum held."""
+    """One packet whose checksum held; nobody changes it (frozen, it would cost a µs more)."""
 
     version: int
     source: int
@@ -87,29 +87,29 @@ class PacketDecoder(FrameSearch[Packet]):
         self._magic = magic
         self._sequence = SequenceCounter(self.statistics, bits=SEQUENCE_BITS)
 
-    def _take(self, position: int) -> tuple[Packet, int] | None:
-        buffer = self._buffer
-        if len(buffer) < position + HEADER.size:
-            self._needed = position + HEADER.size
+    def _take(self, data: bytes, position: int) -> tuple[Packet, int] | None:
+        start = position + HEADER.size
+        if len(data) < start:
+            self._needed = start
             return None
-        magic, version, source, length, sequence, t_device_ns = HEADER.unpack_from(buffer, position)
+        magic, version, source, length, sequence, t_device_ns = HEADER.unpack_from(data, position)
         sizes = self._sizes.get(magic)
         if sizes is None:
             return None
         if not sizes[0] <= length <= sizes[1]:
             self.statistics.length_errors += 1
             return None
-        end = position + HEADER.size + length
-        if len(buffer) < end + CRC.size:
+        end = start + length
+        if len(data) < end + CRC.size:
             self._needed = end + CRC.size
             return None
-        body = bytes(buffer[position:end])
-        if CRC.unpack_from(buffer, end)[0] != zlib.crc32(body):
+        # Through a view: images are too large to be copied for their checksum.
+        if CRC.unpack_from(data, end)[0] != zlib.crc32(memoryview(data)[position:end]):
             self.statistics.crc_errors += 1
             return None
         if magic == self._magic:
             self._sequence.count(sequence)
-        packet = Packet(version, source, sequence, t_device_ns, body[HEADER.size :], magic)
+        packet = Packet(version, source, sequence, t_device_ns, data[start:end], magic)
         return packet, OVERHEAD + length
 
 

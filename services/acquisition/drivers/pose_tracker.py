@@ -10,10 +10,10 @@ from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from operator import mul
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64
 
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
@@ -129,7 +129,7 @@ class PoseGate:
         elapsed_s = self._elapsed_ns / 1e9
         if math.dist(pose[:3], last[:3]) > MAX_SPEED_M_PER_S * elapsed_s:
             return False
-        cosine = abs(math.fsum(a * b for a, b in zip(pose[3:], last[3:], strict=True)))
+        cosine = abs(math.fsum(map(mul, pose[3:], last[3:])))
         return 2.0 * math.acos(min(1.0, cosine)) <= MAX_TURN_RATE_RAD_PER_S * elapsed_s
 
 
@@ -147,25 +147,35 @@ class PoseStream:
         self.gate.reset()
         self.events.end()
 
-    def occlude(self, packet: Packet, *, state: int, t_host_ns: int) -> None:
+    def occlude(self, *, state: int, sequence: int, t_device_ns: int, t_host_ns: int) -> None:
         """The tracker is not running: whatever pose it sends is none."""
-        self.gate.pass_time(packet.t_device_ns)
-        self.events.leave_out(
-            "occluded", state=state, sequence=packet.sequence, t_host_ns=t_host_ns
-        )
+        self.gate.pass_time(t_device_ns)
+        self.events.leave_out("occluded", state=state, sequence=sequence, t_host_ns=t_host_ns)
 
     def take(
-        self, pose: Float64[np.ndarray, " 7"], packet: Packet, *, state: int, t_host_ns: int
+        self,
+        pose: Sequence[float],
+        *,
+        state: int,
+        sequence: int,
+        t_device_ns: int,
+        t_host_ns: int,
     ) -> Sample | None:
-        """The sample of a running tracker's pose (unit quaternion); None where it jumps."""
-        self.gate.pass_time(packet.t_device_ns)
-        if not self.gate.admits(pose.tolist()):
-            self.events.leave_out(
-                "jumped", state=state, sequence=packet.sequence, t_host_ns=t_host_ns
-            )
+        """The sample of a running tracker's pose; None where it jumps.
+
+        Args:
+            pose: x y z (m) qw qx qy qz (unit) in the world frame.
+            state: what the tracker says of it.
+            sequence: of the packet.
+            t_device_ns: when the pose was taken.
+            t_host_ns: when it arrived.
+        """
+        self.gate.pass_time(t_device_ns)
+        if not self.gate.admits(pose):
+            self.events.leave_out("jumped", state=state, sequence=sequence, t_host_ns=t_host_ns)
             return None
         self.events.end()
-        return Sample(t_host_ns, pose, packet.t_device_ns, packet.sequence)
+        return Sample(t_host_ns, np.array(pose), t_device_ns, sequence)
 
 
 def pose_descriptor(stream: str) -> StreamDescriptor:
@@ -185,6 +195,11 @@ def pose_descriptor(stream: str) -> StreamDescriptor:
             "capabilities": ClockCapabilities(crc=True, sequence=True, device_time=True),
         }
     )
+
+
+def are_finite(numbers: Sequence[float]) -> bool:
+    """Whether each of some float32s is a number: only then is their sum, which cannot overflow."""
+    return math.isfinite(sum(numbers))
 
 
 def source_of(stream: str) -> str:
@@ -208,6 +223,7 @@ class PoseTrackerDecoder:
         self.reports = ReportReassembler()
         self.poses = PoseStream()
         self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
+        self._descriptor = pose_descriptor(stream)
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -217,7 +233,7 @@ class PoseTrackerDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The pose stream."""
-        return (pose_descriptor(self._stream),)
+        return (self._descriptor,)
 
     @property
     def tracking(self) -> TrackingEvents:
@@ -261,13 +277,21 @@ class PoseTrackerDecoder:
         if not self.poses.order.admits(packet.sequence):
             return None
         state, *numbers = PAYLOAD.unpack(packet.payload)
+        sequence, t_device_ns = packet.sequence, packet.t_device_ns
         if state != TrackingState.RUNNING_OK:
-            self.poses.occlude(packet, state=state, t_host_ns=t_host_ns)
+            self.poses.occlude(
+                state=state, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
+            )
             return None
-        pose = np.array(numbers)
-        norm = math.hypot(*numbers[3:])
-        if not all(map(math.isfinite, numbers)) or abs(norm - 1.0) > NORM_TOLERANCE:
+        x, y, z, w, i, j, k = numbers
+        norm = math.hypot(w, i, j, k)
+        if not are_finite(numbers) or abs(norm - 1.0) > NORM_TOLERANCE:
             self.statistics.refused += 1
             return None
-        pose[3:] /= norm
-        return self.poses.take(pose, packet, state=state, t_host_ns=t_host_ns)
+        return self.poses.take(
+            (x, y, z, w / norm, i / norm, j / norm, k / norm),
+            state=state,
+            sequence=sequence,
+            t_device_ns=t_device_ns,
+            t_host_ns=t_host_ns,
+        )

@@ -66,18 +66,17 @@ class ReportReassembler:
             self.statistics.malformed += 1
             return None
         report_id, counter, part, num_parts, length = REPORT_HEADER.unpack_from(report)
-        if not (part < num_parts and length <= PART_BYTES):
+        if part >= num_parts or length > PART_BYTES:
             self.statistics.malformed += 1
             return None
-        key = (report_id, counter, num_parts)
         if part == 0:
             self.reset()
-            self._key = key
-        elif key != self._key or part != len(self._parts):
+            self._key = (report_id, counter, num_parts)
+        elif part != len(self._parts) or (report_id, counter, num_parts) != self._key:
             self.reset()
             return None
         self._parts.append(report[REPORT_HEADER.size : REPORT_HEADER.size + length])
-        if len(self._parts) < num_parts:
+        if part + 1 < num_parts:
             return None
         message = b"".join(self._parts)
         self._parts = []

@@ -24,6 +24,7 @@ STREAM_SIZES = {
     "wrist_right_commanded": 7,
 }
 PAYLOAD = struct.Struct(f"<{sum(STREAM_SIZES.values())}d")
+_NUMBER = np.dtype("<f8")
 
 
 def robot_descriptor(stream: str) -> StreamDescriptor:
@@ -52,6 +53,7 @@ class RobotStateDecoder:
 
     def __init__(self) -> None:
         self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
+        self._descriptors = tuple(robot_descriptor(stream) for stream in STREAM_SIZES)
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -61,7 +63,7 @@ class RobotStateDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The six streams."""
-        return tuple(robot_descriptor(stream) for stream in STREAM_SIZES)
+        return self._descriptors
 
     def reset(self) -> None:
         """Forget half a packet."""
@@ -76,8 +78,8 @@ class RobotStateDecoder:
         readings: Readings = {}
         for packet in self._packets.feed(data):
             check_packet(packet, device=DEVICE, source=None)
-            numbers = np.frombuffer(packet.payload, dtype="<f8")
-            if not np.all(np.isfinite(numbers)):
+            numbers = np.frombuffer(packet.payload, _NUMBER)
+            if np.count_nonzero(np.isfinite(numbers)) < numbers.size:
                 self.statistics.refused += 1
                 continue
             start = 0

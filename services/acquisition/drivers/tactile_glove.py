@@ -16,6 +16,7 @@ MAGIC = b"DXTG"
 PAYLOAD_BYTES = 2 * NUM_RAW_TAXELS
 NOMINAL_RATE_HZ = 60.0
 FULL_SCALE_COUNTS = 65_535
+_COUNT = np.dtype("<u2")
 
 
 def glove_descriptor(side: Side) -> StreamDescriptor:
@@ -52,6 +53,8 @@ class TactileGloveDecoder:
             others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
         )
         self._side: Side | None = side
+        self._device = f"glove_{side or 'any'}"
+        self._descriptor = glove_descriptor(side or "left")
         self._on_reply = on_reply
 
     @property
@@ -62,7 +65,7 @@ class TactileGloveDecoder:
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The raw stream (named for the left hand when the side is open)."""
-        return (glove_descriptor(self._side or "left"),)
+        return (self._descriptor,)
 
     def reset(self) -> None:
         """Forget half a packet."""
@@ -84,12 +87,12 @@ class TactileGloveDecoder:
                 if self._on_reply is not None:
                     self._on_reply(packet, t_host_ns)
                 continue
-            check_packet(packet, device=f"glove_{self._side or 'any'}", source=self._side)
-            counts = np.frombuffer(packet.payload, dtype="<u2")
+            check_packet(packet, device=self._device, source=self._side)
+            counts = np.frombuffer(packet.payload, _COUNT)
             samples.append(Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence))
         return samples
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """The same by stream name."""
         samples = self.feed(data, t_host_ns)
-        return {self.descriptors[0].name: samples} if samples else {}
+        return {self._descriptor.name: samples} if samples else {}

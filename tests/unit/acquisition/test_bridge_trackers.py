@@ -1,5 +1,6 @@
 """Trackers behind bridges: frames against closed forms, gates against the mock's truth."""
 
+import itertools
 import math
 
 import numpy as np
@@ -19,10 +20,13 @@ from services.acquisition.drivers.bridge_tracker import (
     BridgeFingerTrackerDecoder,
     BridgePoseTrackerDecoder,
     TrackingResult,
+)
+from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
+from services.acquisition.drivers.sender_frame import (
+    SenderFrame,
     pose_in_our_frame,
     quaternion_of_one,
 )
-from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.bridge_sources import (
     LEFT_HANDED,
@@ -135,6 +139,48 @@ def test_the_quaternion_of_one_is_the_reference_one(axis, angle_rad):
     sign = 1.0 if q_wxyz @ reference > 0 else -1.0
     np.testing.assert_allclose(sign * q_wxyz, reference, atol=1e-14)
     assert sign > 0 or abs(reference[0]) < 1e-9
+
+
+def all_conventions():
+    """The 48 ways in which three axes can lie along ours."""
+    for names in itertools.permutations("xyz"):
+        for signs in itertools.product("+-", repeat=3):
+            axes = tuple(sign + name for sign, name in zip(signs, names, strict=True))
+            matrix = np.zeros((3, 3))
+            for column, (sign, name) in enumerate(axes):
+                matrix["xyz".index(name), column] = 1.0 if sign == "+" else -1.0
+            handedness = "right" if np.linalg.det(matrix) > 0 else "left"
+            yield FrameConvention(handedness=handedness, axes=axes)
+
+
+def outcome(convert):
+    """The bytes of a pose, or the words it is refused with."""
+    try:
+        return np.array(convert()).tobytes()
+    except PacketError as error:
+        return error.message
+
+
+@pytest.mark.parametrize("convention", list(all_conventions()), ids=lambda c: "".join(c.axes))
+def test_the_frame_of_a_sender_is_the_product_of_matrices(convention):
+    rng = np.random.default_rng(4)
+    vectors_rad = [*rng.normal(0, 2, (20, 3)), *math.pi * np.eye(3), *np.eye(3), np.zeros(3)]
+    for vector_rad in vectors_rad:
+        matrix = matrix_of(rotation_from_vector(vector_rad), rng.normal(0, 3, 3))
+        sent = matrix.astype(np.float32).astype(np.float64)
+        for numbers in (sent, np.round(sent)):
+            frame, M = SenderFrame(convention, 0.01), convention.ours_from_theirs()
+            got = outcome(lambda f=frame, n=numbers: f.pose(n.ravel().tolist()))
+            assert got == outcome(lambda m=M, n=numbers: pose_in_our_frame(n, m, 0.01))
+
+
+@pytest.mark.parametrize("place", range(12))
+@pytest.mark.parametrize("number", [math.nan, math.inf, -math.inf])
+def test_a_matrix_with_a_number_that_is_none_is_refused(place, number):
+    numbers = matrix_of(np.eye(3)).ravel().tolist()
+    numbers[place] = number
+    with pytest.raises(PacketError, match="NaN or infinity"):
+        SenderFrame(Y_UP, 1.0).pose(numbers)
 
 
 @pytest.mark.parametrize("frame", [Y_UP, LEFT_HANDED])

@@ -57,7 +57,7 @@ def test_any_order_gives_the_same_hand(order):
     assert parse_node_order(node_bytes(nodes)) == list(order)
     points = points_of()
     payload = VALIDITY.pack(ALL_SEEN) + points[order].tobytes()
-    keypoints, num_unseen = unpack_keypoints(payload, list(order))
+    keypoints, num_unseen = unpack_keypoints(payload, np.array(order))
     np.testing.assert_array_equal(keypoints, points)
     assert num_unseen == 0
 
@@ -66,7 +66,7 @@ def test_any_order_gives_the_same_hand(order):
 def test_unseen_nodes_follow_their_ids(order, unseen_places):
     bits = ALL_SEEN & ~sum(1 << place for place in unseen_places)
     payload = VALIDITY.pack(bits) + points_of()[order].tobytes()
-    keypoints, num_unseen = unpack_keypoints(payload, list(order))
+    keypoints, num_unseen = unpack_keypoints(payload, np.array(order))
     unseen = set(np.flatnonzero(np.isnan(keypoints).any(axis=1)))
     assert unseen == {order[place] for place in unseen_places}
     assert num_unseen == len(unseen_places)
@@ -109,7 +109,7 @@ def test_a_node_that_is_no_place_is_not_seen(number):
     points = points_of()
     points[NODE_INDEX["index", "tip"], 1] = number
     payload = VALIDITY.pack(ALL_SEEN) + points.tobytes()
-    keypoints, num_unseen = unpack_keypoints(payload, list(range(NUM_KEYPOINTS)))
+    keypoints, num_unseen = unpack_keypoints(payload, np.arange(NUM_KEYPOINTS))
     assert num_unseen == 1
     assert np.isnan(keypoints[NODE_INDEX["index", "tip"]]).all()
     assert np.isfinite(np.delete(keypoints, NODE_INDEX["index", "tip"], axis=0)).all()

@@ -1,3 +1,4 @@
+import binascii
 import struct
 
 import numpy as np
@@ -46,6 +47,13 @@ def slow_crc16(data):
 
 def test_crc16_is_the_one_of_the_catalogues():
     assert crc16(b"123456789") == 0x29B1
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_crc16_is_the_plain_one_at_every_length(seed):
+    data = np.random.default_rng(seed).bytes(3088)
+    for length in range(len(data) + 1):
+        assert crc16(data[:length]) == binascii.crc_hqx(data[:length], 0xFFFF), length
 
 
 def test_wuji_samples_carry_what_the_device_says(rng):
