@@ -13,6 +13,7 @@ import pytest
 from dextouch.errors import InvalidInputError
 from services.cli.bench.acquisition import stage
 from services.cli.bench.acquisition.acceptance import requirements
+from services.cli.bench.acquisition.drivers import DriverSpeed, decode_all, make_talks
 from services.cli.bench.acquisition.families import make_families
 from services.cli.bench.acquisition.noise import (
     Judgement,
@@ -21,8 +22,9 @@ from services.cli.bench.acquisition.noise import (
     disturb,
     judge,
 )
-from services.cli.bench.command import stage_parser
+from services.cli.bench.command import stage_parser, usage
 from services.cli.bench.figures import Figure
+from services.cli.bench.stages import STAGES
 
 FAMILIES = {family.name: family for family in make_families()}
 BAD_LINE = Line(bit_error_rate=1e-4, byte_loss_rate=1e-5)
@@ -45,6 +47,8 @@ def test_a_quick_run_measures_everything(run):
     assert len(found) == 8
     assert len(figures["us_a_packet"]) == 24
     assert all(all(value > 0 for value in row["rounds"]) for row in figures["us_a_packet"])
+    assert len(figures["drivers"]) == 11
+    assert all(min(row["us_a_packet"]) > 0 for row in figures["drivers"])
     (eight,) = figures["eight_gloves"]
     assert eight["errors"] == 0
     assert eight["packets"] > 0
@@ -87,15 +91,18 @@ def test_the_line_tells_what_it_touched():
 
 def test_verdicts_say_what_was_not_measured():
     found = Judgement("wuji", "ours", 100, 3, 97, 1, 0)
-    speeds = {("wuji", "ours", 0): Figure.of([16.0]), ("wuji", "mark alone", 0): Figure.of([1.0])}
-    table = {r.what: r.verdict() for r in requirements([found], speeds, {}, None)}
+    names = ("glove wuji", "glove dextouch", "robot state")
+    times = (Figure.of([16.0]), Figure.of([15.0]), Figure.of([99.0]))
+    drivers = [DriverSpeed(n, 9.0, 1.0, t) for n, t in zip(names, times, strict=True)]
+    table = {r.what: r.verdict() for r in requirements([found], drivers, {}, None)}
     assert table == {
         "wrong packets, dextouch": "not measured",
         "packets lost untouched, dextouch": "not measured",
         "wrong packets of 100, wuji": "FAIL",
         "packets lost untouched of 100, wuji": "pass",
         "ways of cutting the stream that change the packets, all families": "not measured",
-        "processor time a packet in whole reads, wuji": "FAIL",
+        "processor time a packet, glove wuji": "FAIL",
+        "processor time a packet, glove dextouch": "pass",
         "core a stream, 8 gloves at 60 Hz on terminals": "not measured",
     }
 
@@ -107,3 +114,23 @@ def test_options_that_mean_nothing_are_refused(words, tmp_path):
     options = parser.parse_args(words)
     with pytest.raises(InvalidInputError, match=words[0]):
         stage.measure(options, tmp_path, pytest.fail)
+
+
+@pytest.mark.parametrize("talk", make_talks(seed=1), ids=lambda talk: talk.name)
+def test_every_driver_takes_each_packet_that_is_timed(talk):
+    decoder = talk.decoder()
+    for read in talk.greeting:
+        assert decoder.decode(read, 0) == {}
+    num_streams = len(decoder.descriptors)
+    # Packets without a mark at their start need one to find their place.
+    num_packets = len(talk.packets) - ("justfloat" in talk.name)
+    assert decode_all(talk, decoder) == num_streams * num_packets
+    assert talk.packet_bytes == np.mean([len(b"".join(packet)) for packet in talk.packets])
+
+
+def test_help_keeps_names_and_words_apart():
+    lines = usage().splitlines()
+    assert all(
+        any(line.split() == [name, *entry.does.split()] for line in lines)
+        for name, entry in STAGES.items()
+    )

@@ -45,12 +45,13 @@ class StageEntry(NamedTuple):
 STAGES = {
     "acquisition": StageEntry(
         "services.cli.bench.acquisition.stage",
-        "decode glove packets over a bad line, read eight gloves at once",
+        "decode packets of gloves over a bad line, time every driver",
         "Sends packets of three glove families over a line with bit errors and byte loss, and "
         "counts what our decoders and their rivals (the mark and a length; the mark alone) give "
-        "that was never sent, and what they lose untouched. Times every way by the size of reads, "
-        "and reads eight gloves at 60 Hz on pseudo terminals. Close other programs first: timings "
-        "on a busy machine say little.",
+        "that was never sent, and what they lose untouched. Times every way by the size of reads "
+        "and the decoder of every driver (gloves, trackers, bridges, robot, cameras), and reads "
+        "eight gloves at 60 Hz on pseudo terminals. Close other programs first: timings on a busy "
+        "machine say little.",
     ),
     "store": StageEntry(
         "services.cli.bench.store.stage",

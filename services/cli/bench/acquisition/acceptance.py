@@ -2,17 +2,18 @@
 
 from collections.abc import Mapping, Sequence
 
+from services.cli.bench.acquisition.drivers import DriverSpeed
 from services.cli.bench.acquisition.noise import Judgement
-from services.cli.bench.acquisition.speed import WHOLE
 from services.cli.bench.figures import Figure, Requirement
 
 OURS = "ours"
 CHECKED = ("dextouch", "wuji")
+GLOVE = "glove "
 
 
 def requirements(
     judgements: Sequence[Judgement],
-    speeds: Mapping[tuple[str, str, int], Figure],
+    drivers: Sequence[DriverSpeed],
     split_differences: Mapping[str, int],
     core_share: Figure | None,
 ) -> list[Requirement]:
@@ -44,11 +45,17 @@ def requirements(
             0.0,
         )
     )
-    for family, way, size in speeds:
-        if way == OURS and size == WHOLE:
-            median_us = speeds[family, way, size].median
-            what = f"processor time a packet in whole reads, {family}"
-            table.append(Requirement(what, median_us, "at most", 15.0, "µs"))
+    table += [
+        Requirement(
+            f"processor time a packet, {driver.name}",
+            driver.time_us.median,
+            "at most",
+            15.0,
+            "µs",
+        )
+        for driver in drivers
+        if driver.name.startswith(GLOVE)
+    ]
     share = None if core_share is None else core_share.median
     table.append(
         Requirement("core a stream, 8 gloves at 60 Hz on terminals", share, "at most", 1.0, "%")

@@ -7,6 +7,7 @@ from typing import Any
 
 from dextouch.errors import InvalidInputError
 from services.cli.bench.acquisition.acceptance import requirements
+from services.cli.bench.acquisition.drivers import make_talks, measure_drivers
 from services.cli.bench.acquisition.families import make_families
 from services.cli.bench.acquisition.noise import Line, count_split_differences, judge
 from services.cli.bench.acquisition.ptys import NUM_STREAMS, run_ptys
@@ -39,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Decode over a bad line, time every way of decoding, read eight gloves.
+    """Decode over a bad line, time every way of decoding and every driver, read eight gloves.
 
     Raises:
         InvalidInputError: a number that measures nothing.
@@ -63,6 +64,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     num_subjects = plan["rounds"] * 3 * sum(len(family.ways) for family in families)
     with bar("timing", num_subjects) as step:
         speeds = measure_speed(families, plan["rounds"], seed=seed, on_step=step)
+    talks = make_talks(seed=seed)
+    with bar("every driver", plan["rounds"] * len(talks)) as step:
+        drivers = measure_drivers(talks, plan["rounds"], on_step=step)
     runs = []
     num_pty_rounds = 1 if options.quick else _NUM_PTY_ROUNDS
     with bar("eight gloves", num_pty_rounds) as step:
@@ -74,9 +78,9 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         stage="acquisition",
         machine=describe_machine(PACKAGES),
         options={**plan, "seed": seed},
-        tables=tables(judgements, speeds, LINE, share),
+        tables=tables(judgements, speeds, drivers, line=LINE, core_share=share),
         panels=panels(judgements, speeds),
-        requirements=requirements(judgements, speeds, splits, share),
+        requirements=requirements(judgements, drivers, splits, share),
         data={
             "line": asdict(LINE),
             "judgements": [asdict(found) for found in judgements],
@@ -85,11 +89,21 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
                 {"family": family, "way": way, "read_bytes": size, "rounds": list(figure.values)}
                 for (family, way, size), figure in speeds.items()
             ],
+            "drivers": [
+                {
+                    "driver": driver.name,
+                    "packet_bytes": driver.packet_bytes,
+                    "packet_reads": driver.packet_reads,
+                    "us_a_packet": list(driver.time_us.values),
+                }
+                for driver in drivers
+            ],
             "eight_gloves": runs,
         },
         notes=[
             "justfloat has no checksum: errors that leave a possible reading are delivered by any "
-            "decoder; its stream says so in its capabilities"
+            "decoder; its stream says so in its capabilities",
+            "cameras: raw images are checked and JPEG images looked at too, one of 10 decoded",
         ],
     )
 

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from services.cli.bench.acquisition.acceptance import OURS
+from services.cli.bench.acquisition.drivers import DriverSpeed
 from services.cli.bench.acquisition.noise import Judgement, Line
 from services.cli.bench.acquisition.speed import READ_SIZES, WHOLE
 from services.cli.bench.chart import Panel, Point
@@ -13,7 +14,12 @@ Speeds = Mapping[tuple[str, str, int], Figure]
 
 
 def tables(
-    judgements: Sequence[Judgement], speeds: Speeds, line: Line, core_share: Figure
+    judgements: Sequence[Judgement],
+    speeds: Speeds,
+    drivers: Sequence[DriverSpeed],
+    *,
+    line: Line,
+    core_share: Figure,
 ) -> list[ResultTable]:
     """All tables of the stage."""
     sizes = [f"{size} B" if size else "a packet" for size in READ_SIZES]
@@ -37,11 +43,24 @@ def tables(
             ],
         ),
         ResultTable(
-            "Processor time a packet (µs), by bytes a read",
+            "Processor time of gloves' packets (µs), by bytes a read",
             ("family, way", *sizes),
             [
                 (f"{family}, {way}", *(speeds[family, way, size].text() for size in READ_SIZES))
                 for family, way in ways
+            ],
+        ),
+        ResultTable(
+            "Processor time of every driver, from the bytes of a read to samples",
+            ("driver", "bytes a packet", "reads a packet", "a packet (µs)"),
+            [
+                (
+                    driver.name,
+                    f"{driver.packet_bytes:.0f}",
+                    f"{driver.packet_reads:g}",
+                    driver.time_us.text(),
+                )
+                for driver in drivers
             ],
         ),
         ResultTable(
