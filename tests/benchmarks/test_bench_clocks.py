@@ -13,7 +13,15 @@ import pytest
 from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli.bench.clocks import stage
 from services.cli.bench.clocks.rivals import OFFLINE, ONLINE
-from services.cli.bench.clocks.scenes import BASE_DELAY_NS, Scene, simulate
+from services.cli.bench.clocks.scenes import (
+    BASE_DELAY_NS,
+    MORE_SCENES,
+    SCENES,
+    STAMPLESS_SCENES,
+    Scene,
+    find_scene,
+    simulate,
+)
 from services.cli.bench.clocks.scores import score
 from services.cli.bench.command import stage_parser
 
@@ -78,3 +86,8 @@ def test_options_that_mean_nothing_are_refused(words, tmp_path):
         stage.measure(parser.parse_args(words), tmp_path, pytest.fail)
     with pytest.raises(UnknownNameError, match="wander"):
         stage.measure(parser.parse_args(["--scenes", "storm"]), tmp_path, pytest.fail)
+
+
+def test_every_scene_can_be_named_in_a_list():
+    for name in SCENES | MORE_SCENES | STAMPLESS_SCENES:
+        assert [find_scene(part) for part in name.split(",")] == [find_scene(name)]

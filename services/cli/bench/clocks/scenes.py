@@ -89,7 +89,7 @@ MORE_SCENES = {
     "stamps of 1 ms": Scene(tick_ns=1_000_000),
     "step -9 ms": Scene(step_ms=-9.0),
     "step -3 ms": Scene(step_ms=-3.0),
-    "restart, -5 s": Scene(step_ms=-5000.0),
+    "restart -5 s": Scene(step_ms=-5000.0),
 }
 # For streams without stamps: only how many samples got lost makes them hard.
 STAMPLESS_SCENES = {
