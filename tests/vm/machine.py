@@ -17,6 +17,8 @@ TOOLS = (QEMU, "apt-cache", "apt-get", "dpkg-deb", "depmod", "modprobe", "cpio",
 FIRST_MODULES = ("virtio_pci", "9pnet_virtio", "9p")
 ENDED = re.compile(r"VM: ended with (\d+)")
 MEMORY_MIB = 2048
+# The machine's clock counts a nanosecond an instruction, so that a busy host does not make it slow.
+ICOUNT = "shift=0"
 
 
 class MachineError(Exception):
@@ -105,6 +107,8 @@ def run_in_machine(
 ) -> tuple[int, str]:
     """Run shell commands on the kernel; exit status of the last, and the whole console.
 
+    The console can be followed in `console.log` of the folder.
+
     Args:
         commands: lines of a shell script; it ends with the first that fails.
         folder: keeps the kernel, and the files of this run.
@@ -120,23 +124,25 @@ def run_in_machine(
     header = ["set -e", f"export VM_KERNEL={shlex.quote(str(kernel.root))}"]
     script.write_text("\n".join([*header, *exports, *commands]) + "\n")
     command = [
-        QEMU, "-accel", "tcg", "-cpu", "max", "-m", str(MEMORY_MIB), "-smp", "1", "-nographic",
-        "-no-reboot", "-nic", "none", "-kernel", str(kernel.image),
+        QEMU, "-accel", "tcg", "-cpu", "max", "-m", str(MEMORY_MIB), "-smp", "1", "-icount", ICOUNT,
+        "-nographic", "-no-reboot", "-nic", "none", "-kernel", str(kernel.image),
         "-initrd", str(make_first_files(kernel, script, folder)),
         "-append", "console=ttyS0 quiet panic=-1",
         "-virtfs", "local,path=/,mount_tag=host,security_model=none,readonly=on,multidevs=remap",
     ]  # fmt: skip
-    try:
-        done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
-            timeout=timeout_s, check=False,
-        )  # fmt: skip
-    except subprocess.TimeoutExpired as error:
-        said = (error.stdout or b"").decode(errors="replace")
-        raise MachineError(
-            f"the machine did not end within {timeout_s} s; it said:\n{said}"
-        ) from error
-    console = done.stdout.decode(errors="replace").replace("\r\n", "\n")
+    log = folder / "console.log"
+    ran_out = False
+    with log.open("wb") as file:
+        try:
+            subprocess.run(
+                command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT,
+                timeout=timeout_s, check=False,
+            )  # fmt: skip
+        except subprocess.TimeoutExpired:
+            ran_out = True
+    console = log.read_bytes().decode(errors="replace").replace("\r\n", "\n")
+    if ran_out:
+        raise MachineError(f"the machine did not end within {timeout_s} s; it said:\n{console}")
     ended = ENDED.findall(console)
     if not ended:
         raise MachineError(f"the machine broke off; it said:\n{console}")

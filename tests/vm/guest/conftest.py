@@ -8,11 +8,26 @@ import pytest
 from dextouch.errors import DeviceError
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
-from tests.vm.guest import kernel_devices
 
 # How long anything may take on an emulated processor.
 PATIENCE_S = 20.0
+# What a station promises, measured from before the kernel is told; here by the guest's clock.
+MAX_FLAGGED_S = 0.3
+MAX_BACK_S = 2.0
+# Begins the rows of the table; the host looks for it.
+ROW = "VM row: "
 PAUSE = threading.Event().wait
+
+
+@pytest.fixture
+def measured(capsys):
+    """Adds a row to the table that the host prints: device, what was done, what came of it."""
+
+    def note(device, done, result):
+        with capsys.disabled():
+            print(f"\n{ROW}{device} | {done} | {result}")  # noqa: T201
+
+    return note
 
 
 @pytest.fixture
@@ -47,18 +62,17 @@ def opened():
 
 
 def reopen(driver):
-    """Open as the station's supervisor does: again until the device is there; seconds it took."""
-    begun = time.monotonic()
-
-    def ready():
+    """Open as the station's supervisor does: again until the device is there."""
+    deadline = time.monotonic() + PATIENCE_S
+    while True:
         try:
             driver.open()
         except DeviceError:
-            return False
-        return True
-
-    kernel_devices.until(ready, within_s=PATIENCE_S, pause=PAUSE)
-    return time.monotonic() - begun
+            if time.monotonic() > deadline:
+                raise
+            PAUSE(0.02)
+        else:
+            return
 
 
 def collect(driver, stream, count):
@@ -75,9 +89,24 @@ def collect(driver, stream, count):
     return samples
 
 
-def seconds_until_refused(driver):
-    """How long a driver takes to see that its device is gone."""
+def seconds_until_back(driver, plug):
+    """How long, from the plug on, until a driver has its device open again."""
+    driver.close()
     begun = time.monotonic()
+    plug()
+    reopen(driver)
+    return time.monotonic() - begun
+
+
+def replug_row(flagged_s, back_s):
+    """What was done and what came of it, for the table."""
+    return "pulled out, put back", f"loss seen {1e3 * flagged_s:.0f} ms, back {back_s:.2f} s"
+
+
+def seconds_until_refused(driver, pull):
+    """How long a driver takes, from the pull on, to see that its device is gone."""
+    begun = time.monotonic()
+    pull()
     with pytest.raises(DeviceError, match=r"unplug|gone|lost"):
         _read_for_long(driver, begun + PATIENCE_S)
     return time.monotonic() - begun

@@ -1,8 +1,12 @@
 """Devices of our own on a real kernel: USB gadgets behind a dummy controller, and uhid."""
 
+import fcntl
 import os
+import select
 import struct
-from collections.abc import Callable
+import threading
+import time
+from collections.abc import Callable, Iterable
 from pathlib import Path
 
 GADGETS = Path("/sys/kernel/config/usb_gadget")
@@ -16,8 +20,12 @@ REPORT_DESCRIPTOR = bytes.fromhex(
     "8502 0902 8102 0903 9102"
     "c0"
 )  # fmt: skip
-_CREATE, _DESTROY, _INPUT = 11, 1, 12
+_CREATE, _DESTROY, _INPUT, _OUTPUT = 11, 1, 12, 6
+_MAX_EVENT_BYTES, _DATA_BYTES = 4380, 4096
 _BUS_USB = 3
+_VIVID = Path("/sys/bus/platform/drivers/vivid")
+# VIDIOC_S_CTRL, and vivid's "Timestamp Source".
+_SET_CONTROL, _VIVID_STAMP_POINT = 0xC008561C, 0x00F0F018
 
 
 class Gadget:
@@ -100,9 +108,21 @@ def device_node(gadget: Gadget) -> Path:
 
 
 class UserHid:
-    """A HID device by /dev/uhid: any ids, reports without a bus between."""
+    """A HID device by /dev/uhid: any ids, reports without a bus between.
 
-    def __init__(self, *, ids: tuple[int, int], serial_number: str) -> None:
+    Args:
+        ids: vendor and product.
+        serial_number: as the device says it.
+        answer: gives the reports that follow one from the host.
+    """
+
+    def __init__(
+        self,
+        *,
+        ids: tuple[int, int],
+        serial_number: str,
+        answer: Callable[[bytes], Iterable[bytes]] | None = None,
+    ) -> None:
         self._file = os.open("/dev/uhid", os.O_RDWR)
         self._write(
             _CREATE,
@@ -112,6 +132,10 @@ class UserHid:
                 _BUS_USB, *ids, 0, 0,
             ) + REPORT_DESCRIPTOR,
         )  # fmt: skip
+        self._ended = threading.Event()
+        self._listener = threading.Thread(target=self._listen, args=(answer,), daemon=True)
+        if answer is not None:
+            self._listener.start()
 
     def send(self, report: bytes) -> None:
         """One input report."""
@@ -119,11 +143,42 @@ class UserHid:
 
     def destroy(self) -> None:
         """Pull it out."""
+        self._ended.set()
+        if self._listener.is_alive():
+            self._listener.join()
         self._write(_DESTROY, b"")
         os.close(self._file)
 
+    def _listen(self, answer: Callable[[bytes], Iterable[bytes]]) -> None:
+        while not self._ended.is_set():
+            if not select.select([self._file], [], [], 0.05)[0]:
+                continue
+            event = os.read(self._file, _MAX_EVENT_BYTES)
+            if struct.unpack_from("<I", event) == (_OUTPUT,):
+                data = event[4 : 4 + _DATA_BYTES]
+                (num_bytes,) = struct.unpack_from("<H", event, 4 + _DATA_BYTES)
+                for report in answer(data[:num_bytes]):
+                    self.send(report)
+
     def _write(self, kind: int, data: bytes) -> None:
         os.write(self._file, struct.pack("<I", kind) + data)
+
+
+def stamp_camera(path: Path, *, at_start: bool) -> None:
+    """Whether vivid stamps images with their start or their end (its own control)."""
+    with path.open("rb+", buffering=0) as device:
+        control = struct.pack("<Ii", _VIVID_STAMP_POINT, int(at_start))
+        fcntl.ioctl(device, _SET_CONTROL, control)
+
+
+def unplug_camera() -> None:
+    """Take the virtual camera from its driver."""
+    (_VIVID / "unbind").write_text("vivid.0")
+
+
+def plug_camera() -> None:
+    """Give the virtual camera back to its driver."""
+    (_VIVID / "bind").write_text("vivid.0")
 
 
 def until(told: Callable[[], bool], *, within_s: float, pause: Callable[[float], object]) -> None:
@@ -132,8 +187,8 @@ def until(told: Callable[[], bool], *, within_s: float, pause: Callable[[float],
     Raises:
         TimeoutError: it did not become true.
     """
-    for _ in range(int(within_s / 0.02)):
-        if told():
-            return
+    deadline = time.monotonic() + within_s
+    while not told():
+        if time.monotonic() > deadline:
+            raise TimeoutError(f"not within {within_s} s")
         pause(0.02)
-    raise TimeoutError(f"not within {within_s} s")

@@ -1,13 +1,22 @@
 """Trackers on real hidraw nodes, made by uhid and behind a USB gadget."""
 
 import os
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 
 from services.acquisition.settings import PoseTrackerSettings
 from tests.vm.guest import kernel_devices, packets
-from tests.vm.guest.conftest import collect, reopen, seconds_until_refused
+from tests.vm.guest.conftest import (
+    MAX_BACK_S,
+    MAX_FLAGGED_S,
+    PATIENCE_S,
+    collect,
+    replug_row,
+    seconds_until_back,
+    seconds_until_refused,
+)
 
 IDS = (0x1209, 0x0D02)
 SERIAL = "POSE-17"
@@ -33,14 +42,15 @@ def assert_poses(samples, first):
         np.testing.assert_allclose(sample.values, packets.pose_values(number), atol=1e-6)
 
 
-def test_every_pose_of_a_kernel_device_arrives(tracker, opened, send):
+def test_every_pose_of_a_kernel_device_arrives(tracker, opened, send, measured):
     driver = opened(SETTINGS)
     send(tracker.send, packets.pose_reports(0, 200))
     assert_poses(collect(driver, STREAM, 200), 0)
     assert driver.statistics.lost == 0
+    measured("pose tracker, uhid", "200 poses at 100 Hz", "200 right, 0 lost")
 
 
-def test_the_kernel_drops_the_newest_reports_and_the_sequence_tells(tracker, opened):
+def test_the_kernel_drops_the_newest_reports_and_the_sequence_tells(tracker, opened, measured):
     driver = opened(SETTINGS)
     for report in packets.pose_reports(0, 200):
         tracker.send(report)
@@ -51,26 +61,44 @@ def test_the_kernel_drops_the_newest_reports_and_the_sequence_tells(tracker, ope
     (sample,) = collect(driver, STREAM, 1)
     assert sample.sequence == 200
     assert driver.statistics.lost == 200 - RING
+    measured(
+        "pose tracker, uhid",
+        "200 reports unread",
+        f"{RING} kept, {driver.statistics.lost} counted lost, 0 wrong",
+    )
+
+
+@contextmanager
+def device_side(gadget):
+    """What sends reports as the gadget itself.
+
+    Closed before the gadget is pulled: Linux 6.1 makes the node anew in place while it is held, and
+    breaks down at the close (`list_del corruption` in `cd_forget`).
+    """
+    node = os.open(kernel_devices.device_node(gadget), os.O_RDWR)
+    try:
+        yield lambda report: os.write(node, report)
+    finally:
+        os.close(node)
+
+
+def pass_poses(gadget, send, driver, first, count):
+    """Poses from the gadget's side through the kernel and the driver; all must be right."""
+    with device_side(gadget) as write:
+        sender = send(write, packets.pose_reports(first, count))
+        assert_poses(collect(driver, STREAM, count), first)
+        sender.join(PATIENCE_S)
 
 
 @pytest.mark.parametrize("link", ["hid", "usb"])
-def test_a_tracker_on_usb_survives_being_replugged(plug, opened, send, capsys, link):
+def test_a_tracker_on_usb_survives_being_replugged(plug, opened, send, measured, link):
     gadget = plug(kernel_devices.hid_gadget, ids=IDS, serial_number=SERIAL)
     gadget.plug()
     driver = opened(SETTINGS.model_copy(update={"link": link}))
-    node = os.open(kernel_devices.device_node(gadget), os.O_RDWR)
-    try:
-        send(lambda report: os.write(node, report), packets.pose_reports(0, 100))
-        assert_poses(collect(driver, STREAM, 100), 0)
-        gadget.unplug()
-        flagged_s = seconds_until_refused(driver)
-        gadget.plug()
-        back_s = reopen(driver)
-        send(lambda report: os.write(node, report), packets.pose_reports(150, 50))
-        assert_poses(collect(driver, STREAM, 50), 150)
-    finally:
-        os.close(node)
-    with capsys.disabled():
-        print(f"\n{link}: unplug seen after {1e3 * flagged_s:.0f} ms, back after {back_s:.2f} s")  # noqa: T201
-    assert flagged_s <= 0.3
-    assert back_s <= 2.0
+    pass_poses(gadget, send, driver, 0, 100)
+    flagged_s = seconds_until_refused(driver, gadget.unplug)
+    back_s = seconds_until_back(driver, gadget.plug)
+    pass_poses(gadget, send, driver, 150, 50)
+    measured(f"pose tracker, USB gadget by {link}", *replug_row(flagged_s, back_s))
+    assert flagged_s <= MAX_FLAGGED_S
+    assert back_s <= MAX_BACK_S
