@@ -16,6 +16,7 @@ from services.acquisition.health_cells import CellJudge, cells_of
 from services.acquisition.health_clock import ClockJudge
 from services.acquisition.health_levels import Board, EventLog, Verdict, worst
 from services.acquisition.health_link import LinkJudge
+from services.acquisition.health_path import PathJudge
 from services.acquisition.health_report import device_health, stale_code, stream_health
 from services.acquisition.health_station import CalibrationJudge, DiskJudge
 from services.acquisition.health_taxels import TaxelJudge
@@ -26,6 +27,7 @@ from services.acquisition.health_tracking import (
     TrackingJudge,
 )
 from services.acquisition.live import LiveView
+from services.acquisition.path_latency import PathWatch
 from services.acquisition.schemas import (
     HealthEvent,
     HealthEvents,
@@ -89,6 +91,7 @@ class HealthMonitor:
         self._streams = [watched for s in self._supervisors for watched in watch(s, live)]
         self._board = Board()
         self._figures: dict[str, float] = {}
+        self._station_evaluated_ns = 0
         self._disk: DiskJudge | None = None
         self._calibration = CalibrationJudge(
             [watched.descriptor for watched in self._streams], live.calibration
@@ -105,6 +108,15 @@ class HealthMonitor:
     def watch_disk(self, spool_root: Path) -> None:
         """Judge from now on how long the disk of the takes lasts."""
         self._disk = DiskJudge(spool_root, self._supervisors)
+        # The first look begins the measurement of what arrives.
+        self._disk.judge(self._clock.now_ns())
+
+    def watch_paths(self, paths: PathWatch) -> None:
+        """Compare measured path delays with the calibration from now on."""
+        for watched in self._streams:
+            name = watched.descriptor.name
+            if paths.num_failures(name) is not None:
+                watched.judges.append(PathJudge(name, paths, self._live.calibration))
 
     def start(self) -> None:
         """Start evaluating."""
@@ -125,7 +137,7 @@ class HealthMonitor:
         with self._evaluating:
             for watched in self._streams:
                 self._evaluate(watched, now_ns, confirming=False)
-            self._evaluate_station(now_ns)
+            self._evaluate_station(now_ns, confirming=False)
 
     def tick(self) -> None:
         """What is due now: silences, confirmations, and each second a regular evaluation."""
@@ -141,6 +153,8 @@ class HealthMonitor:
                 waits = watched.board.is_rising or watched.is_suspicious
                 if waits and now_ns >= watched.evaluated_ns + CONFIRM_NS:
                     self._evaluate(watched, now_ns, confirming=True)
+            if self._board.is_rising and now_ns >= self._station_evaluated_ns + CONFIRM_NS:
+                self._evaluate_station(now_ns, confirming=True)
 
     def report(self) -> StationHealth:
         """Every stream and device at this moment."""
@@ -191,13 +205,14 @@ class HealthMonitor:
         for code, level in changes:
             self._log.add(now_ns, watched.descriptor.name, code, level)
 
-    def _evaluate_station(self, now_ns: int) -> None:
+    def _evaluate_station(self, now_ns: int, *, confirming: bool) -> None:
         verdicts = [self._calibration.judge(now_ns)]
         if self._disk is not None:
             verdicts.append(self._disk.judge(now_ns))
         findings = [finding for verdict in verdicts for finding in verdict.findings]
         with self._lock:
-            changes = self._board.update(findings, now_ns)
+            changes = self._board.update(findings, now_ns, confirming=confirming)
+            self._station_evaluated_ns = now_ns
             self._figures = {k: v for verdict in verdicts for k, v in verdict.figures.items()}
             self._figures["unjudged_samples"] = float(self.num_unjudged)
         for code, level in changes:

@@ -168,21 +168,26 @@ class CellJudge:
         if not history.is_enough:
             return Verdict()
         exists = np.isfinite(self._lowest)
-        loaded = history.last > self._lowest + LOADED_SHARE * self._full_scale
+        margin = LOADED_SHARE * self._full_scale
         if self._grid is None:
             exists &= self._highest > self._lowest
+            loaded = history.last > self._lowest + margin
             dead, stuck = np.zeros_like(exists), self._stuck(loaded)
         else:
+            # A cell that was out of order from the start tells nothing of its own rest.
+            rest = float(np.median(self._lowest[exists])) if exists.any() else 0.0
+            loaded = history.last > rest + margin
             history.find_silent(self._moved_around(exists, self._grid))
             dead, stuck = history.silent & ~loaded, history.silent & loaded
         saturated = history.saturated()
-        gone = exists & np.isnan(history.recent).all(axis=0)
+        # This maker's NaN says that there is no cell: none may come and go.
+        gone = exists & np.isnan(history.recent).any(axis=0)
         num_cells = max(1, int(exists.sum()))
         found: dict[Code, tuple[np.ndarray, str]] = {
             "taxels_dead": (dead & exists & ~gone, "dead"),
             "taxels_stuck": (stuck & exists & ~saturated, "stuck"),
             "taxels_saturated": (saturated & exists, "saturated"),
-            "nan": (gone, "gone"),
+            "nan": (gone, "without a number"),
         }
         findings: tuple[HealthFinding, ...] = ()
         figures: dict[str, float] = {}

@@ -73,7 +73,8 @@ class LinkJudge:
             counts.popleft()
         findings, figures = self._judge_counts(counts[0], counts[-1])
         arrivals = self._judge_arrivals(block, now_ns)
-        return Verdict(findings + arrivals.findings, {**figures, **arrivals.figures})
+        findings += self._judge_stamps(block) + arrivals.findings
+        return Verdict(findings, {**figures, **arrivals.figures})
 
     def _count(self, now_ns: int) -> _Counts:
         statistics, counters = self._supervisor.driver.statistics, self._supervisor.counters
@@ -166,6 +167,14 @@ class LinkJudge:
         else:
             return _events("reconnect", reconnects, "reconnects")
         return (HealthFinding(code=code, level="ERROR", message=reason),)
+
+    def _judge_stamps(self, block: Block) -> tuple[HealthFinding, ...]:
+        """Whether a device that tells its time goes on telling it."""
+        missing = int(np.count_nonzero(block.t_device_ns < 0))
+        if not self._descriptor.capabilities.device_time or not missing:
+            return ()
+        text = f"{missing} of {len(block)} samples come without the device's time"
+        return (HealthFinding(code="clock_stamps", level="ERROR", message=text),)
 
     def _judge_arrivals(self, block: Block, now_ns: int) -> Verdict:
         name, rate_hz = self._descriptor.name, self._descriptor.nominal_rate_hz

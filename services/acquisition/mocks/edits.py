@@ -42,8 +42,8 @@ from services.acquisition.drivers.tactile_glove import MAGIC as GLOVE_MAGIC
 OUR_MAGIC = b"DX"
 # What pinned cells show: counts of our glove, shares of full scale, counts of a justfloat glove.
 PINNED = {
-    "stuck": {GLOVE_MAGIC: 1_000, MARK: 0.25, TAIL: 1_000.0},
-    "saturated": {GLOVE_MAGIC: 65_535, MARK: 1.0, TAIL: 4_095.0},
+    "stuck": {GLOVE_MAGIC: 1_000.0, MARK: 0.25, TAIL: 1_000.0},
+    "saturated": {GLOVE_MAGIC: 65_535.0, MARK: 1.0, TAIL: 4_095.0},
 }
 # Where the numbers of a payload begin, and what they are.
 FLOATS = {
