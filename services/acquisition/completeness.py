@@ -98,6 +98,7 @@ def take_ledger(facts: Sequence[StreamFacts]) -> tuple[LedgerEntry, ...]:
             "length_errors": fact.decoder.length_errors,
             "resync_bytes": fact.decoder.resync_bytes,
             "refused": fact.decoder.refused,
+            "suspects": fact.decoder.suspects,
             "repeated": fact.decoder.repeated,
             "restarts": fact.decoder.restarts,
             **_taxel_events(fact),

@@ -41,19 +41,19 @@ class Station:
     ) -> None:
         self.name = name
         self.clock = clock
+        self.live = LiveView(drivers, calibration)
+        self.supervisors = [
+            DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
+        ]
+        self.health = HealthMonitor(self.supervisors, live=self.live, clock=clock, station=name)
         self.recorder = Recorder(
             station=name,
             spool_root=spool_root,
             drivers=drivers,
             clock=clock,
             calibration=calibration,
-            options=TakeOptions(safety or SpoolSafety(), self._device_events),
+            options=TakeOptions(safety or SpoolSafety(), self._device_events, self.health),
         )
-        self.live = LiveView(drivers, calibration)
-        self.supervisors = [
-            DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
-        ]
-        self.health = HealthMonitor(self.supervisors, live=self.live, clock=clock, station=name)
 
     def start(self) -> None:
         """Start all readers and the health evaluation."""

@@ -19,6 +19,7 @@ from dextouch.streams.samples import Sample
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.counters import DeviceCounters
 from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.drivers.pose_tracker import TrackingEvents
 from services.acquisition.drivers.reports import OrderFilter
 
@@ -32,8 +33,23 @@ EVENTS = (
     "wrong_version",
     "wrong_side",
     "wrong_serial_number",
+    "wrong_hello",
+    "wrong_nodes",
+    "ambiguous_device",
+    "absent_device",
+    "silent_bridge",
     "driver_failure",
 )
+# What a driver noticed in its own samples and counts one by one: images by the codes that the
+# health has for them, poses and nodes that a tracker did not see.
+IMAGE_EVENTS = {
+    "image_frozen": "num_frozen",
+    "image_blurred": "num_blurred",
+    "image_clipped": "num_clipped",
+    "image_gap": "num_gaps",
+    "queue": "num_dropped",
+}
+JUDGED_EVENTS = (*IMAGE_EVENTS, "occluded", "jumped", "stale", "unseen_nodes")
 Sink = Callable[[str, Readings], None]
 # Packets that overtake each other do so within a few; a restarted device jumps further.
 WINDOW_SAMPLES = 64
@@ -81,15 +97,11 @@ class DeviceSupervisor:
             *self._guards.values(),
             *_order_filters(self.driver),
         ]
-        tracking = getattr(self.driver.decoder, "tracking", None)
-        tracked: dict[str, int] = {}
-        if isinstance(tracking, TrackingEvents):
-            tracked = {str(kind): count for kind, count in tracking.packets.items()}
         return {
             **self._events,
             "repeated": sum(each.repeated for each in filters),
             "late": sum(each.late for each in filters),
-            **tracked,
+            **_judged_events(self.driver),
         }
 
     def _run(self) -> None:
@@ -164,9 +176,25 @@ class DeviceSupervisor:
 
 def _order_filters(driver: Driver) -> list[OrderFilter]:
     """Where a tracker's decoder leaves repeated and late packets out by itself."""
-    places = (driver.decoder, getattr(driver.decoder, "poses", None))
+    inner = (getattr(driver.decoder, name, None) for name in ("poses", "connection"))
+    places = (driver.decoder, *inner)
     found = [getattr(place, "order", None) for place in places]
     return [each for each in found if isinstance(each, OrderFilter)]
+
+
+def _judged_events(driver: Driver) -> dict[str, int]:
+    """What a driver noticed in its own samples, where it looks at them."""
+    found: dict[str, int] = {}
+    tracking = getattr(driver.decoder, "tracking", None)
+    if isinstance(tracking, TrackingEvents):
+        found.update({str(kind): count for kind, count in tracking.packets.items()})
+    unseen_nodes = getattr(driver.decoder, "unseen_nodes", None)
+    if isinstance(unseen_nodes, int):
+        found["unseen_nodes"] = unseen_nodes
+    quality = getattr(driver, "quality", None)
+    if isinstance(quality, ImageQuality):
+        found.update({code: getattr(quality, name) for code, name in IMAGE_EVENTS.items()})
+    return found
 
 
 class SequenceGuard:
@@ -187,6 +215,7 @@ class SequenceGuard:
         self.late = 0
         self._judges = capabilities.sequence and capabilities.device_time
         self._modulus = 1 << capabilities.sequence_bits
+        self._period_ns = descriptor.period_ns()
         # Sequence and device time of the newest samples that passed.
         self._passed: deque[tuple[int, int]] = deque(maxlen=WINDOW_SAMPLES)
 
@@ -200,18 +229,19 @@ class SequenceGuard:
         if self._passed:
             last_sequence, last_t_device_ns = self._passed[-1]
             back = (last_sequence - sample.sequence) % self._modulus
-            if back < WINDOW_SAMPLES and self._is_old(sample, last_t_device_ns):
+            if back < WINDOW_SAMPLES and self._is_old(sample, back, last_t_device_ns):
                 return False
         self._passed.append((sample.sequence, sample.t_device_ns))
         return True
 
-    def _is_old(self, sample: Sample, last_t_device_ns: int) -> bool:
+    def _is_old(self, sample: Sample, back: int, last_t_device_ns: int) -> bool:
         """Whether a sample with a small step back is one of the same run of the device."""
         if (sample.sequence, sample.t_device_ns) in self._passed:
             self.repeated += 1
             return True
-        first_t_device_ns = self._passed[0][1]
-        if first_t_device_ns < sample.t_device_ns < last_t_device_ns:
+        # The very first packet may be late, too; a restarted device's clock falls further back.
+        oldest_ns = min(self._passed[0][1], last_t_device_ns - 2 * back * self._period_ns)
+        if oldest_ns < sample.t_device_ns < last_t_device_ns:
             self.late += 1
             return True
         return False

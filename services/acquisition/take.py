@@ -23,7 +23,8 @@ from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import take_gates
 from services.acquisition.drivers.packets import DecoderStatistics
 from services.acquisition.schemas import TakeCheck
-from services.acquisition.supervisor import SpoolFlusher, SpoolSafety
+from services.acquisition.supervisor import JUDGED_EVENTS, SpoolFlusher, SpoolSafety
+from services.acquisition.take_findings import HealthSource, TakeFindings
 
 logger = structlog.get_logger(__name__)
 
@@ -38,11 +39,13 @@ def _no_events() -> DeviceEvents:
 class TakeOptions:
     """How takes are kept, and who counts what happens to devices besides their decoders.
 
-    `device_events` gives, by device, counts of named events since the station's start.
+    `device_events` gives, by device, counts of named events since the station's start; `health`
+    is what the station finds in its streams meanwhile.
     """
 
     safety: SpoolSafety = field(default_factory=SpoolSafety)
     device_events: Callable[[], DeviceEvents] = _no_events
+    health: HealthSource | None = None
 
 
 class Take:
@@ -78,13 +81,14 @@ class Take:
         self._events_before = options.device_events()
         self._events: dict[str, dict[str, int]] = {}
         self._watch = HostWatch(clock)
+        self._findings = TakeFindings(options.health, self._started_ns)
         self._lock = threading.Lock()
         self._gates = take_gates(spool.attributes.streams)
         self.flusher = SpoolFlusher(
             spool.path,
             safety=options.safety,
             clock=clock,
-            on_tick=self._watch.look,
+            on_tick=self._look_around,
             on_failure=self._fail,
         )
 
@@ -130,7 +134,9 @@ class Take:
                 self.spool.flush()
             except StorageError as error:
                 self.failure = error.message
-        return check_take(self.facts, span)
+        check = check_take(self.facts, span)
+        found = self._findings.problems(self.streams, check.problems)
+        return check.model_copy(update={"problems": (*check.problems, *found)})
 
     def release(self) -> None:
         """Give threads and files back; what was spooled stays as it is."""
@@ -163,11 +169,26 @@ class Take:
                 for event, e in self._watch.events.items()
                 if e.count
             ]
-        return tuple(entries)
+        known = {(entry.stream, entry.event) for entry in entries}
+        # Where the devices count the same event themselves, their count is the exact one.
+        found = self._findings.entries(self.streams)
+        return (*entries, *(e for e in found if (e.stream, e.event) not in known))
 
     def quality(self) -> dict[str, float]:
         """Figures of the ended take by stream."""
-        return take_quality(self.facts, self.span) if self.span else {}
+        if self.span is None:
+            return {}
+        judged = {
+            f"{fact.descriptor.name}_num_{event}": float(count)
+            for fact in self.facts
+            for event, count in self._events.get(fact.descriptor.device or "", {}).items()
+            if event in JUDGED_EVENTS
+        }
+        return {**self._findings.quality(), **judged, **take_quality(self.facts, self.span)}
+
+    def _look_around(self) -> None:
+        self._watch.look()
+        self._findings.look()
 
     def _fail(self, error: StorageError) -> None:
         with self._lock:
@@ -180,6 +201,7 @@ class Take:
         if error is not None:
             self.failure = error.message
             logger.error("stop_take_by_disk", error=error.message)
+        self._findings.end()
         self._events = _grown(self._options.device_events(), self._events_before)
         self.facts = [
             StreamFacts(

@@ -126,7 +126,8 @@ class MockStation:
 
         Raises:
             ConflictError: the recorder is busy.
-            DeviceError: a mock could not play (its reader is stuck).
+            DeviceError: a mock could not play (its reader is stuck, or its faults are none that
+                such a device can have).
         """
         recorder = self.station.recorder
         recorder.arm(prompt)
@@ -194,7 +195,7 @@ class MockStation:
                     ):
                         return
                     lap += 1
-            except DeviceError as error:
+            except (DeviceError, InvalidInputError) as error:
                 self._failures.append(f"{pair.device.name}: {error.message}")
 
     def _drain(self) -> None:
