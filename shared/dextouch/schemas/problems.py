@@ -119,9 +119,13 @@ def error_from_problem(problem: Problem) -> DexTouchError:
 
 
 def first_problems(error: ValidationError, *, limit: int = 5) -> str:
-    """What pydantic found, in one line, without the input itself."""
+    """What pydantic found, in one line, without the input itself.
+
+    Pydantic puts "Value error, " before what our own validators say.
+    """
     items = error.errors(include_input=False, include_url=False)[:limit]
     return "; ".join(
-        f"{'.'.join(str(part) for part in item['loc']) or 'fields'}: {item['msg']}"
+        f"{'.'.join(str(part) for part in item['loc']) or 'fields'}: "
+        f"{item['msg'].removeprefix('Value error, ')}"
         for item in items
     )
