@@ -29,6 +29,7 @@ ADVICE: Final[Mapping[Code, str]] = {
     "clock_residual": "Use a direct link: the delay of its packets varies too much.",
     "clock_step": "Record the take again; leave the device on between takes.",
     "clock_stamps": "Restart the device: its packets come without their time.",
+    "latency_calibration": "Calibrate the path delay again; cable, hub or firmware changed.",
     "taxels_dead": "Look for a broken line or connector; exchange the glove if it stays.",
     "taxels_stuck": "Take off what presses there and bend the glove; exchange it if it stays.",
     "taxels_saturated": "Let go of what presses there; if it stays, the cells are shorted.",

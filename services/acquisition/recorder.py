@@ -2,13 +2,14 @@
 
 import shutil
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from secrets import token_hex
 
 import structlog
 
+from dextouch.clocks import PathLatency
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.log import SpoolWriter
 from dextouch.errors import ConflictError
@@ -18,6 +19,7 @@ from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import begin_take
+from services.acquisition.path_latency import add_latencies
 from services.acquisition.schemas import (
     Action,
     RecorderStatus,
@@ -73,6 +75,9 @@ class Recorder:
         self._clock = clock
         self._calibration = dict(calibration)
         self._options = options or TakeOptions()
+        self._latencies: Callable[[], Mapping[str, PathLatency]] = dict
+        # Names that the station's calibration gave to the present take.
+        self._stated: frozenset[str] = frozenset()
         # Held for a whole action, disk included; readers never take it.
         self._lock = threading.RLock()
         self._state: State = "idle"
@@ -84,6 +89,10 @@ class Recorder:
         self._take: Take | None = None
         self._check: TakeCheck | None = None
         self._done: dict[Action, SaveTake | None] = {}
+
+    def measure_latencies(self, latencies: Callable[[], Mapping[str, PathLatency]]) -> None:
+        """Give takes measured path delays of streams whose delay the calibration does not name."""
+        self._latencies = latencies
 
     def status(self) -> RecorderStatus:
         """Where it stands."""
@@ -175,12 +184,16 @@ class Recorder:
             if not check.complete and not how.accept_incomplete:
                 reasons = "; ".join(p.message for p in check.problems if p.level == "ERROR")
                 raise ConflictError(f"the take is incomplete: {reasons}. Accept or discard it")
+            spool = take.spool
+            calibration = add_latencies(
+                spool.attributes.calibration, self._latencies(), stated=self._stated
+            )
             changed = {
+                "calibration": calibration,
                 "success": how.success,
                 "ledger": take.ledger(),
                 "quality": take.quality(),
             }
-            spool = take.spool
             spool.set_attributes(spool.attributes.model_copy(update=changed))
             spool.close()
             self._state = "saved"
@@ -246,6 +259,8 @@ class Recorder:
         if prompt is None:
             raise ConflictError("record: nothing was armed; arm first")
         now = datetime.now(UTC)
+        stated = self._calibration | begin_take(self._drivers.values())
+        self._stated = frozenset(stated)
         streams: list[StreamDescriptor] = []
         for driver in self._drivers.values():
             streams.extend(driver.descriptors)
@@ -254,7 +269,7 @@ class Recorder:
             station=self._station,
             started_at=now,
             started_t_host_ns=self._clock.now_ns(),
-            calibration=self._calibration | begin_take(self._drivers.values()),
+            calibration=add_latencies(stated, self._latencies(), stated=self._stated),
             streams=tuple(streams),
             **prompt.model_dump(),
         )

@@ -33,6 +33,7 @@ Code = Literal[
     "clock_residual",
     "clock_step",
     "clock_stamps",
+    "latency_calibration",
     "taxels_dead",
     "taxels_stuck",
     "taxels_saturated",
