@@ -10,6 +10,7 @@ from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.health import HealthMonitor
 from services.acquisition.live import LiveView
+from services.acquisition.path_latency import PathWatch
 from services.acquisition.recorder import Recorder
 from services.acquisition.supervisor import DeviceSupervisor, SpoolSafety
 from services.acquisition.take import DeviceEvents, TakeOptions
@@ -45,7 +46,9 @@ class Station:
         self.supervisors = [
             DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
         ]
+        self.paths = PathWatch(self.supervisors, clock=clock)
         self.health = HealthMonitor(self.supervisors, live=self.live, clock=clock, station=name)
+        self.health.watch_paths(self.paths)
         self.recorder = Recorder(
             station=name,
             spool_root=spool_root,
@@ -54,12 +57,14 @@ class Station:
             calibration=calibration,
             options=TakeOptions(safety or SpoolSafety(), self._device_events, self.health),
         )
+        self.recorder.measure_latencies(self.paths.latencies)
 
     def start(self) -> None:
         """Start all readers and the health evaluation."""
         for supervisor in self.supervisors:
             supervisor.start()
         self.health.start()
+        self.paths.start()
 
     def wait_connected(self, timeout_s: float = CONNECT_TIMEOUT_S) -> None:
         """Block until every device answers.
@@ -73,6 +78,8 @@ class Station:
 
     def stop(self) -> None:
         """Stop everything; an unsaved take stays in the spool."""
+        # First, while the readers still bring the answer that it may wait for.
+        self.paths.stop()
         self.health.stop()
         stoppers = [threading.Thread(target=supervisor.stop) for supervisor in self.supervisors]
         for stopper in stoppers:
@@ -87,3 +94,4 @@ class Station:
     def _accept(self, device: str, readings: Readings) -> None:
         self.recorder.accept(device, readings)
         self.live.accept(device, readings)
+        self.paths.accept(readings)
