@@ -43,7 +43,10 @@ class LiveView:
                 calibration_row(calibration, f"{name}_gain_counts_per_kpa"),
             )
             for name, d in self._descriptors.items()
-            if d.kind == "tactile" and d.unit == "counts"
+            # Without a calibration the station starts all the same: it records the takes for one.
+            if d.kind == "tactile"
+            and d.unit == "counts"
+            and {f"{name}_tare_counts", f"{name}_gain_counts_per_kpa"} <= calibration.keys()
         }
 
     def accept(self, device: str, readings: Readings) -> None:

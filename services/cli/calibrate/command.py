@@ -19,9 +19,9 @@ Measure what a station must know of its devices. Everything goes into one folder
   pictures/                  coverage and residuals, to look at
 
 A whole calibration:
-  1. glove     lay the glove down, record 10 s; put it under known pressures, record each for 5 s
-               dextouch station calibrate glove --side left --rest spool/rest \\
-                 --presses presses.csv --to calibration
+  1. glove     at a running station, which records rest and known pressures as you are told
+               dextouch station calibrate glove --side left --url http://127.0.0.1:8083 \\
+                 --spool spool --to calibration
   2. camera    25 photos of a printed board, everywhere in the image, near and far, tilted
                dextouch station calibrate camera --camera head --photos photos/head \\
                  --board charuco:5x7:30mm:22mm --to calibration
@@ -50,15 +50,18 @@ degrees and more about at least two of its axes, better three. The camera must b
 photos are needed. When poses are refused as inverted, --invert turns that side round."""
 
 _GLOVE = """\
-Takes are folders of the station's spool (or ids of recordings, with --store): this command works
-on takes only, since a station shows pressures live, not counts.
+  --url URL                  a running station records all takes: this command says what to do
+                             (rest, then each pressure), checks every take and asks again where one
+                             is not good. The takes are read from the station's --spool; on another
+                             machine give --store URL, and they are read once they are uploaded
+  --rest TAKE --presses CSV  takes that are there: folders of a spool, or ids with --store URL
 
 The list of presses is a CSV: take and pressure_kpa, or mass_kg and area_cm2 of a weight; and if
 wanted sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds from the take's start).
   take,pressure_kpa,sigma_kpa,pads
   spool/bladder-10,10,0.1,all
   spool/bladder-30,30,0.3,all
-Without --presses only the tare is measured, which may be done every day; the gain stays."""
+Without presses only the tare is measured, which may be done every day; the gain stays."""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -122,7 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     words = parser.add_subparsers(dest="word", required=True, metavar="WORD")
     _add_camera(_word(words, "camera", "photos of a board → K and distortion of a camera", _CAMERA))
     _add_hand_eye(_word(words, "hand-eye", "photos and poses → camera on its tracker", _HAND_EYE))
-    _add_glove(_word(words, "glove", "rest and pressed takes → tare, gain, faults", _GLOVE))
+    _add_glove(_word(words, "glove", "rest and known pressures → tare, gain, faults", _GLOVE))
     shown = _word(words, "show", "what a calibration holds, how old and how good it is", "")
     shown.add_argument("folder", type=Path, help="calibration folder or file, or a spooled take")
     return parser
@@ -178,7 +181,16 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
 def _add_glove(parser: argparse.ArgumentParser) -> None:
     _add_common(parser)
     parser.add_argument("--side", required=True, choices=("left", "right"))
-    parser.add_argument("--rest", required=True, metavar="TAKE", help="10 s without contact")
+    parser.add_argument("--url", metavar="URL", help="this running station records the takes now")
+    parser.add_argument("--key", metavar="KEY", help="API key of the station")
+    parser.add_argument(
+        "--spool",
+        type=Path,
+        default=Path("spool"),
+        metavar="FOLDER",
+        help="the station's takes, with --url (%(default)s)",
+    )
+    parser.add_argument("--rest", metavar="TAKE", help="10 s without contact")
     parser.add_argument("--presses", type=Path, metavar="CSV", help="list of takes under pressure")
     parser.add_argument("--store", metavar="URL", help="where recordings named by id are")
     parser.add_argument(

@@ -1,43 +1,24 @@
 """`dextouch station calibrate glove`: a rest take and presses in; tare, gain and faults out."""
 
 import argparse
-import csv
-from dataclasses import dataclass
+from collections.abc import Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes import EpisodeStore, RecordingReader
-from dextouch.episodes.log import SpoolReader
-from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.streams.samples import SampleBatch
+from dextouch.errors import InvalidInputError
 from services.alignment.calibration.tactile_faults import OK, STATES
-from services.alignment.calibration.tactile_gain import TaxelPress
 from services.alignment.calibration.tactile_glove_calibration import (
     GloveCalibration,
     calibrate_glove,
-    pad_taxels,
 )
 from services.alignment.calibration.tactile_tare import measure_tare
+from services.cli.calibrate import guided
+from services.cli.calibrate.glove_takes import PressRow, press_of, read_presses, read_take
 from services.cli.calibrate.photos import progress
 from services.cli.calibrate.pictures import glove_picture
 from services.cli.calibrate.record import write_entry, write_picture
-
-STANDARD_GRAVITY_M_S2 = 9.80665
-COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads", "mass_kg", "area_cm2", "start_s", "stop_s")
-
-
-@dataclass(frozen=True)
-class PressRow:
-    """One line of the list of presses; `stop_s` None means to the end of the take."""
-
-    take: str
-    pressure_kpa: float
-    sigma_kpa: float
-    pads: str
-    start_s: float
-    stop_s: float | None
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
@@ -48,116 +29,39 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         NotFoundError: no such take, or it has no readings of this glove.
     """
     side = options.side
-    rows = read_presses(options.presses, options.pressure_sigma) if options.presses else []
-    tare = measure_tare(read_take(options.rest, options).values, side=side)
-    presses = [_press(row, options) for row in progress(rows, "reading presses")]
+    rest, rows = _takes(options)
+    tare = measure_tare(read_take(rest, options).values, side=side)
+    presses = [press_of(row, options) for row in progress(list(rows), "reading presses")]
     found = calibrate_glove(tare, presses, full_scale_counts=options.full_scale)
     picture = write_picture(options.to, f"glove_{side}.svg", glove_picture(found))
-    report = _facts(found, options, rows)
+    report = _facts(found, rest, rows)
     _keep(found, options.to, report)
     _tell(report, picture)
     return report
 
 
-def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
-    """Lines of a CSV: `take` and either `pressure_kpa` or `mass_kg` with `area_cm2`.
-
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: columns or numbers that do not fit.
-    """
-    if not path.is_file():
-        raise NotFoundError(f"{path}: no such list of presses")
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        names = set(reader.fieldnames or ())
-        if "take" not in names or names - set(COLUMNS):
+def _takes(options: argparse.Namespace) -> tuple[str, Sequence[PressRow]]:
+    """The rest take and the presses: those that are named, or recorded now by a station."""
+    if options.url is not None:
+        if options.rest is not None or options.presses is not None:
             raise InvalidInputError(
-                f"{path}: got columns {sorted(names)}, expected take and some of "
-                f"{', '.join(COLUMNS[1:])}"
+                "got --url and --rest or --presses, expected one of the two: a station records its "
+                "takes now, or takes are named that are there"
             )
-        rows = []
-        for row in reader:
-            where = f"{path}: line {reader.line_num}"
-            try:
-                rows.append(_press_row(row, relative_sigma, path.parent))
-            except (TypeError, ValueError) as error:
-                raise InvalidInputError(f"{where}: {error}") from error
-    if not rows:
-        raise InvalidInputError(f"{path}: holds no press")
-    return rows
-
-
-def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
-    """Readings of one glove from a spool folder, or from a recording of the store.
-
-    Raises:
-        NotFoundError: no such take, or without this glove.
-        InvalidInputError: the stream holds pressures, not counts.
-    """
-    name = f"tactile_{options.side}"
-    reader: SpoolReader | RecordingReader
-    if Path(take).is_dir():
-        reader = SpoolReader(Path(take))
-    elif options.store:
-        reader = EpisodeStore(options.store).recording(take)
-    else:
-        raise NotFoundError(
-            f"take {take!r}: no such folder; name a take of the station's spool, or add --store "
-            "URL for the id of a recording"
-        )
-    streams = reader.streams
-    if name not in streams:
-        raise NotFoundError(f"take {take!r}: has no {name!r}, only {', '.join(sorted(streams))}")
-    if streams[name].unit != "counts":
+        return guided.walk(options, guided.station_takes(options))
+    if options.rest is None:
         raise InvalidInputError(
-            f"take {take!r}: {name} is in {streams[name].unit}, expected raw counts"
+            "expected --url of a running station, which records what is needed, or --rest TAKE"
         )
-    return reader.read(name)
+    rows = read_presses(options.presses, options.pressure_sigma) if options.presses else []
+    return options.rest, rows
 
 
-def _press_row(row: dict[str, str], relative_sigma: float, folder: Path) -> PressRow:
-    take = row["take"]
-    if (folder / take).is_dir():
-        take = str(folder / take)
-    if row.get("pressure_kpa") and (row.get("mass_kg") or row.get("area_cm2")):
-        raise ValueError("got pressure_kpa and a weight, expected one of the two")
-    if row.get("pressure_kpa"):
-        pressure_kpa = float(row["pressure_kpa"])
-    elif row.get("mass_kg") and row.get("area_cm2"):
-        force_n = float(row["mass_kg"]) * STANDARD_GRAVITY_M_S2
-        pressure_kpa = force_n / (float(row["area_cm2"]) * 1e-4) / 1e3
-    else:
-        raise ValueError("expected pressure_kpa, or mass_kg and area_cm2")
-    given = row.get("sigma_kpa")
-    sigma_kpa = float(given) if given else relative_sigma * pressure_kpa
-    stop = row.get("stop_s")
-    return PressRow(
-        take,
-        pressure_kpa,
-        sigma_kpa,
-        row.get("pads") or "all",
-        float(row.get("start_s") or 0.0),
-        float(stop) if stop else None,
-    )
-
-
-def _press(row: PressRow, options: argparse.Namespace) -> TaxelPress:
-    batch = read_take(row.take, options)
-    t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
-    wanted = t_s >= row.start_s
-    if row.stop_s is not None:
-        wanted &= t_s < row.stop_s
-    return TaxelPress(row.pressure_kpa, row.sigma_kpa, batch.values[wanted], pad_taxels(row.pads))
-
-
-def _facts(
-    found: GloveCalibration, options: argparse.Namespace, rows: list[PressRow]
-) -> dict[str, object]:
+def _facts(found: GloveCalibration, rest: str, rows: Sequence[PressRow]) -> dict[str, object]:
     level = found.tare.level
     facts: dict[str, object] = {
-        "side": options.side,
-        "rest_take": str(options.rest),
+        "side": found.tare.side,
+        "rest_take": rest,
         "num_rest_readings": found.tare.num_samples,
         "tare_median_counts": float(np.median(level.mean_counts)),
         "tare_sigma_median_counts": float(np.median(level.sigma_counts)),

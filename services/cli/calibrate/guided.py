@@ -1,0 +1,245 @@
+"""A running station and an operator at its glove in; a rest take and presses, recorded now, out."""
+
+import argparse
+import json
+import re
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Protocol, runtime_checkable
+
+from dextouch.clients.http_link import HttpLink, Reply
+from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
+from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
+from services.alignment.calibration.tactile_glove_calibration import calibrate_glove, pad_taxels
+from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
+from services.cli.calibrate.glove_takes import (
+    PressRow,
+    press_of,
+    press_row,
+    read_take,
+    write_presses,
+)
+from services.cli.calibrate.photos import progress
+
+REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
+# How long an upload may take before the take is given up.
+UPLOAD_S = 120.0
+TASK = "calibrate-glove"
+PRESS_HELP = "30, or 30 palm, or 30 thumb+index (kPa), or 2kg/90cm2 palm (a weight)"
+NEXT = "Next pressure (Enter alone: no more; drop: forget the last): "
+_PRESS = re.compile(
+    r"(?:(?P<kpa>[0-9.]+)(?: ?kpa)?|(?P<kg>[0-9.]+) ?kg ?/ ?(?P<cm2>[0-9.]+) ?cm2)"
+    r"(?: +(?P<pads>[a-z+]+))?"
+)
+
+Ask = Callable[[str], str]
+Wait = Callable[[float], None]
+
+
+@runtime_checkable
+class Link(Protocol):
+    """What is needed of `HttpLink`."""
+
+    def request(self, method: str, path: str, *, body: bytes | None = None) -> Reply:
+        """Ask the station."""
+        ...
+
+
+class StationTakes:
+    """Records takes through a running station's recorder and finds them again.
+
+    Args:
+        link: to the station.
+        spool: the station's folder of takes, where this machine has it.
+        has_store: whether takes may come from the store that the station uploads to.
+        wait: passes time.
+    """
+
+    def __init__(
+        self, link: Link, *, spool: Path, has_store: bool, wait: Wait = time.sleep
+    ) -> None:
+        self._link, self._spool, self._has_store, self._wait = link, spool, has_store, wait
+
+    def record(self, name: str, words: str, seconds: float) -> str:
+        """One take; interrupted ones are thrown away.
+
+        Returns:
+            Its folder in the spool, or its id where only the store has it.
+
+        Raises:
+            ConflictError: the recorder is busy with another take; save or discard that.
+            UnavailableError: the station does not answer.
+            NotFoundError: neither spool nor store has the take.
+        """
+        self._act("arm", {"task": TASK, "instruction": words})
+        self._act("record", {"recording_id": name})
+        is_whole = False
+        try:
+            for _ in progress(list(range(round(seconds / TICK_S))), words):
+                self._wait(TICK_S)
+            self._act("stop", {"recording_id": name})
+            is_whole = True
+        finally:
+            if not is_whole:
+                self._act("discard", {"recording_id": name})
+        # Other devices may be absent; whether the glove was there, its readings tell.
+        self._act("save", {"recording_id": name, "accept_incomplete": True})
+        return self._find(name)
+
+    def _act(self, action: str, body: dict[str, object]) -> None:
+        self._link.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
+
+    def _find(self, name: str) -> str:
+        folder = self._spool / name
+        if folder.is_dir():
+            return str(folder.resolve())
+        if not self._has_store:
+            raise NotFoundError(
+                f"take {name!r}: not in {self._spool.resolve()}; name the station's spool with "
+                "--spool, or on another machine its store with --store URL"
+            )
+        for _ in progress(list(range(round(UPLOAD_S))), "waiting for the upload"):
+            uploads = json.loads(self._link.request("GET", "/v1/uploads").body)
+            if any(take["recording_id"] == name and take["uploaded"] for take in uploads):
+                return name
+            self._wait(1.0)
+        raise NotFoundError(
+            f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
+            "uploads, then calibrate with --rest and --presses"
+        )
+
+
+def station_takes(options: argparse.Namespace) -> StationTakes:
+    """Of the station that the options name."""
+    link = HttpLink(options.url, api_key=options.key)
+    return StationTakes(link, spool=options.spool, has_store=options.store is not None)
+
+
+def walk(
+    options: argparse.Namespace, takes: StationTakes, *, ask: Ask = input
+) -> tuple[str, Sequence[PressRow]]:
+    """Lead an operator through rest and presses; the rest take and the presses that are good.
+
+    A take that is not good is explained and asked for again. The list of presses is kept in the
+    folder, so that the same takes can be calibrated again.
+
+    Raises:
+        InvalidInputError: nobody answers.
+    """
+    guide = _Guide(options, takes, ask)
+    rest, tare = guide.rest()
+    rows = guide.presses(tare)
+    again = f"dextouch station calibrate glove --side {options.side} --rest {rest}"
+    if rows:
+        path = options.to / f"presses_{options.side}.csv"
+        write_presses(path, rows)
+        again += f" --presses {path}"
+    print(f"The same takes again: {again} --to {options.to}")
+    return rest, rows
+
+
+class _Guide:
+    """What is asked of the operator, and of the station, one after the other."""
+
+    def __init__(self, options: argparse.Namespace, takes: StationTakes, ask: Ask) -> None:
+        self._options, self._takes, self._ask = options, takes, ask
+        self._started = f"calibration-glove-{options.side}-{datetime.now(UTC):%Y%m%d-%H%M%S}"
+        self._num_takes = 0
+
+    def rest(self) -> tuple[str, TaxelTare]:
+        """A rest take whose tare is good."""
+        side = self._options.side
+        while True:
+            self._answer(
+                f"Lay the {side} glove down, untouched, and let it rest for a minute. "
+                f"Enter records {REST_S:g} s: "
+            )
+            take = self._record(f"{side} glove at rest, untouched", REST_S)
+            try:
+                return take, measure_tare(read_take(take, self._options).values, side=side)
+            except InvalidInputError as error:
+                print(f"Once more: {error.message}")
+
+    def presses(self, tare: TaxelTare) -> list[PressRow]:
+        """Presses until the operator has no more."""
+        print(f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}.")
+        rows: list[PressRow] = []
+        known: list[TaxelPress] = []
+        while words := self._answer(NEXT).strip():
+            if words == "drop":
+                rows, known = rows[:-1], known[:-1]
+                print(f"{len(rows)} presses are left")
+                continue
+            try:
+                wanted = parse_press(words, self._options.pressure_sigma)
+            except (InvalidInputError, UnknownNameError) as error:
+                print(error.message)
+                continue
+            told = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+            self._answer(f"Put {told}. Enter records {PRESS_S:g} s, once it holds still: ")
+            row = replace(wanted, take=self._record(f"{told}, held still", PRESS_S))
+            try:
+                press = press_of(row, self._options)
+                fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+            except InvalidInputError as error:
+                print(f"Not used: {error.message}")
+                continue
+            rows.append(row)
+            known.append(press)
+            print(self._known_so_far(tare, known))
+        return rows
+
+    def _known_so_far(self, tare: TaxelTare, presses: list[TaxelPress]) -> str:
+        try:
+            found = calibrate_glove(
+                tare, presses, full_scale_counts=self._options.full_scale
+            ).num_by_state()
+        except InvalidInputError as error:
+            return f"{len(presses)} presses, not enough yet: {error.message}"
+        others = ", ".join(f"{n} {state}" for state, n in found.items() if state != "ok")
+        return (
+            f"{len(presses)} presses: {found['ok']} of 320 taxels known"
+            f"{f' ({others})' if others else ''}; more pressures show bends"
+        )
+
+    def _record(self, words: str, seconds: float) -> str:
+        self._num_takes += 1
+        return self._takes.record(f"{self._started}-{self._num_takes}", words, seconds)
+
+    def _answer(self, question: str) -> str:
+        try:
+            return self._ask(question)
+        except EOFError as error:
+            raise InvalidInputError(
+                "calibrate glove --url: nobody answers; run it at a terminal, or name takes with "
+                "--rest and --presses"
+            ) from error
+
+
+def parse_press(words: str, relative_sigma: float) -> PressRow:
+    """A known pressure as an operator types it (`PRESS_HELP`); its take is still to come.
+
+    Raises:
+        InvalidInputError: no pressure above 0.
+        UnknownNameError: no such pad.
+    """
+    matched = _PRESS.fullmatch(words.strip().lower())
+    if matched is None:
+        raise InvalidInputError(f"pressure: got {words!r}, expected {PRESS_HELP}")
+    given = {name: value for name, value in matched.groupdict().items() if value}
+    columns = {"kpa": "pressure_kpa", "kg": "mass_kg", "cm2": "area_cm2", "pads": "pads"}
+    try:
+        row = press_row(
+            {"take": ""} | {columns[name]: value for name, value in given.items()},
+            relative_sigma,
+            Path(),
+        )
+    except (ValueError, ZeroDivisionError) as error:
+        raise InvalidInputError(f"pressure: got {words!r}, expected {PRESS_HELP}") from error
+    if not row.pressure_kpa > 0:
+        raise InvalidInputError(f"pressure: got {words!r}, expected above 0")
+    pad_taxels(row.pads)
+    return row

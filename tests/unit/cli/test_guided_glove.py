@@ -1,0 +1,287 @@
+"""`dextouch station calibrate glove --url`: a recorder, an operator who errs, a calibration."""
+
+import json
+from argparse import Namespace
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from dextouch.clients.http_link import Reply
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.streams.samples import Sample
+from services.acquisition.clock import VirtualClock
+from services.acquisition.devices import load_calibration
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
+from services.acquisition.live import LiveView
+from services.acquisition.mocks.ports import PtyPort
+from services.acquisition.mocks.tactile_glove import GloveCalibration
+from services.acquisition.recorder import Recorder
+from services.acquisition.schemas import SaveTake, TakeName, TakePrompt
+from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.cli.calibrate import glove, guided
+from services.cli.calibrate.command import main
+from services.cli.calibrate.glove_takes import read_presses
+
+TRUTH = GloveCalibration.seeded("left", 4)
+
+
+@dataclass
+class Bench:
+    """A station's recorder behind its routes, its glove, and what lies on the glove."""
+
+    recorder: Recorder
+    clock: VirtualClock
+    kpa: np.ndarray
+    sent: list[str]
+    uploaded: bool = False
+    num_samples: int = 0
+    creeps: bool = False
+    rng: np.random.Generator = field(default_factory=lambda: np.random.default_rng(0))
+
+    def request(self, method, path, *, body=None):
+        """As the station's routes."""
+        self.sent.append(f"{method} {path}")
+        if path == "/v1/uploads":
+            take = {"recording_id": self.recorder.status().recording_id, "uploaded": self.uploaded}
+            return Reply(200, {}, json.dumps([take]).encode())
+        kinds = {"arm": TakePrompt, "save": SaveTake}
+        action = path.removeprefix("/v1/recorder/")
+        asked = kinds.get(action, TakeName).model_validate_json(body)
+        argument = asked if action in kinds else asked.recording_id
+        status = getattr(self.recorder, action)(argument)
+        return Reply(200, {}, status.model_dump_json().encode())
+
+    def wait(self, seconds):
+        """The glove goes on sending while the command waits."""
+        for _ in range(round(60 * seconds)):
+            self.num_samples += 1
+            kpa = self.kpa * (1 + 0.01 * self.num_samples * self.creeps)
+            counts = TRUTH.counts(kpa[None], side="left")[0].astype(float)
+            noise = self.rng.normal(scale=2.0, size=360)
+            values = np.rint(counts + noise).clip(0, 65535).astype(np.uint16)
+            now_ns = self.clock.now_ns()
+            sample = Sample(now_ns, values, now_ns, self.num_samples)
+            self.recorder.accept("glove_left", {"tactile_left": [sample]})
+            waiter = self.clock.waiter(drives_time=True)
+            waiter.wait_until(now_ns + 16_666_667)
+            waiter.close()
+
+
+@pytest.fixture
+def bench(tmp_path, monkeypatch):
+    monkeypatch.setattr(guided, "REST_S", 2.0)
+    monkeypatch.setattr(guided, "PRESS_S", 1.5)
+    clock = VirtualClock(10**9)
+    decoder = TactileGloveDecoder("left")
+    driver = Driver("glove_left", transport=PtyPort("a").transport, decoder=decoder, clock=clock)
+    recorder = Recorder(
+        station="test",
+        spool_root=tmp_path / "spool",
+        drivers=[driver],
+        clock=clock,
+        calibration={},
+    )
+    return Bench(recorder, clock, np.zeros(320), [])
+
+
+def options(tmp_path, **changed):
+    given = {
+        "side": "left",
+        "to": tmp_path / "to",
+        "url": "http://station",
+        "key": None,
+        "spool": tmp_path / "spool",
+        "store": None,
+        "rest": None,
+        "presses": None,
+        "pressure_sigma": 0.02,
+        "full_scale": 65535.0,
+    }
+    return Namespace(**given | changed)
+
+
+def operator(bench, script):
+    """Answers questions; each answer comes with what then lies on the glove (None: as before)."""
+    asked = []
+
+    def ask(question):
+        asked.append(question)
+        if len(asked) > len(script):
+            raise EOFError
+        answer, kpa = script[len(asked) - 1]
+        bench.kpa = bench.kpa if kpa is None else np.full(320, float(kpa))
+        return answer
+
+    return ask, asked
+
+
+def guide(bench, tmp_path, script, monkeypatch, **changed):
+    """The whole command with a fake link and operator."""
+    ask, asked = operator(bench, script)
+    given = options(tmp_path, **changed)
+    takes = guided.StationTakes(
+        bench, spool=given.spool, has_store=given.store is not None, wait=bench.wait
+    )
+    walk = guided.walk
+    monkeypatch.setattr(guided, "station_takes", lambda _: takes)
+    monkeypatch.setattr(guided, "walk", lambda o, t: walk(o, t, ask=ask))
+    return glove.calibrate(given), asked
+
+
+def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsys):
+    script = [
+        ("", 0.0),
+        ("ten", None),
+        ("10 toe", None),
+        ("10", None),
+        # Forgot to press: told and asked again.
+        ("", 0.0),
+        ("10", None),
+        ("", 10.0),
+        # A slip: 3 kPa, with which nothing fits.
+        ("2kg/65.38cm2", None),
+        ("", 30.0),
+        ("drop", None),
+        ("2kg/6.538cm2", None),
+        ("", 30.0),
+        ("", None),
+    ]
+    report, asked = guide(bench, tmp_path, script, monkeypatch)
+    said = capsys.readouterr().out
+    assert len(asked) == len(script)
+    assert "Lay the left glove down" in asked[0]
+    assert "Put 10 kPa on all" in asked[4]
+    assert "got 'ten', expected 30, or" in said
+    assert "toe" in said
+    assert "Not used: gain: no pressed taxel moved" in said
+    assert "2 presses, not enough yet: gain: 320 taxels are off a straight line" in said
+    assert "1 presses are left" in said
+    assert "2 presses: 320 of 320 taxels known" in said
+    assert report["num_by_state"] == {"ok": 320}
+    found = TactileCalibration.from_record(
+        load_calibration(tmp_path / "to/calibration.json"), "left"
+    )
+    gain_error = found.gain_counts_per_kpa[found.cells] / TRUTH.gain_counts_per_kpa[found.cells] - 1
+    assert np.abs(gain_error).max() < 0.02
+    # The takes are there, closed, and the kept list repeats the calibration.
+    assert len(list((tmp_path / "spool").iterdir())) == 5
+    rows = read_presses(tmp_path / "to/presses_left.csv", 0.02)
+    assert [round(row.pressure_kpa, 2) for row in rows] == [10.0, 30.0]
+    arguments = [
+        "glove",
+        "--side",
+        "left",
+        "--rest",
+        report["rest_take"],
+        "--to",
+        str(tmp_path / "b"),
+    ]
+    arguments += ["--presses", str(tmp_path / "to/presses_left.csv")]
+    assert main(arguments) == 0
+    again, first = (
+        load_calibration(tmp_path / f"{where}/calibration.json") for where in ("b", "to")
+    )
+    name = "tactile_left_gain_counts_per_kpa"
+    assert again[name] == first[name]
+
+
+def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, capsys):
+    bench.creeps = True
+    ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])
+    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    rest, rows = guided.walk(options(tmp_path), takes, ask=ask)
+    assert rows == []
+    assert rest.endswith("-2")
+    assert "Once more: rest take" in capsys.readouterr().out
+
+
+def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
+    ask, _ = operator(bench, [("", 0.0), ("20", None), ("", 20.0), ("", None)])
+    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+
+    def creeping(question):
+        bench.creeps = "Put" in question
+        return ask(question)
+
+    _, rows = guided.walk(options(tmp_path), takes, ask=creeping)
+    assert rows == []
+    assert "changed while it lay" in capsys.readouterr().out
+
+
+def test_interrupted_takes_are_discarded(bench, tmp_path):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        takes.record("take-1", "rest", 1.0)
+    assert bench.recorder.status().state == "discarded"
+    assert list((tmp_path / "spool").iterdir()) == []
+
+
+def test_a_busy_recorder_is_left_alone(bench, tmp_path):
+    bench.recorder.arm(TakePrompt(task="t", instruction="i"))
+    bench.recorder.record("other")
+    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    with pytest.raises(ConflictError, match="while recording"):
+        takes.record("take-1", "rest", 1.0)
+    assert bench.recorder.status().recording_id == "other"
+
+
+def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
+    takes = guided.StationTakes(
+        bench, spool=tmp_path / "not-here", has_store=False, wait=bench.wait
+    )
+    with pytest.raises(NotFoundError, match=r"--spool.*--store"):
+        takes.record("take-1", "rest", 1.0)
+    bench.uploaded = True
+    takes = guided.StationTakes(bench, spool=tmp_path / "not-here", has_store=True, wait=bench.wait)
+    assert takes.record("take-2", "rest", 1.0) == "take-2"
+    assert bench.sent[-1] == "GET /v1/uploads"
+
+
+def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
+    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    with pytest.raises(InvalidInputError, match="nobody answers"):
+        guided.walk(options(tmp_path), takes, ask=operator(bench, [])[0])
+    with pytest.raises(InvalidInputError, match="one of the two"):
+        glove.calibrate(options(tmp_path, rest="take"))
+    with pytest.raises(InvalidInputError, match="--url of a running station"):
+        glove.calibrate(options(tmp_path, url=None))
+
+
+@pytest.mark.parametrize(
+    ("words", "kpa", "pads"),
+    [
+        ("30", 30.0, "all"),
+        ("7.5 kPa palm", 7.5, "palm"),
+        ("12 thumb+index", 12.0, "thumb+index"),
+        ("2kg/90cm2 palm", 2 * 9.80665 / 9.0, "palm"),
+    ],
+)
+def test_pressures_as_they_are_typed(words, kpa, pads):
+    row = guided.parse_press(words, 0.02)
+    assert row.pressure_kpa == pytest.approx(kpa)
+    assert row.sigma_kpa == pytest.approx(0.02 * kpa)
+    assert row.pads == pads
+
+
+@pytest.mark.parametrize("words", ["0", "-3", "3 3", "1.2.3", "2kg", "2kg/0cm2", "palm", "kpa"])
+def test_what_is_no_pressure_is_refused(words):
+    with pytest.raises(InvalidInputError, match="pressure: got"):
+        guided.parse_press(words, 0.02)
+    with pytest.raises(UnknownNameError):
+        guided.parse_press("3 toe", 0.02)
+
+
+def test_a_station_starts_before_its_gloves_are_calibrated(bench):
+    """Else nobody could record the takes that a calibration needs."""
+    drivers = list(bench.recorder._drivers.values())
+    live = LiveView(drivers, {})
+    assert live.glove("tactile_left") is None
+    tare = {"tactile_left_tare_counts": ((1.0,) * 360,)}
+    assert LiveView(drivers, tare).tactile_streams() == []
+    with pytest.raises(NotFoundError, match=r"tactile_left_gain.*got 3 numbers"):
+        LiveView(drivers, tare | {"tactile_left_gain_counts_per_kpa": ((1.0,) * 3,)})
