@@ -21,18 +21,14 @@ from services.acquisition.drivers.bridge_tracker import (
     BridgeFingerTrackerDecoder,
     BridgePoseTrackerDecoder,
 )
-from services.acquisition.drivers.finger_tracker import FingerTracker
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
 from services.acquisition.mocks.devices import MockFactory
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.finger_tracker import FingerTrackerSource
+from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.mocks.usb_backend import UsbPort
 
 BOOT_NS = 4_000_000_000_000
 FLAG_WITHIN_S = 0.3
@@ -110,15 +106,31 @@ def robot_streams():
     return streams
 
 
-def from_factory(name, other=None, streams=None):
+class CameraSubject(Subject):
+    """A camera on the station: its images are stamped with the station's own clock."""
+
+    def __init__(self, pair, clock):
+        super().__init__(pair.driver, pair.device.port, pair.device.source, None)
+        self.clock = clock
+        self.start_ns = clock.now_ns()
+
+    def units(self):
+        """The next image, when it is due."""
+        sequence, self.next_sequence = self.next_sequence, self.next_sequence + 1
+        due_ns = self.start_ns + sequence * self.driver.descriptors[0].period_ns()
+        self.clock.suspend(due_ns - self.clock.now_ns())
+        return self.source.units(sequence % len(self.source.t_ns), sequence, due_ns)
+
+
+def build(streams, links):
+    clock = VirtualClock()
+    factory = MockFactory(streams, faults=FaultScript(), seed=1, clock=clock, links=links)
+    return {pair.device.name: pair for pair in factory.build()}, clock
+
+
+def from_factory(name, other=None, streams=None, links=None):
     def make():
-        factory = MockFactory(
-            streams() if streams else list(STREAMS.values()),
-            faults=FaultScript(),
-            seed=1,
-            clock=VirtualClock(),
-        )
-        pairs = {pair.device.name: pair for pair in factory.build()}
+        pairs, _ = build(streams() if streams else list(STREAMS.values()), links)
         source = pairs[other].device.source if other else None
         device = pairs[name].device
         return Subject(pairs[name].driver, device.port, device.source, source)
@@ -126,33 +138,9 @@ def from_factory(name, other=None, streams=None):
     return make
 
 
-def fingers(port_class):
-    def make():
-        sources = {
-            side: FingerTrackerSource(
-                STREAMS[f"keypoints_{side}"], side=side, noise_m=0.0, rng=RNG(1)
-            )
-            for side in ("left", "right")
-        }
-        port = port_class("FT-1", answer=sources["left"].answer)
-        driver = FingerTracker("fingers", "left", transport=port.transport, clock=VirtualClock())
-        return Subject(driver, port, sources["left"], sources["right"])
-
-    return make
-
-
-def poses(port_class):
-    def make():
-        sources = [
-            PoseTrackerSource(STREAMS[f"wrist_{side}"], faults=DeviceFaults(), rng=RNG(1))
-            for side in ("left", "right")
-        ]
-        port = port_class("LHR-1")
-        decoder = PoseTrackerDecoder("wrist_left")
-        driver = Driver("pose", transport=port.transport, decoder=decoder, clock=VirtualClock())
-        return Subject(driver, port, *sources)
-
-    return make
+def station_camera():
+    pairs, clock = build([STREAMS["camera_head"]], MockLinks(cameras="station"))
+    return CameraSubject(pairs["camera_head"], clock)
 
 
 def bridge_finger_sources():
@@ -177,22 +165,35 @@ def bridged(sources, decoder):
     return Subject(driver, port, *sources)
 
 
+def fingers(links):
+    return from_factory("finger_tracker_left", "finger_tracker_right", links=links)
+
+
+def poses(links):
+    return from_factory("pose_tracker_wrist_left", "pose_tracker_wrist_right", links=links)
+
+
+HID, USB, BRIDGE = (MockLinks(trackers=link) for link in ("hid", "usb", "bridge"))
 SUBJECTS = {
     "glove by serial": from_factory("glove_left", "glove_right"),
-    "fingers by hid": from_factory("finger_tracker_left", "finger_tracker_right"),
-    "fingers by usb": fingers(UsbPort),
-    "fingers by bridge": lambda: bridged(
-        bridge_finger_sources(), BridgeFingerTrackerDecoder("left")
+    "wuji glove by serial": from_factory(
+        "glove_left", "glove_right", links=MockLinks(gloves="wuji")
     ),
-    "pose by hid": from_factory("pose_tracker_wrist_left", "pose_tracker_wrist_right"),
-    "pose by usb": poses(UsbPort),
-    "pose by bridge": lambda: bridged(
-        bridge_pose_sources(), BridgePoseTrackerDecoder("wrist_left")
-    ),
+    "fingers by hid": fingers(HID),
+    "fingers by usb": fingers(USB),
+    "fingers by bridge": fingers(BRIDGE),
+    "pose by hid": poses(HID),
+    "pose by usb": poses(USB),
+    "pose by bridge": poses(BRIDGE),
     "camera by bridge": from_factory("camera_head"),
+    "camera of the station": station_camera,
     "robot by socket": from_factory("robot_state", streams=robot_streams),
 }
 SIDED = [name for name in SUBJECTS if not name.startswith(("camera", "robot"))]
+# Neither a Wuji glove nor a camera on the station's own bus tells a version.
+VERSIONED = [
+    name for name in SUBJECTS if name not in ("wuji glove by serial", "camera of the station")
+]
 
 
 def plugged(name):
@@ -210,6 +211,13 @@ def subject(request):
 
 @pytest.fixture(params=SIDED)
 def sided(request):
+    made = plugged(request.param)
+    yield made
+    made.close()
+
+
+@pytest.fixture(params=VERSIONED)
+def versioned(request):
     made = plugged(request.param)
     yield made
     made.close()
@@ -306,14 +314,14 @@ def test_half_a_packet_costs_only_itself(subject):
     assert subject.driver.statistics.lost == 1
 
 
-def test_another_version_is_refused(subject, monkeypatch):
-    subject.driver.open()
-    assert exchange(subject, 2) == [0, 1]
-    monkeypatch.setattr(sys.modules[type(subject.source).__module__], "VERSION", 9)
+def test_another_version_is_refused(versioned, monkeypatch):
+    versioned.driver.open()
+    assert exchange(versioned, 2) == [0, 1]
+    monkeypatch.setattr(sys.modules[type(versioned.source).__module__], "VERSION", 9)
     with pytest.raises(DeviceError, match="version 9") as caught:
-        exchange(subject, 2)
+        exchange(versioned, 2)
     assert caught.value.details["device"]
-    assert subject.samples == []
+    assert versioned.samples == []
 
 
 def test_the_other_sides_packets_are_refused(sided):
