@@ -12,6 +12,8 @@ import yaml
 
 from dextouch.serving.app import create_service_app
 from dextouch.serving.settings import ServiceSettings
+from services.acquisition.health_metrics import STATION_FIGURES, HealthCollector
+from services.acquisition.schemas import StationHealth
 
 ROOT = Path(__file__).parents[3]
 COMPOSE = ROOT / "docker-compose.yml"
@@ -129,6 +131,9 @@ async def test_alerts_name_exported_metrics():
     async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
         await client.get("/healthz")
         exported = set(re.findall(r"^(dextouch_\w+)", (await client.get("/metrics")).text, re.M))
+    figures = dict.fromkeys(STATION_FIGURES, 0.0)
+    health = StationHealth(station="x", level="OK", figures=figures, streams=(), devices=())
+    exported |= {metric.name for metric in HealthCollector(lambda: health, dict).collect()}
     rules = yaml.safe_load((ROOT / "deploy/prometheus/rules.yml").read_text())
     expressions = [rule["expr"] for group in rules["groups"] for rule in group["rules"]]
     assert expressions
