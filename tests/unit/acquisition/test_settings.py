@@ -4,7 +4,9 @@ from dextouch.errors import InvalidInputError
 from dextouch.serving.settings import ServiceSettings, load_settings
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
+from services.acquisition.mocks.links import MockLinks
 from services.acquisition.settings import AcquisitionSettings
+from services.acquisition.supervisor import SpoolSafety
 
 OPTIONS = {
     "station",
@@ -42,6 +44,25 @@ def test_environment_and_flags(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_STATION", "desk_3")
     settings = load_settings(AcquisitionSettings, ["--mock", "true", "--seed", "4"])
     assert (settings.station, settings.mock, settings.seed) == ("desk_3", True, 4)
+
+
+def test_the_spools_safety_and_the_mocks_links_are_options_too(monkeypatch):
+    defaults = AcquisitionSettings()
+    assert SpoolSafety(defaults.flush_period_s, defaults.min_free_bytes) == SpoolSafety()
+    monkeypatch.setenv("DEXTOUCH_ACQUISITION_FLUSH_PERIOD_S", "0.1")
+    monkeypatch.setenv("DEXTOUCH_ACQUISITION_MOCK_LINKS__TRACKERS", "bridge")
+    flags = ["--min_free_bytes", "1000", "--mock_links.images", "h264"]
+    settings = load_settings(AcquisitionSettings, flags)
+    assert (settings.flush_period_s, settings.min_free_bytes) == (0.1, 1000)
+    assert settings.mock_links == MockLinks(trackers="bridge", images="h264")
+
+
+@pytest.mark.parametrize(
+    "flags", [["--flush_period_s", "0"], ["--min_free_bytes", "-1"], ["--mock_links.gloves", "x"]]
+)
+def test_impossible_options_are_refused(flags):
+    with pytest.raises(InvalidInputError):
+        load_settings(AcquisitionSettings, flags)
 
 
 def test_real_devices_become_drivers():
