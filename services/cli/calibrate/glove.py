@@ -18,7 +18,7 @@ from services.cli.calibrate import guided
 from services.cli.calibrate.glove_takes import PressRow, press_of, read_presses, read_take
 from services.cli.calibrate.photos import progress
 from services.cli.calibrate.pictures import glove_picture
-from services.cli.calibrate.record import write_entry, write_picture
+from services.cli.calibrate.record import MATRICES_FILE, write_entry, write_picture
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
@@ -37,6 +37,9 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     report = _facts(found, rest, rows)
     _keep(found, options.to, report)
     _tell(report, picture)
+    if options.url is not None:
+        path = (options.to / MATRICES_FILE).resolve()
+        print(f"Restart the station with DEXTOUCH_ACQUISITION_CALIBRATION={path}")
     return report
 
 

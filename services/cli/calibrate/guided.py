@@ -7,8 +7,9 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Protocol, TypeVar, runtime_checkable
 
 from dextouch.clients.http_link import HttpLink, Reply
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
@@ -35,6 +36,7 @@ _PRESS = re.compile(
     r"(?: +(?P<pads>[a-z+]+))?"
 )
 
+Found = TypeVar("Found")
 Ask = Callable[[str], str]
 Wait = Callable[[float], None]
 
@@ -63,11 +65,20 @@ class StationTakes:
     ) -> None:
         self._link, self._spool, self._has_store, self._wait = link, spool, has_store, wait
 
-    def record(self, name: str, words: str, seconds: float) -> str:
-        """One take; interrupted ones are thrown away.
+    def record(
+        self, name: str, words: str, seconds: float, check: Callable[[str], Found]
+    ) -> tuple[str, Found]:
+        """One take that is good; interrupted ones, and those that are not, are thrown away.
+
+        Args:
+            name: id of the take.
+            words: what is recorded, for the operator and as the take's instruction.
+            seconds: how long.
+            check: raises what is wrong with a take. Where only the store has takes, it is asked
+                when the take is saved already.
 
         Returns:
-            Its folder in the spool, or its id where only the store has it.
+            The take's folder in the spool, or its id in the store; and what the check found.
 
         Raises:
             ConflictError: the recorder is busy with another take; save or discard that.
@@ -76,26 +87,28 @@ class StationTakes:
         """
         self._act("arm", {"task": TASK, "instruction": words})
         self._act("record", {"recording_id": name})
-        is_whole = False
+        folder, found, is_good = self._spool / name, None, False
         try:
             for _ in progress(list(range(round(seconds / TICK_S))), words):
                 self._wait(TICK_S)
             self._act("stop", {"recording_id": name})
-            is_whole = True
+            if folder.is_dir():
+                found = check(str(folder.resolve()))
+            is_good = True
         finally:
-            if not is_whole:
+            if not is_good:
                 self._act("discard", {"recording_id": name})
         # Other devices may be absent; whether the glove was there, its readings tell.
         self._act("save", {"recording_id": name, "accept_incomplete": True})
-        return self._find(name)
+        if found is not None:
+            return str(folder.resolve()), found
+        self._await_upload(name)
+        return name, check(name)
 
     def _act(self, action: str, body: dict[str, object]) -> None:
         self._link.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
 
-    def _find(self, name: str) -> str:
-        folder = self._spool / name
-        if folder.is_dir():
-            return str(folder.resolve())
+    def _await_upload(self, name: str) -> None:
         if not self._has_store:
             raise NotFoundError(
                 f"take {name!r}: not in {self._spool.resolve()}; name the station's spool with "
@@ -104,7 +117,7 @@ class StationTakes:
         for _ in progress(list(range(round(UPLOAD_S))), "waiting for the upload"):
             uploads = json.loads(self._link.request("GET", "/v1/uploads").body)
             if any(take["recording_id"] == name and take["uploaded"] for take in uploads):
-                return name
+                return
             self._wait(1.0)
         raise NotFoundError(
             f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
@@ -157,9 +170,12 @@ class _Guide:
                 f"Lay the {side} glove down, untouched, and let it rest for a minute. "
                 f"Enter records {REST_S:g} s: "
             )
-            take = self._record(f"{side} glove at rest, untouched", REST_S)
             try:
-                return take, measure_tare(read_take(take, self._options).values, side=side)
+                return self._record(
+                    f"{side} glove at rest, untouched",
+                    REST_S,
+                    lambda take: measure_tare(read_take(take, self._options).values, side=side),
+                )
             except InvalidInputError as error:
                 print(f"Once more: {error.message}")
 
@@ -180,14 +196,14 @@ class _Guide:
                 continue
             told = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
             self._answer(f"Put {told}. Enter records {PRESS_S:g} s, once it holds still: ")
-            row = replace(wanted, take=self._record(f"{told}, held still", PRESS_S))
             try:
-                press = press_of(row, self._options)
-                fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+                take, press = self._record(
+                    f"{told}, held still", PRESS_S, partial(self._press, tare, wanted)
+                )
             except InvalidInputError as error:
                 print(f"Not used: {error.message}")
                 continue
-            rows.append(row)
+            rows.append(replace(wanted, take=take))
             known.append(press)
             print(self._known_so_far(tare, known))
         return rows
@@ -205,9 +221,17 @@ class _Guide:
             f"{f' ({others})' if others else ''}; more pressures show bends"
         )
 
-    def _record(self, words: str, seconds: float) -> str:
+    def _press(self, tare: TaxelTare, wanted: PressRow, take: str) -> TaxelPress:
+        """The press of a take, if a gain follows from it alone."""
+        press = press_of(replace(wanted, take=take), self._options)
+        fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
+        return press
+
+    def _record(
+        self, words: str, seconds: float, check: Callable[[str], Found]
+    ) -> tuple[str, Found]:
         self._num_takes += 1
-        return self._takes.record(f"{self._started}-{self._num_takes}", words, seconds)
+        return self._takes.record(f"{self._started}-{self._num_takes}", words, seconds, check)
 
     def _answer(self, question: str) -> str:
         try:

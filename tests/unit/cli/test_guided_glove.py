@@ -160,13 +160,14 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
     assert "1 presses are left" in said
     assert "2 presses: 320 of 320 taxels known" in said
     assert report["num_by_state"] == {"ok": 320}
+    assert f"CALIBRATION={tmp_path / 'to/calibration.json'}" in said
     found = TactileCalibration.from_record(
         load_calibration(tmp_path / "to/calibration.json"), "left"
     )
     gain_error = found.gain_counts_per_kpa[found.cells] / TRUTH.gain_counts_per_kpa[found.cells] - 1
     assert np.abs(gain_error).max() < 0.02
-    # The takes are there, closed, and the kept list repeats the calibration.
-    assert len(list((tmp_path / "spool").iterdir())) == 5
+    # The good takes are there, the dropped one too; the kept list repeats the calibration.
+    assert len(list((tmp_path / "spool").iterdir())) == 4
     rows = read_presses(tmp_path / "to/presses_left.csv", 0.02)
     assert [round(row.pressure_kpa, 2) for row in rows] == [10.0, 30.0]
     arguments = [
@@ -195,6 +196,8 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
     assert rows == []
     assert rest.endswith("-2")
     assert "Once more: rest take" in capsys.readouterr().out
+    # What was not good was thrown away.
+    assert [take.name for take in (tmp_path / "spool").iterdir()] == [rest.rsplit("/", 1)[-1]]
 
 
 def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
@@ -216,7 +219,7 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
 
     takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=interrupted)
     with pytest.raises(KeyboardInterrupt):
-        takes.record("take-1", "rest", 1.0)
+        takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().state == "discarded"
     assert list((tmp_path / "spool").iterdir()) == []
 
@@ -226,7 +229,7 @@ def test_a_busy_recorder_is_left_alone(bench, tmp_path):
     bench.recorder.record("other")
     takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
     with pytest.raises(ConflictError, match="while recording"):
-        takes.record("take-1", "rest", 1.0)
+        takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().recording_id == "other"
 
 
@@ -235,10 +238,10 @@ def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
         bench, spool=tmp_path / "not-here", has_store=False, wait=bench.wait
     )
     with pytest.raises(NotFoundError, match=r"--spool.*--store"):
-        takes.record("take-1", "rest", 1.0)
+        takes.record("take-1", "rest", 1.0, str.upper)
     bench.uploaded = True
     takes = guided.StationTakes(bench, spool=tmp_path / "not-here", has_store=True, wait=bench.wait)
-    assert takes.record("take-2", "rest", 1.0) == "take-2"
+    assert takes.record("take-2", "rest", 1.0, str.upper) == ("take-2", "TAKE-2")
     assert bench.sent[-1] == "GET /v1/uploads"
 
 
