@@ -1,5 +1,6 @@
 """What `dextouch station calibrate` makes of each view: advice, poses, live images, boards."""
 
+import json
 import re
 from itertools import count
 
@@ -16,6 +17,7 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import invert, transform
 from services.alignment.calibration.hand_eye import mount_difference
 from services.cli.calibrate import advice, boards, live
+from services.cli.calibrate.command import main
 from tests.unit.cli.rendered_boards import (
     BOARD,
     SIZE,
@@ -23,6 +25,7 @@ from tests.unit.cli.rendered_boards import (
     board_at,
     good_views,
     render,
+    smeared,
     write_photos,
 )
 
@@ -130,6 +133,28 @@ def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path)
     assert session.is_enough
     assert [view.name for view in session.views] == [f"photo_{i:02d}.png" for i in range(25)]
     assert next(waits) == 15
+
+
+def test_blurred_photos_are_named_and_do_not_count(tmp_path, capsys):
+    photo = render(board_at([0, 0, 0.4], [0, 0, 0]))
+    pair = [cv2.imencode(".png", image)[1].tobytes() for image in (photo, smeared(photo, (6, 0)))]
+    named = list(zip(("sharp", "moved"), pair, strict=True))
+    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    live.follow_folder(session, iter(named))
+    assert [view.name for view in session.views] == ["sharp"]
+    assert "moved: blurred, left out" in capsys.readouterr().out
+    # The board stands still, but the image is blurred all the same: out of focus, say.
+    still = iter([("a", pair[1]), ("b", pair[1])])
+    assert live.collect_live(session, still, tmp_path / "live") == 0
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for name, data in named:
+        (photos / f"{name}.png").write_bytes(data)
+    arguments = ["camera", "--camera", "head", "--photos", str(photos), "--board", BOARD]
+    report = tmp_path / "report.json"
+    assert main([*arguments, "--check", "--to", str(tmp_path), "--json", str(report)]) == 0
+    told = json.loads(report.read_text())
+    assert (told["blurred"], told["num_with_board"], told["num_photos"]) == (["moved.png"], 1, 2)
 
 
 def test_station_images_come_once_each_and_pauses_are_no_images():
