@@ -21,13 +21,16 @@ _STAMP_BYTES = 8
 def batch_bytes(descriptor: StreamDescriptor, batch: SampleBatch) -> bytes:
     """The body that holds a batch, which fits the descriptor (checked by the caller)."""
     stamps = (batch.t_host_ns, batch.t_device_ns, batch.sequence)
-    parts = [np.ascontiguousarray(column, dtype="<i8").tobytes() for column in stamps]
+    parts: list[bytes | memoryview] = [
+        np.ascontiguousarray(column, dtype="<i8").data for column in stamps
+    ]
     if descriptor.unit in ENCODED_UNITS:
-        parts.append(np.array([len(image) for image in batch.values], dtype="<u4").tobytes())
+        parts.append(np.array([len(image) for image in batch.values], dtype="<u4").data)
         parts.extend(batch.values)
     else:
         dtype = descriptor.numpy_dtype().newbyteorder("<")
-        parts.append(np.ascontiguousarray(batch.values, dtype=dtype).tobytes())
+        parts.append(np.ascontiguousarray(batch.values, dtype=dtype).data)
+    # Arrays are joined as they lie in memory: an image is copied once.
     return b"".join(parts)
 
 
