@@ -33,7 +33,8 @@ class JustFloatGloveSource:
     ) -> None:
         if num_values < NUM_TAXELS:
             raise InvalidInputError(f"num_values: got {num_values}, expected at least {NUM_TAXELS}")
-        counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, full_scale)
+        # No device sends the negative zero that rounding leaves of noise.
+        counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, full_scale) + 0.0
         self._stream = stream
         self._values = np.zeros((len(counts), num_values), dtype="<f4")
         self._values[:, :NUM_TAXELS] = counts

@@ -22,6 +22,7 @@ from services.acquisition.schemas import Code, HealthFinding
 from services.acquisition.supervisor import DeviceSupervisor
 
 DOCS = Path(__file__).parents[3] / "docs" / "health.md"
+BOOT_NS = 77
 CALIBRATION = {
     "tactile_left_tare_counts": ((100.0,) * 360,),
     "tactile_left_gain_counts_per_kpa": ((40.0,) * 360,),
@@ -64,8 +65,11 @@ class Bench:
             (name,) = supervisor.counters.streams
             start_ns = self.clock.now_ns()
             count = round(rate_hz * rate)
-            stamps = start_ns + np.arange(1, count + 1) * 1_000_000_000 // count
-            readings = {name: [Sample(int(t), value) for t in stamps]}
+            stamps = (start_ns + np.arange(1, count + 1) * 1_000_000_000 // count).tolist()
+            first = supervisor.driver.statistics.packets
+            readings = {
+                name: [Sample(t, value, t + BOOT_NS, first + k) for k, t in enumerate(stamps)]
+            }
             supervisor.counters.add(readings)
             self.live.accept(supervisor.driver.name, readings)
             supervisor.driver.statistics.packets += count
