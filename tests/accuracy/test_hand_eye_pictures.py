@@ -131,6 +131,9 @@ def test_pictures_of_a_moving_board_are_blurred(camera, shift_px):
     moved = find_board("", smeared(photo, shift_px), board)
     assert (sharp.is_blurred, moved.is_blurred) == (False, True)
     assert moved.edge_width_px > sharp.edge_width_px + 1.5
+    # Four times the width and height: the same angles, so the same verdict.
+    larger = cv2.resize(photo, None, fx=4, fy=4, interpolation=cv2.INTER_CUBIC)
+    assert not find_board("", larger, board).is_blurred
     # Corners of a row alone tell of the edges along it.
     row = sharp.points_board[:, 1] == sharp.points_board[0, 1]
     assert edge_width_px(photo, sharp.points_board[row], sharp.pixels[row]) < 3

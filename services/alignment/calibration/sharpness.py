@@ -9,12 +9,20 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 # Wider edges are blurred. Measured on rendered ChArUco boards: sharp 2.0 to 2.2 px, out of focus by
-# 1.5 px (one sigma) 3.1 to 3.7, moved by 3 px 2.4 to 3.3, moved by 6 px 4.1 to 5.1.
+# 1.5 px (one sigma) 3.1 to 3.7, moved by 3 px 2.4 to 3.3, moved by 6 px 4.1 to 5.1; on photos of a
+# real camera of 640 by 480 px 2.0 to 3.1.
 MAX_EDGE_WIDTH_PX = 3.8
+# That of 1280 by 720 px. Angles count: the pixels of larger images are smaller ones.
+USUAL_DIAGONAL_PX = 1469.0
 # The profile across an edge, as a part of it: further off the markers of ChArUco boards begin.
 REACH = 0.12
 MIN_REACH_PX = 2.0
 STEP_PX = 0.5
+
+
+def max_edge_width_px(photo: np.ndarray) -> float:
+    """Wider edges on a photo of this size are blurred."""
+    return MAX_EDGE_WIDTH_PX * max(1.0, float(np.hypot(*photo.shape)) / USUAL_DIAGONAL_PX)
 
 
 def edge_width_px(

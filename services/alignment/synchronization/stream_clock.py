@@ -13,11 +13,6 @@ from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
 
 NS_PER_MS = 1e6
-# A device whose samples are counted must be a steady one. Beyond these its nominal rate is wrong
-# or it samples when it likes, and its arrivals say more.
-MAX_COUNTED_SKEW_PPM = 20_000.0
-MAX_COUNTED_LOSS = 0.1
-MAX_STEPS_PER_SAMPLE = 0.001
 MIN_COUNTED_SAMPLES = 60
 
 
@@ -137,12 +132,7 @@ def _counted(batch: SampleBatch, period_ns: int) -> _Dated:
     if len(batch) < MIN_COUNTED_SAMPLES or (np.diff(batch.t_host_ns) < 0).any():
         return arrivals
     take = date_by_counting(batch.t_host_ns, period_ns=period_ns)
-    is_steady = (
-        abs(take.skew_ppm) <= MAX_COUNTED_SKEW_PPM
-        and take.num_lost <= MAX_COUNTED_LOSS * len(batch)
-        and take.num_steps <= MAX_STEPS_PER_SAMPLE * len(batch)
-    )
-    if not is_steady:
+    if not take.is_steady:
         return arrivals
     waited_ns = (batch.t_host_ns - take.t_host_ns).astype(np.float64)
     rms_ns = float(np.sqrt(np.mean(waited_ns**2)))

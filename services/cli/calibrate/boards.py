@@ -15,7 +15,7 @@ from services.alignment.calibration.board_detection import (
     Chessboard,
     find_boards,
 )
-from services.alignment.calibration.sharpness import MAX_EDGE_WIDTH_PX, edge_width_px
+from services.alignment.calibration.sharpness import edge_width_px, max_edge_width_px
 
 Board = Chessboard | CharucoBoard
 _METRES = {"mm": 1e-3, "cm": 1e-2, "m": 1.0}
@@ -30,7 +30,8 @@ class BoardView:
     """Corners of the board in one photo.
 
     `points_board` are places on the board (m), `pixels` OpenCV's: the middle of the first is 0, 0.
-    `pattern` says how the board is printed, `edge_width_px` how blurred its edges are.
+    `pattern` says how the board is printed, `edge_width_px` how blurred its edges are. An
+    `is_blurred` photo must not count: camera or board moved, and its corners are off.
     """
 
     name: str
@@ -38,11 +39,7 @@ class BoardView:
     pixels: Float32[np.ndarray, "n 2"]
     pattern: str
     edge_width_px: float
-
-    @property
-    def is_blurred(self) -> bool:
-        """Whether camera or board moved: corners of such a photo are off along the motion."""
-        return self.edge_width_px > MAX_EDGE_WIDTH_PX
+    is_blurred: bool
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,8 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
     if isinstance(board, Chessboard):
         pixels = _dark_first(photo, pixels, board)
     width_px = edge_width_px(photo, found.points_board[0], pixels)
-    return BoardView(name, found.points_board[0], pixels, found.pattern, width_px)
+    is_blurred = width_px > max_edge_width_px(photo)
+    return BoardView(name, found.points_board[0], pixels, found.pattern, width_px, is_blurred)
 
 
 def usual_pattern(views: Sequence[BoardView]) -> str:

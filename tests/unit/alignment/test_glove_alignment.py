@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.schemas.episodes import matrix_rows
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
@@ -216,3 +216,9 @@ def test_cameras_keep_their_distortion_and_must_be_of_the_recorded_size(tmp_path
         align(tmp_path / "other", camera, batch, lens | {"image_size_head_px": ((8.0, 16.0),)})
     with pytest.raises(InvalidInputError, match="distortion_head"):
         align(tmp_path / "wrong", camera, batch, lens | {"distortion_head": ((0.0,),)})
+
+
+def test_masks_of_episodes_without_refusals_and_of_broken_ones():
+    assert measured_taxels({}).all()
+    with pytest.raises(ShapeError, match="tactile_right_refused_taxels"):
+        measured_taxels({"tactile_right_refused_taxels": ((0.0,) * 360,)})
