@@ -164,8 +164,9 @@ SCRIPTS = {
     "wrap, wuji": Script(GLOVE, {"first_sequence": 2**16 - 40}, (), None, WUJI),
     "unplug, wuji": unplugged(GLOVE, WUJI),
     "wrong side, wuji": from_1_s(GLOVE, "wrong_side", "wrong_side", WUJI),
+    "dead, wuji": Script(GLOVE, {"dead_taxels": (66, 72)}, ("taxels_dead",), None, WUJI, 1.6),
     "saturated, wuji": Script(
-        GLOVE, {"saturated_taxels": (70, 200)}, ("taxels_saturated",), None, WUJI, 1.6
+        GLOVE, {"saturated_taxels": (66, 72)}, ("taxels_saturated",), None, WUJI, 1.6
     ),
     "nan, wuji": nan(GLOVE, "nan", None, WUJI),
     # This glove has no checksum, number or time: what only these could show is not told.
@@ -186,7 +187,7 @@ SCRIPTS = {
 }
 # What the device throws the link away for, and with it what came in the same moment.
 REFUSED_DEVICE = ("wrong_side", "wrong_version")
-PINNED = {"dead": 0, "stuck": 1_000, "saturated": 65_535, "saturated, wuji": 1.0}
+PINNED = {"dead": 0, "stuck": 1_000, "saturated": 65_535, "dead, wuji": 0.0, "saturated, wuji": 1.0}
 
 
 def record(script, fault, folder):

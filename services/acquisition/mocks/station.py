@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
+import structlog
+
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas.episodes import Matrix
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
@@ -19,6 +21,8 @@ from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.schemas import SaveTake, TakeCheck, TakePrompt
 from services.acquisition.station import Station
 from services.acquisition.supervisor import SpoolSafety
+
+logger = structlog.get_logger(__name__)
 
 LEDGER_FILE = "mock_ledger.json"
 LEAD_NS = 20_000_000
@@ -197,6 +201,7 @@ class MockStation:
                     lap += 1
             except (DeviceError, InvalidInputError) as error:
                 self._failures.append(f"{pair.device.name}: {error.message}")
+                logger.exception("stop_mock_device", device=pair.device.name)
 
     def _drain(self) -> None:
         for pair in self.pairs:
