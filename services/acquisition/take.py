@@ -2,7 +2,7 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import structlog
 
@@ -207,7 +207,7 @@ class Take:
             StreamFacts(
                 descriptor,
                 self.streams[descriptor.name],
-                _difference(driver.statistics, self._before[name]),
+                self._counted(name, driver),
             )
             for name, driver in self._drivers.items()
             for descriptor in driver.descriptors
@@ -215,6 +215,13 @@ class Take:
         self.span = TakeSpan(self._started_ns, self._clock.now_ns())
         self.flusher.cancel()
         return self.span
+
+    def _counted(self, device: str, driver: Driver) -> DecoderStatistics:
+        """What the decoder counted during the take."""
+        counted = _difference(driver.statistics, self._before[device])
+        # To a decoder a packet that was overtaken looks like a restart; it is counted as late.
+        late = self._events.get(device, {}).get("late", 0)
+        return replace(counted, restarts=max(0, counted.restarts - late))
 
 
 def _grown(after: DeviceEvents, before: DeviceEvents) -> dict[str, dict[str, int]]:

@@ -285,6 +285,7 @@ def test_a_fault_is_counted_and_nothing_is_invented(name, undisturbed, tmp_path)
     # It is told under a name, as often as it happened, by both ledgers.
     own = entries.get(stream, {})
     assert set(script.events) <= set(own), own
+    assert "restarts" not in own, "no fault of these restarts a device"
     if script.fate is not None:
         told = ledger.count(script.fate)
         if script.events[0] == "lost":
