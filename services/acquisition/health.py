@@ -13,7 +13,7 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_camera import CameraJudge
 from services.acquisition.health_cells import CellJudge, cells_of
-from services.acquisition.health_clock import ClockJudge
+from services.acquisition.health_clock import ClockJudge, CountingJudge
 from services.acquisition.health_levels import Board, EventLog, Verdict, worst
 from services.acquisition.health_link import LinkJudge
 from services.acquisition.health_path import PathJudge
@@ -274,6 +274,8 @@ def watch(supervisor: DeviceSupervisor, live: LiveView) -> list[_Watched]:
             judges.append(clock)
         elif descriptor.capabilities.device_time and clock is not None:
             judges.append(_SameAs(clock))
+        elif not descriptor.capabilities.sequence:
+            judges.append(CountingJudge(descriptor))
         judges += _value_judges(driver, descriptor, live)
         if isinstance(driver.decoder, TellsTracking):
             judges.append(TrackingJudge(driver))

@@ -1,13 +1,14 @@
 """Device stamps and arrivals of one device come in; skew, residual and steps of its clock go out.
 
-Runs at the evaluation, never in the reader, and only for devices that stamp their samples.
+Runs at the evaluation, never in the reader. Devices that neither stamp nor number their samples are
+judged by the count of samples that they must have sent.
 """
 
 from collections import deque
 
 import numpy as np
 
-from dextouch.clocks import OnlineClock
+from dextouch.clocks import LookAheadClock, OnlineClock
 from dextouch.errors import InvalidInputError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.health_blocks import Block, Rolling
@@ -28,6 +29,8 @@ MIN_RESIDUALS = 30
 # Before the clock has a slope of its own, two halves of so many samples give a first one.
 MIN_EARLY_SAMPLES = 40
 BINS = 10
+# Counting bears delays up to most of a period; what comes near is told.
+RESIDUAL_SHARES = (0.25, 0.5)
 
 
 class ClockJudge:
@@ -65,10 +68,9 @@ class ClockJudge:
         text = f"its clock is off by {skew_ppm:+.0f} ppm"
         findings = above("clock_skew", abs(skew_ppm), SKEW_LIMITS_PPM, text)
         if len(kept_s) >= MIN_RESIDUALS:
-            # The median is path delay, which stamps of one direction cannot tell from offset.
-            scatter_s = float(np.percentile(np.abs(kept_s - np.median(kept_s)), 95))
+            scatter_s = _scatter_s(kept_s)
             figures["clock_residual_p95_seconds"] = scatter_s
-            figures["clock_sigma_seconds"] = self._sigma_s(kept_s)
+            figures["clock_sigma_seconds"] = _sigma_s(kept_s)
             text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about its clock"
             findings += above("clock_residual", scatter_s, RESIDUAL_LIMITS_S, text)
         return Verdict((*findings, *self._judge_steps(now_ns)), figures)
@@ -144,10 +146,73 @@ class ClockJudge:
             return (HealthFinding(code="clock_step", level="WARN", message=text),)
         return ()
 
-    def _sigma_s(self, residuals_s: np.ndarray) -> float:
-        """How far the lower edge of the residuals moves from second to second."""
-        edges = [part.min() for part in np.array_split(residuals_s, BINS)]
-        return float(1.4826 * np.median(np.abs(edges - np.median(edges))))
+
+class CountingJudge:
+    """Judges a stream without time and number: its clock is the count of its samples.
+
+    The nominal period may be off by percents, so that skew is told and `rate` judges it; losses
+    that were miscounted look like resets, so that these are told too and are no step. What is sent
+    unsteadily has no clock to judge.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor) -> None:
+        self._period_ns = descriptor.period_ns()
+        self._limits_s = tuple(
+            max(limit_s, share * self._period_ns * 1e-9)
+            for limit_s, share in zip(RESIDUAL_LIMITS_S, RESIDUAL_SHARES, strict=True)
+        )
+        self._residuals = Rolling(WINDOW_NS)
+        self._num_resets = 0
+        self._restart()
+
+    def _restart(self) -> None:
+        self._clock = LookAheadClock(self._period_ns)
+        self._undated: deque[int] = deque()
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        try:
+            arrivals_ns, residuals_ns = self._follow(block)
+        except InvalidInputError:
+            # Arrivals that go back: another reader, another clock.
+            self._num_resets += 1 + self._clock.num_steps
+            self._restart()
+            return Verdict()
+        kept_s = self._residuals.add(arrivals_ns, residuals_ns * 1e-9, now_ns)
+        if not len(block) or len(kept_s) < MIN_RESIDUALS or not self._clock.is_steady:
+            return Verdict()
+        scatter_s = _scatter_s(kept_s)
+        figures = {
+            "clock_resets": float(self._num_resets + self._clock.num_steps),
+            "clock_skew_ratio": self._clock.skew_ppm * 1e-6,
+            "clock_residual_p95_seconds": scatter_s,
+            "clock_sigma_seconds": _sigma_s(kept_s),
+        }
+        text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about the count of its samples"
+        limits_s = (self._limits_s[0], self._limits_s[1])
+        return Verdict(above("clock_residual", scatter_s, limits_s, text), figures)
+
+    def _follow(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
+        """Arrivals of the samples that got their final time now, and how long they waited, ns."""
+        arrivals_ns: list[int] = []
+        residuals_ns: list[int] = []
+        for t_host_ns in block.t_host_ns.tolist():
+            self._undated.append(t_host_ns)
+            for dated in self._clock.advance(t_host_ns):
+                arrivals_ns.append(self._undated.popleft())
+                residuals_ns.append(arrivals_ns[-1] - dated.t_host_ns)
+        return np.array(arrivals_ns, dtype=np.int64), np.array(residuals_ns, dtype=np.int64)
+
+
+def _scatter_s(residuals_s: np.ndarray) -> float:
+    """How far 95 % lie from the median, which is path delay and cannot be told from offset."""
+    return float(np.percentile(np.abs(residuals_s - np.median(residuals_s)), 95))
+
+
+def _sigma_s(residuals_s: np.ndarray) -> float:
+    """How far the lower edge of the residuals moves from second to second."""
+    edges = [part.min() for part in np.array_split(residuals_s, BINS)]
+    return float(1.4826 * np.median(np.abs(edges - np.median(edges))))
 
 
 def _signed(steps: np.ndarray, bits: int, unit: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 import structlog
 
-from dextouch.clocks import OnlineClock, PathLatency, RoundTrip, RoundTripClock
+from dextouch.clocks import KnownSkew, OnlineClock, PathLatency, RoundTrip, RoundTripClock
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.schemas.episodes import Matrix
 from dextouch.streams.descriptors import StreamDescriptor
@@ -54,7 +54,8 @@ class _StreamPath:
         self.name = descriptor.name
         self._descriptor = descriptor
         self._queue: deque[tuple[int, int]] = deque(maxlen=KEPT_SAMPLES)
-        self._max_samples = WINDOW_S * descriptor.nominal_rate_hz
+        self._rate_hz = descriptor.nominal_rate_hz
+        self._max_samples = WINDOW_S * self._rate_hz
         self._clock = OnlineClock(descriptor)
         self._num_steps = 0
         self._num_samples = 0
@@ -85,9 +86,15 @@ class _StreamPath:
         if self._newest is None or self._num_samples < MIN_SAMPLES:
             return None
         t_remote_ns, t_estimated_ns = self._newest
-        found = trips.latency(t_remote_ns=t_remote_ns, t_estimated_ns=t_estimated_ns)
         num = min(self._num_samples, self._max_samples)
         edge_ns = EDGE_SPREADS * self._clock.spread_ns / math.sqrt(num)
+        # Many samples tell the drift sooner than few exchanges; two ends of the edge make it.
+        skew_sigma_ppm = 2e-3 * edge_ns * self._rate_hz / num
+        found = trips.latency(
+            t_remote_ns=t_remote_ns,
+            t_estimated_ns=t_estimated_ns,
+            skew=KnownSkew(-self._clock.skew_ppm, skew_sigma_ppm),
+        )
         sigma_ns = math.hypot(found.sigma_ns, edge_ns)
         if found.latency_ns < -IMPOSSIBLE_SIGMAS * sigma_ns:
             return None

@@ -10,7 +10,13 @@ from dextouch.clocks.look_ahead import (
     date_by_counting,
 )
 from dextouch.clocks.online_clock import OnlineClock
-from dextouch.clocks.round_trips import ClockOffset, PathLatency, RoundTrip, RoundTripClock
+from dextouch.clocks.round_trips import (
+    ClockOffset,
+    KnownSkew,
+    PathLatency,
+    RoundTrip,
+    RoundTripClock,
+)
 from dextouch.clocks.timestamps import SequenceReport, find_lost_samples, unwrap_counter
 
 __all__ = [
@@ -19,6 +25,7 @@ __all__ = [
     "ClockSegment",
     "CountedSample",
     "CountedTake",
+    "KnownSkew",
     "LookAheadClock",
     "LookAheadUpdate",
     "OnlineClock",

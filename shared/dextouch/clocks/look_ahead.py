@@ -21,6 +21,11 @@ LOOK_AHEAD = 10
 LOST_SHARE = 0.75
 # While a queue drains the answer may have to wait for so many times more samples.
 MAX_WAIT = 6
+# A device whose samples are counted must be a steady one. Beyond these its nominal rate is wrong
+# or it samples when it likes, and its arrivals say more.
+MAX_STEADY_SKEW_PPM = 20_000.0
+MAX_STEADY_LOSS = 0.1
+MAX_STEPS_PER_SAMPLE = 0.001
 # Provisional times believe in a loss after so many late samples.
 LOOK_BACK = 3
 
@@ -85,6 +90,16 @@ class LookAheadClock:
     def skew_ppm(self) -> float:
         """How much longer a sample period is than the nominal one."""
         return self._envelope.slope_ns_per_s * 1e-3
+
+    @property
+    def is_steady(self) -> bool:
+        """Whether the device samples so steadily that counting dates it better than arrivals."""
+        num_arrived = self._index + 1 - self._num_lost
+        return (
+            abs(self.skew_ppm) <= MAX_STEADY_SKEW_PPM
+            and self._num_lost <= MAX_STEADY_LOSS * num_arrived
+            and self.num_steps <= MAX_STEPS_PER_SAMPLE * num_arrived
+        )
 
     def update(self, t_host_ns: int) -> LookAheadUpdate:
         """Take in one arrival on the host's monotonic clock.
@@ -185,6 +200,7 @@ class CountedTake:
         skew_ppm: how much longer a sample period is than the nominal one, at the end.
         num_lost: samples that never arrived.
         num_steps: restarts of the device, and losses that were miscounted and mended.
+        is_steady: whether these times are better than the arrivals.
     """
 
     number: Int64[np.ndarray, " n"]
@@ -192,6 +208,7 @@ class CountedTake:
     skew_ppm: float
     num_lost: int
     num_steps: int
+    is_steady: bool
 
 
 def date_by_counting(
@@ -218,4 +235,5 @@ def date_by_counting(
         skew_ppm=clock.skew_ppm,
         num_lost=clock.num_lost,
         num_steps=clock.num_steps,
+        is_steady=clock.is_steady,
     )

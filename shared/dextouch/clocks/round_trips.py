@@ -65,6 +65,14 @@ class PathLatency:
     sigma_ns: float
 
 
+@dataclass(frozen=True)
+class KnownSkew:
+    """How much faster a remote clock runs, with its standard deviation."""
+
+    skew_ppm: float
+    sigma_ppm: float
+
+
 class RoundTripClock:
     """Offset between the local clock and a remote one that answers.
 
@@ -131,8 +139,14 @@ class RoundTripClock:
         for hull in (self._upper, self._lower):
             hull.forget_before(x_s - WINDOW_S)
 
-    def estimate(self, at_local_ns: int | None = None) -> ClockOffset:
+    def estimate(
+        self, at_local_ns: int | None = None, *, skew: KnownSkew | None = None
+    ) -> ClockOffset:
         """The offset at a local time; without one, at the last exchange.
+
+        Args:
+            at_local_ns: any local time.
+            skew: what something else tells of it; used where the exchanges know it less.
 
         Raises:
             ClockFitError: no exchange yet (`details["cause"]` is "too_few").
@@ -142,6 +156,8 @@ class RoundTripClock:
         at_local_ns = self._last_ns if at_local_ns is None else at_local_ns
         x_s = self._x_s(at_local_ns)
         slope, doubt = self._slope()
+        if skew is not None and skew.sigma_ppm * 1e3 < doubt:
+            slope, doubt = skew.skew_ppm * 1e3, skew.sigma_ppm * 1e3
         high_ns, low_ns = self._band_ns(x_s, slope)
         width_ns = max(0.0, high_ns - low_ns)
         drift_ns = doubt * self._age_s(x_s, slope)
@@ -153,14 +169,17 @@ class RoundTripClock:
             skew_ppm=slope * 1e-3,
         )
 
-    def latency(self, *, t_remote_ns: int, t_estimated_ns: int) -> PathLatency:
+    def latency(
+        self, *, t_remote_ns: int, t_estimated_ns: int, skew: KnownSkew | None = None
+    ) -> PathLatency:
         """The path delay that is still in a device's corrected times.
 
         Args:
             t_remote_ns: a sample's device time.
             t_estimated_ns: the same sample's time by `OnlineClock` or `fit_clock`.
+            skew: of the remote clock, as samples tell it.
         """
-        offset = self.estimate(t_estimated_ns)
+        offset = self.estimate(t_estimated_ns, skew=skew)
         true_ns = t_remote_ns - offset.offset_ns
         return PathLatency(t_estimated_ns - true_ns, offset.sigma_ns)
 

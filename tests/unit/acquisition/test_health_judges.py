@@ -16,7 +16,7 @@ from services.acquisition.drivers.tactile_glove import glove_descriptor
 from services.acquisition.health_blocks import Block, SampleBlocks
 from services.acquisition.health_camera import CameraJudge
 from services.acquisition.health_cells import CellJudge, Cells
-from services.acquisition.health_clock import ClockJudge
+from services.acquisition.health_clock import ClockJudge, CountingJudge
 from services.acquisition.health_taxels import (
     GloveRecord,
     TaxelJudge,
@@ -401,6 +401,55 @@ def test_a_clock_that_wraps_is_no_step():
         wrapped = Block(arrived.t_host_ns, device_ns, numbers, NONE)
         assert judge.judge(wrapped, (second + 1) * SECOND_NS).findings == ()
     assert judge.num_steps == 0
+
+
+def bare_descriptor(rate_hz=60):
+    return StreamDescriptor(
+        name="tactile_left",
+        kind="tactile",
+        shape=(400,),
+        dtype="float32",
+        unit="counts",
+        nominal_rate_hz=rate_hz,
+    )
+
+
+def bare(numbers, rng, *, delay_ms, skew_ppm=0.0):
+    t_s = numbers / 60 * (1 + skew_ppm * 1e-6) + rng.exponential(delay_ms * 1e-3, len(numbers))
+    return block(np.maximum.accumulate(t_s))
+
+
+@pytest.mark.parametrize(
+    ("delay_ms", "level"), [(0.5, None), (2.0, "WARN"), (5.0, "ERROR")], ids=["0.5", "2", "5"]
+)
+def test_a_stream_without_stamps_is_judged_by_its_count(delay_ms, level, rng):
+    judge = CountingJudge(bare_descriptor())
+    for second in range(15):
+        numbers = second * 60 + np.arange(60)
+        kept = numbers[rng.random(60) > 0.005]
+        arrived = bare(kept, rng, delay_ms=delay_ms, skew_ppm=300.0)
+        verdict = judge.judge(arrived, (second + 1) * SECOND_NS)
+    assert codes(verdict) == ({} if level is None else {"clock_residual": level})
+    figures = verdict.figures
+    if level is None:
+        assert figures["clock_skew_ratio"] * 1e6 == pytest.approx(300, abs=60)
+        assert figures["clock_residual_p95_seconds"] == pytest.approx(1.15e-3, abs=0.4e-3)
+        assert figures["clock_resets"] == 0
+    assert len(judge._undated) <= 10 * 6
+    assert codes(judge.judge(block([]), 16 * SECOND_NS)) == {}
+
+
+def test_a_restart_of_a_stream_without_stamps_is_counted_and_no_clock_is_guessed(rng):
+    judge = CountingJudge(bare_descriptor())
+    for second in range(20):
+        # It pauses for half a second and goes on between two of its former moments.
+        numbers = second * 60 + np.arange(60) + (30.5 if second >= 10 else 0.0)
+        verdict = judge.judge(bare(numbers, rng, delay_ms=0.3), (second + 1) * SECOND_NS)
+    assert verdict.figures["clock_resets"] == 1
+    unsteady = CountingJudge(bare_descriptor())
+    for second in range(5):
+        arrived = block(second + np.sort(rng.random(40)))
+        assert unsteady.judge(arrived, (second + 1) * SECOND_NS).figures == {}
 
 
 def test_blocks_are_bounded_and_count_what_they_lose():

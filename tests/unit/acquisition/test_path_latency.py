@@ -1,0 +1,220 @@
+"""Path delays from time requests: simulated gloves, silence, steps, takes and findings."""
+
+import numpy as np
+import pytest
+from prometheus_client import CollectorRegistry, generate_latest
+
+from dextouch.clocks import PathLatency, RoundTrip
+from dextouch.episodes.log import SpoolReader
+from dextouch.errors import DeviceError
+from dextouch.streams.samples import Sample
+from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
+from services.acquisition.health import HealthMonitor
+from services.acquisition.health_metrics import HealthCollector
+from services.acquisition.health_path import PathJudge
+from services.acquisition.live import LiveView
+from services.acquisition.mocks.ports import PtyPort
+from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
+from services.acquisition.recorder import Recorder
+from services.acquisition.schemas import SaveTake, TakePrompt
+from services.acquisition.supervisor import DeviceSupervisor
+
+SECOND_NS = 1_000_000_000
+COUNTS = np.full(360, 100, np.uint16)
+CALIBRATION = {
+    "tactile_left_tare_counts": ((100.0,) * 360,),
+    "tactile_left_gain_counts_per_kpa": ((40.0,) * 360,),
+}
+NAME, SIGMA_NAME = "tactile_left_latency_ns", "tactile_left_latency_sigma_ns"
+
+
+class SimulatedGlove(Driver):
+    """Samples and answers of a glove whose clock and ways are known; nothing is read or written."""
+
+    def __init__(self, seed=0, *, clock=None):
+        port = PtyPort("glove_left")
+        super().__init__(
+            "glove_left",
+            transport=port.transport,
+            decoder=TactileGloveDecoder("left"),
+            clock=clock or RealClock(),
+        )
+        self.rng = np.random.default_rng(seed)
+        self.latency_ns = int(self.rng.uniform(0.5e6, 40e6))
+        self.skew_ppm = self.rng.uniform(-80, 80)
+        # The least time of either way differs: that is what nobody can see.
+        self.least_ns = self.rng.uniform(0.05e6, 0.8e6, 2)
+        self.step_ns = 0
+        self.is_silent = False
+        self.num_asked = 0
+        self.second = 0
+        self.watch = None
+
+    def device_ns(self, t_ns):
+        return int(t_ns * (1 - self.skew_ppm * 1e-6)) + 5 * 10**12 + self.step_ns
+
+    def time_round_trip(self):
+        self.num_asked += 1
+        if self.is_silent:
+            raise DeviceError("glove_left: no answer to time_sync")
+        sent_ns = self.second * SECOND_NS
+        there_ns, back_ns = (self.least_ns + self.rng.exponential(0.3e6, 2)).astype(int).tolist()
+        told_ns = self.device_ns(sent_ns + there_ns)
+        return RoundTrip(sent_ns, told_ns, told_ns, sent_ns + there_ns + back_ns)
+
+    def live_a_second(self):
+        true_ns = self.second * SECOND_NS + np.arange(60) * SECOND_NS // 60
+        waits_ns = self.latency_ns + self.rng.exponential(0.8e6, 60)
+        arrivals_ns = np.maximum.accumulate(true_ns + waits_ns.astype(int))
+        samples = [
+            Sample(t_ns, COUNTS, self.device_ns(taken_ns), self.second * 60 + n)
+            for n, (t_ns, taken_ns) in enumerate(
+                zip(arrivals_ns.tolist(), true_ns.tolist(), strict=True)
+            )
+        ]
+        self.watch.accept({"tactile_left": samples, "nobody": samples})
+        self.second += 1
+        self.watch.look()
+        return self.watch.latencies().get("tactile_left")
+
+
+def watched(glove, clock=None):
+    clock = clock or RealClock()
+    supervisor = DeviceSupervisor(glove, sink=lambda *_: None, clock=clock)
+    supervisor.counters.is_connected = True
+    glove.watch = PathWatch([supervisor], clock=clock)
+    return supervisor
+
+
+def test_every_error_is_within_three_sigma():
+    worst, sigmas_ns = 0.0, []
+    for seed in range(6):
+        glove = SimulatedGlove(seed)
+        watched(glove)
+        for second in range(35):
+            found = glove.live_a_second()
+            assert (found is None) == (second < 4), second
+            if found is not None:
+                error_ns = found.latency_ns - glove.latency_ns
+                worst = max(worst, abs(error_ns) / found.sigma_ns)
+        sigmas_ns.append(found.sigma_ns)
+    assert worst <= 3.0
+    assert max(sigmas_ns) <= 0.6e6
+
+
+def test_a_silent_device_is_counted_and_left_alone_for_longer_and_longer():
+    glove = SimulatedGlove()
+    watched(glove)
+    glove.is_silent = True
+    for _ in range(200):
+        glove.watch.look()
+    assert glove.num_asked == glove.watch.num_failures("tactile_left")
+    assert 200 / 2**MAX_BACK_OFF <= glove.num_asked <= 5 + 200 / 2**MAX_BACK_OFF
+    glove.is_silent = False
+    for _ in range(40):
+        glove.watch.look()
+    assert any(glove.live_a_second() is not None for _ in range(5))
+
+
+def test_nobody_is_asked_who_is_not_there_or_cannot_answer_or_lives_in_virtual_time():
+    glove = SimulatedGlove()
+    supervisor = watched(glove)
+    supervisor.counters.is_connected = False
+    glove.live_a_second()
+    assert glove.num_asked == 0
+    virtual = VirtualClock()
+    other = SimulatedGlove(clock=virtual)
+    watched(other, virtual)
+    other.live_a_second()
+    assert other.num_asked == 0
+    assert other.watch.num_failures("tactile_left") is None
+    other.watch.start()
+    other.watch.stop()
+
+
+@pytest.mark.parametrize("step_ns", [-30_000_000, 5 * SECOND_NS])
+def test_after_a_step_of_the_devices_clock_the_delay_is_the_same_or_not_told(step_ns):
+    glove = SimulatedGlove(3)
+    watched(glove)
+    for _ in range(10):
+        glove.live_a_second()
+    glove.step_ns = step_ns
+    found = [glove.live_a_second() for _ in range(10)]
+    assert found[0] is None
+    assert found[-1] is not None
+    told = [latency for latency in found if latency is not None]
+    errors = [abs(each.latency_ns - glove.latency_ns) / each.sigma_ns for each in told]
+    assert max(errors) <= 3.0
+
+
+def test_missing_stamps_do_not_end_the_watch():
+    glove = SimulatedGlove()
+    watched(glove)
+    for _ in range(10):
+        glove.live_a_second()
+    glove.watch.accept({"tactile_left": [Sample(glove.second * SECOND_NS, COUNTS)]})
+    assert glove.live_a_second() is None
+    assert any(glove.live_a_second() is not None for _ in range(5))
+
+
+def test_a_calibrated_delay_wins_and_a_better_measurement_replaces_a_worse_one():
+    measured = {"a": PathLatency(3, 1.0), "b": PathLatency(4, 1.0)}
+    stated = {"a_latency_ns": ((9.0,),)}
+    first = add_latencies(stated, measured, stated=stated)
+    assert first == {**stated, "b_latency_ns": ((4.0,),), "b_latency_sigma_ns": ((1.0,),)}
+    worse = add_latencies(first, {"b": PathLatency(7, 2.0)}, stated=stated)
+    better = add_latencies(first, {"b": PathLatency(5, 0.5)}, stated=stated)
+    assert worse == first
+    assert better["b_latency_ns"] == ((5.0,),)
+    assert better["b_latency_sigma_ns"] == ((0.5,),)
+
+
+def test_a_take_gets_the_delay_at_its_start_and_a_better_one_at_its_end(tmp_path):
+    clock = VirtualClock(10**9)
+    latencies = {"tactile_left": PathLatency(3_000_000, 5e5)}
+    recorder = Recorder(
+        station="test",
+        spool_root=tmp_path,
+        drivers=[SimulatedGlove(clock=clock)],
+        clock=clock,
+        calibration={"K_head": ((1.0,),)},
+    )
+    recorder.measure_latencies(lambda: latencies)
+    recorder.arm(TakePrompt(task="stand_bottle", instruction="stand it up", consent=True))
+    recorder.record("take")
+    attributes = SpoolReader(tmp_path / "take").attributes
+    assert attributes.calibration[NAME] == ((3e6,),)
+    latencies["tactile_left"] = PathLatency(3_200_000, 2e5)
+    recorder.stop()
+    recorder.save(SaveTake(accept_incomplete=True))
+    attributes = SpoolReader(tmp_path / "take").attributes
+    assert attributes.calibration == {
+        "K_head": ((1.0,),),
+        NAME: ((3.2e6,),),
+        SIGMA_NAME: ((2e5,),),
+    }
+
+
+@pytest.mark.parametrize(("off_ns", "is_found"), [(0, False), (8_000_000, True)])
+def test_a_calibration_that_the_answers_contradict_is_a_finding(off_ns, is_found):
+    glove = SimulatedGlove(1)
+    supervisor = watched(glove)
+    for _ in range(15):
+        glove.live_a_second()
+    calibrated = {NAME: ((float(glove.latency_ns + off_ns),),), SIGMA_NAME: ((2e5,),)}
+    live = LiveView([glove], {**CALIBRATION, **calibrated})
+    monitor = HealthMonitor([supervisor], live=live, clock=RealClock(), station="bench")
+    monitor.watch_paths(glove.watch)
+    (judge,) = [j for j in monitor._streams[0].judges if isinstance(j, PathJudge)]
+    verdict = judge.judge(live.blocks.take("tactile_left"), 0)
+    found = [(finding.code, finding.level) for finding in verdict.findings]
+    assert found == ([("latency_calibration", "WARN")] if is_found else [])
+    supervisor.counters.add({"tactile_left": [Sample(RealClock().now_ns(), COUNTS)]})
+    monitor.evaluate()
+    registry = CollectorRegistry()
+    registry.register(HealthCollector(monitor.report, monitor.raised))
+    text = generate_latest(registry).decode()
+    for name in ("path_latency_seconds", "path_latency_sigma_seconds", "time_requests_failed"):
+        assert f"\ndextouch_{name}{{" in text
