@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.clocks import RoundTrip, RoundTripClock
+from dextouch.clocks import KnownSkew, RoundTrip, RoundTripClock
 from dextouch.errors import ClockFitError, InvalidInputError
 
 START_NS = 10**18
@@ -51,6 +51,18 @@ def test_drift_is_known_after_minutes():
     later_ns = START_NS + 360 * 10**9
     assert clock.estimate(later_ns).offset_ns == pytest.approx(remote(later_ns) - later_ns, abs=3e5)
     assert clock.estimate(later_ns).sigma_ns >= clock.estimate().sigma_ns
+
+
+def test_a_drift_that_samples_know_makes_the_first_seconds_sure():
+    clock = RoundTripClock()
+    remote = ask(clock, np.random.default_rng(0), count=20, offset_ns=0, skew=8e-5)
+    alone, told = clock.estimate(), clock.estimate(skew=KnownSkew(80.0, 2.0))
+    true_ns = remote(told.at_local_ns) - told.at_local_ns
+    assert told.skew_ppm == 80.0
+    assert abs(told.offset_ns - true_ns) <= 3 * told.sigma_ns
+    assert told.sigma_ns < 0.5 * alone.sigma_ns
+    vague = clock.estimate(skew=KnownSkew(-80.0, 1000.0))
+    assert vague == alone, "what is known worse is not used"
 
 
 @pytest.mark.parametrize("step_ns", [5_000_000, -5_000_000, 10**12])
