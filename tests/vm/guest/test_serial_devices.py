@@ -5,12 +5,16 @@ import select
 import threading
 import time
 import tty
+from itertools import count
 from pathlib import Path
 
 import numpy as np
 
+from services.acquisition.clock import RealClock
+from services.acquisition.devices import build_drivers
 from services.acquisition.mocks.glove_answers import GloveAnswers
 from services.acquisition.settings import TactileGloveSettings
+from services.acquisition.supervisor import DeviceSupervisor
 from tests.vm.guest import kernel_devices, packets
 from tests.vm.guest.conftest import (
     MAX_BACK_S,
@@ -117,3 +121,45 @@ def test_a_glove_is_found_again_under_another_port(plug, opened, measured):
     assert flagged_s <= MAX_FLAGGED_S
     assert back_s <= MAX_BACK_S
     assert driver.statistics.crc_errors == 0
+
+
+def test_a_station_reads_on_when_its_glove_is_put_back(plug, measured):
+    gadget = plug(kernel_devices.serial_gadget, ids=IDS, serial_number="GLOVE-L")
+    gadget.plug()
+    glove = GloveOnALine(gadget)
+    glove.packets = (data for number in count() for data in packets.glove_packets(number, 1))
+    glove.start()
+    clock, samples = RealClock(), []
+    settings = TactileGloveSettings(side="left", serial_number="GLOVE-L")
+    (driver,) = build_drivers([settings], clock)
+    station = DeviceSupervisor(
+        driver, sink=lambda _, readings: samples.extend(*readings.values()), clock=clock
+    )
+
+    def wait_until(told):
+        kernel_devices.until(told, within_s=PATIENCE_S, pause=PAUSE)
+
+    station.start()
+    try:
+        wait_until(lambda: len(samples) >= 30)
+        begun = time.monotonic()
+        gadget.unplug()
+        wait_until(lambda: not station.connected.is_set())
+        flagged_s = time.monotonic() - begun
+        num_before = len(samples)
+        begun = time.monotonic()
+        gadget.plug()
+        wait_until(lambda: len(samples) > num_before)
+        back_s = time.monotonic() - begun
+        wait_until(lambda: len(samples) >= num_before + 30)
+    finally:
+        station.stop()
+        glove.close()
+    numbers = [sample.sequence for sample in samples]
+    assert numbers == sorted(set(numbers))
+    for sample in samples:
+        np.testing.assert_array_equal(sample.values, packets.glove_counts(sample.sequence))
+    assert station.events()["lost_device"] == 1
+    measured("glove, ACM gadget, supervised", *replug_row(flagged_s, back_s))
+    assert flagged_s <= MAX_FLAGGED_S
+    assert back_s <= MAX_BACK_S
