@@ -93,14 +93,14 @@ class DeviceSupervisor:
 
     def events(self) -> dict[str, int]:
         """Counts of what happened to the device since the start, by name."""
-        filters: list[SequenceGuard | OrderFilter] = [
-            *self._guards.values(),
-            *_order_filters(self.driver),
-        ]
+        filters = _order_filters(self.driver)
+        # All streams of a device come in the same packets; each guard has seen all of these.
+        guards = self._guards.values()
         return {
             **self._events,
-            "repeated": sum(each.repeated for each in filters),
-            "late": sum(each.late for each in filters),
+            "repeated": sum(f.repeated for f in filters)
+            + max((g.repeated for g in guards), default=0),
+            "late": sum(f.late for f in filters) + max((g.late for g in guards), default=0),
             **_judged_events(self.driver),
         }
 

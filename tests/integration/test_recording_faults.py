@@ -8,12 +8,13 @@ import pytest
 
 from dextouch.episodes.log import SpoolReader
 from services.acquisition.clock import VirtualClock
+from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
-from tests.integration.recording_streams import human_streams, stream
+from tests.integration.recording_streams import human_streams, robot_streams, stream
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 GLOVE, FINGERS, TRACKER, CAMERA = (
@@ -301,6 +302,27 @@ def test_a_fault_is_counted_and_nothing_is_invented(name, undisturbed, tmp_path)
     # The other stream has not noticed.
     assert_same(spool.read(NEIGHBOR), batches[NEIGHBOR])
     assert entries.get(NEIGHBOR) == entries_before.get(NEIGHBOR)
+
+
+@pytest.mark.parametrize(
+    ("fault", "event", "fate"),
+    [
+        ("nan_probability", "refused", Fate.REFUSED),
+        ("reorder_probability", "late", Fate.LATE),
+        ("duplicate_probability", "repeated", Fate.REPEATED),
+    ],
+)
+def test_a_packet_of_many_streams_is_counted_once_in_each(fault, event, fate, tmp_path):
+    streams = [s for s in robot_streams(1.3) if s.descriptor.name in STREAM_SIZES]
+    faults = FaultScript(others=DeviceFaults.model_validate({fault: 0.1}))
+    with MockStation(streams, faults, 5, VirtualClock(), spool_root=tmp_path) as station:
+        take = station.run_take(PROMPT, recording_id="take")
+    entries = ledger_of(SpoolReader(take.spool_path))
+    told = take.ledger.of("robot_state").count(fate)
+    assert told > 0
+    assert {name: entries[name][event] for name in STREAM_SIZES} == dict.fromkeys(
+        STREAM_SIZES, told
+    )
 
 
 @pytest.mark.parametrize("name", ["stall", "version", "unplug, serial"])
