@@ -162,8 +162,9 @@ class AcquisitionSettings(ServiceSettings):
 
     With `mock` the devices are simulated: they play the episode `mock_episode_id` of the local
     store `mock_store` round and round, or a made-up pattern when no episode is named, connected
-    as `mock_links` says. Otherwise `devices` names the real ones, and `calibration` a JSON file of
-    named matrices.
+    as `mock_links` says, without faults or, as in the demo, with those of an ordinary station
+    (`mock_faults=first_light`: its losses are findings of the health). Otherwise `devices` names
+    the real ones, and `calibration` a JSON file of named matrices.
 
     Takes reach the disk every `flush_period_s`, which is what a power loss costs at most. One ends
     when less than `min_free_bytes` are left on the disk of the `spool`, and none begins then.
@@ -178,7 +179,7 @@ class AcquisitionSettings(ServiceSettings):
     mock: bool = False
     mock_store: str | None = None
     mock_episode_id: str | None = None
-    mock_faults: Literal["none", "first_light"] = "first_light"
+    mock_faults: Literal["none", "first_light"] = "none"
     mock_links: MockLinks = MockLinks()
     seed: int = Field(default=0, ge=0)
     devices: tuple[DeviceSettings, ...] = ()

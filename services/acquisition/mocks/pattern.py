@@ -15,6 +15,9 @@ from services.acquisition.mocks.replay import ReplayStream
 IMAGE_PX = 64
 FOVY_RAD = 1.0
 PEAK_KPA = 30.0
+# Patches of the cameras' ground: as large as the squares that the image check looks at.
+PATCH_PX = 4
+PATCH_CONTRAST = 20
 ROUND_S = 8.0
 
 
@@ -117,10 +120,12 @@ def _poses(turn_rad: np.ndarray, centre_m: np.ndarray) -> Float64[np.ndarray, "n
 
 
 def _images(turn_rad: np.ndarray) -> UInt8[np.ndarray, "n 64 64 3"]:
+    """A ball rolls over patches, whose edges keep every image about as sharp as the others."""
     rows, columns = np.mgrid[0:IMAGE_PX, 0:IMAGE_PX]
     centre_row = IMAGE_PX * (0.5 + 0.3 * np.sin(turn_rad))[:, None, None]
     centre_column = IMAGE_PX * (0.5 + 0.3 * np.cos(turn_rad))[:, None, None]
     ball = np.hypot(rows - centre_row, columns - centre_column) < IMAGE_PX / 8
-    ground = np.broadcast_to(60 + rows + columns, ball.shape)
+    patches = PATCH_CONTRAST * ((rows // PATCH_PX + columns // PATCH_PX) % 2)
+    ground = np.broadcast_to(40 + rows + columns + patches, ball.shape)
     red = np.where(ball, 230, ground)
     return np.stack([red, np.where(ball, 120, ground), ground], axis=-1).astype(np.uint8)

@@ -15,6 +15,7 @@ from services.acquisition.drivers.image_quality import (
     laplacian_variance,
     quarter_size,
 )
+from services.acquisition.mocks.pattern import pattern_streams
 
 PERIOD_NS = 33_333_333
 
@@ -135,6 +136,13 @@ def test_the_median_of_a_long_session_is_bounded_and_right(rng):
     assert len(median._values) < MAX_SHARPNESSES
     # 256 … 511 values remain: their median scatters by 10 · 1.25 / √256 = 0.8.
     assert median.value == pytest.approx(np.median(values), abs=3.0)
+
+
+def test_a_mock_stations_pattern_is_always_as_sharp():
+    (camera,) = (s for s in pattern_streams() if s.descriptor.name == "camera_head")
+    sharpness = [laplacian_variance(quarter_size(image)) for image in camera.values]
+    assert min(sharpness) > 0.5 * np.median(sharpness)
+    assert camera.values.max() < 250
 
 
 def test_nothing_is_known_of_no_image():

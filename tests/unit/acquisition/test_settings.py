@@ -40,6 +40,10 @@ def test_options_are_these():
     assert set(AcquisitionSettings.model_fields) - set(ServiceSettings.model_fields) == OPTIONS
 
 
+def test_a_mock_station_is_healthy_unless_asked():
+    assert AcquisitionSettings(mock=True).mock_faults == "none"
+
+
 def test_environment_and_flags(monkeypatch):
     monkeypatch.setenv("DEXTOUCH_ACQUISITION_STATION", "desk_3")
     settings = load_settings(AcquisitionSettings, ["--mock", "true", "--seed", "4"])
