@@ -28,6 +28,14 @@ STEPS_ERROR = 3
 MIN_RESIDUALS = 30
 # Before the clock has a slope of its own, two halves of so many samples give a first one.
 MIN_EARLY_SAMPLES = 40
+# Arrivals that a busy host delays tilt the line of so young a clock: parts of them must agree.
+YOUNG_NS = 20_000_000_000
+SKEW_PARTS = 4
+# A nominal rate may be off by so much, which adds up where many samples are missing.
+RATE_SHARE = 0.02
+# The smallest step that the line finds is 1 ms; a step shows in the distance of two stamps.
+DEPARTURE_NS = 500_000
+BORNE_OUT_NS = 5_000_000_000
 BINS = 10
 # Counting bears delays up to most of a period; what comes near is told.
 RESIDUAL_SHARES = (0.25, 0.5)
@@ -49,6 +57,8 @@ class ClockJudge:
         self._clock = OnlineClock(self._descriptor)
         self._known_steps = 0
         self._last: tuple[int, int, int] | None = None
+        self._departed_ns: int | None = None
+        self._since_ns: int | None = None
 
     def judge(self, block: Block, now_ns: int) -> Verdict:
         """One evaluation."""
@@ -63,7 +73,7 @@ class ClockJudge:
             finding = HealthFinding(code="clock_stamps", level="ERROR", message=error.message)
             return Verdict((finding, *self._judge_steps(now_ns)))
         kept_s = self._residuals.add(block.t_host_ns, residuals_ns * 1e-9, now_ns)
-        skew_ppm = self._clock.skew_ppm or self._early_skew_ppm()
+        skew_ppm = self._skew_ppm(int(block.t_host_ns[-1]))
         figures = {**self._figures(), "clock_skew_ratio": skew_ppm * 1e-6}
         text = f"its clock is off by {skew_ppm:+.0f} ppm"
         findings = above("clock_skew", abs(skew_ppm), SKEW_LIMITS_PPM, text)
@@ -94,7 +104,10 @@ class ClockJudge:
             residuals_ns[index] = t_host_ns - estimate_ns
         if self._clock.num_steps > self._known_steps:
             self._known_steps = self._clock.num_steps
-            self._note(int(block.t_host_ns[-1]))
+            # Arrivals that a busy host delays for long look like a step; the stamps tell.
+            t_ns, departed_ns = int(block.t_host_ns[-1]), self._departed_ns
+            if departed_ns is not None and t_ns - departed_ns < BORNE_OUT_NS:
+                self._note(t_ns)
         return residuals_ns
 
     def _jumps(self, block: Block) -> list[int]:
@@ -104,31 +117,63 @@ class ClockJudge:
         if self._last is not None:
             stamps = np.concatenate([np.array(self._last)[:, None], stamps], axis=1)
         self._last = (int(stamps[0, -1]), int(stamps[1, -1]), int(stamps[2, -1]))
-        if stamps.shape[1] < 2 or stamps[1].min() < 0:
+        if stamps.shape[1] < 2:
             return []
         host_ns, device_ns, numbers = np.diff(stamps, axis=1)
+        period_ns = self._descriptor.period_ns()
+        numbers = (
+            _signed(numbers, capabilities.sequence_bits, 1)
+            if capabilities.sequence
+            else np.ones_like(numbers)
+        )
+        if stamps[1].min() < 0:
+            self._note_departures(stamps[0, 1:], numbers != 1)
+            return []
         device_ns = _signed(device_ns, capabilities.device_time_bits, capabilities.tick_ns)
+        off_ns = np.abs(device_ns - numbers * period_ns)
+        departed = (off_ns > DEPARTURE_NS + capabilities.tick_ns) | (numbers < 1)
+        self._note_departures(stamps[0, 1:], departed)
         offsets_ns = self._drift_ns + np.cumsum(host_ns - device_ns)
         self._drift_ns = int(offsets_ns[-1])
         self._offsets.add(stamps[0, 1:], offsets_ns, int(stamps[0, -1]))
         if not capabilities.sequence:
             return []
-        numbers = _signed(numbers, capabilities.sequence_bits, 1)
-        off_sequence = np.abs(device_ns - numbers * self._descriptor.period_ns()) > STEP_NS
+        off_sequence = off_ns > STEP_NS + RATE_SHARE * period_ns * (numbers - 1)
         off_host = np.abs(device_ns - host_ns) > STEP_NS
         jumped = off_sequence & off_host & (numbers > 0)
         return [int(t_ns) for t_ns in stamps[0, 1:][jumped]]
 
+    def _note_departures(self, t_host_ns: np.ndarray, departed: np.ndarray) -> None:
+        """Remember when samples were last not as far apart as their numbers say."""
+        if departed.any():
+            self._departed_ns = int(t_host_ns[departed][-1])
+
+    def _skew_ppm(self, t_host_ns: int) -> float:
+        """The line's slope; of a young clock only where the edges of all parts bear it out."""
+        if self._since_ns is None:
+            self._since_ns = t_host_ns
+        slope_ppm = self._clock.skew_ppm
+        if slope_ppm != 0.0 and t_host_ns - self._since_ns >= YOUNG_NS:
+            return slope_ppm
+        early_ppm = self._early_skew_ppm()
+        is_borne_out = slope_ppm * early_ppm > 0 and abs(early_ppm) > 0.5 * abs(slope_ppm)
+        return slope_ppm if is_borne_out else early_ppm
+
     def _early_skew_ppm(self) -> float:
-        """Slope of the offsets' lower edge over two halves, less what its scatter could feign."""
+        """Slope of the offsets' lower edge that all parts of the window show, less its doubt."""
         offsets_ns, t_ns = self._offsets.values, self._offsets.t_ns
         if len(t_ns) < MIN_EARLY_SAMPLES or self._steps:
             return 0.0
-        first, second = np.array_split(offsets_ns, 2)
-        span_s = (t_ns[-1] - t_ns[0]) * 0.5e-9
-        slope_ppm = (second.min() - first.min()) * 1e-3 / span_s
-        above_ns = np.concatenate([first - first.min(), second - second.min()]).mean()
-        doubt_ppm = 4.0 * above_ns * 1e-3 / len(first) / span_s
+        parts = np.array_split(offsets_ns, SKEW_PARTS)
+        edges_ns = np.array([part.min() for part in parts])
+        span_s = (t_ns[-1] - t_ns[0]) * 1e-9 / SKEW_PARTS
+        slopes_ppm = np.diff(edges_ns) * 1e-3 / span_s
+        if slopes_ppm.min() * slopes_ppm.max() <= 0:
+            return 0.0
+        # Late arrivals raise an edge for a while; what the whole window does, each part does.
+        above_ns = np.mean([np.mean(part - part.min()) for part in parts])
+        doubt_ppm = 4.0 * above_ns * 1e-3 / len(offsets_ns) / span_s
+        slope_ppm = slopes_ppm[np.argmin(np.abs(slopes_ppm))]
         return float(np.sign(slope_ppm) * max(0.0, abs(slope_ppm) - doubt_ppm))
 
     def _note(self, t_ns: int) -> None:

@@ -387,6 +387,33 @@ def test_steps_are_counted_once_and_three_in_an_hour_are_an_error():
     assert quiet.findings == ()
 
 
+def late_ms(load, t_s):
+    """How long a host that is busy in some way makes samples wait."""
+    if load == "at the start":
+        return 60.0 * (t_s < 1.3)
+    if load == "two seconds and a half":
+        return 40.0 * ((t_s > 6) & (t_s < 8.5))
+    return np.clip(20.0 * (t_s - 4), 0.0, 50.0) * (t_s < 9)
+
+
+@pytest.mark.parametrize("load", ["at the start", "two seconds and a half", "a growing queue"])
+@pytest.mark.parametrize("has_sequence", [True, False])
+def test_late_arrivals_of_a_busy_host_are_no_finding_of_the_devices_clock(load, has_sequence, rng):
+    descriptor = glove_descriptor("left")
+    capabilities = descriptor.capabilities.model_copy(update={"sequence": has_sequence})
+    judge = ClockJudge(descriptor.model_copy(update={"capabilities": capabilities}))
+    raised = set()
+    for second in range(15):
+        arrived = stamped(second, skew_ppm=50.0, rng=rng, delay_ms=0.5)
+        t_s = second + np.arange(60) / 60
+        t_host_ns = arrived.t_host_ns + np.rint(late_ms(load, t_s) * 1e6).astype(np.int64)
+        t_host_ns = np.maximum.accumulate(t_host_ns)
+        sequence = arrived.sequence if has_sequence else np.full(60, -1)
+        late = Block(t_host_ns, arrived.t_device_ns, sequence, NONE)
+        raised |= set(codes(judge.judge(late, (second + 1) * SECOND_NS)))
+    assert raised <= {"clock_residual"}
+
+
 def test_a_clock_that_wraps_is_no_step():
     capabilities = glove_descriptor("left").capabilities.model_copy(
         update={"sequence_bits": 16, "device_time_bits": 32, "tick_ns": 1000}
