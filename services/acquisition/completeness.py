@@ -94,6 +94,7 @@ def take_ledger(facts: Sequence[StreamFacts]) -> tuple[LedgerEntry, ...]:
     for fact in facts:
         counted: Mapping[str, int] = {
             "lost": fact.decoder.lost,
+            "late": fact.decoder.late,
             "crc_errors": fact.decoder.crc_errors,
             "length_errors": fact.decoder.length_errors,
             "resync_bytes": fact.decoder.resync_bytes,

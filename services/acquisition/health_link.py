@@ -92,12 +92,13 @@ class LinkJudge:
             ),
             refused=statistics.refused,
             suspects=statistics.suspects,
-            # The guard of the order sees repetitions that lie further back; both see the others.
+            # The guard of the order sees repetitions that lie further back, and nothing where a
+            # device has no clock; what both see counts once.
             repeated=max(statistics.repeated, events.get("repeated", 0)),
             restarts=statistics.restarts,
             reconnects=counters.reconnects,
             dropped=queue_dropped(driver),
-            late=events.get("late", 0),
+            late=max(statistics.late, events.get("late", 0)),
             wrong_side=events.get("wrong_side", 0),
             wrong_version=events.get("wrong_version", 0),
         )
@@ -119,7 +120,8 @@ class LinkJudge:
     ) -> tuple[tuple[HealthFinding, ...], dict[str, float]]:
         expected = round(self._descriptor.nominal_rate_hz * WINDOW_NS * 1e-9)
         packets = max(expected, last.packets - first.packets + last.lost - first.lost)
-        lost = (last.lost - first.lost) / packets
+        # An overtaken packet is taken off what is lost when it comes.
+        lost = max(0, last.lost - first.lost) / packets
         damaged = last.damaged - first.damaged
         refused = last.refused - first.refused
         suspects = last.suspects - first.suspects
@@ -134,8 +136,7 @@ class LinkJudge:
             *above("queue", dropped / packets, LOSS_LIMITS, f"{dropped} fell out of a queue"),
             *_events("repeated", last.repeated - first.repeated, "packets came twice"),
             *_events("reordered", late, "packets came behind later ones and were left out"),
-            # A packet that was overtaken is a step back, too.
-            *_events("restart", last.restarts - first.restarts - late, "restarts of the device"),
+            *_events("restart", last.restarts - first.restarts, "restarts of the device"),
             *self._judge_connection(first, last),
         )
         if resync and not damaged:

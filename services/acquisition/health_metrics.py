@@ -78,12 +78,16 @@ class HealthCollector(Collector):
     ) -> None:
         self._report = report
         self._raised = raised
+        # A counter must not shrink, as the loss does when an overtaken packet comes.
+        self._lost: dict[str, int] = {}
 
     def collect(self) -> Iterator[Metric]:
         """All metrics of one report."""
         health = self._report()
         yield from _stream_metrics(health)
-        yield from _device_metrics(health)
+        for device in health.devices:
+            self._lost[device.device] = max(device.lost, self._lost.get(device.device, 0))
+        yield from _device_metrics(health, self._lost)
         for name, text in STATION_FIGURES.items():
             if name in health.figures:
                 family = GaugeMetricFamily(f"dextouch_{name}", text)
@@ -124,7 +128,7 @@ def _stream_metrics(health: StationHealth) -> Iterator[Metric]:
     yield from (level, age, samples, *figures.values())
 
 
-def _device_metrics(health: StationHealth) -> Iterator[Metric]:
+def _device_metrics(health: StationHealth, lost: Mapping[str, int]) -> Iterator[Metric]:
     connected = GaugeMetricFamily(
         "dextouch_device_connected", "1 while the device is open.", labels=DEVICE_LABELS
     )
@@ -134,7 +138,8 @@ def _device_metrics(health: StationHealth) -> Iterator[Metric]:
     for name, (text, count) in DEVICE_COUNTERS.items():
         family = CounterMetricFamily(f"dextouch_{name}", text, labels=DEVICE_LABELS)
         for device in health.devices:
-            family.add_metric((device.hand or "", device.device), count(device))
+            value = lost[device.device] if name == "lost_packets" else count(device)
+            family.add_metric((device.hand or "", device.device), value)
         yield family
 
 

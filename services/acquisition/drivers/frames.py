@@ -7,10 +7,15 @@ from typing import Generic, TypeVar
 Found = TypeVar("Found")
 
 
+# Packets that overtake each other do so within a few; a restarted device jumps further.
+LATE_PACKETS = 64
+
+
 @dataclass
 class DecoderStatistics:
     """What a decoder has seen; `lost` counts by sequence numbers, between first and last.
 
+    A packet that was overtaken is `lost` until it comes, from then on `late`: `lost` may shrink.
     `suspects` are packets that were held back although all that their family checks held: their
     numbers cannot be readings.
     """
@@ -20,6 +25,7 @@ class DecoderStatistics:
     length_errors: int = 0
     resync_bytes: int = 0
     lost: int = 0
+    late: int = 0
     repeated: int = 0
     restarts: int = 0
     refused: int = 0
@@ -27,12 +33,18 @@ class DecoderStatistics:
 
 
 class SequenceCounter:
-    """Counts lost packets, repetitions and restarts by a sequence number of so many bits."""
+    """Counts lost, late and repeated packets and restarts by a sequence number of so many bits.
+
+    A number that goes back is late if it is missing among the last 64, else that of a device that
+    started anew.
+    """
 
     def __init__(self, statistics: DecoderStatistics, *, bits: int) -> None:
         self._statistics = statistics
         self._modulus = 1 << bits
         self._last: int | None = None
+        # Numbers behind the last one that have not come, and whether they are counted as lost.
+        self._missing: dict[int, bool] = {}
 
     def count(self, sequence: int, *, is_restarted: bool = False) -> None:
         """One packet came.
@@ -43,17 +55,40 @@ class SequenceCounter:
         """
         statistics = self._statistics
         statistics.packets += 1
-        if self._last is not None:
-            step = (sequence - self._last) % self._modulus
-            if is_restarted:
-                statistics.restarts += 1
-            elif step == 0:
-                statistics.repeated += 1
-            elif step < self._modulus // 2:
-                statistics.lost += step - 1
-            else:
-                statistics.restarts += 1
+        if self._last is None:
+            self._begin(sequence)
+            return
+        step = (sequence - self._last) % self._modulus
+        if sequence in self._missing:
+            # Its clock steps back, too, which alone would look like a restart.
+            statistics.late += 1
+            statistics.lost -= self._missing.pop(sequence)
+        elif step == 0 and not is_restarted:
+            statistics.repeated += 1
+        elif step < self._modulus // 2 and not is_restarted:
+            statistics.lost += step - 1
+            self._go_on(sequence, step)
+        else:
+            statistics.restarts += 1
+            self._begin(sequence)
+
+    def _begin(self, sequence: int) -> None:
+        """The first packet of a run; those that it overtook nobody missed."""
         self._last = sequence
+        before = range(sequence - LATE_PACKETS, sequence)
+        self._missing = {number % self._modulus: False for number in before}
+
+    def _go_on(self, sequence: int, step: int) -> None:
+        self._last = sequence
+        if step > 1:
+            skipped = range(sequence - min(step - 1, LATE_PACKETS), sequence)
+            self._missing |= {number % self._modulus: True for number in skipped}
+        # In the order of their numbers: what can only come too late for anybody goes first.
+        while self._missing:
+            oldest = next(iter(self._missing))
+            if (sequence - oldest) % self._modulus <= LATE_PACKETS:
+                break
+            del self._missing[oldest]
 
 
 class PortionedSearch(ABC, Generic[Found]):

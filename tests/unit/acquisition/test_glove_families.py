@@ -79,6 +79,15 @@ def test_wuji_counters_wrap_and_restart(rng):
     assert (statistics.repeated, statistics.restarts) == (1, 1)
 
 
+def test_an_overtaken_wuji_packet_is_late_though_its_clock_steps_back(rng):
+    decoder = WujiGloveDecoder("left")
+    for sequence in (5, 7, 6, 8):
+        decoder.feed(wuji(sequence, 8 * sequence, rng))
+    statistics = decoder.statistics
+    assert (statistics.packets, statistics.late) == (4, 1)
+    assert (statistics.lost, statistics.restarts) == (0, 0)
+
+
 @pytest.mark.parametrize(("hand", "words"), [(1, "'right'"), (7, "hand 7")])
 def test_wrong_hand_is_named(rng, hand, words):
     with pytest.raises(DeviceError, match=words):

@@ -238,6 +238,20 @@ def test_packets_held_back_are_a_finding_a_metric_and_a_count_of_the_device(benc
     assert 'dextouch_suspect_packets_total{device="glove_left",hand="left"} 6.0' in text
 
 
+def test_a_packet_that_comes_late_does_not_shrink_the_counter_of_losses(bench):
+    """Prometheus takes a counter that shrinks for one that began anew."""
+    statistics = bench.supervisors[0].driver.statistics
+    registry = CollectorRegistry()
+    registry.register(HealthCollector(bench.monitor.report, bench.monitor.raised))
+    line = 'dextouch_lost_packets_total{device="glove_left",hand="left"} '
+    told = []
+    for lost in (3, 2, 4):
+        statistics.lost = lost
+        (found,) = [x for x in generate_latest(registry).decode().splitlines() if line in x]
+        told.append(float(found.removeprefix(line)))
+    assert told == [3.0, 3.0, 4.0]
+
+
 def test_bytes_skipped_after_an_opening_are_no_damage(bench):
     glove = bench.supervisors[0]
 

@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, InvalidInputError
+from services.acquisition.drivers.frames import SequenceCounter
 from services.acquisition.drivers.packets import (
     SOURCES,
     DecoderStatistics,
@@ -105,6 +106,56 @@ def test_sequence_wraps_and_restarts(rng):
     sequences = [2**32 - 2, 2**32 - 1, 0, 2, 2, 0]
     _, statistics = decode(b"".join(glove_packet(s, rng) for s in sequences), [])
     assert statistics == DecoderStatistics(packets=6, lost=1, repeated=1, restarts=1)
+
+
+@pytest.mark.parametrize(
+    ("sequences", "expected"),
+    [
+        ([0, 2, 1, 3], {"late": 1}),
+        ([0, 3, 2, 1, 4], {"late": 2}),
+        ([0, 3, 1, 4], {"late": 1, "lost": 1}),
+        # The very first one may be overtaken, too; nobody missed it.
+        ([1, 0, 2], {"late": 1}),
+        ([2**32 - 1, 1, 0, 2], {"late": 1}),
+        # What came already, or is missing too long, is no late packet.
+        ([5, 6, 7, 5, 6], {"restarts": 1}),
+        ([0, 2, *range(3, 67), 1, 2], {"lost": 1, "restarts": 1}),
+        ([100, 7, 6, 8], {"restarts": 1, "late": 1}),
+        ([0, 1000, 936, 1001], {"lost": 998, "late": 1}),
+        ([0, 1000, 935, 936], {"lost": 999, "restarts": 1}),
+    ],
+)
+def test_a_packet_that_was_overtaken_is_late_and_no_loss(sequences, expected):
+    statistics = DecoderStatistics()
+    counter = SequenceCounter(statistics, bits=32)
+    for sequence in sequences:
+        counter.count(sequence)
+    assert statistics == DecoderStatistics(packets=len(sequences), **expected)
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    start=st.sampled_from([0, 40, 2**16 - 100]),
+    is_told_by_clock=st.booleans(),
+)
+def test_reordering_and_loss_are_told_apart(seed, start, is_told_by_clock):
+    """Packets up to 20 places late: lost, late and packets are those of the sender."""
+    rng = np.random.default_rng(seed)
+    kept = np.flatnonzero(rng.random(300) > 0.1)
+    delays = np.where(rng.random(len(kept)) < 0.1, rng.integers(1, 20, len(kept)) + 0.5, 0)
+    order = kept[np.argsort(kept + delays, kind="stable")].tolist()
+    statistics = DecoderStatistics()
+    counter = SequenceCounter(statistics, bits=16)
+    newest = -1
+    for number in order:
+        is_back = number < newest
+        counter.count((start + number) % 2**16, is_restarted=is_back and is_told_by_clock)
+        newest = max(newest, number)
+    num_from_first = sum(number >= order[0] for number in order)
+    lost = max(order) - order[0] + 1 - num_from_first
+    late = sum(number < max(order[:index], default=-1) for index, number in enumerate(order))
+    assert statistics == DecoderStatistics(packets=len(kept), lost=lost, late=late)
 
 
 def test_magic_inside_the_payload_is_payload():
