@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import structlog
 
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.log import SpoolWriter, StreamRecord
 from dextouch.errors import StorageError
 from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.samples import Sample, SampleBatch
@@ -51,7 +51,8 @@ class TakeOptions:
 class Take:
     """One running or ended take: reader threads append to its spool, a thread of its own flushes.
 
-    The only lock that readers take is held for one append and never while the disk is waited for.
+    The only lock that readers take is held for the write of one append: what is written is made
+    before, and the disk is waited for elsewhere.
 
     Args:
         spool: new, of this take.
@@ -105,23 +106,31 @@ class Take:
         return (self._clock.now_ns() - self._started_ns) / 1e9
 
     def accept(self, readings: Readings) -> None:
-        """Append new readings (called by the reader threads); nothing after the end."""
+        """Append new readings (called by the reader threads); nothing after the end.
+
+        A stream's readings come from one thread, so its bytes are made before the lock is taken.
+        """
+        if self.has_ended:
+            return
+        encoded = [self._encode(name, samples) for name, samples in readings.items()]
         with self._lock:
             if self.span is not None:
                 return
             try:
-                for name, samples in readings.items():
-                    self._append(name, samples)
+                for record, samples in encoded:
+                    if record is not None:
+                        self.spool.append_record(record)
+                        self.streams[record.stream_name].add(samples)
             except StorageError as error:
                 self._end(error)
 
-    def _append(self, name: str, samples: list[Sample]) -> None:
+    def _encode(self, name: str, samples: list[Sample]) -> tuple[StreamRecord | None, list[Sample]]:
         if name in self._gates:
             # Of video only what can be looked at without what came before the take.
             samples = self._gates[name].admit(samples)
-        if samples:
-            self.spool.append(name, SampleBatch.from_samples(samples))
-            self.streams[name].add(samples)
+        if not samples:
+            return None, samples
+        return self.spool.encode(name, SampleBatch.from_samples(samples)), samples
 
     def end(self) -> TakeCheck:
         """Take no more readings, make everything survive a power loss and judge it."""
@@ -219,9 +228,8 @@ class Take:
     def _counted(self, device: str, driver: Driver) -> DecoderStatistics:
         """What the decoder counted during the take."""
         counted = _difference(driver.statistics, self._before[device])
-        # To a decoder a packet that was overtaken looks like a restart; it is counted as late.
-        late = self._events.get(device, {}).get("late", 0)
-        return replace(counted, restarts=max(0, counted.restarts - late))
+        # What was missing before the take and came in it is no loss of the take, nor a gain.
+        return replace(counted, lost=max(0, counted.lost))
 
 
 def _grown(after: DeviceEvents, before: DeviceEvents) -> dict[str, dict[str, int]]:

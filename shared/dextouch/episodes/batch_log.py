@@ -15,7 +15,7 @@ from pathlib import Path
 import google_crc32c
 import numpy as np
 
-from dextouch.episodes.files import disk_errors, write_all
+from dextouch.episodes.files import disk_errors, write_parts
 from dextouch.errors import CorruptDataError, StorageError
 
 LOG_FILE = "batches.log"
@@ -211,6 +211,20 @@ def _next_header(data: LogBytes, place: int) -> int:
     return place if place >= 0 else len(data)
 
 
+@dataclass(frozen=True)
+class RecordBody:
+    """The body of a record with its checksum, ready to be written."""
+
+    data: bytes
+    crc32c: int
+    num_samples: int
+
+    @staticmethod
+    def of(data: bytes, *, num_samples: int) -> "RecordBody":
+        """A body whose checksum is made here."""
+        return RecordBody(data, google_crc32c.value(data), num_samples)
+
+
 class BatchLogWriter:
     """Appends records to a spool's log; each append is one write.
 
@@ -232,23 +246,25 @@ class BatchLogWriter:
             os.pwrite(self._file, LOG_MAGIC, 0)
             self._cut(self._end)
 
-    def append(self, body: bytes, *, stream: int, first_sample: int, num_samples: int) -> int:
+    def append(self, body: RecordBody, *, stream: int, first_sample: int) -> int:
         """Append a record, whole or not at all; its place comes back, for `undo`.
 
         Raises:
             StorageFullError: no space; the file is as it was before this call.
         """
-        place = self._end
-        crc = google_crc32c.value(body)
-        header = _HEADER.pack(_MARK, place, first_sample, stream, num_samples, len(body), crc)
+        place, length = self._end, len(body.data)
+        header = _HEADER.pack(
+            _MARK, place, first_sample, stream, body.num_samples, length, body.crc32c
+        )
+        parts = (header, _CRC.pack(google_crc32c.value(header)), body.data)
         try:
             with disk_errors(self._what):
-                write_all(self._file, header + _CRC.pack(google_crc32c.value(header)) + body)
+                write_parts(self._file, parts)
         except StorageError:
             # Cutting off needs no space: what was acknowledged before stays readable.
             self._cut(place)
             raise
-        self._end = place + HEADER_BYTES + len(body)
+        self._end = place + HEADER_BYTES + length
         return place
 
     def undo(self, place: int) -> None:

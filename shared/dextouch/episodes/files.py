@@ -3,7 +3,7 @@
 import errno
 import fcntl
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
@@ -39,6 +39,17 @@ def write_all(descriptor: int, data: bytes | memoryview) -> None:
     view = memoryview(data)
     while view:
         view = view[os.write(descriptor, view) :]
+
+
+def write_parts(descriptor: int, parts: Sequence[bytes]) -> None:
+    """Write every byte of the parts, one behind the other, without joining them first."""
+    views = [memoryview(part) for part in parts if part]
+    while views:
+        num_written = os.writev(descriptor, views)
+        while views and num_written >= len(views[0]):
+            num_written -= len(views.pop(0))
+        if views:
+            views[0] = views[0][num_written:]
 
 
 def sync_folder(path: Path) -> None:

@@ -6,11 +6,12 @@ until it is finished. Images of `jpeg` and `h264` streams travel as object array
 
 import os
 import shutil
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
 from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
-from dextouch.episodes.batch_log import BatchLogWriter, read_bodies, read_records
+from dextouch.episodes.batch_log import BatchLogWriter, RecordBody, read_bodies, read_records
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
 from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
 from dextouch.episodes.spool_reader import (
@@ -21,10 +22,27 @@ from dextouch.episodes.spool_reader import (
 )
 from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
 from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import check_batch
+from dextouch.streams.checks import check_batch, check_follows
 from dextouch.streams.samples import SampleBatch
 
-__all__ = ["RecoveryReport", "SpoolReader", "SpoolWriter", "read_attributes", "recover"]
+__all__ = [
+    "RecoveryReport",
+    "SpoolReader",
+    "SpoolWriter",
+    "StreamRecord",
+    "read_attributes",
+    "recover",
+]
+
+
+@dataclass(frozen=True)
+class StreamRecord:
+    """A batch of one stream as it goes into a spool's log."""
+
+    stream_name: str
+    body: RecordBody
+    first_t_host_ns: int
+    last_t_host_ns: int
 
 
 class SpoolWriter:
@@ -102,16 +120,37 @@ class SpoolWriter:
             InvalidInputError: a batch that does not fit the stream.
             StorageFullError: no space; everything appended before stays.
         """
-        number = self._number(stream_name)
-        descriptor = self.attributes.streams[number]
-        check_batch(descriptor, batch, last_t_host_ns=self._last_t_host_ns[stream_name])
+        record = self.encode(stream_name, batch)
+        if record is not None:
+            self.append_record(record, flush=flush)
+
+    def encode(self, stream_name: str, batch: SampleBatch) -> StreamRecord | None:
+        """What `append_record` writes of a batch; None of an empty one.
+
+        It changes nothing, so that many threads can call it at once while another one appends.
+
+        Raises:
+            UnknownNameError: no such stream.
+            InvalidInputError: a batch that does not fit the stream.
+        """
+        descriptor = self.attributes.streams[self._number(stream_name)]
+        check_batch(descriptor, batch)
         if not len(batch):
-            return
+            return None
+        body = RecordBody.of(batch_bytes(descriptor, batch), num_samples=len(batch))
+        return StreamRecord(stream_name, body, int(batch.t_host_ns[0]), int(batch.t_host_ns[-1]))
+
+    def append_record(self, record: StreamRecord, *, flush: bool = False) -> None:
+        """Append an encoded batch, as `append` does.
+
+        Raises:
+            InvalidInputError: it begins before the last sample of its stream.
+            StorageFullError: no space; everything appended before stays.
+        """
+        name = record.stream_name
+        check_follows(name, record.first_t_host_ns, self._last_t_host_ns[name])
         place = self._log.append(
-            batch_bytes(descriptor, batch),
-            stream=number,
-            first_sample=self._num_samples[stream_name],
-            num_samples=len(batch),
+            record.body, stream=self._number(name), first_sample=self._num_samples[name]
         )
         self._is_dirty = True
         if flush:
@@ -120,9 +159,9 @@ class SpoolWriter:
             except StorageError:
                 self._log.undo(place)
                 raise
-        self._num_samples[stream_name] += len(batch)
-        self._num_batches[stream_name] += 1
-        self._last_t_host_ns[stream_name] = int(batch.t_host_ns[-1])
+        self._num_samples[name] += record.body.num_samples
+        self._num_batches[name] += 1
+        self._last_t_host_ns[name] = record.last_t_host_ns
 
     def num_samples(self, stream_name: str) -> int:
         """How many samples of a stream are spooled."""

@@ -15,16 +15,13 @@ ENCODED_UNITS = (JPEG_UNIT, H264_UNIT)
 _START_CODES = (b"\x00\x00\x00\x01", b"\x00\x00\x01")
 
 
-def check_batch(
-    descriptor: StreamDescriptor, batch: SampleBatch, *, last_t_host_ns: int | None = None
-) -> None:
+def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
     """Refuse a batch that is not of this stream.
 
     Args:
         descriptor: of the stream.
         batch: values of the descriptor's dtype and shape; for the units `jpeg` and `h264` an
             object array of bytes; `t_host_ns` never decreases.
-        last_t_host_ns: stamp of the sample before the batch.
 
     Raises:
         ShapeError: another dtype or shape.
@@ -44,17 +41,25 @@ def check_batch(
         )
     if not len(batch):
         return
-    if last_t_host_ns is not None and int(batch.t_host_ns[0]) < last_t_host_ns:
-        raise InvalidInputError(
-            f"{name}: t_host_ns goes back to {int(batch.t_host_ns[0])} from {last_t_host_ns}; "
-            "append samples in the order of their arrival"
-        )
     if len(batch) == 1:
         return
     back = np.flatnonzero(np.diff(batch.t_host_ns) < 0)
     if len(back):
         raise InvalidInputError(
             f"{name}: t_host_ns goes back after sample {int(back[0])} of the batch; "
+            "append samples in the order of their arrival"
+        )
+
+
+def check_follows(name: str, t_host_ns: int, last_t_host_ns: int | None) -> None:
+    """Refuse a batch whose first stamp lies before the last one of its stream.
+
+    Raises:
+        InvalidInputError: it does.
+    """
+    if last_t_host_ns is not None and t_host_ns < last_t_host_ns:
+        raise InvalidInputError(
+            f"{name}: t_host_ns goes back to {t_host_ns} from {last_t_host_ns}; "
             "append samples in the order of their arrival"
         )
 

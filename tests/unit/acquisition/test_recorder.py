@@ -131,6 +131,36 @@ def test_gap_and_rate_are_found(recorder, clock):
     assert codes == {("tactile_left", "gap", "ERROR"), ("tactile_left", "rate", "ERROR")}
 
 
+def test_readers_make_their_bytes_before_they_hold_the_lock(recorder, clock, monkeypatch):
+    recorder.arm(PROMPT)
+    recorder.record("take")
+    running, held = recorder._take, []
+    encode, write = running.spool.encode, running.spool.append_record
+
+    def noting(call):
+        def call_and_note(*args):
+            held.append(running._lock.locked())
+            return call(*args)
+
+        return call_and_note
+
+    monkeypatch.setattr(running.spool, "encode", noting(encode))
+    monkeypatch.setattr(running.spool, "append_record", noting(write))
+    play(recorder, clock, 0.01)
+    assert held == [False, True] * 2
+
+
+def test_a_packet_missing_since_before_the_take_is_no_gain(recorder, clock):
+    counter, values = recorder._drivers["glove_left"].decoder.statistics, np.zeros(360, np.uint16)
+    counter.lost = 3
+    recorder.arm(PROMPT)
+    recorder.record("take")
+    recorder.accept("glove_left", {"tactile_left": [Sample(clock.now_ns(), values, 5, 1)]})
+    counter.lost, counter.late = 2, 1
+    (glove, _) = recorder.stop().check.streams
+    assert (glove.stream, glove.lost) == ("tactile_left", 0)
+
+
 def test_full_disk_keeps_what_is_there(recorder, clock, tmp_path, monkeypatch):
     recorder.arm(PROMPT)
     recorder.record("take")
@@ -139,7 +169,7 @@ def test_full_disk_keeps_what_is_there(recorder, clock, tmp_path, monkeypatch):
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(os, "write", full)
+    monkeypatch.setattr(os, "writev", full)
     play(recorder, clock, 0.1)
     monkeypatch.undo()
     status = recorder.status()

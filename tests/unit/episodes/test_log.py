@@ -1,6 +1,7 @@
 """The spool: what was acknowledged stays, whatever happens to the process, the disk or the bits."""
 
 import errno
+import os
 import random
 import subprocess
 import sys
@@ -301,6 +302,34 @@ def test_a_full_disk_keeps_what_was_recorded(path, file_size_limit):
     writer.close()
     got = log.SpoolReader(path).read("glove_left")
     assert got.sequence.tolist() == [0, 1, 2, 3, 4, 5, 7]
+
+
+@pytest.mark.parametrize("portion", [1, 7, 40, 43, 44, 45, 700])
+def test_short_writes_go_on_where_they_ended(path, monkeypatch, portion):
+    whole = os.writev
+
+    def some(descriptor, parts):
+        first, *rest = parts
+        if len(first) >= portion or not rest:
+            return os.write(descriptor, first[:portion])
+        return whole(descriptor, [first, rest[0][: portion - len(first)]])
+
+    monkeypatch.setattr(os, "writev", some)
+    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+        for first in range(3):
+            writer.append("glove_left", glove_batch(first))
+    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
+
+
+def test_an_encoded_batch_is_written_later_and_must_follow(path):
+    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+        records = [writer.encode("glove_left", glove_batch(first)) for first in (0, 1)]
+        assert writer.num_samples("glove_left") == 0
+        for record in records:
+            writer.append_record(record)
+        with pytest.raises(InvalidInputError, match="goes back to 0 from 16666667"):
+            writer.append_record(records[0])
+    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 2))
 
 
 def test_what_does_not_fit_is_refused(path, tmp_path):
