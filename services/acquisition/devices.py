@@ -56,7 +56,7 @@ def build_drivers(devices: Sequence[DeviceSettings], clock: StationClock) -> lis
     """One driver a device.
 
     Raises:
-        InvalidInputError: two devices of the same name, or none at all.
+        InvalidInputError: two devices of the same name or with the same stream, or none at all.
     """
     drivers = [_build(device, clock) for device in devices]
     names = [driver.name for driver in drivers]
@@ -65,7 +65,21 @@ def build_drivers(devices: Sequence[DeviceSettings], clock: StationClock) -> lis
             f"station: got devices {names}, expected at least one and no two alike; "
             "set DEXTOUCH_ACQUISITION_DEVICES or DEXTOUCH_ACQUISITION_MOCK"
         )
+    _refuse_shared_streams(drivers)
     return drivers
+
+
+def _refuse_shared_streams(drivers: Sequence[Driver]) -> None:
+    owners: dict[str, str] = {}
+    for driver in drivers:
+        for descriptor in driver.descriptors:
+            owner = owners.setdefault(descriptor.name, driver.name)
+            if owner != driver.name:
+                raise InvalidInputError(
+                    f"station: stream {descriptor.name!r} is given by {owner!r} and by "
+                    f"{driver.name!r}, expected one device a stream; leave one of them out, or "
+                    "name the streams that robot_state shall give (`streams`)"
+                )
 
 
 def load_calibration(path: Path | None) -> dict[str, Matrix]:
@@ -105,7 +119,8 @@ def _build(device: DeviceSettings, clock: StationClock) -> Driver:
         return CameraDriver(device.stream, transport=_tcp(device), decoder=camera, clock=clock)
     if isinstance(device, StationCameraSettings):
         return _station_camera(device, clock)
-    return Driver("robot_state", transport=_tcp(device), decoder=RobotStateDecoder(), clock=clock)
+    robot = RobotStateDecoder(device.streams)
+    return Driver("robot_state", transport=_tcp(device), decoder=robot, clock=clock)
 
 
 def _station_camera(device: StationCameraSettings, clock: StationClock) -> StationCamera:

@@ -1,7 +1,7 @@
 """Environment and flags in (DEXTOUCH_ACQUISITION_…), a station's frozen settings out."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, model_validator
 
@@ -11,6 +11,14 @@ from services.acquisition.mocks.links import MockLinks
 from services.acquisition.supervisor import SpoolSafety
 
 POSE_STREAMS = Literal["wrist_left", "wrist_right", "head"]
+ROBOT_STREAMS = Literal[
+    "joints_measured",
+    "joints_commanded",
+    "wrist_left",
+    "wrist_right",
+    "wrist_left_commanded",
+    "wrist_right_commanded",
+]
 CAMERAS = Literal["camera_head", "camera_wrist_left", "camera_wrist_right"]
 
 
@@ -139,9 +147,14 @@ class StationCameraSettings(_DeviceSettings):
 
 
 class RobotStateSettings(_DeviceSettings):
-    """A robot's state server at a TCP address."""
+    """A robot's state server at a TCP address.
+
+    `streams` names those of its six streams that are recorded: a station whose trackers give the
+    wrists leaves `wrist_left` and `wrist_right` out.
+    """
 
     kind: Literal["robot_state"] = "robot_state"
+    streams: tuple[ROBOT_STREAMS, ...] = Field(default=get_args(ROBOT_STREAMS), min_length=1)
     host: str = "127.0.0.1"
     port: int = Field(gt=0, le=65535)
 

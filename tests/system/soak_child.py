@@ -1,6 +1,5 @@
 """A whole station that records and uploads take after take on a simulated clock until killed."""
 
-import itertools
 import json
 import sys
 import threading
@@ -12,13 +11,13 @@ import structlog
 from dextouch.clients.episode_store import EpisodeStoreClient
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 from services.acquisition.uploader import Uploader, recover_spool
 from tests.integration.recording_streams import human_streams, robot_streams
 
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")
-# A human's hands or a robot's state: the wrists are streams of both.
 NAMES = (
     *(f"{kind}_{side}" for kind in ("glove", "finger_tracker") for side in ("left", "right")),
     *(f"pose_tracker_{stream}" for stream in ("head", "wrist_left", "wrist_right")),
@@ -30,13 +29,10 @@ NAMES = (
 PROMPT = TakePrompt(task="soak", instruction="soak")
 
 
-def streams_of(kind, seconds):
-    """Everything that a station can have of a human's hands (h) or of a robot's state (r)."""
-    human = human_streams(seconds, CAMERAS)
-    if kind == "h":
-        return human
-    wrists = [s for s in human if s.descriptor.name.startswith("camera_wrist")]
-    return [*robot_streams(seconds), *wrists]
+def all_streams(seconds):
+    """Everything that a station can have at once; trackers give the wrists, the robot the rest."""
+    streams = [*robot_streams(seconds), *human_streams(seconds, CAMERAS)]
+    return list({stream.descriptor.name: stream for stream in streams}.values())
 
 
 def random_faults(seed, seconds, num_takes):
@@ -111,26 +107,27 @@ def upload(root, store_url):
                 return
 
 
-def main(spool, store_url, seed, first_take, kinds, seconds):
-    """Record the takes from the first one on, `kinds` telling of each: one station a kind."""
+def main(spool, store_url, seed, first_take, end_take, seconds):
+    """Record the takes from the first one on by one station."""
     # Facts go out alone, or a warning of another thread could end up inside of one.
     structlog.configure(logger_factory=structlog.PrintLoggerFactory(sys.stderr))
     root, seconds, number = Path(spool), float(seconds), int(first_take)
     recover_spool(root)
-    for kind, takes in itertools.groupby(kinds[number:]):
-        num_takes = len(list(takes))
-        with MockStation(
-            streams_of(kind, seconds),
-            random_faults(int(seed) * 1000 + number, seconds, num_takes),
-            number,
-            VirtualClock(),
-            spool_root=root,
-        ) as mock:
-            for _ in range(num_takes):
-                record(mock, number)
-                upload(root, store_url)
-                tell(event="uploaded", kind=kind, rss_bytes=rss_bytes())
-                number += 1
+    num_takes = int(end_take) - number
+    with MockStation(
+        all_streams(seconds),
+        random_faults(int(seed) * 1000 + number, seconds, num_takes),
+        number,
+        VirtualClock(),
+        spool_root=root,
+        links=MockLinks(wrists="trackers"),
+    ) as mock:
+        assert {pair.device.name for pair in mock.pairs} == set(NAMES)
+        for _ in range(num_takes):
+            record(mock, number)
+            upload(root, store_url)
+            tell(event="uploaded", rss_bytes=rss_bytes())
+            number += 1
     upload(root, store_url)
     tell(event="done")
 

@@ -1,10 +1,12 @@
-"""Robot state over a socket: packets come in, six streams of joints and wrist poses go out."""
+"""Robot state over a socket: packets come in, streams of joints and wrist poses go out."""
 
 import struct
+from collections.abc import Sequence
 from typing import Literal
 
 import numpy as np
 
+from dextouch.errors import InvalidInputError
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor, StreamKind
 from dextouch.streams.samples import Sample
 from services.acquisition.drivers.base import Readings, check_packet
@@ -49,11 +51,25 @@ def robot_descriptor(stream: str) -> StreamDescriptor:
 
 
 class RobotStateDecoder:
-    """One packet gives one sample of each stream, all with the same stamps."""
+    """One packet gives one sample of each stream, all with the same stamps.
 
-    def __init__(self) -> None:
+    Args:
+        streams: names of those that are wanted, of `STREAM_SIZES`; the packets hold all six. A
+            station whose trackers give the wrists leaves these out.
+
+    Raises:
+        InvalidInputError: no stream, or an unknown or repeated one.
+    """
+
+    def __init__(self, streams: Sequence[str] = tuple(STREAM_SIZES)) -> None:
+        if not streams or len(set(streams)) < len(streams) or set(streams) - set(STREAM_SIZES):
+            raise InvalidInputError(
+                f"robot state: got streams {list(streams)}, expected some of {list(STREAM_SIZES)}, "
+                "each once"
+            )
         self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
-        self._descriptors = tuple(robot_descriptor(stream) for stream in STREAM_SIZES)
+        self._descriptors = tuple(robot_descriptor(stream) for stream in streams)
+        self._wanted = frozenset(streams)
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -62,7 +78,7 @@ class RobotStateDecoder:
 
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The six streams."""
+        """The wanted streams."""
         return self._descriptors
 
     def reset(self) -> None:
@@ -70,7 +86,7 @@ class RobotStateDecoder:
         self._packets.reset()
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """Samples of all six streams completed by `data`.
+        """Samples of the wanted streams completed by `data`.
 
         Raises:
             DeviceError: another packet version.
@@ -84,8 +100,9 @@ class RobotStateDecoder:
                 continue
             start = 0
             for stream, size in STREAM_SIZES.items():
-                values = numbers[start : start + size]
-                sample = Sample(t_host_ns, values, packet.t_device_ns, packet.sequence)
-                readings.setdefault(stream, []).append(sample)
+                if stream in self._wanted:
+                    values = numbers[start : start + size]
+                    sample = Sample(t_host_ns, values, packet.t_device_ns, packet.sequence)
+                    readings.setdefault(stream, []).append(sample)
                 start += size
         return readings

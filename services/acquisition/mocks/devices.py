@@ -38,6 +38,7 @@ from services.acquisition.mocks.tracker_devices import (
 from services.acquisition.mocks.video_camera import video_camera
 
 LATENCY_SIGMA_MS = 0.2
+WRISTS = ("wrist_left", "wrist_right")
 
 
 class MockFactory:
@@ -78,15 +79,15 @@ class MockFactory:
         pairs = [pair for side in SIDES for pair in self._hand(side)]
         if "joints_measured" in self._streams:
             parts = {name: s for name, s in self._streams.items() if name in STREAM_SIZES}
-            port, decoder = SocketPort("robot"), RobotStateDecoder()
+            port, decoder = SocketPort("robot"), RobotStateDecoder(self._robot_streams())
             driver = Driver(
                 "robot_state", transport=port.transport, decoder=decoder, clock=self._clock
             )
             device = self._device("robot_state", RobotStateSource(parts), port)
             pairs.append(MockPair(device, driver))
-            trackers = ["head"]
+            trackers = ["head", *(name for name in WRISTS if name not in self._robot_streams())]
         else:
-            trackers = ["wrist_left", "wrist_right", "head"]
+            trackers = [*WRISTS, "head"]
         pairs += [
             mock_pose_tracker(self._streams[name], self._place(f"pose_tracker_{name}"))
             for name in trackers
@@ -99,6 +100,10 @@ class MockFactory:
                 "keypoints_…, wrist_…, head, camera_… or joints_…"
             )
         return pairs
+
+    def _robot_streams(self) -> list[str]:
+        by_trackers = self._links.wrists == "trackers"
+        return [name for name in STREAM_SIZES if not (by_trackers and name in WRISTS)]
 
     def calibration(self) -> dict[str, Matrix]:
         """What a calibrated station knows of its gloves: tare and gain of the 360 cells.

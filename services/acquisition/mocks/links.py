@@ -16,6 +16,8 @@ class MockLinks(BaseModel):
             that turns counts into kPa.
         trackers: finger and pose trackers by HID, by USB, or behind an SDK's bridge.
         cameras: images over a socket, or from a camera on the station's own bus.
+        wrists: whether a robot or pose trackers give the wrists where there is a robot's state; its
+            packets hold them in any case.
         images: how images are encoded: by the bridge, or by the station for a camera of its own.
     """
 
@@ -23,5 +25,6 @@ class MockLinks(BaseModel):
 
     gloves: GloveProtocol = "dextouch"
     trackers: TrackerLink = "hid"
+    wrists: Literal["robot", "trackers"] = "robot"
     cameras: Literal["bridge", "station"] = "bridge"
     images: Literal["rgb8", "jpeg", "h264"] = "rgb8"

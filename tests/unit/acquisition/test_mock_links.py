@@ -19,6 +19,7 @@ from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.transports.usb import UsbTransport
+from tests.integration.recording_streams import human_streams, robot_streams
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 
@@ -55,6 +56,21 @@ def test_each_link_has_the_driver_of_a_real_station():
     assert (type(camera), camera.descriptors[0].unit) == (CameraDriver, "h264")
     _, (camera,) = build(("camera_head",), cameras="station", images="jpeg")
     assert (type(camera), camera.descriptors[0].unit) == (StationCamera, "jpeg")
+
+
+def test_trackers_may_give_the_wrists_beside_a_robot():
+    made = [*robot_streams(0.5), *human_streams(0.5)]
+    made = list({stream.descriptor.name: stream for stream in made}.values())
+    names = {}
+    for wrists in ("robot", "trackers"):
+        factory = MockFactory(
+            made, faults=FaultScript(), seed=1, clock=VirtualClock(), links=MockLinks(wrists=wrists)
+        )
+        drivers = [pair.driver for pair in factory.build()]
+        names[wrists] = [d.name for driver in drivers for d in driver.descriptors]
+        assert ("pose_tracker_wrist_left" in [d.name for d in drivers]) == (wrists == "trackers")
+    assert sorted(names["robot"]) == sorted(names["trackers"])
+    assert len(set(names["robot"])) == len(names["robot"])
 
 
 @pytest.mark.parametrize(("gloves", "num_values"), [("wuji", 768), ("justfloat", 401)])

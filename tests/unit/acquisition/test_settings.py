@@ -1,3 +1,5 @@
+import json
+
 import pytest
 
 from dextouch.errors import InvalidInputError
@@ -80,6 +82,32 @@ def test_real_devices_become_drivers():
         "robot_state",
     ]
     assert len({d.name for driver in drivers for d in driver.descriptors}) == 11
+
+
+def test_two_devices_of_one_stream_are_refused_by_name():
+    tracker = {"kind": "pose_tracker", "stream": "wrist_left", "vendor_id": 1, "product_id": 4}
+    settings = AcquisitionSettings(devices=(*DEVICES, tracker))
+    with pytest.raises(InvalidInputError, match=r"'wrist_left'.*'robot_state'.*pose_tracker_wri"):
+        build_drivers(settings.devices, RealClock())
+
+
+def test_a_robot_beside_trackers_gives_the_streams_that_it_is_asked_for():
+    names = ("joints_measured", "joints_commanded")
+    trackers = [
+        {"kind": "pose_tracker", "stream": name, "vendor_id": 1, "product_id": 4 + index}
+        for index, name in enumerate(("wrist_left", "wrist_right"))
+    ]
+    robot = {**DEVICES[-1], "streams": names}
+    settings = AcquisitionSettings(devices=(*DEVICES[:-1], *trackers, robot))
+    *_, driver = build_drivers(settings.devices, RealClock())
+    assert tuple(d.name for d in driver.descriptors) == names
+
+
+@pytest.mark.parametrize("streams", [[], ["elbow"], ["wrist_left", "wrist_left"]])
+def test_a_robot_without_known_streams_is_refused(streams):
+    flags = ["--devices", json.dumps([{**DEVICES[-1], "streams": streams}])]
+    with pytest.raises(InvalidInputError):
+        build_drivers(load_settings(AcquisitionSettings, flags).devices, RealClock())
 
 
 @pytest.mark.parametrize(
