@@ -26,6 +26,9 @@ from services.acquisition.drivers.reports import OrderFilter
 logger = structlog.get_logger(__name__)
 
 RETRY_NS = 200_000_000
+# What stays the same is logged once and then so rarely, with its count.
+LOG_AGAIN_NS = 60_000_000_000
+NOTHING_LOGGED = ("", 0, 0)
 # What a supervisor counts besides the decoder's statistics and the device's counters. An error of
 # a driver says which of them it is in its detail `event`.
 EVENTS = (
@@ -72,6 +75,8 @@ class DeviceSupervisor:
         self._events = dict.fromkeys(EVENTS, 0)
         self._guards = {d.name: SequenceGuard(d) for d in driver.descriptors}
         self._sink = sink
+        # The last message that was logged, when, and how often it came since it was new.
+        self._logged = NOTHING_LOGGED
         self._clock = clock
         self._stopping = threading.Event()
         self._waiter: Waiter | None = None
@@ -111,7 +116,7 @@ class DeviceSupervisor:
             except DeviceError as error:
                 self.counters.last_error = error.message
                 self._count(error)
-                logger.warning("lose_device", device=self.driver.name, error=error.message)
+                self._log_loss(error.message)
                 self._close_and_wait()
             except Exception as error:
                 self.counters.failures += 1
@@ -129,6 +134,8 @@ class DeviceSupervisor:
         while not self._stopping.is_set():
             readings = self._in_order(self.driver.read())
             if readings:
+                # A loss of a device that gave something is new, whatever it says.
+                self._logged = NOTHING_LOGGED
                 self.counters.add(readings)
                 self._sink(self.driver.name, readings)
 
@@ -143,6 +150,17 @@ class DeviceSupervisor:
         elif self.counters.is_connected:
             # Failing to open a device that is gone is no further loss.
             self._events["lost_device"] += 1
+
+    def _log_loss(self, message: str) -> None:
+        """Log what is new, and what goes on once a minute."""
+        now_ns = self._clock.now_ns()
+        last_message, logged_ns, count = self._logged
+        if message == last_message and now_ns - logged_ns < LOG_AGAIN_NS:
+            self._logged = (message, logged_ns, count + 1)
+            return
+        count = count + 1 if message == last_message else 1
+        self._logged = (message, now_ns, count)
+        logger.warning("lose_device", device=self.driver.name, error=message, count=count)
 
     def _set_connected(self, *, is_connected: bool) -> None:
         self.counters.is_connected = is_connected

@@ -1,0 +1,76 @@
+"""What a device that is not there writes into the log of a station."""
+
+from structlog.testing import capture_logs
+
+from dextouch.errors import DeviceError
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
+from services.acquisition.mocks.ports import HidPort
+from services.acquisition.supervisor import DeviceSupervisor
+
+
+class Waits:
+    """A clock that jumps to the end of every wait; after the last one the station stops."""
+
+    def __init__(self, num_waits):
+        self.t_ns, self.num_left, self.supervisor = 10**12, num_waits, None
+
+    def now_ns(self):
+        return self.t_ns
+
+    def waiter(self, *, drives_time=False):
+        return self
+
+    def wait_until(self, t_ns):
+        self.t_ns, self.num_left = t_ns, self.num_left - 1
+        if self.num_left == 0:
+            self.supervisor._stopping.set()
+        return True
+
+    def cancel(self):
+        pass
+
+    def close(self):
+        pass
+
+
+class Absent(Driver):
+    """A device that says in turn why it is not there."""
+
+    messages = ("head: no such device",)
+    num_opened = 0
+
+    def open(self):
+        self.num_opened += 1
+        raise DeviceError(self.messages[self.num_opened * len(self.messages) // 1000])
+
+
+def losses(num_waits, messages=Absent.messages):
+    clock = Waits(num_waits)
+    driver = Absent(
+        "head",
+        transport=HidPort("head").transport,
+        decoder=PoseTrackerDecoder("head"),
+        clock=clock,
+    )
+    driver.messages = messages
+    clock.supervisor = DeviceSupervisor(driver, sink=lambda *_: None, clock=clock)
+    with capture_logs() as logs:
+        clock.supervisor._run()
+    assert driver.num_opened == num_waits
+    return [(e["error"], e["count"]) for e in logs if e["event"] == "lose_device"]
+
+
+def test_an_absent_device_is_logged_once_and_then_once_a_minute():
+    # 900 tries, 0.2 s apart, are three minutes.
+    message = "head: no such device"
+    assert losses(900) == [(message, 1), (message, 301), (message, 601)]
+
+
+def test_another_reason_is_logged_at_once():
+    assert losses(900, ("gone", "no permission")) == [
+        ("gone", 1),
+        ("gone", 301),
+        ("no permission", 1),
+        ("no permission", 301),
+    ]
