@@ -7,6 +7,7 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
 from dextouch import __version__
+from dextouch.episodes.files import disk_errors
 from dextouch.serving.app import create_service_app
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
@@ -113,8 +114,10 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
 
     Raises:
         InvalidInputError: neither devices nor mocks, or an unknown episode to play.
+        StorageError: the folder of the takes cannot be made.
     """
-    settings.spool.mkdir(parents=True, exist_ok=True)
+    with disk_errors(f"make the spool {settings.spool}"):
+        settings.spool.mkdir(parents=True, exist_ok=True)
     recover_spool(settings.spool)
     running = _MockStation(settings) if settings.mock else _RealStation(settings)
     uploads = uploader or _make_uploader(settings)

@@ -201,3 +201,18 @@ class AcquisitionSettings(ServiceSettings):
     episode_store_key: SecretStr | None = None
     upload_period_s: float = Field(default=2.0, gt=0, le=3600)
     keep_uploaded: bool = True
+
+    @model_validator(mode="after")
+    def _mock_or_devices(self) -> "AcquisitionSettings":
+        if (self.mock_store is None) != (self.mock_episode_id is None):
+            raise ValueError(
+                f"got mock_store {self.mock_store!r} and mock_episode_id {self.mock_episode_id!r}, "
+                "expected both (the episode that mock devices play) or neither (a pattern)"
+            )
+        if self.mock and self.devices:
+            kinds = ", ".join(device.kind for device in self.devices)
+            raise ValueError(
+                f"got mock and devices ({kinds}), expected one of the two: mock devices take the "
+                "place of real ones"
+            )
+        return self

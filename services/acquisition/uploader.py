@@ -25,6 +25,7 @@ logger = structlog.get_logger(__name__)
 
 RECORDING_FILE = "recording.json"
 UPLOADED_FILE = "uploaded.json"
+NO_STORE = "no episode_store_url is set: takes stay in the spool"
 MAX_BATCH_SAMPLES = 120
 # Of pixels: half of what may travel, since a JPEG image of noise can be larger than its pixels.
 MAX_BATCH_BYTES = 8 * 2**20
@@ -109,6 +110,8 @@ class Uploader:
             except StorageError as damage:
                 error = damage.message
             uploaded = (path / UPLOADED_FILE).exists()
+            if self._store is None and not uploaded and error is None:
+                error = NO_STORE
             found.append(UploadStatus(recording_id=path.name, uploaded=uploaded, error=error))
         return found
 

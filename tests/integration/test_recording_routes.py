@@ -51,6 +51,7 @@ async def test_a_take_over_http(tmp_path):
         assert spool.attributes.success
         uploads = (await client.get("/v1/uploads")).json()
         assert [u["recording_id"] for u in uploads] == [recording_id]
+        assert uploads[0]["error"].startswith("no episode_store_url is set")
 
         health = (await client.get("/v1/health")).json()
         assert {s["stream"] for s in health["streams"]} == set(spool.streams)

@@ -1,9 +1,11 @@
 import json
 
 import pytest
+from pydantic import ValidationError
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, StorageError
 from dextouch.serving.settings import ServiceSettings, load_settings
+from services.acquisition.app import create_app
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.mocks.links import MockLinks
@@ -82,6 +84,26 @@ def test_real_devices_become_drivers():
         "robot_state",
     ]
     assert len({d.name for driver in drivers for d in driver.descriptors}) == 11
+
+
+@pytest.mark.parametrize(
+    ("options", "told"),
+    [
+        ({"mock": True, "mock_episode_id": "e"}, "both"),
+        ({"mock": True, "mock_store": "s"}, "both"),
+        ({"mock": True, "devices": DEVICES[:1]}, "tactile_glove.*one of the two"),
+    ],
+)
+def test_options_that_would_be_ignored_are_refused(options, told):
+    with pytest.raises(ValidationError, match=told):
+        AcquisitionSettings(**options)
+
+
+def test_a_spool_that_cannot_be_made_is_refused_by_name(tmp_path):
+    (tmp_path / "file").write_text("")
+    spool = tmp_path / "file" / "spool"
+    with pytest.raises(StorageError, match=r"make the spool .*file/spool"):
+        create_app(AcquisitionSettings(mock=True, spool=spool))
 
 
 def test_two_devices_of_one_stream_are_refused_by_name():
