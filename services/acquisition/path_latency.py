@@ -199,8 +199,13 @@ class PathWatch:
         """One round: ask all devices, then tell what is known."""
         found: dict[str, PathLatency] = {}
         for device in self._devices:
-            device.ask()
-            found |= device.latencies()
+            try:
+                device.ask()
+                found |= device.latencies()
+            except Exception:
+                # One device must not end the measuring of all others for the station's whole life.
+                device.num_failures += 1
+                logger.exception("fail_path_latency", device=device.name)
         self._latencies = found
 
     def latencies(self) -> Mapping[str, PathLatency]:

@@ -62,7 +62,7 @@ class TactileGlove(Driver):
         self._side: Side = side
         self._serial_number = serial_number
         self._numbers = itertools.count(1)
-        self._asked: dict[int, int] = {}
+        self._asked: set[int] = set()
         self._replies: dict[int, tuple[Packet, int]] = {}
         self._answered = threading.Condition()
         self._writing = threading.Lock()
@@ -148,18 +148,30 @@ class TactileGlove(Driver):
         for _ in range(NUM_ATTEMPTS):
             number = next(self._numbers) % SEQUENCE_MODULUS
             data = encode_request(command, argument=argument, request=number)
-            with self._writing:
-                self._asked[number] = self._clock.now_ns()
-                self.transport.write(data)
-            reply = self._await(number, timeout_ns)
-            asked_ns = self._asked.pop(number)
-            if reply is not None:
-                return reply[0], (asked_ns, reply[1])
+            answer = self._ask_once(number, data, timeout_ns)
+            if answer is not None:
+                return answer
         raise DeviceError(
             f"{self.name}: no answer to {command.name.lower()} from {self.info} in "
             f"{NUM_ATTEMPTS} attempts; is it a glove of this protocol?",
             device=self.name,
         )
+
+    def _ask_once(
+        self, number: int, data: bytes, timeout_ns: int
+    ) -> tuple[Packet, tuple[int, int]] | None:
+        try:
+            with self._writing:
+                self._asked.add(number)
+                asked_ns = self._clock.now_ns()
+                self.transport.write(data)
+            reply = self._await(number, timeout_ns)
+        finally:
+            # Also what came when nobody waited any more: a station asks for months.
+            with self._answered:
+                self._asked.discard(number)
+                self._replies.pop(number, None)
+        return None if reply is None else (reply[0], (asked_ns, reply[1]))
 
     def _await(self, number: int, timeout_ns: int) -> tuple[Packet, int] | None:
         """The reply; read here if this is the reading thread, else that one brings it."""

@@ -3,8 +3,11 @@
 import contextlib
 import os
 import select
+import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING
+
+import structlog
 
 from dextouch.errors import DeviceError
 from services.acquisition.transports.base import TransportInfo
@@ -12,9 +15,14 @@ from services.acquisition.transports.base import TransportInfo
 if TYPE_CHECKING:
     import serial
 
+logger = structlog.get_logger(__name__)
+
 READ_TIMEOUT_S = 0.1
 # A device that takes nothing in must not hold up the station for ever.
 WRITE_TIMEOUT_S = 0.5
+# The kernel keeps a closing port for up to 30 s while the device takes nothing in; only root may
+# shorten that.
+CLOSE_TIMEOUT_S = 1.0
 # More than a kernel buffer holds: one read takes all that has come.
 READ_BYTES = 65_536
 
@@ -66,6 +74,7 @@ class SerialTransport:
         self._serial_number = serial_number
         self._address = "not opened"
         self._port: serial.Serial | None = None
+        self._closing: threading.Thread | None = None
         self._poll = select.poll()
 
     @property
@@ -77,11 +86,16 @@ class SerialTransport:
         """Find and open the port; what lay in its buffer is dropped.
 
         Raises:
-            DeviceError: absent, taken by another process, or not to be opened.
+            DeviceError: absent, taken by another process, still closing, or not to be opened.
         """
         import serial
 
         self.close()
+        if self._closing is not None and self._closing.is_alive():
+            raise DeviceError(
+                f"{self.info}: is still being closed, since the device takes nothing in; wait half "
+                "a minute or replug it"
+            )
         self._address = self._find()
         try:
             self._port = serial.Serial(
@@ -128,14 +142,28 @@ class SerialTransport:
         """
         try:
             self._opened().write(data)
-        except OSError as error:
+        except (OSError, TypeError, ValueError) as error:
+            # pyserial fails with the latter two where another thread closes the port meanwhile.
             raise DeviceError(f"{self.info}: lost while writing ({error})") from error
 
     def close(self) -> None:
-        """Close the port."""
-        if self._port is not None:
-            self._port.close()
-            self._port = None
+        """Close the port; what takes longer than 1 s goes on by itself, and is said."""
+        port, self._port = self._port, None
+        if port is None:
+            return
+        self._closing = threading.Thread(
+            target=self._give_back, args=(port,), name="close-serial", daemon=True
+        )
+        self._closing.start()
+        self._closing.join(CLOSE_TIMEOUT_S)
+        if self._closing.is_alive():
+            logger.warning("wait_for_port_to_close", address=self._address)
+
+    def _give_back(self, port: "serial.Serial") -> None:
+        try:
+            port.close()
+        except OSError as error:
+            logger.warning("fail_to_close_port", address=self._address, error=str(error))
 
     def _opened(self) -> "serial.Serial":
         if self._port is None:

@@ -108,6 +108,27 @@ def test_time_round_trip_is_on_the_devices_clock(glove):
     assert trip.delay_ns >= 0
 
 
+def test_requests_that_fail_leave_nothing_behind(glove, monkeypatch):
+    glove.driver.open()
+
+    def fail(_):
+        raise DeviceError("lost while writing")
+
+    monkeypatch.setattr(glove.driver.transport, "write", fail)
+    for _ in range(3):
+        with pytest.raises(DeviceError, match="lost while writing"):
+            glove.driver.diagnostics()
+    monkeypatch.undo()
+    # Nobody answers this one in time; its answer comes later.
+    monkeypatch.setattr(glove.driver, "_await", lambda *_: None)
+    with pytest.raises(DeviceError, match="no answer"):
+        glove.driver.diagnostics()
+    monkeypatch.undo()
+    play(glove, range(1))
+    read_samples(glove.driver, 1)
+    assert (glove.driver._asked, glove.driver._replies) == (set(), {})
+
+
 def test_tare_is_the_mean_of_the_next_packets(glove, monkeypatch):
     """Asked by one thread while another one reads, as in a station."""
     glove.driver.open()

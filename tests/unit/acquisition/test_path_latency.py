@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
+from structlog.testing import capture_logs
 
 from dextouch.clocks import PathLatency, RoundTrip
 from dextouch.episodes.log import SpoolReader
@@ -116,6 +117,21 @@ def test_a_silent_device_is_counted_and_left_alone_for_longer_and_longer():
     for _ in range(40):
         glove.watch.look()
     assert any(glove.live_a_second() is not None for _ in range(5))
+
+
+def test_a_driver_that_fails_is_said_and_the_others_are_still_asked(monkeypatch):
+    broken, glove = SimulatedGlove(), SimulatedGlove(1)
+    supervisors = [watched(broken), watched(glove)]
+    watch = broken.watch = glove.watch = PathWatch(supervisors, clock=RealClock())
+    monkeypatch.setattr(broken, "time_round_trip", lambda: None)
+    with capture_logs() as logs:
+        watch.look()
+        watch.look()
+    assert glove.num_asked == 2
+    assert watch.num_failures("tactile_left") == 2
+    assert [(log["event"], log["device"]) for log in logs] == [
+        ("fail_path_latency", "glove_left")
+    ] * 2
 
 
 def test_nobody_is_asked_who_is_not_there_or_cannot_answer_or_lives_in_virtual_time():
