@@ -44,7 +44,12 @@ class Soak:
                 stdout=subprocess.PIPE,
                 stderr=errors,
                 text=True,
-                env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'shared'}"},
+                env={
+                    **os.environ,
+                    # As deployed: see deploy/Dockerfile.
+                    "MALLOC_ARENA_MAX": "2",
+                    "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'shared'}",
+                },
             )
         is_done = False
         self.rss_bytes = []
