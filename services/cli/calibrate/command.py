@@ -10,6 +10,8 @@ from services.cli.calibrate.boards import BOARD_HELP, parse_board
 
 Report = dict[str, object]
 EXIT_LEVEL = 1
+STANDARD_OUTPUT = Path("-")
+JSON_HELP = "write the result there as well; - prints it last"
 
 _ABOUT = """\
 Measure what a station must know of its devices. Everything goes into one folder:
@@ -72,11 +74,16 @@ def main(argv: Sequence[str]) -> int:
     """
     options = _parser().parse_args(list(argv))
     report = _WORDS[options.word](options)
-    if options.json is not None:
+    if options.json == STANDARD_OUTPUT:
+        print(_as_text(report))
+    elif options.json is not None:
         options.json.parent.mkdir(parents=True, exist_ok=True)
-        text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
-        options.json.write_text(text + "\n", encoding="utf-8")
+        options.json.write_text(_as_text(report) + "\n", encoding="utf-8")
     return EXIT_LEVEL if report.get("level") == "ERROR" else 0
+
+
+def _as_text(report: Report) -> str:
+    return json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
 
 
 def _camera(options: argparse.Namespace) -> Report:
@@ -141,7 +148,7 @@ def _word(
         epilog=more,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
+    parser.add_argument("--json", type=Path, metavar="PATH", help=JSON_HELP)
     return parser
 
 

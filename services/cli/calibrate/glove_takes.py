@@ -38,6 +38,15 @@ def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such list of presses")
+    try:
+        return _read_rows(path, relative_sigma)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(
+            f"{path}: no CSV in UTF-8 ({error}); expected the columns {', '.join(COLUMNS)}"
+        ) from error
+
+
+def _read_rows(path: Path, relative_sigma: float) -> list[PressRow]:
     with path.open(encoding="utf-8", newline="") as file:
         reader = csv.DictReader(file, skipinitialspace=True)
         names = set(reader.fieldnames or ())

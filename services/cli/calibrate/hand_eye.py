@@ -182,12 +182,23 @@ def _json_poses(entries: list[object], path: Path) -> dict[str, np.ndarray]:
 def _csv_poses(path: Path) -> dict[str, np.ndarray]:
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file of poses; expected {POSES_HELP}")
+    try:
+        return _read_csv_poses(path)
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise InvalidInputError(
+            f"{path}: no CSV in UTF-8 ({error}); expected {POSES_HELP}"
+        ) from error
+
+
+def _read_csv_poses(path: Path) -> dict[str, np.ndarray]:
     poses: dict[str, np.ndarray] = {}
     with path.open(encoding="utf-8", newline="") as file:
         reader = csv.DictReader(file, skipinitialspace=True)
         missing = {"image", *POSE_COLUMNS} - set(reader.fieldnames or ())
         if missing:
-            raise InvalidInputError(f"{path}: columns {sorted(missing)} missing; got {POSES_HELP}")
+            raise InvalidInputError(
+                f"{path}: columns {sorted(missing)} missing; expected {POSES_HELP}"
+            )
         for row in reader:
             try:
                 pose = np.array([float(row[column]) for column in POSE_COLUMNS])

@@ -22,6 +22,8 @@ MAX_MOTION_PX = 1.5
 # Views nearer to a kept one than this part of the image's diagonal add nothing.
 MIN_NEWS = 0.04
 MAX_VIEWS = 60
+# So many live images without a new view (4 s and more) are told.
+TELL_AFTER_IMAGES = 20
 
 Arrivals = Iterator[tuple[str, bytes]]
 Wait = Callable[[float], None]
@@ -108,20 +110,32 @@ def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
     photos.mkdir(parents=True, exist_ok=True)
     before: BoardView | None = None
     num_kept = len(list(photos.glob("live_*.jpg")))
-    num_before = num_kept
+    num_before, num_idle = num_kept, 0
     for name, data in arrivals:
         photo = decode_photo(data, where=name)
         view = session.find(name, photo)
         still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
         before = view
         if view is None or not still or view.is_blurred or not session.is_new(view, photo):
+            num_idle += 1
+            if num_idle % TELL_AFTER_IMAGES == 0:
+                print(_why_nothing_is_kept(view, still=still))
             continue
+        num_idle = 0
         (photos / f"live_{num_kept:04d}.jpg").write_bytes(data)
         num_kept += 1
         session.keep(view, photo)
         if session.is_enough:
             break
     return num_kept - num_before
+
+
+def _why_nothing_is_kept(view: BoardView | None, *, still: bool) -> str:
+    if view is None:
+        return "no board in the last image; does --board tell the inner corners of this one?"
+    if not still or view.is_blurred:
+        return "the board in the last image moves or is blurred; hold it still"
+    return "the board is where it was; hold it elsewhere"
 
 
 def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:

@@ -18,6 +18,7 @@ from dextouch import __version__
 from dextouch.episodes.files import replace_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NonFiniteError, NotFoundError
 from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.schemas.problems import first_problems
 
 MATRICES_FILE = "calibration.json"
 DETAILS_FILE = "calibration_details.json"
@@ -109,7 +110,9 @@ def read_matrices(folder: Path) -> dict[str, Matrix]:
     try:
         return _MATRICES.validate_json(path.read_bytes())
     except ValidationError as error:
-        raise CorruptDataError(f"{path}: no JSON of named matrices ({error})") from error
+        raise CorruptDataError(
+            f"{path}: no JSON of named matrices ({first_problems(error)})"
+        ) from error
 
 
 def read_details(folder: Path) -> dict[str, object]:
@@ -196,7 +199,7 @@ def _judge_one(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Find
         if age_s < -60:
             reasons.append("made in the future; set the clock of one of the two machines")
     else:
-        reasons.append("age unknown; calibrate again with this command")
+        reasons.append(f"age unknown; {_where_from(name)}")
     sigma, sigma_reasons = _sigma(name, matrices)
     reasons += sigma_reasons
     level = "WARN" if reasons else "OK"
@@ -205,6 +208,18 @@ def _judge_one(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Find
     shape = "x".join(str(n) for n in np.shape(matrices[name]))
     told = tuple(reason.removeprefix("ERROR ") for reason in reasons)
     return Finding(name, shape, made_at, age_days, sigma, level, told)
+
+
+def _where_from(name: str) -> str:
+    """What to do about a matrix of unknown age: not every one is measured by this command."""
+    if name.endswith("_latency_ns"):
+        return (
+            "not of this command: a device's path is measured by the station, a camera's is its "
+            "settings' latency_ms"
+        )
+    if name.startswith("T_tracker_") and "_wrist_" in name:
+        return "not of this command: measure where the wrist sits on its tracker"
+    return "calibrate again with this command"
 
 
 def _sigma(name: str, matrices: Mapping[str, Matrix]) -> tuple[str, list[str]]:

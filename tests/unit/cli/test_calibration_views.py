@@ -118,6 +118,21 @@ def test_live_views_are_kept_only_when_still_and_new(tmp_path):
     assert (tmp_path / "to/pictures/coverage_head.svg").is_file()
 
 
+@pytest.mark.parametrize(
+    ("image", "words"),
+    [
+        (np.full((270, 480), 128, np.uint8), "no board in the last image"),
+        (render(board_at([0.0, 0, 0.5], [0, 0.4, 0])), "hold it elsewhere"),
+    ],
+)
+def test_live_images_that_add_nothing_are_told_now_and_then(image, words, tmp_path, capsys):
+    data = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 97])[1].tobytes()
+    session = live.Session(boards.parse_board(BOARD), tmp_path / "to", "head")
+    num_images = 2 * live.TELL_AFTER_IMAGES + 3
+    live.collect_live(session, ((f"{i}", data) for i in range(num_images)), tmp_path / "photos")
+    assert capsys.readouterr().out.count(words) == 2
+
+
 def test_a_watched_folder_is_read_once_and_left_when_the_views_suffice(tmp_path):
     views = good_views()
     photos = write_photos(tmp_path / "photos", views[:10])

@@ -11,6 +11,7 @@ import pytest
 
 from dextouch.episodes.log import SpoolWriter
 from dextouch.errors import (
+    CorruptDataError,
     InvalidInputError,
     NotFoundError,
     ShapeError,
@@ -170,6 +171,10 @@ def test_broken_pose_files_are_refused_with_their_line(tmp_path):
             main([*arguments, str(broken)])
     with pytest.raises(NotFoundError):
         main([*arguments, str(tmp_path / "nothing.csv")])
+    for data in (b"\xff\xfe\x00\x01", "image,größe\n".encode("latin-1")):
+        path.write_bytes(data)
+        with pytest.raises(InvalidInputError, match="no CSV in UTF-8"):
+            main([*arguments, str(path)])
 
 
 TRUTH = GloveCalibration.seeded("left", 4)
@@ -256,6 +261,9 @@ def test_broken_lists_of_presses_are_refused(tmp_path):
         path.write_text(text)
         with pytest.raises(error, match=words):
             main([*arguments, "--presses", str(path)])
+    path.write_bytes(b"take,pressure_kpa\nr\xe9st,1\n")
+    with pytest.raises(InvalidInputError, match="no CSV in UTF-8"):
+        main([*arguments, "--presses", str(path)])
     with pytest.raises(NotFoundError, match="tactile_right"):
         main(["glove", "--side", "right", "--rest", rest, "--to", str(tmp_path / "to")])
     # Nothing was written by any of them.
@@ -309,6 +317,26 @@ def test_show_reads_what_a_take_carries(tmp_path):
     assert report["level"] == "WARN"
     (reasons,) = (finding["reasons"] for finding in report["findings"])
     assert list(reasons) == ["age unknown; calibrate again with this command", "sigma unknown"]
+
+
+def test_show_prints_json_last_and_says_whence_what_it_does_not_measure(tmp_path, capsys):
+    matrices = {
+        "head_latency_ns": ((2e6,),),
+        "T_tracker_left_wrist_left": np.eye(4).tolist(),
+        "K_head": np.eye(3).tolist(),
+    }
+    (tmp_path / "calibration.json").write_text(json.dumps(matrices))
+    main(["show", str(tmp_path), "--json", "-"])
+    said = capsys.readouterr().out
+    report = json.loads(said[said.index("\n{") :])
+    told = {f["name"]: f["reasons"][0] for f in report["findings"]}
+    assert "latency_ms" in told["head_latency_ns"]
+    assert "sits on its tracker" in told["T_tracker_left_wrist_left"]
+    assert told["K_head"] == "age unknown; calibrate again with this command"
+    (tmp_path / "calibration.json").write_text('{"K_head": "no matrix"}')
+    with pytest.raises(CorruptDataError, match="no JSON of named matrices") as refused:
+        main(["show", str(tmp_path)])
+    assert "http" not in refused.value.message
 
 
 def test_photos_of_two_sizes_and_no_photos_are_refused(tmp_path):
