@@ -311,6 +311,18 @@ def test_calibration_that_is_missing_or_old_is_told():
     ]
 
 
+@pytest.mark.parametrize("known", [(), ("tare_counts",), ("gain_counts_per_kpa",)])
+def test_a_station_starts_with_half_a_calibration_of_a_glove(known):
+    calibration = {f"tactile_left_{name}": ((100.0,) * 360,) for name in known}
+    decoder = TactileGloveDecoder("left")
+    driver = Driver("g", transport=PtyPort("a").transport, decoder=decoder, clock=VirtualClock(1))
+    live = LiveView([driver], calibration)
+    assert (live.glove("tactile_left"), live.tactile_streams()) == (None, [])
+    (finding,) = CalibrationJudge(driver.descriptors, calibration).judge(0).findings
+    assert finding.code == "calibration_missing"
+    assert all(f"tactile_left_{name}" not in finding.message for name in known)
+
+
 @pytest.mark.parametrize(("minutes", "level"), [(40, None), (20, "WARN"), (4, "ERROR")])
 def test_the_disk_is_judged_by_the_time_it_lasts(bench, tmp_path, minutes, level):
     rate = 60 * 720 + 100 * 56
