@@ -286,7 +286,8 @@ def watch(supervisor: DeviceSupervisor, live: LiveView) -> list[_Watched]:
 def _value_judges(driver: Driver, descriptor: StreamDescriptor, live: LiveView) -> list[Judge]:
     """Judges of what the samples say, by the kind of the stream."""
     if descriptor.kind == "tactile":
-        glove, cells = live.glove(descriptor.name), cells_of(driver.decoder)
+        glove = live.glove(descriptor.name)
+        cells = cells_of(driver.decoder, live.calibration)
         judges: list[Judge] = [FiniteJudge("nan", "taxels are no numbers")]
         if glove is not None:
             judges.append(TaxelJudge(descriptor, glove))

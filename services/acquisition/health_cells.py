@@ -6,11 +6,15 @@ cell, and where a glove does not tell which cells are neighbours, one that never
 slot that means nothing.
 """
 
+import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Shaped
 
+from dextouch.errors import InvalidInputError
+from dextouch.schemas.episodes import Matrix
 from services.acquisition.drivers.base import Decoder
 from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
 from services.acquisition.drivers.glove_wuji import GRID, WujiGloveDecoder
@@ -18,6 +22,8 @@ from services.acquisition.health_blocks import Block
 from services.acquisition.health_levels import Verdict, above
 from services.acquisition.schemas import Code, HealthFinding
 
+# In the calibration's map, of a taxel that no cell measures.
+NO_CELL = -1
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000
 QUIET_NS = 5_000_000_000
@@ -123,20 +129,51 @@ class CellHistory:
 class Cells:
     """What is known of a glove of another maker.
 
-    `grid` are rows and columns in which its cells lie, None where nothing tells.
+    `grid` are rows and columns in which its cells lie, None where nothing tells; `used` says which
+    of them measure a taxel, None where no map tells.
     """
 
     full_scale: float
     grid: tuple[int, int] | None
+    used: Bool[np.ndarray, " cells"] | None = None
 
 
-def cells_of(decoder: Decoder) -> Cells | None:
-    """What is known of the cells that a decoder reads; None of other devices."""
+def cells_of(decoder: Decoder, calibration: Mapping[str, Matrix]) -> Cells | None:
+    """What is known of the cells that a decoder reads; None of other devices.
+
+    Args:
+        decoder: of a device with one stream.
+        calibration: of the station; `tactile_<side>_cells` (1 x 320) gives for each taxel the
+            number of its cell, -1 for none.
+
+    Raises:
+        InvalidInputError: the map names a cell that the glove has not.
+    """
     if isinstance(decoder, WujiGloveDecoder):
-        return Cells(1.0, GRID)
+        return Cells(1.0, GRID, _used_cells(decoder, calibration))
     if isinstance(decoder, JustFloatGloveDecoder):
-        return Cells(decoder.full_scale, None)
+        return Cells(decoder.full_scale, None, _used_cells(decoder, calibration))
     return None
+
+
+def _used_cells(
+    decoder: Decoder, calibration: Mapping[str, Matrix]
+) -> Bool[np.ndarray, " cells"] | None:
+    (descriptor,) = decoder.descriptors
+    num_cells, name = math.prod(descriptor.shape), f"tactile_{descriptor.side}_cells"
+    if name not in calibration:
+        return None
+    cells = np.array(calibration[name], dtype=np.float64).ravel()
+    wrong = (cells != np.rint(cells)) | (cells < NO_CELL) | (cells >= num_cells)
+    if wrong.any():
+        taxel = int(np.argmax(wrong))
+        raise InvalidInputError(
+            f"calibration {name!r}: got {cells[taxel]:g} for taxel {taxel}, expected a whole "
+            f"number -1 … {num_cells - 1}, the cell of the {descriptor.side} glove that measures it"
+        )
+    used = np.zeros(num_cells, dtype=np.bool_)
+    used[cells[cells != NO_CELL].astype(np.int64)] = True
+    return used
 
 
 class CellJudge:
@@ -144,7 +181,8 @@ class CellJudge:
 
     On a known grid a cell is silent when it does not change while its neighbours move: dead at
     rest, stuck under load. Without one, a loaded cell is stuck when it does not change for 5 s
-    while three quarters of the loaded cells do.
+    while three quarters of the loaded cells do. Cells that no taxel uses tell of their neighbours
+    and are not judged themselves.
 
     Args:
         cells: what is known of the glove.
@@ -153,6 +191,7 @@ class CellJudge:
     def __init__(self, cells: Cells) -> None:
         self._full_scale = cells.full_scale
         self._grid = cells.grid
+        self._used = cells.used
         self._history = CellHistory(cells.full_scale)
         self._lowest = np.empty(0)
         self._highest = np.empty(0)
@@ -181,12 +220,13 @@ class CellJudge:
             dead, stuck = history.silent & ~loaded, history.silent & loaded
         saturated = history.saturated()
         # This maker's NaN says that there is no cell: none may come and go.
-        gone = exists & np.isnan(history.recent).any(axis=0)
-        num_cells = max(1, int(exists.sum()))
+        judged = exists if self._used is None else exists & self._used
+        gone = judged & np.isnan(history.recent).any(axis=0)
+        num_cells = max(1, int(judged.sum()))
         found: dict[Code, tuple[np.ndarray, str]] = {
-            "taxels_dead": (dead & exists & ~gone, "dead"),
-            "taxels_stuck": (stuck & exists & ~saturated, "stuck"),
-            "taxels_saturated": (saturated & exists, "saturated"),
+            "taxels_dead": (dead & judged & ~gone, "dead"),
+            "taxels_stuck": (stuck & judged & ~saturated, "stuck"),
+            "taxels_saturated": (saturated & judged, "saturated"),
             "nan": (gone, "without a number"),
         }
         findings: tuple[HealthFinding, ...] = ()
@@ -196,7 +236,7 @@ class CellJudge:
             findings += above(code, count / num_cells, SHARE_LIMITS, f"{count} cells {word}")
             if code != "nan":
                 figures[f"{word}_taxels_ratio"] = count / num_cells
-        return Verdict(findings, figures, self._is_waiting(saturated))
+        return Verdict(findings, figures, self._is_waiting(judged & ~saturated))
 
     def _remember(self, values: np.ndarray) -> None:
         if not len(self._lowest):
@@ -223,10 +263,10 @@ class CellJudge:
         around = (sum_around(moving) - moving) / np.maximum(count, 1.0)
         return np.where(exists, around.ravel(), 0.0)
 
-    def _is_waiting(self, saturated: np.ndarray) -> bool:
+    def _is_waiting(self, judged: np.ndarray) -> bool:
         low, _ = self._history.extremes()
         pinned = low >= SATURATED_SHARE * self._full_scale
-        return bool((pinned & ~saturated).any())
+        return bool((pinned & judged).any())
 
 
 def sum_around(grid: np.ndarray) -> np.ndarray:

@@ -5,17 +5,20 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from dextouch.errors import InvalidInputError
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import expand_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
+from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
 from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.tactile_glove import glove_descriptor
 from services.acquisition.health_blocks import Block, SampleBlocks
 from services.acquisition.health_camera import CameraJudge
-from services.acquisition.health_cells import CellJudge, Cells
+from services.acquisition.health_cells import CellJudge, Cells, cells_of
 from services.acquisition.health_clock import ClockJudge, CountingJudge
 from services.acquisition.health_taxels import (
     GloveRecord,
@@ -265,15 +268,15 @@ class Sheet:
 class GridSheet(Sheet):
     absent = np.nan
 
-    def __init__(self):
-        super().__init__(Cells(1.0, (24, 32)), 768)
+    def __init__(self, used=None):
+        super().__init__(Cells(1.0, (24, 32), used), 768)
 
 
 class BareSheet(Sheet):
     absent = 0.0
 
-    def __init__(self):
-        super().__init__(Cells(4095.0, None), 401, full_scale=4095.0)
+    def __init__(self, used=None):
+        super().__init__(Cells(4095.0, None, used), 401, full_scale=4095.0)
 
 
 @pytest.mark.parametrize("kind", [GridSheet, BareSheet])
@@ -306,6 +309,43 @@ def test_a_cell_out_of_order_is_found_without_a_tare(kind, value, code, seconds)
     for _ in range(2):
         verdict = sheet()
     assert verdict.findings == ()
+
+
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0, np.nan])
+@pytest.mark.parametrize("is_used", [True, False])
+def test_a_cell_that_no_taxel_uses_is_not_judged(value, is_used):
+    used = np.zeros(768, dtype=np.bool_)
+    used[100:420] = True
+    used[200] = is_used
+    sheet = GridSheet(used)
+
+    def change(values):
+        values[:, 200] = value
+
+    sheet()
+    verdicts = [sheet(change) for _ in range(3)]
+    assert bool(verdicts[-1].findings) == is_used
+    assert is_used or not any(verdict.suspicious for verdict in verdicts)
+
+
+@pytest.mark.parametrize(
+    "decoder",
+    [
+        WujiGloveDecoder("left"),
+        JustFloatGloveDecoder("left", num_values=401, full_scale=4095.0, rate_hz=60.0),
+    ],
+)
+def test_the_map_of_the_calibration_says_which_cells_are_used(decoder):
+    num_cells = int(np.prod(decoder.descriptors[0].shape))
+    assert cells_of(decoder, {}).used is None
+    cells = np.arange(320.0) * 2 + 1
+    cells[cells >= num_cells] = -1
+    used = cells_of(decoder, {"tactile_left_cells": (tuple(cells),)}).used
+    assert np.flatnonzero(used).tolist() == cells[cells >= 0].tolist()
+    for wrong in (num_cells, -2, 0.5):
+        cells[7] = wrong
+        with pytest.raises(InvalidInputError, match="for taxel 7, expected a whole number"):
+            cells_of(decoder, {"tactile_left_cells": (tuple(cells),)})
 
 
 def test_a_hand_that_holds_still_on_a_glove_of_unknown_layout_is_no_fault():
