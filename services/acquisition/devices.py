@@ -96,12 +96,6 @@ def load_calibration(path: Path | None) -> dict[str, Matrix]:
         raise InvalidInputError(f"calibration {path}: no JSON of matrices ({error})") from error
 
 
-def stated_calibration(drivers: Sequence[Driver]) -> dict[str, Matrix]:
-    """What drivers know of their own streams: latency with sigma and exposure of cameras."""
-    cameras = [driver for driver in drivers if isinstance(driver, StationCamera)]
-    return {name: matrix for driver in cameras for name, matrix in driver.calibration().items()}
-
-
 def _build(device: DeviceSettings, clock: StationClock) -> Driver:
     if isinstance(device, TactileGloveSettings):
         return _glove(device, clock)

@@ -7,7 +7,7 @@ from pydantic import ValidationError
 from dextouch.episodes.video import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import RealClock, VirtualClock
-from services.acquisition.devices import build_drivers, stated_calibration
+from services.acquisition.devices import build_drivers
 from services.acquisition.drivers import image_encoding
 from services.acquisition.drivers.image_encoding import TakeAware
 from services.acquisition.drivers.station_camera import CameraTiming, StationCamera
@@ -322,7 +322,7 @@ def test_settings_become_a_driver_that_says_what_is_known():
     (driver,) = build_drivers(settings.devices, RealClock())
     assert isinstance(driver, StationCamera)
     assert driver.descriptors[0].unit == "h264"
-    assert stated_calibration([driver]) == {
+    assert driver.calibration() == {
         "camera_head_latency_ns": ((35.5e6,),),
         "camera_head_latency_sigma_ns": ((1.5e6,),),
         "camera_head_exposure_ns": ((8e6,),),
