@@ -147,3 +147,10 @@ def test_prometheus_scrapes_every_service():
     targets = {target for entry in job["static_configs"] for target in entry["targets"]}
     lasting = {name for name, service in OURS.items() if not service.get("profiles")}
     assert targets == {f"{name}:8000" for name in lasting}
+
+
+@pytest.mark.parametrize("path", ["deploy/Dockerfile", "deploy/systemd/dextouch-station.service"])
+def test_all_threads_share_two_heaps_as_in_the_soak_test(path):
+    """With a heap a thread a station grows from take to take."""
+    assert re.search(r"\bMALLOC_ARENA_MAX=2\b", (ROOT / path).read_text())
+    assert '"MALLOC_ARENA_MAX": "2"' in (ROOT / "tests/system/test_station_soak.py").read_text()
