@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -76,8 +77,7 @@ class OpenCvHandEye(Method):
 
     def solve(self, scene: "Scene") -> Answer:
         """By OpenCV."""
-        import cv2
-
+        cv2 = _quiet_opencv()
         tracker, board = scene.Ts_world_tracker, scene.Ts_camera_board
         try:
             # By keyword: the fifth positional argument is an output, not the method.
@@ -101,7 +101,7 @@ class OpenCvRobotWorld(Method):
 
     def solve(self, scene: "Scene") -> Answer:
         """By OpenCV, which finds the board's place too."""
-        import cv2
+        cv2 = _quiet_opencv()
 
         board, tracker = scene.Ts_camera_board, invert(scene.Ts_world_tracker)
         try:
@@ -124,6 +124,14 @@ METHODS: tuple[Method, ...] = (
     *(OpenCvHandEye(name) for name in ("tsai", PARK, "horaud", "andreff", "daniilidis")),
     *(OpenCvRobotWorld(name) for name in ("shah", "li")),
 )
+
+
+def _quiet_opencv() -> ModuleType:
+    """OpenCV without the lines that it prints where it gives up; the table says so."""
+    import cv2
+
+    cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+    return cv2
 
 
 def _finite(name: str, R: object, t: object) -> Float64[np.ndarray, "4 4"]:
