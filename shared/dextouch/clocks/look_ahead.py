@@ -69,7 +69,7 @@ class LookAheadClock:
         self._period_ns = period_ns
         self._look_ahead = look_ahead
         self._waiting: deque[int] = deque()
-        self._envelope = RunningEnvelope(min_slope_span_s=COUNTED_SLOPE_SPAN_S)
+        self._envelope = RunningEnvelope(min_slope_span_s=COUNTED_SLOPE_SPAN_S, is_counted=True)
         self._start_ns: int | None = None
         self._index = -1
         self._num_lost = 0

@@ -77,6 +77,7 @@ class OnlineClock:
             envelope = self._envelope = RunningEnvelope(
                 resolution_ns=self._counter.resolution_ns,
                 min_slope_span_s=COUNTED_SLOPE_SPAN_S if counted else MIN_SLOPE_SPAN_S,
+                is_counted=counted,
             )
             self._device_start_ns, self._reference_ns = device_ns, t_host_ns - device_ns
         since_ns = device_ns - self._device_start_ns

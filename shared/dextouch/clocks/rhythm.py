@@ -43,6 +43,15 @@ class Rhythm:
         num = max(1, round(distance_s / period_s))
         return abs(distance_s - num * period_s) > ODD_S + ODD_SCATTERS * self._scatter_s
 
+    def is_kept(self, distance_s: float) -> bool:
+        """Whether a distance is one period of a regular device: no jump, nothing lost."""
+        period_s = self.period_s
+        return (
+            period_s is not None
+            and round(distance_s / period_s) == 1
+            and not self.is_odd(distance_s)
+        )
+
     def add(self, distance_s: float) -> None:
         """Take in the next distance, of whatever sign."""
         if self._period_s <= 0.0:

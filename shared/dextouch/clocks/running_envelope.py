@@ -27,6 +27,9 @@ EARLY_SPREADS = 0.25
 UNSURE_STEP_NS = 4_000_000.0
 UNSURE_SPREADS = 4.0
 CONFIRM_S = 1.0
+# Where the stamps of a regular device kept their distance all the while, its clock did not jump:
+# the host is busy, and may be for so long before the path is believed to have become longer.
+BUSY_S = 10.0
 # So many in a row are late by half the mean delay or more only where all of them are.
 MIN_CONFIRM_SAMPLES = 30
 # Samples that were merely late may have come before the step itself.
@@ -90,7 +93,8 @@ class RunningEnvelope:
 
     A point far below the line cannot be a delay: the clock was stepped and the line starts anew
     at once. Points that all lie above it for a second, by the device's time and by the host's, are
-    a step too (a burst of packets after a stall is a second of device time only).
+    a step too (a burst of packets after a stall is a second of device time only), unless the stamps
+    of a regular device kept their distance all the while: then the host was busy.
 
     A device that samples regularly shows in the distance of its stamps by how much its clock was
     stepped, but for whole periods. Then the line and what it hangs on are moved by as much, instead
@@ -99,13 +103,20 @@ class RunningEnvelope:
     Args:
         resolution_ns: of the device's stamps; steps below it do not show.
         min_slope_span_s: the slope is 0 until the points span so many seconds.
+        is_counted: device time is a count of samples, which keeps its distance whatever the device
+            does.
     """
 
     def __init__(
-        self, *, resolution_ns: int = 0, min_slope_span_s: float = MIN_SLOPE_SPAN_S
+        self,
+        *,
+        resolution_ns: int = 0,
+        min_slope_span_s: float = MIN_SLOPE_SPAN_S,
+        is_counted: bool = False,
     ) -> None:
         self._step_ns = STEP_NS + resolution_ns
         self._min_slope_span_s = min_slope_span_s
+        self._is_counted = is_counted
         self._num_steps = 0
         self._num_points = 0
         self._spread_ns = 0.0
@@ -114,6 +125,7 @@ class RunningEnvelope:
         self._last_x_s = 0.0
         self._rhythm = Rhythm()
         self._odd: _Odd | None = None
+        self._broken_x_s = -math.inf
         self._start(LowerHull())
 
     @property
@@ -149,6 +161,8 @@ class RunningEnvelope:
             distance_s = x_s - self._last_x_s
             if self._rhythm.is_odd(distance_s):
                 self._odd = _Odd(x_s, distance_s)
+            if not self._rhythm.is_kept(distance_s):
+                self._broken_x_s = x_s
             self._rhythm.add(distance_s)
             is_pending = self._is_pending(self._line, x_s, y_ns, now_s)
             offset_ns = self._line.at(x_s) if is_pending else self._follow(x_s, y_ns)
@@ -238,7 +252,9 @@ class RunningEnvelope:
         lasted_s = min(x_s - self._pending_since[0], now_s - self._pending_since[1])
         if lasted_s >= DOUBTFUL_S:
             self._pending.add(x_s, y_ns)
-        return lasted_s >= CONFIRM_S and self._num_pending >= MIN_CONFIRM_SAMPLES
+        may_have_jumped = self._is_counted or self._broken_x_s >= self._pending_since[0]
+        needed_s = CONFIRM_S if may_have_jumped else BUSY_S
+        return lasted_s >= needed_s and self._num_pending >= MIN_CONFIRM_SAMPLES
 
     def _thresholds_ns(self) -> tuple[float, float]:
         """How far below, and how far above the line a point is remarkable."""

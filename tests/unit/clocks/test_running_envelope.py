@@ -75,3 +75,31 @@ def test_a_restarted_device_samples_at_other_moments(phase_ns):
     np.testing.assert_allclose(error[1100:], 0, atol=0.1)
     np.testing.assert_allclose(error[640:], 0, atol=0.65)
     assert clock.num_steps == 1
+
+
+def late_after(seconds, *, lasts_s, late_ns):
+    """A minute of ordinary delays; for a while every sample waits longer."""
+    true_ns = np.arange(60 * 60, dtype=np.int64) * PERIOD_NS + 10**15
+    since_s = (true_ns - true_ns[0]) * 1e-9 - seconds
+    delay_ns = np.arange(len(true_ns)) * 7919 % 97 * 30_000
+    delay_ns = delay_ns + late_ns * ((since_s >= 0) & (since_s < lasts_s))
+    return true_ns, np.maximum.accumulate(true_ns + delay_ns) - true_ns
+
+
+@pytest.mark.parametrize("lasts_s", [1.5, 8.0])
+@pytest.mark.parametrize("late_ns", [5_000_000, 60_000_000])
+def test_a_busy_host_is_no_step_of_a_regular_devices_clock(lasts_s, late_ns):
+    true_ns, delay_ns = late_after(30, lasts_s=lasts_s, late_ns=late_ns)
+    clock = OnlineClock()
+    error = errors_ms(clock, true_ns - 10**14, true_ns, delay_ns)
+    np.testing.assert_allclose(error[60:], 0, atol=0.1)
+    assert clock.num_steps == 0
+
+
+def test_a_path_that_became_longer_for_good_is_believed_after_ten_seconds():
+    true_ns, delay_ns = late_after(30, lasts_s=1000, late_ns=5_000_000)
+    clock = OnlineClock()
+    error = errors_ms(clock, true_ns - 10**14, true_ns, delay_ns)
+    np.testing.assert_allclose(error[60 * 29 : 60 * 39], 0, atol=0.1)
+    np.testing.assert_allclose(error[60 * 41 :], 5, atol=0.1)
+    assert clock.num_steps == 1
