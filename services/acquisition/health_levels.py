@@ -134,19 +134,23 @@ class EventLog:
     """The newest changes of levels, oldest first."""
 
     def __init__(self) -> None:
-        self._events: deque[HealthEvent] = deque(maxlen=MAX_EVENTS)
+        # Bare, since a station that lives for weeks keeps thousands and seldom shows one.
+        self._events: deque[tuple[int, str, Code, Level]] = deque(maxlen=MAX_EVENTS)
         self._raised: dict[tuple[str, str], int] = {}
 
     def add(self, t_host_ns: int, stream: str, code: Code, level: Level) -> None:
         """A code of a stream has reached a level; OK is its end."""
-        event = HealthEvent(t_host_ns=t_host_ns, stream=stream, code=code, level=level)
-        self._events.append(event)
+        self._events.append((t_host_ns, stream, code, level))
         if level != "OK":
             self._raised[stream, code] = self._raised.get((stream, code), 0) + 1
 
     def events(self, since_ns: int = 0) -> tuple[HealthEvent, ...]:
         """Events from a moment on."""
-        return tuple(event for event in list(self._events) if event.t_host_ns >= since_ns)
+        return tuple(
+            HealthEvent(t_host_ns=t_ns, stream=stream, code=code, level=level)
+            for t_ns, stream, code, level in list(self._events)
+            if t_ns >= since_ns
+        )
 
     def raised(self) -> dict[tuple[str, str], int]:
         """How often each (stream, code) was raised since the station's start."""
