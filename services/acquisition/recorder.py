@@ -19,6 +19,7 @@ from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import begin_take
+from services.acquisition.heap import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
 from services.acquisition.schemas import (
     Action,
@@ -199,6 +200,7 @@ class Recorder:
             self._state = "saved"
             self._done["save"] = how
             logger.info("save_take", recording_id=spool.attributes.recording_id)
+            give_back_free_memory()
             return self.status()
 
     def discard(self, recording_id: str | None = None) -> RecorderStatus:
@@ -242,6 +244,7 @@ class Recorder:
         with disk_errors(f"discard take {self._discarded_id!r}"):
             shutil.rmtree(take.spool.path)
         logger.info("discard_take", recording_id=self._discarded_id)
+        give_back_free_memory()
 
     def _settle(self) -> None:
         """A take that the disk ended is checked as soon as somebody looks."""
