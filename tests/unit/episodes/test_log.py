@@ -2,10 +2,6 @@
 
 import errno
 import os
-import random
-import subprocess
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,55 +18,15 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch, encoded_values
-
-GLOVE = StreamDescriptor(
-    name="glove_left",
-    kind="tactile",
-    shape=(360,),
-    dtype="uint16",
-    unit="counts",
-    nominal_rate_hz=60,
+from tests.unit.episodes.spooled_batches import (
+    ATTRIBUTES,
+    CAMERA,
+    GLOVE,
+    assert_same,
+    camera_batch,
+    glove_batch,
 )
-CAMERA = StreamDescriptor(
-    name="camera_head",
-    kind="image",
-    shape=(8, 8, 3),
-    dtype="uint8",
-    unit="jpeg",
-    nominal_rate_hz=30,
-)
-ATTRIBUTES = RecordingAttributes(
-    recording_id="take-1",
-    task="stand_bottle",
-    instruction="",
-    domain="human",
-    station="bench",
-    streams=(GLOVE, CAMERA),
-)
-
-
-def glove_batch(first, count=1):
-    numbers = np.arange(first, first + count, dtype=np.int64)
-    values = (numbers[:, None] + np.arange(360)).astype("<u2")
-    return SampleBatch(numbers * 16_666_667, numbers * 1000, numbers, values)
-
-
-def camera_batch(first, count=1):
-    images = [np.full((8, 8, 3), 10 * (first + k), np.uint8) for k in range(count)]
-    numbers = np.arange(first, first + count, dtype=np.int64)
-    return SampleBatch(
-        numbers, np.full(count, -1), numbers, encoded_values([encode_jpeg(i) for i in images])
-    )
-
-
-def assert_same(got, expected):
-    np.testing.assert_array_equal(got.values, expected.values)
-    for stamp in ("t_host_ns", "t_device_ns", "sequence"):
-        np.testing.assert_array_equal(getattr(got, stamp), getattr(expected, stamp))
 
 
 @pytest.fixture
@@ -356,59 +312,3 @@ def test_what_does_not_fit_is_refused(path, tmp_path):
     with pytest.raises(InvalidInputError, match="without a stream"):
         log.SpoolWriter(tmp_path / "x", ATTRIBUTES.model_copy(update={"streams": ()}))
     writer.close()
-
-
-CHILD = """
-import sys
-from pathlib import Path
-import numpy as np
-from dextouch.episodes.log import SpoolWriter
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.samples import SampleBatch
-
-attributes = RecordingAttributes.model_validate_json(sys.argv[2])
-writer = SpoolWriter(Path(sys.argv[1]), attributes)
-for number in range(100_000):
-    k = np.array([number])
-    values = (k[:, None] + np.arange(360)).astype("<u2")
-    writer.append("glove_left", SampleBatch(k * 16_666_667, k * 1000, k, values))
-    if number % 10 == 0:
-        writer.flush()
-    sys.stdout.write(f"{number}\\n")
-    sys.stdout.flush()
-"""
-
-
-def kill_in_the_middle(path, num_lines):
-    """Acknowledged samples of a child that was killed after at least `num_lines` of them."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", CHILD, str(path), ATTRIBUTES.model_dump_json()],
-        stdout=subprocess.PIPE,
-    )
-    for _ in range(num_lines):
-        child.stdout.readline()
-    child.kill()
-    rest = child.stdout.read().splitlines(keepends=True)
-    child.stdout.close()
-    child.wait()
-    return num_lines + sum(line.endswith(b"\n") for line in rest)
-
-
-def check_kills(folder: Path, count: int, seed: int):
-    rng = random.Random(seed)
-    for trial in range(count):
-        path = folder / f"take-{trial}"
-        acknowledged = kill_in_the_middle(path, rng.randint(1, 200))
-        count = log.recover(path).num_samples["glove_left"]
-        assert acknowledged <= count <= acknowledged + 1
-        got = log.SpoolReader(path).read("glove_left")
-        assert_same(got, glove_batch(0, count))
-
-
-def test_a_killed_process_loses_nothing_acknowledged(tmp_path):
-    check_kills(tmp_path, 5, seed=1)
-
-
-@pytest.mark.slow
-def test_a_killed_process_loses_nothing_acknowledged_50_times(tmp_path):
-    check_kills(tmp_path, 50, seed=2)
