@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from dextouch.hands.wuji_hand_2 import FingerTable, JointRow, Quaternion, Vector3
+from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion, Vector3
 
 # Base of each finger's metacarpal in the right wrist frame, metres.
 METACARPAL_BASES_M: Final[dict[str, np.ndarray]] = {
@@ -40,6 +40,8 @@ _THUMB_BASE_TURN: Final = (0.6294, -0.0606, -0.7201, 0.2856)
 _THUMB_SADDLE_TURN: Final = (0.9347, 0.0919, 0.3425, -0.0234)
 _THUMB_ROLL: Final = (0.9591, -0.0122, 0.0419, 0.2796)
 _NO_TURN: Final = (1.0, 0.0, 0.0, 0.0)
+# As on the robot: the abduction hinge is the knuckle, the two flexions after it PIP and DIP.
+_POINTS: Final = (1, 2, 3)
 
 
 def _finger(name: str) -> FingerTable:
@@ -54,6 +56,7 @@ def _finger(name: str) -> FingerTable:
     x_axis, y_axis = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     place: Vector3 = (float(knuckle[0]), float(knuckle[1]), float(knuckle[2]))
     return FingerTable(
+        name,
         (
             JointRow(f"r_{firmware}_mcp_flex", place, fan, x_axis, flex),
             JointRow(f"r_{firmware}_mcp_abd", (0.0, 0.0, 0.0), _NO_TURN, y_axis, abd),
@@ -61,6 +64,7 @@ def _finger(name: str) -> FingerTable:
             JointRow(f"r_{firmware}_dip", (0.0, 0.0, -middle), _NO_TURN, x_axis, dip),
         ),
         (0.0, 0.0, -distal),
+        _POINTS,
     )
 
 
@@ -69,6 +73,7 @@ def _thumb() -> FingerTable:
     flex, abd, mcp, ip = _THUMB_LIMITS_RAD
     x_axis, y_axis = (1.0, 0.0, 0.0), (0.0, 1.0, 0.0)
     return FingerTable(
+        "thumb",
         (
             JointRow("r_thumb_cmc_flex", _THUMB_BASE_M, _THUMB_BASE_TURN, x_axis, flex),
             JointRow("r_thumb_cmc_abd", (0.0, 0.0, 0.0), _THUMB_SADDLE_TURN, y_axis, abd),
@@ -76,6 +81,7 @@ def _thumb() -> FingerTable:
             JointRow("r_thumb_ip", (0.0, 0.0, -proximal), _NO_TURN, x_axis, ip),
         ),
         (0.0, 0.0, -distal),
+        _POINTS,
     )
 
 
@@ -96,7 +102,7 @@ def human_fingers(side: str) -> tuple[FingerTable, ...]:
         return right
     mirrored = []
     for finger in right:
-        a, b, c, d = (_mirrored(row) for row in finger.joints)
+        rows = tuple(_mirrored(row) for row in finger.joints)
         x, y, z = finger.tip_m
-        mirrored.append(FingerTable((a, b, c, d), (x, -y, z)))
+        mirrored.append(FingerTable(finger.chain, rows, (x, -y, z), finger.points))
     return tuple(mirrored)

@@ -1,23 +1,149 @@
-"""The robot hand: joint names, limits and forward kinematics in wrist coordinates."""
+"""Hands of any number of fingers: joint names, limits and forward kinematics in wrist coordinates.
 
+`HandModel` takes finger tables (of a module or, by `dextouch.hands.hand_files`, of a file);
+`RobotHand` is the Wuji Hand 2. All share one wrist frame: fingers along -z, the thumb side +x,
+the right palm faces +y, the left -y.
+"""
+
+from collections.abc import Sequence
 from functools import cached_property
+from typing import Final, Literal
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
 from dextouch.geometry.transforms import transform
-from dextouch.hands.wuji_hand_2 import LEFT_HAND, RIGHT_HAND, FingerTable
+from dextouch.hands.finger_table import FingerTable, check_fingers
+from dextouch.hands.wuji_hand_2 import LEFT_HAND, RIGHT_HAND
 
-NUM_JOINTS = 20
-NUM_FINGERS = 5
+NUM_JOINTS: Final = 20
+NUM_FINGERS: Final = 5
+SIDES: Final[tuple[Literal["left", "right"], ...]] = ("left", "right")
 
 
-class RobotHand:
+class HandModel:
+    """A hand of 1 to 5 fingers with 1 to 6 hinges each.
+
+    Args:
+        side: "left" or "right".
+        fingers: tables in the order of the hand's joint vector.
+        name: for messages.
+
+    Raises:
+        UnknownNameError: any other side, or a chain that the tracked skeleton lacks.
+        InvalidInputError: tables that describe no hand; the message names the joint.
+        NonFiniteError: NaN or infinity in a table.
+    """
+
+    def __init__(self, side: str, fingers: Sequence[FingerTable], *, name: str) -> None:
+        if side not in SIDES:
+            raise UnknownNameError("side", side, list(SIDES))
+        check_fingers(fingers, where=name)
+        self.side = side
+        self.name = name
+        self.fingers = tuple(fingers)
+
+    @cached_property
+    def joint_names(self) -> tuple[str, ...]:
+        """Joint names in the order of the joint vector: finger by finger, from the wrist out."""
+        return tuple(row.name for finger in self.fingers for row in finger.joints)
+
+    @cached_property
+    def lower_rad(self) -> Float64[np.ndarray, " joints"]:
+        """Lower joint limits."""
+        return np.array([row.limits_rad[0] for finger in self.fingers for row in finger.joints])
+
+    @cached_property
+    def upper_rad(self) -> Float64[np.ndarray, " joints"]:
+        """Upper joint limits."""
+        return np.array([row.limits_rad[1] for finger in self.fingers for row in finger.joints])
+
+    @cached_property
+    def _is_joint(self) -> Bool[np.ndarray, "fingers hinges"]:
+        """Which places of the [fingers, most hinges of a finger] table a hinge fills."""
+        counts = np.array([len(finger.joints) for finger in self.fingers])
+        return np.asarray(np.arange(counts.max()) < counts[:, None])
+
+    @cached_property
+    def _offsets(self) -> Float64[np.ndarray, "fingers hinges 4 4"]:
+        rows = [row for finger in self.fingers for row in finger.joints]
+        offsets = np.tile(np.eye(4), (*self._is_joint.shape, 1, 1))
+        R = rotation_from_quaternion(np.array([row.q_wxyz for row in rows]))
+        offsets[self._is_joint] = transform(R, np.array([row.position_m for row in rows]))
+        return offsets
+
+    @cached_property
+    def _axes(self) -> Float64[np.ndarray, "fingers hinges 3"]:
+        axes = np.zeros((*self._is_joint.shape, 3))
+        axes[self._is_joint] = [row.axis for finger in self.fingers for row in finger.joints]
+        return axes
+
+    @cached_property
+    def _tips(self) -> Float64[np.ndarray, "fingers 3"]:
+        return np.array([finger.tip_m for finger in self.fingers])
+
+    @cached_property
+    def _points(self) -> Int64[np.ndarray, "fingers 3"]:
+        return np.array([finger.points for finger in self.fingers], dtype=np.int64)
+
+    def joint_frames(
+        self, joints_rad: np.ndarray
+    ) -> Float64[np.ndarray, "time fingers hinges 4 4"]:
+        """T_wrist_joint of every hinge, after its own turn; of the Wuji hand [T, 5, 4, 4, 4].
+
+        A finger with fewer hinges than another repeats its last frame.
+
+        Args:
+            joints_rad: [T, J] joint angles in the order of `joint_names`.
+
+        Raises:
+            ShapeError: not [T, J].
+            NonFiniteError: NaN or infinity.
+        """
+        q = np.asarray(joints_rad, dtype=np.float64)
+        count = len(self.joint_names)
+        if q.ndim != 2 or q.shape[1] != count:
+            raise ShapeError(f"joint angles: got shape {q.shape}, expected [T, {count}]")
+        if not np.isfinite(q).all():
+            raise NonFiniteError(f"joint angles of the {self.side} hand hold NaN or infinity")
+        num_fingers, num_hinges = self._is_joint.shape
+        angles = np.zeros((len(q), num_fingers, num_hinges))
+        angles[:, self._is_joint] = q
+        turns = transform(rotation_from_vector(angles[..., None] * self._axes), np.zeros(3))
+        frames = np.empty((len(q), num_fingers, num_hinges, 4, 4))
+        T_wrist_parent = np.broadcast_to(np.eye(4), (len(q), num_fingers, 4, 4))
+        for joint in range(num_hinges):
+            T_wrist_parent = T_wrist_parent @ self._offsets[:, joint] @ turns[:, :, joint]
+            frames[:, :, joint] = T_wrist_parent
+        return frames
+
+    def chain_points_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time fingers 4 3"]:
+        """Knuckle, PIP, DIP and tip of every finger in wrist coordinates, metres.
+
+        The knuckle is the last common point of a finger before its first phalanx: of the Wuji
+        hand the origin of the abduction frame (of the thumb: of the second CMC frame).
+        """
+        frames = self.joint_frames(joints_rad)
+        # Beyond a finger's own hinges the last frame stands again, so that -1 is right for all.
+        last = frames[:, :, -1]
+        tips = last[..., :3, :3] @ self._tips[:, :, None]
+        tip_points = tips[..., 0] + last[..., :3, 3]
+        fingers = np.arange(len(self.fingers))[:, None]
+        points = frames[..., :3, 3][:, fingers, self._points]
+        return np.concatenate([points, tip_points[:, :, None]], axis=2)
+
+    def fingertips_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time fingers 3"]:
+        """Fingertips in wrist coordinates, metres, for joint angles [T, J]."""
+        return self.chain_points_m(joints_rad)[:, :, 3]
+
+
+class RobotHand(HandModel):
     """Wuji Hand 2: five fingers × four hinges, thumb … little, from the wrist outwards.
 
-    The four hinges of a finger are S1 flexion, S2 abduction, S3 and S4 flexion.
+    The four hinges of a finger are S1 flexion, S2 abduction, S3 and S4 flexion; the order is the
+    firmware's.
 
     Args:
         side: "left" or "right".
@@ -27,76 +153,5 @@ class RobotHand:
     """
 
     def __init__(self, side: str) -> None:
-        tables = {"left": LEFT_HAND, "right": RIGHT_HAND}
-        if side not in tables:
-            raise UnknownNameError("side", side, list(tables))
-        self.side = side
-        self.fingers: tuple[FingerTable, ...] = tables[side]
-
-    @cached_property
-    def joint_names(self) -> tuple[str, ...]:
-        """The 20 joint names in firmware order."""
-        return tuple(row.name for finger in self.fingers for row in finger.joints)
-
-    @cached_property
-    def lower_rad(self) -> Float64[np.ndarray, "20"]:
-        """Lower joint limits."""
-        return np.array([row.limits_rad[0] for finger in self.fingers for row in finger.joints])
-
-    @cached_property
-    def upper_rad(self) -> Float64[np.ndarray, "20"]:
-        """Upper joint limits."""
-        return np.array([row.limits_rad[1] for finger in self.fingers for row in finger.joints])
-
-    @cached_property
-    def _offsets(self) -> Float64[np.ndarray, "5 4 4 4"]:
-        rows = [list(finger.joints) for finger in self.fingers]
-        R = rotation_from_quaternion(np.array([[row.q_wxyz for row in f] for f in rows]))
-        return transform(R, np.array([[row.position_m for row in f] for f in rows]))
-
-    @cached_property
-    def _axes(self) -> Float64[np.ndarray, "5 4 3"]:
-        return np.array([[row.axis for row in finger.joints] for finger in self.fingers])
-
-    @cached_property
-    def _tips(self) -> Float64[np.ndarray, "5 3"]:
-        return np.array([finger.tip_m for finger in self.fingers])
-
-    def joint_frames(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 5 4 4 4"]:
-        """T_wrist_joint of every hinge, after its own turn.
-
-        Args:
-            joints_rad: [T, 20] joint angles in firmware order.
-
-        Raises:
-            ShapeError: not [T, 20].
-            NonFiniteError: NaN or infinity.
-        """
-        q = np.asarray(joints_rad, dtype=np.float64)
-        if q.ndim != 2 or q.shape[1] != NUM_JOINTS:
-            raise ShapeError(f"joint angles: got shape {q.shape}, expected [T, {NUM_JOINTS}]")
-        if not np.isfinite(q).all():
-            raise NonFiniteError(f"joint angles of the {self.side} hand hold NaN or infinity")
-        angles = q.reshape(-1, NUM_FINGERS, 4)
-        turns = transform(rotation_from_vector(angles[..., None] * self._axes), np.zeros(3))
-        frames = np.empty((len(q), NUM_FINGERS, 4, 4, 4))
-        T_wrist_parent = np.broadcast_to(np.eye(4), (len(q), NUM_FINGERS, 4, 4))
-        for joint in range(4):
-            T_wrist_parent = T_wrist_parent @ self._offsets[:, joint] @ turns[:, :, joint]
-            frames[:, :, joint] = T_wrist_parent
-        return frames
-
-    def chain_points_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 5 4 3"]:
-        """MCP, PIP, DIP and tip of every finger in wrist coordinates, metres.
-
-        "MCP" is the origin of the abduction frame (of the thumb: of the second CMC frame), the
-        last common point of a finger before its first phalanx.
-        """
-        frames = self.joint_frames(joints_rad)
-        tips = frames[:, :, 3, :3, :3] @ self._tips[:, :, None]
-        tip_points = tips[..., 0] + frames[:, :, 3, :3, 3]
-        return np.concatenate([frames[:, :, 1:, :3, 3], tip_points[:, :, None]], axis=2)
-
-    def fingertips_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 5 3"]:
-        """Fingertips, thumb … little, in wrist coordinates, metres, for joint angles [T, 20]."""
-        return self.chain_points_m(joints_rad)[:, :, 3]
+        fingers = LEFT_HAND if side == "left" else RIGHT_HAND
+        super().__init__(side, fingers, name=f"Wuji Hand 2 {side}")

@@ -1,38 +1,23 @@
 """Wuji Hand 2 (Beta 2) joint tables: left and right kept apart since they are no exact mirror.
 
-Figures from the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on PyPI).
+Figures from the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on PyPI), to
+its last digit; fingertips are its sites `*_tip` (tests/accuracy/test_hand_model.py compares).
 Wrist frame: fingers point along -z, the thumb side is +x, the right palm faces +y, the left -y.
 Each row: the joint's frame in its parent (position in metres, quaternion w x y z), its axis, its
 limits in radians.
 """
 
-from typing import Final, NamedTuple
+from typing import Final
 
-Vector3 = tuple[float, float, float]
-Quaternion = tuple[float, float, float, float]
+from dextouch.hands.finger_table import FingerTable, JointRow
 
 _NO_TURN: Final = (1.0, 0.0, 0.0, 0.0)
-
-
-class JointRow(NamedTuple):
-    """One hinge: where its frame sits in its parent, how it turns, how far."""
-
-    name: str
-    position_m: Vector3
-    q_wxyz: Quaternion
-    axis: Vector3
-    limits_rad: tuple[float, float]
-
-
-class FingerTable(NamedTuple):
-    """Four joints from the wrist outwards and the fingertip in the last joint's frame."""
-
-    joints: tuple[JointRow, JointRow, JointRow, JointRow]
-    tip_m: Vector3
-
+# Hinges S2, S3 and S4: their origins are knuckle, PIP and DIP (of the thumb: CMC, MCP and IP).
+_POINTS: Final = (1, 2, 3)
 
 LEFT_HAND: Final = (
     FingerTable(
+        "thumb",
         (
             JointRow(
                 "l_thumb_cmc_flex",
@@ -58,8 +43,10 @@ LEFT_HAND: Final = (
             JointRow("l_thumb_ip", (0.0, 0.0, -0.035), _NO_TURN, (-1.0, 0.0, 0.0), (-1.047, 1.57)),
         ),
         (0.0, 0.0, -0.029787),
+        _POINTS,
     ),
     FingerTable(
+        "index",
         (
             JointRow(
                 "l_index_finger_mcp_flex",
@@ -91,8 +78,10 @@ LEFT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
     FingerTable(
+        "middle",
         (
             JointRow(
                 "l_middle_finger_mcp_flex",
@@ -124,8 +113,10 @@ LEFT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
     FingerTable(
+        "ring",
         (
             JointRow(
                 "l_ring_finger_mcp_flex",
@@ -153,8 +144,10 @@ LEFT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
     FingerTable(
+        "little",
         (
             JointRow(
                 "l_pinky_mcp_flex",
@@ -178,10 +171,12 @@ LEFT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
 )
 RIGHT_HAND: Final = (
     FingerTable(
+        "thumb",
         (
             JointRow(
                 "r_thumb_cmc_flex",
@@ -209,8 +204,10 @@ RIGHT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02978),
+        _POINTS,
     ),
     FingerTable(
+        "index",
         (
             JointRow(
                 "r_index_finger_mcp_flex",
@@ -238,8 +235,10 @@ RIGHT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
     FingerTable(
+        "middle",
         (
             JointRow(
                 "r_middle_finger_mcp_flex",
@@ -271,8 +270,10 @@ RIGHT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
     FingerTable(
+        "ring",
         (
             JointRow(
                 "r_ring_finger_mcp_flex",
@@ -296,8 +297,10 @@ RIGHT_HAND: Final = (
             ),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
     FingerTable(
+        "little",
         (
             JointRow(
                 "r_pinky_mcp_flex",
@@ -323,5 +326,6 @@ RIGHT_HAND: Final = (
             JointRow("r_pinky_dip", (0.0, 0.0, -0.0275), _NO_TURN, (1.0, 0.0, 0.0), (-1.047, 1.57)),
         ),
         (0.0, 0.0, -0.02475),
+        _POINTS,
     ),
 )
