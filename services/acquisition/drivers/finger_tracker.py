@@ -1,15 +1,15 @@
 """Finger tracker over HID: reports come in, 25 keypoints a sample (m, wrist frame) go out."""
 
 import struct
-from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
-from dextouch.errors import DeviceError, PacketError
-from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, NODE_INDEX, NUM_KEYPOINTS, WRIST
+from dextouch.errors import DeviceError, InvalidInputError, PacketError
+from dextouch.hands.node_order import NO_KEYPOINT, node_order
+from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, NUM_KEYPOINTS, WRIST
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import Side
@@ -59,16 +59,17 @@ def resolve_nodes(nodes: Sequence[tuple[str, str]]) -> list[int]:
     Raises:
         PacketError: a node unknown to us, missing, or named twice; the message says which.
     """
-    counts = Counter(nodes)
-    unknown = [node for node in counts if node not in NODE_INDEX]
-    missing = [node for node in NODE_INDEX if node not in counts]
-    twice = [node for node, count in counts.items() if count > 1]
-    if unknown or missing or twice:
+    try:
+        places = list(node_order(nodes).places)
+    except InvalidInputError as error:
+        raise PacketError(f"descriptor: {error.message}", **error.details) from error
+    if NO_KEYPOINT in places:
         raise PacketError(
-            f"descriptor: expected each of the {NUM_KEYPOINTS} nodes once; unknown {unknown}, "
-            f"missing {missing}, named twice {twice}"
+            f"descriptor: expected each of the {NUM_KEYPOINTS} nodes once; unknown "
+            f"{[nodes[place] for place, index in enumerate(places) if index == NO_KEYPOINT]}: a "
+            "palm is no keypoint, leave it out"
         )
-    return [NODE_INDEX[node] for node in nodes]
+    return places
 
 
 def parse_node_order(payload: bytes) -> list[int]:
