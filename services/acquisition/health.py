@@ -14,7 +14,8 @@ from services.acquisition.health_blocks import Block
 from services.acquisition.health_camera import CameraJudge
 from services.acquisition.health_cells import CellJudge, cells_of
 from services.acquisition.health_clock import ClockJudge, CountingJudge
-from services.acquisition.health_levels import Board, EventLog, Verdict, worst
+from services.acquisition.health_events import EventLog
+from services.acquisition.health_levels import Board, Verdict, worst
 from services.acquisition.health_link import LinkJudge
 from services.acquisition.health_path import PathJudge
 from services.acquisition.health_report import device_health, stale_code, stream_health

@@ -1,4 +1,4 @@
-"""Single judgements come in; levels with hysteresis, findings by code and an event log go out."""
+"""Single judgements come in; levels with hysteresis and findings by code go out."""
 
 from collections import deque
 from collections.abc import Mapping, Sequence
@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 from typing import Literal
 
 from services.acquisition.health_advice import ADVICE
-from services.acquisition.schemas import Code, HealthEvent, HealthFinding, Level, RaisedFinding
+from services.acquisition.schemas import Code, HealthFinding, Level, RaisedFinding
 
 RAISE_AFTER = 2
 CLEAR_AFTER = 5
-MAX_EVENTS = 2000
 SEVERITY: tuple[Level, ...] = ("OK", "WARN", "ERROR", "STALE")
 
 Judgement = Literal["OK", "WARN", "ERROR"]
@@ -128,33 +127,6 @@ class Board:
             if hysteresis.level != "OK"
         ]
         return tuple(sorted(raised, key=lambda item: -_rank(item.level)))
-
-
-class EventLog:
-    """The newest changes of levels, oldest first."""
-
-    def __init__(self) -> None:
-        # Bare, since a station that lives for weeks keeps thousands and seldom shows one.
-        self._events: deque[tuple[int, str, Code, Level]] = deque(maxlen=MAX_EVENTS)
-        self._raised: dict[tuple[str, str], int] = {}
-
-    def add(self, t_host_ns: int, stream: str, code: Code, level: Level) -> None:
-        """A code of a stream has reached a level; OK is its end."""
-        self._events.append((t_host_ns, stream, code, level))
-        if level != "OK":
-            self._raised[stream, code] = self._raised.get((stream, code), 0) + 1
-
-    def events(self, since_ns: int = 0) -> tuple[HealthEvent, ...]:
-        """Events from a moment on."""
-        return tuple(
-            HealthEvent(t_host_ns=t_ns, stream=stream, code=code, level=level)
-            for t_ns, stream, code, level in list(self._events)
-            if t_ns >= since_ns
-        )
-
-    def raised(self) -> dict[tuple[str, str], int]:
-        """How often each (stream, code) was raised since the station's start."""
-        return dict(self._raised)
 
 
 def _rank(level: Level) -> int:

@@ -19,6 +19,7 @@ from dextouch.schemas.recordings import (
 )
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
+from services.acquisition.heap import give_back_free_memory
 from services.acquisition.schemas import UploadStatus
 
 logger = structlog.get_logger(__name__)
@@ -130,6 +131,7 @@ class Uploader:
                 if self._upload(path):
                     done.append(path.name)
                     self._errors.pop(path.name, None)
+                    give_back_free_memory()
             except DexTouchError as error:
                 if self._errors.get(path.name) != error.message:
                     logger.warning("fail_upload", recording_id=path.name, error=error.message)

@@ -97,14 +97,12 @@ def record(mock, number):
     tell(event="saved", take=take.recording_id, counts=counts)
 
 
-def upload(root, store_url):
+def upload(uploader):
     """Everything that is finished."""
-    with EpisodeStoreClient(store_url) as client:
-        uploader = Uploader(root, client, period_s=1.0)
-        for _ in range(50):
-            uploader.upload_all()
-            if all(status.uploaded for status in uploader.status()):
-                return
+    for _ in range(50):
+        uploader.upload_all()
+        if all(status.uploaded for status in uploader.status()):
+            return
 
 
 def main(spool, store_url, seed, first_take, end_take, seconds):
@@ -114,21 +112,23 @@ def main(spool, store_url, seed, first_take, end_take, seconds):
     root, seconds, number = Path(spool), float(seconds), int(first_take)
     recover_spool(root)
     num_takes = int(end_take) - number
-    with MockStation(
+    mock = MockStation(
         all_streams(seconds),
         random_faults(int(seed) * 1000 + number, seconds, num_takes),
         number,
         VirtualClock(),
         spool_root=root,
         links=MockLinks(wrists="trackers"),
-    ) as mock:
+    )
+    with mock, EpisodeStoreClient(store_url) as client:
+        uploader = Uploader(root, client, period_s=1.0)
         assert {pair.device.name for pair in mock.pairs} == set(NAMES)
         for _ in range(num_takes):
             record(mock, number)
-            upload(root, store_url)
+            upload(uploader)
             tell(event="uploaded", rss_bytes=rss_bytes())
             number += 1
-    upload(root, store_url)
+        upload(uploader)
     tell(event="done")
 
 

@@ -74,25 +74,29 @@ class SessionMedian:
     """The median of a whole session in bounded memory: evenly thinned out when it gets full."""
 
     def __init__(self) -> None:
-        self._values: list[float] = []
+        # All of it at the start, so that a session takes no more with the time.
+        self._values = np.zeros(MAX_SHARPNESSES)
+        self._count = 0
         self._every = 1
         self._num_seen = 0
 
     def add(self, value: float) -> None:
         """One more value."""
         if self._num_seen % self._every == 0:
-            self._values.append(value)
+            self._values[self._count] = value
+            self._count += 1
         self._num_seen += 1
-        if len(self._values) == MAX_SHARPNESSES:
-            self._values = self._values[::2]
+        if self._count == MAX_SHARPNESSES:
+            self._count //= 2
+            self._values[: self._count] = self._values[::2]
             self._every *= 2
 
     @property
     def value(self) -> float | None:
         """The median; None of fewer than 10 values."""
-        if len(self._values) < MIN_SHARPNESSES:
+        if self._count < MIN_SHARPNESSES:
             return None
-        return float(np.median(self._values))
+        return float(np.median(self._values[: self._count]))
 
 
 class ImageChecker:

@@ -174,17 +174,25 @@ class MockDevice:
             self.port.link.wait_consumed()
 
     def _events(self, schedule: Schedule) -> Iterator[_Event]:
-        events = [
-            _Event(int(t_ns), None, index) for index, t_ns in enumerate(schedule.t_arrival_ns)
-        ]
         span = (schedule.t_true_ns[0], schedule.t_arrival_ns[-1])
-        for window_s in self.faults.unplugged_s:
-            for edge_s, plug in zip(window_s, (False, True), strict=True):
-                t_ns = round(edge_s * 1e9)
-                if span[0] <= t_ns <= span[1]:
-                    events.append(_Event(t_ns, plug, -1))
-        # A stable sort by time alone keeps the packets in order.
-        return iter(sorted(events, key=lambda event: event.t_ns))
+        edges = [
+            _Event(t_ns, plug, -1)
+            for window_s in self.faults.unplugged_s
+            for t_ns, plug in zip((round(s * 1e9) for s in window_s), (False, True), strict=True)
+            if span[0] <= t_ns <= span[1]
+        ]
+        # A stable sort by time alone keeps the packets in order, and plugging behind them. One
+        # event is made at a time: a long take has many.
+        times_ns = np.concatenate(
+            [schedule.t_arrival_ns, np.array([edge.t_ns for edge in edges], dtype=np.int64)]
+        )
+        num_packets = len(schedule.t_arrival_ns)
+        for place in np.argsort(times_ns, kind="stable"):
+            index = int(place)
+            if index < num_packets:
+                yield _Event(int(times_ns[index]), None, index)
+            else:
+                yield edges[index - num_packets]
 
     def _send(self, index: int, schedule: Schedule) -> None:
         sequence = self._next_sequence
