@@ -15,9 +15,11 @@ $(VENV)/.runtime: pyproject.toml constraints.txt
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[all]'
 	touch $@
 
+# aiowuji holds the maker's model of the hand, for tests; alone, since its driver has telemetry on.
 $(VENV)/.dev: pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt --no-deps aiowuji
 	touch $@ $(VENV)/.runtime
 
 demo: $(VENV)/.runtime   ## record, align, imagine and score, on this machine
