@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
 from services.acquisition.app import create_app
+from services.acquisition.heap import keep_for_life
 from services.acquisition.settings import AcquisitionSettings
 
 
@@ -16,7 +17,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     configure_logging(
         service="acquisition", log_format=settings.log_format, level=settings.log_level
     )
-    run(create_app(settings), settings)
+    app = create_app(settings)
+    keep_for_life()
+    run(app, settings)
     return 0
 
 

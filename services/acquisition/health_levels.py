@@ -1,6 +1,5 @@
 """Single judgements come in; levels with hysteresis and findings by code go out."""
 
-from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
@@ -49,9 +48,12 @@ class Hysteresis:
     It rises to the milder of the last 2, and falls to the graver of the last 5.
     """
 
+    # Small, as a station has one for each code that any of its streams ever showed.
+    __slots__ = ("_recent", "level")
+
     def __init__(self) -> None:
         self.level: Judgement = "OK"
-        self._recent: deque[Judgement] = deque(maxlen=CLEAR_AFTER)
+        self._recent: tuple[Judgement, ...] = ()
 
     @property
     def is_rising(self) -> bool:
@@ -60,10 +62,9 @@ class Hysteresis:
 
     def update(self, judgement: Judgement) -> Judgement:
         """One evaluation."""
-        recent = self._recent
-        recent.append(judgement)
+        recent = self._recent = (*self._recent, judgement)[-CLEAR_AFTER:]
         if len(recent) >= RAISE_AFTER:
-            mildest = min(list(recent)[-RAISE_AFTER:], key=_rank)
+            mildest = min(recent[-RAISE_AFTER:], key=_rank)
             if _rank(mildest) > _rank(self.level):
                 self.level = mildest
         if len(recent) == CLEAR_AFTER:
@@ -100,7 +101,8 @@ class Board:
         for finding in sorted(findings, key=lambda item: _rank(item.level)):
             judged[finding.code] = finding.level
             self._messages[finding.code] = finding.message
-            self._codes.setdefault(finding.code, Hysteresis())
+            if finding.code not in self._codes:
+                self._codes[finding.code] = Hysteresis()
         changes: list[tuple[Code, Judgement]] = []
         for code, hysteresis in list(self._codes.items()):
             judgement = judged.get(code, "OK")

@@ -330,12 +330,14 @@ class SpoolFlusher:
         self._path = path
         self._safety = safety
         self._clock = clock
-        self._on_tick = on_tick
-        self._on_failure = on_failure
         with disk_errors(f"open log of spool {path.name!r}"):
             self._log = os.open(path / LOG_FILE, os.O_RDONLY)
         self._waiter = clock.waiter()
-        self._thread = threading.Thread(target=self._run, name="flush-spool", daemon=True)
+        # The thread alone keeps the callbacks, and lets them go at its end. Kept here, they would
+        # hold their take, which holds this: a circle, not free before it is looked for.
+        self._thread = threading.Thread(
+            target=self._run, args=(on_tick, on_failure), name="flush-spool", daemon=True
+        )
         self._thread.start()
 
     def cancel(self) -> None:
@@ -347,22 +349,22 @@ class SpoolFlusher:
         self._waiter.cancel()
         self._thread.join()
 
-    def _run(self) -> None:
+    def _run(self, on_tick: Callable[[], None], on_failure: Callable[[StorageError], None]) -> None:
         period_ns = round(self._safety.flush_period_s * 1e9)
         try:
             with closing(self._waiter) as waiter:
                 due_ns = self._clock.now_ns() + period_ns
                 while waiter.wait_until(due_ns):
+                    on_tick()
                     self._flush()
                     # After a long stop of the process one flush is enough.
                     due_ns = max(due_ns, self._clock.now_ns()) + period_ns
         except StorageError as error:
-            self._on_failure(error)
+            on_failure(error)
         finally:
             os.close(self._log)
 
     def _flush(self) -> None:
-        self._on_tick()
         check_free_space(self._path, self._safety)
         start_s = time.perf_counter()
         with disk_errors(f"flush spool {self._path.name!r}"):

@@ -10,6 +10,7 @@ import structlog
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from services.acquisition.clock import VirtualClock
+from services.acquisition.heap import keep_for_life
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.station import MockStation
@@ -122,6 +123,8 @@ def main(spool, store_url, seed, first_take, end_take, seconds):
     )
     with mock, EpisodeStoreClient(store_url) as client:
         uploader = Uploader(root, client, period_s=1.0)
+        # As `python -m services.acquisition` does.
+        keep_for_life()
         assert {pair.device.name for pair in mock.pairs} == set(NAMES)
         for _ in range(num_takes):
             record(mock, number)

@@ -46,7 +46,7 @@ class TrackingState(IntEnum):
     RUNNING_OK = 200
 
 
-@dataclass
+@dataclass(slots=True)
 class TrackingEvent:
     """A run of packets that were left out for one reason.
 

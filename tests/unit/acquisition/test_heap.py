@@ -1,12 +1,14 @@
 """Memory that is free in the process goes back to the system."""
 
+import gc
 import platform
+import weakref
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from services.acquisition.heap import give_back_free_memory
+from services.acquisition.heap import give_back_free_memory, keep_for_life
 
 
 def resident_bytes():
@@ -22,3 +24,36 @@ def test_free_memory_goes_back():
     assert give_back_free_memory()
     assert resident_bytes() < before - 40_000_000
     assert kept.all()
+
+
+class Circle:
+    """Holds itself."""
+
+    def __init__(self):
+        self.itself = self
+
+
+@pytest.fixture
+def no_collector():
+    gc.disable()
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+def test_what_holds_itself_in_a_circle_is_free_then(no_collector):
+    gone = weakref.ref(Circle())
+    assert gone() is not None
+    give_back_free_memory()
+    assert gone() is None
+
+
+def test_what_exists_at_the_start_is_not_looked_through_again(no_collector):
+    circle = weakref.ref(Circle())
+    keep_for_life()
+    assert circle() is None, "what nobody needs must not be kept for life"
+    assert gc.get_freeze_count() > 10_000
+    assert len(gc.get_objects()) < 1000
+    younger = weakref.ref(Circle())
+    give_back_free_memory()
+    assert younger() is None

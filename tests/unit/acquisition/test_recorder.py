@@ -1,5 +1,7 @@
 import errno
+import gc
 import os
+import weakref
 
 import numpy as np
 import pytest
@@ -191,3 +193,18 @@ def test_unsaved_takes_stay_in_the_spool(recorder, clock, tmp_path):
 def test_prompt_needs_an_instruction():
     with pytest.raises(ValueError, match="instruction"):
         TakePrompt(task="a", instruction="")
+
+
+def test_an_old_take_is_free_at_once_and_waits_for_no_collector(recorder, clock):
+    recorder.arm(PROMPT)
+    recorder.record()
+    play(recorder, clock, 1.0)
+    recorder.stop()
+    recorder.save(ANYWAY)
+    take = weakref.ref(recorder._take)
+    gc.disable()
+    try:
+        recorder.arm(PROMPT)
+        assert take() is None
+    finally:
+        gc.enable()
