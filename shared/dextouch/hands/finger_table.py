@@ -73,7 +73,9 @@ def _check_unique(names: Iterable[str], what: str) -> None:
     seen: set[str] = set()
     for name in names:
         if name in seen:
-            raise InvalidInputError(f"{what} {name!r} stands twice; names must differ", got=name)
+            raise InvalidInputError(
+                f"{what} {name!r} stands twice; names must differ, fingers share no hinge", got=name
+            )
         seen.add(name)
 
 

@@ -1,0 +1,166 @@
+"""A hand's model file and mapping file in, its `HandModel` in our wrist frame out.
+
+What is most often wrong in a mapping shows in the finished hand and is refused: millimetres for
+metres, the thumb on the wrong side, fingers that bend to the back.
+"""
+
+from itertools import pairwise
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.geometry.transforms import invert, transform
+from dextouch.hands.finger_table import FingerTable
+from dextouch.hands.hand_files.chains import finger_table, fixed_links
+from dextouch.hands.hand_files.elements import Element, read_elements
+from dextouch.hands.hand_files.mapping import HandMapping, read_mapping
+from dextouch.hands.hand_files.mjcf import MjcfModel
+from dextouch.hands.hand_files.model_file import ModelFile
+from dextouch.hands.hand_files.urdf import UrdfModel
+from dextouch.hands.robot_hand import HandModel
+from dextouch.hands.skeleton import CHAINS
+
+# Knuckle to tip along the bones, and wrist to first hinge: no hand is outside, millimetres are.
+FINGER_LENGTH_M: Final = (0.01, 0.5)
+MAX_PALM_M: Final = 1.0
+MAX_ANGLE_RAD: Final = 2 * np.pi
+# Cosine of the angle between the two directions of the wrist that counts as a right angle.
+RIGHT_ANGLE: Final = 1e-3
+# Fingers in the middle of their range lean to the palm; this much of their length to the back is
+# no matter of how the limits lie.
+MAX_BACKWARD: Final = 0.1
+
+
+def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
+    """The hand that a URDF or MJCF file holds and a mapping file describes.
+
+    Args:
+        model_path: URDF (`robot`) or MJCF (`mujoco`), one whole file; meshes are not read.
+        mapping_path: TOML: side, wrist and fingers (docs/hands.md).
+
+    Returns:
+        Joints in the mapping's order, angles as the model counts them, wrist frame as ours:
+        fingers along -z, thumb side +x.
+
+    Raises:
+        NotFoundError, StorageError: a file is not there or cannot be read.
+        LimitExceededError: a file larger than a hand's description needs.
+        UnknownNameError: a name that the model does not have; the valid ones are listed.
+        InvalidInputError: anything else that is no hand; the message names file, element, what was
+            found and what was expected.
+    """
+    root = read_elements(Path(model_path))
+    mapping = read_mapping(Path(mapping_path))
+    model = _model(root)
+    if mapping.wrist not in model.parents:
+        raise UnknownNameError(
+            f"link in {mapping.source} [wrist]:", mapping.wrist, list(model.parents)
+        )
+    bases = fixed_links(model, mapping.wrist, invert(_wrist_axes(mapping)))
+    tables = [
+        finger_table(
+            model,
+            finger,
+            bases=bases,
+            where=f"{mapping.source} [[fingers]] {finger.chain!r}",
+        )
+        for finger in mapping.fingers
+    ]
+    name = root.attributes.get("model") or root.attributes.get("name") or model.source
+    hand = HandModel(mapping.side, tables, name=name)
+    for table in tables:
+        _check_units(table, mapping)
+    _check_thumb_side(hand, mapping)
+    _check_palm(hand, mapping)
+    return hand
+
+
+def _model(root: Element) -> ModelFile:
+    if root.tag == "robot":
+        return UrdfModel(root)
+    if root.tag == "mujoco":
+        return MjcfModel(root)
+    raise root.refusal("expected <robot> (URDF) or <mujoco> (MJCF) as the outermost element")
+
+
+def _wrist_axes(mapping: HandMapping) -> Float64[np.ndarray, "4 4"]:
+    """T_wrist_ours: our wrist frame in the frame of the model's wrist link."""
+    where = f"{mapping.source} [wrist]"
+    along, across = np.array(mapping.fingers_along), np.array(mapping.thumb_side)
+    lengths = np.linalg.norm([along, across], axis=1)
+    if lengths.min() < 1e-6:
+        raise InvalidInputError(f"{where}: got a direction of zeros, expected two directions")
+    z, x = -along / lengths[0], across / lengths[1]
+    if abs(z @ x) > RIGHT_ANGLE:
+        raise InvalidInputError(
+            f"{where}: got fingers_along {along.tolist()} and thumb_side {across.tolist()} at "
+            f"{np.rad2deg(np.arccos(np.clip(-z @ x, -1, 1))):.2f}°, expected 90°"
+        )
+    y = np.cross(z, x)
+    y /= np.linalg.norm(y)
+    return transform(np.stack([np.cross(y, z), y, z], axis=-1), np.array(mapping.origin_m))
+
+
+def _length_m(finger: FingerTable) -> float:
+    """Knuckle to tip along the bones; does not change with the joints."""
+    beyond = [row.position_m for row in finger.joints[finger.points[0] + 1 :]]
+    return float(np.linalg.norm([*beyond, finger.tip_m], axis=-1).sum())
+
+
+def _check_units(finger: FingerTable, mapping: HandMapping) -> None:
+    where = f"{mapping.source}, finger {finger.chain!r}"
+    length_m, palm_m = _length_m(finger), float(np.linalg.norm(finger.joints[0].position_m))
+    shortest, longest = FINGER_LENGTH_M
+    if not shortest <= length_m <= longest or palm_m > MAX_PALM_M:
+        raise InvalidInputError(
+            f"{where}: got {length_m:.4g} m from knuckle to tip and {palm_m:.4g} m from the wrist "
+            f"to its first joint, expected {shortest} … {longest} m and at most {MAX_PALM_M} m; "
+            "are the model's lengths metres, and tip, knuckle and wrist the right ones?"
+        )
+    for row in finger.joints:
+        if max(map(abs, row.limits_rad)) > MAX_ANGLE_RAD:
+            raise InvalidInputError(
+                f"{where}, joint {row.name!r}: got limits {row.limits_rad} rad, expected less than "
+                "a whole turn; are they degrees?"
+            )
+
+
+def _middle_points_m(hand: HandModel) -> dict[str, np.ndarray]:
+    """Knuckle, PIP, DIP and tip [4, 3] by chain, every joint in the middle of its range."""
+    middle = 0.5 * (hand.lower_rad + hand.upper_rad)
+    points = hand.chain_points_m(middle[None])[0]
+    return {finger.chain: points[index] for index, finger in enumerate(hand.fingers)}
+
+
+def _check_thumb_side(hand: HandModel, mapping: HandMapping) -> None:
+    """Knuckles come one after the other from the thumb's side: index, middle, ring, little."""
+    points = _middle_points_m(hand)
+    chains = [chain for chain in CHAINS[1:] if chain in points]
+    across_m = [float(points[chain][0, 0]) for chain in chains]
+    if any(near <= far for near, far in pairwise(across_m)):
+        listed = ", ".join(
+            f"{chain} {1e3 * x:.1f} mm" for chain, x in zip(chains, across_m, strict=True)
+        )
+        raise InvalidInputError(
+            f"{mapping.source}: got knuckles along thumb_side at {listed}, expected them to fall "
+            "from index to little; check thumb_side, fingers_along and the fingers' chains"
+        )
+
+
+def _check_palm(hand: HandModel, mapping: HandMapping) -> None:
+    points = _middle_points_m(hand)
+    to_palm = 1.0 if hand.side == "right" else -1.0
+    bends = []
+    for finger in hand.fingers:
+        if finger.chain != "thumb":
+            knuckle, _, _, tip = points[finger.chain]
+            bends.append(to_palm * (tip[1] - knuckle[1]) / _length_m(finger))
+    if bends and float(np.mean(bends)) < -MAX_BACKWARD:
+        raise InvalidInputError(
+            f"{mapping.source}: fingers in the middle of their range bend to the back of a "
+            f"{hand.side} hand (by {-float(np.mean(bends)):.2f} of their length); check side, "
+            "thumb_side and fingers_along"
+        )
