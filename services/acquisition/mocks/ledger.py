@@ -41,6 +41,8 @@ class Fate(StrEnum):
 
 
 ACCEPTED = (Fate.SENT, Fate.REPEATED, Fate.MARKED)
+# Numbers that are text at the same time while a ledger is saved.
+PIECE = 512
 NUMBERS = ("sequence", "t_true_ns", "t_device_ns", "t_arrival_ns", "flipped_bits")
 
 
@@ -123,9 +125,8 @@ class Ledger:
         for number, (name, device) in enumerate(self.devices.items()):
             yield f"{', ' if number else ''}{json.dumps(name)}: {{"
             for index, column in enumerate(fields(device)):
-                value = getattr(device, column.name)
-                plain = value.tolist() if isinstance(value, array) else value
-                yield f"{', ' if index else ''}{json.dumps(column.name)}: {json.dumps(plain)}"
+                yield f"{', ' if index else ''}{json.dumps(column.name)}: "
+                yield from _json_pieces(getattr(device, column.name))
             yield "}"
         yield "}}"
 
@@ -149,3 +150,14 @@ class Ledger:
             return Ledger(content["seed"], content["start_host_ns"], devices)
         except (ValueError, KeyError, TypeError, AttributeError, OverflowError) as error:
             raise CorruptDataError(f"{path}: not a {FORMAT!r} ({error})") from error
+
+
+def _json_pieces(value: object) -> Iterator[str]:
+    if not isinstance(value, array):
+        yield json.dumps(value)
+        return
+    yield "["
+    for start in range(0, len(value), PIECE):
+        rows = json.dumps(value[start : start + PIECE].tolist())
+        yield f"{', ' if start else ''}{rows[1:-1]}"
+    yield "]"

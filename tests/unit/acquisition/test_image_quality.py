@@ -135,6 +135,10 @@ def test_the_median_of_a_long_session_is_bounded_and_right(rng):
         median.add(float(value))
     assert median._values.shape == (MAX_SHARPNESSES,)
     assert MAX_SHARPNESSES // 2 <= median._count < MAX_SHARPNESSES
+    rising = SessionMedian()
+    for value in np.linspace(0.0, 100.0, 20_000):
+        rising.add(float(value))
+    assert rising.value == pytest.approx(50.0, abs=1.0)
     # 256 … 511 values remain: their median scatters by 10 · 1.25 / √256 = 0.8.
     assert median.value == pytest.approx(np.median(values), abs=3.0)
 
