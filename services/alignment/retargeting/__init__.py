@@ -1,9 +1,19 @@
 """Retargeting: tracked hands and wrists to the robot's joints and poses."""
 
+from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.hand_retargeter import (
     HandRetargeter,
     RetargetResult,
     RetargetStatus,
+    warm_up,
 )
+from services.alignment.retargeting.options import RetargetOptions
 
-__all__ = ["HandRetargeter", "RetargetResult", "RetargetStatus"]
+__all__ = [
+    "HandProfile",
+    "HandRetargeter",
+    "RetargetOptions",
+    "RetargetResult",
+    "RetargetStatus",
+    "warm_up",
+]

@@ -1,40 +1,52 @@
 """Keypoints of a tracked hand in, the robot hand's joint angles with an error and a status out."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import IntEnum
 
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from dextouch.hands.skeleton import CHAINS
-from services.alignment.retargeting.finger_solver import FingerSolver, Solution
-from services.alignment.retargeting.hand_normalization import normalize_hand
-
-# Below this cost a problem is solved to well under a micrometre and needs no second start.
-EXACT_COST_M2 = 1e-16
-# Above it (3 mm) the search may sit in a wrong valley: all starts are tried.
-SUSPICIOUS_COST_M2 = 9e-6
-# Where searches start, as fractions from lower to upper limit.
-FIRST_STARTS = ((0.45, 0.50, 0.40, 0.45), (0.75, 0.50, 0.75, 0.70))
-MORE_STARTS = (
-    (0.30, 0.25, 0.60, 0.50),
-    (0.60, 0.80, 0.45, 0.55),
-    (0.20, 0.60, 0.20, 0.20),
-    (0.85, 0.30, 0.30, 0.85),
-    (0.15, 0.85, 0.85, 0.15),
-    (0.90, 0.75, 0.10, 0.50),
+from dextouch.hands.skeleton import CHAINS, NUM_KEYPOINTS
+from services.alignment.retargeting.finger_points import checked_keypoints, finger_points
+from services.alignment.retargeting.hand_arrays import hand_arrays
+from services.alignment.retargeting.hand_profile import HandProfile
+from services.alignment.retargeting.options import RetargetOptions
+from services.alignment.retargeting.profile_fit import (
+    measure_profile,
+    person_arrays,
+    robot_bone_m,
+    unknown_person,
 )
+from services.alignment.retargeting.solver import arrays
+from services.alignment.retargeting.solver.arrays import (
+    MAX_JOINTS,
+    Memory,
+    Output,
+    PersonArrays,
+    Tuning,
+)
+from services.alignment.retargeting.solver.samples import retarget_samples
+
+NOMINAL_PERIOD_S = arrays.NOMINAL_PERIOD_S
 
 
 class RetargetStatus(IntEnum):
-    """How much of a step is the solver's own answer; the worst that applies."""
+    """How much of a finger's answer is the solver's own; of a sample, the worst that applies.
 
-    SOLVED = 0
-    PARTIAL = 1
-    UNCONVERGED = 2
-    MISSING = 3
+    PARTIAL: some of its points were missing. REACQUIRED: it was lost, searched again and may have
+    jumped. UNCONVERGED: the search did not come to rest. IMPLAUSIBLE: bones or knuckle are not this
+    hand's. MISSING: fewer than two points. The last two hold what was before; a sample is
+    IMPLAUSIBLE or MISSING if all fingers are, PARTIAL if some are.
+    """
+
+    SOLVED = arrays.SOLVED
+    PARTIAL = arrays.PARTIAL
+    REACQUIRED = arrays.REACQUIRED
+    UNCONVERGED = arrays.UNCONVERGED
+    IMPLAUSIBLE = arrays.IMPLAUSIBLE
+    MISSING = arrays.MISSING
 
 
 @dataclass(frozen=True)
@@ -42,128 +54,208 @@ class RetargetResult:
     """Joint angles over time, always finite and inside the limits.
 
     Attributes:
-        joints_rad: 20 angles a step in firmware order.
-        status: `RetargetStatus` a step. PARTIAL: some fingers, MISSING: all fingers were not
-            tracked and are interpolated from the steps around.
-        tip_error_m: distance of each fingertip from its target, both seen from the knuckle;
-            zero where `solved` is False, since there is no target.
-        solved: which fingers had usable keypoints.
+        joints_rad: 20 angles a sample in firmware order.
+        status: `RetargetStatus` a sample.
+        finger_status: `RetargetStatus` of every finger.
+        tip_error_m: distance of each fingertip from its measured place, both seen from the
+            knuckle, at the person's size; zero where `solved` is False, since there is none.
+        solved: which fingers followed points of this sample.
     """
 
     joints_rad: Float64[np.ndarray, "time 20"]
     status: UInt8[np.ndarray, " time"]
+    finger_status: UInt8[np.ndarray, "time 5"]
     tip_error_m: Float64[np.ndarray, "time 5"]
     solved: Bool[np.ndarray, "time 5"]
 
 
 class HandRetargeter:
-    """Follows a tracked hand with the robot hand of the same side, finger by finger.
+    """Follows a tracked hand with the robot hand of the same side.
 
     Args:
         side: "left" or "right".
+        profile: of the person; None measures it from what is retargeted (`retarget`), or goes by
+            each sample alone (`step`).
+        options: of the solver.
 
     Raises:
         UnknownNameError: any other side.
     """
 
-    def __init__(self, side: str) -> None:
+    def __init__(
+        self,
+        side: str,
+        profile: HandProfile | None = None,
+        options: RetargetOptions | None = None,
+    ) -> None:
         self.hand = RobotHand(side)
-        self._solver = FingerSolver(self.hand)
-        span = self._solver.upper_rad - self._solver.lower_rad
-        self._first_starts, self._more_starts = (
-            [self._solver.lower_rad + np.array(fractions) * span for fractions in starts]
-            for starts in (FIRST_STARTS, MORE_STARTS)
-        )
+        self.profile = profile
+        self.options = options or RetargetOptions()
+        self._arrays = hand_arrays(self.hand)
+        self._robot_bone_m = robot_bone_m(self.hand)
+        self._tuning = self.options.tuning()
+        self._person = self._person_of(profile)
+        self._memory = self._blank()
 
-    def retarget(self, keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> RetargetResult:
-        """Joint angles whose finger bones point where the tracked ones do.
+    def reset(self) -> None:
+        """Forget all samples: the next `step` searches from several starts."""
+        self._memory = self._blank()
+
+    def step(
+        self,
+        keypoints_m: np.ndarray,
+        valid: np.ndarray | None = None,
+        elapsed_s: float = NOMINAL_PERIOD_S,
+    ) -> RetargetResult:
+        """Joint angles of one more sample, live; what is not tracked holds its last angles.
+
+        Args:
+            keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
+            valid: bool [25], what the tracker trusts; None trusts every finite node.
+            elapsed_s: since the sample before.
+
+        Returns:
+            A result of one sample (T = 1).
+
+        Raises:
+            ShapeError: wrong shapes.
+            InvalidInputError: elapsed time not positive and finite.
+        """
+        keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
+        if keypoints.shape != (NUM_KEYPOINTS, 3):
+            raise ShapeError(f"keypoints: got shape {keypoints.shape}, expected [25, 3]")
+        if not 0 < elapsed_s < np.inf:
+            raise InvalidInputError(f"elapsed_s: got {elapsed_s}, expected a positive time")
+        trusted = _trusted(keypoints[None], valid if valid is None else np.asarray(valid)[None])
+        elapsed = np.array([elapsed_s], dtype=np.float64)
+        return self._follow((keypoints[None], trusted, elapsed), self._person, self._tuning)
+
+    def retarget(
+        self,
+        keypoints_m: np.ndarray,
+        valid: np.ndarray | None = None,
+        t_s: np.ndarray | None = None,
+    ) -> RetargetResult:
+        """Joint angles of a whole recording; what is not tracked is interpolated in time.
 
         Args:
             keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
             valid: bool [T, 25], what the tracker trusts; None trusts every finite node.
+            t_s: [T] rising times, relative to any moment; None takes 60 Hz.
 
         Raises:
             ShapeError: wrong shapes.
-            InvalidInputError: wrong unit, or a finger that is not tracked in any step.
+            InvalidInputError: times that do not rise, wrong unit, or a finger that is not tracked
+                in any sample.
         """
-        targets = normalize_hand(keypoints_m, self.hand, valid)
-        never = np.asarray(~targets.usable.any(axis=0))
+        keypoints = checked_keypoints(keypoints_m)
+        trusted = _trusted(keypoints, valid)
+        elapsed_s = _elapsed_s(len(keypoints), t_s)
+        person = self._person
+        if self.profile is None:
+            person = self._person_of(measure_profile(finger_points(keypoints, valid), self.hand))
+        # Of slow trackers, not every sample is a loss.
+        lost_s = max(self._tuning.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
+        tuning = self._tuning._replace(reacquire_after_s=lost_s)
+        memory, self._memory = self._memory, self._blank()
+        try:
+            result = self._follow((keypoints, trusted, elapsed_s), person, tuning)
+        finally:
+            self._memory = memory
+        never = np.asarray(~result.solved.any(axis=0))
         if never.any():
             names = ", ".join(name for name, gone in zip(CHAINS, never, strict=True) if gone)
             raise InvalidInputError(
-                f"keypoints of the {self.hand.side} hand: no step shows all nodes of {names}; "
-                "expected every finger at least once"
+                f"keypoints of the {self.hand.side} hand: {names} followed in no sample (bones "
+                "or knuckles are not those of the profile, or nodes are missing); expected every "
+                "finger at least once"
             )
-        solution = self._solve(targets.from_knuckle_m, targets.usable)
-        joints = _fill(solution.joints_rad, targets.usable)
+        return replace(result, joints_rad=_fill(result.joints_rad, result.solved))
+
+    def measure(self, keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> HandProfile:
+        """The profile of a person from calibration samples.
+
+        Args:
+            keypoints_m: [T, 25, 3] of an open, closing and spreading hand.
+            valid: bool [T, 25].
+
+        Raises:
+            ShapeError: wrong shapes.
+            InvalidInputError: wrong unit, or a finger that is whole in no sample.
+        """
+        return measure_profile(finger_points(keypoints_m, valid), self.hand)
+
+    def _person_of(self, profile: HandProfile | None) -> PersonArrays:
+        if profile is None:
+            return unknown_person(self._arrays, self._robot_bone_m)
+        return person_arrays(profile, self._robot_bone_m)
+
+    def _blank(self) -> Memory:
+        rest = np.clip(0.0, self._arrays.lower_rad, self._arrays.upper_rad)
+        return Memory(rest, np.full(NUM_FINGERS, np.inf))
+
+    def _follow(
+        self,
+        samples: tuple[np.ndarray, np.ndarray, np.ndarray],
+        person: PersonArrays,
+        tuning: Tuning,
+    ) -> RetargetResult:
+        num = len(samples[0])
+        output = Output(
+            joints_rad=np.empty((num, NUM_FINGERS, MAX_JOINTS)),
+            finger_status=np.empty((num, NUM_FINGERS), dtype=np.uint8),
+            status=np.empty(num, dtype=np.uint8),
+            tip_error_m=np.empty((num, NUM_FINGERS)),
+        )
+        retarget_samples(self._arrays, person, tuning, samples, self._memory, output)
         return RetargetResult(
-            joints_rad=joints.reshape(-1, NUM_JOINTS),
-            status=_status(targets.usable, solution.converged),
-            tip_error_m=self._tip_errors(joints, targets.from_knuckle_m, targets.usable),
-            solved=targets.usable,
+            joints_rad=output.joints_rad[:, :, :4].reshape(num, NUM_JOINTS),
+            status=output.status,
+            finger_status=output.finger_status,
+            tip_error_m=output.tip_error_m,
+            solved=output.finger_status < RetargetStatus.IMPLAUSIBLE,
         )
 
-    def _solve(self, targets_m: np.ndarray, usable: np.ndarray) -> Solution:
-        """Best of several starts; fixed ones first, then the neighbours' answers in time."""
-        shape = (len(targets_m), NUM_FINGERS, 4)
-        first, *others = (np.broadcast_to(start, shape) for start in self._first_starts)
-        best = self._solver.solve(targets_m, first)
-        for start in others:
-            best = self._retry(best, targets_m, usable & (best.cost_m2 > EXACT_COST_M2), start)
-        for fixed in self._more_starts:
-            suspicious = usable & (best.cost_m2 > SUSPICIOUS_COST_M2)
-            best = self._retry(best, targets_m, suspicious, np.broadcast_to(fixed, shape))
-        for shift in (1, -1):
-            suspicious = usable & (best.cost_m2 > SUSPICIOUS_COST_M2)
-            best = self._retry(best, targets_m, suspicious, np.roll(best.joints_rad, shift, axis=0))
-        return best
 
-    def _retry(
-        self, best: Solution, targets_m: np.ndarray, again_mask: np.ndarray, start_rad: np.ndarray
-    ) -> Solution:
-        """Search once more in the steps where a finger is marked; keep what is better."""
-        open_rows = np.flatnonzero(again_mask.any(axis=1))
-        if not open_rows.size:
-            return best
-        again = self._solver.solve(targets_m[open_rows], start_rad[open_rows])
-        joints, cost, converged = best.joints_rad.copy(), best.cost_m2.copy(), best.converged.copy()
-        # A hair of difference is rounding, not another minimum: keep the first.
-        wins = again.cost_m2 < cost[open_rows] * (1 - 1e-6)
-        at = open_rows[np.nonzero(wins)[0]], np.nonzero(wins)[1]
-        joints[at], cost[at], converged[at] = (
-            again.joints_rad[wins],
-            again.cost_m2[wins],
-            again.converged[wins],
+def warm_up() -> None:
+    """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
+    keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
+    HandRetargeter("right").step(keypoints[0])
+
+
+def _trusted(keypoints_m: np.ndarray, valid: np.ndarray | None) -> Bool[np.ndarray, "time 25"]:
+    if valid is None:
+        return np.ones(keypoints_m.shape[:2], dtype=bool)
+    if np.shape(valid) != keypoints_m.shape[:2]:
+        raise ShapeError(
+            f"keypoints: got valid {np.shape(valid)}, expected {keypoints_m.shape[:2]}"
         )
-        return Solution(joints, cost, converged)
-
-    def _tip_errors(
-        self, joints: np.ndarray, targets_m: np.ndarray, usable: np.ndarray
-    ) -> Float64[np.ndarray, "time 5"]:
-        points = self.hand.chain_points_m(joints.reshape(-1, NUM_JOINTS))
-        reached = points[:, :, 3] - points[:, :, 0]
-        error = np.linalg.norm(reached - targets_m[:, :, 2], axis=-1)
-        return np.where(usable, error, 0.0)
+    return np.ascontiguousarray(valid, dtype=bool)
 
 
-def _fill(joints: np.ndarray, usable: np.ndarray) -> Float64[np.ndarray, "time 5 4"]:
-    """Untracked stretches of a finger, linearly between the steps around; held at the ends."""
-    filled = joints.copy()
-    steps = np.arange(len(joints))
-    for finger in range(NUM_FINGERS):
-        known = usable[:, finger]
-        if known.all():
-            continue
-        for joint in range(4):
-            filled[~known, finger, joint] = np.interp(
-                steps[~known], steps[known], joints[known, finger, joint]
+def _elapsed_s(num_samples: int, t_s: np.ndarray | None) -> Float64[np.ndarray, " time"]:
+    elapsed = np.full(num_samples, NOMINAL_PERIOD_S)
+    if t_s is not None:
+        times = np.asarray(t_s, dtype=np.float64)
+        if times.shape != (num_samples,):
+            raise ShapeError(f"t_s: got shape {times.shape}, expected [{num_samples}]")
+        elapsed[1:] = np.diff(times)
+        bad = np.flatnonzero(~((elapsed > 0) & np.isfinite(elapsed)))
+        if bad.size or not np.isfinite(times).all():
+            at = int(bad[0]) if bad.size else 0
+            raise InvalidInputError(
+                f"t_s: sample {at} is {elapsed[at]:g} s after the one before; expected finite, "
+                "rising times"
             )
+    return elapsed
+
+
+def _fill(joints_rad: np.ndarray, solved: np.ndarray) -> Float64[np.ndarray, "time 20"]:
+    """Untracked stretches of a finger, linearly between the samples around; held at the ends."""
+    filled = joints_rad.copy()
+    rows = np.arange(len(filled))
+    for finger in np.flatnonzero(~solved.all(axis=0)):
+        known = solved[:, finger]
+        for joint in range(4 * finger, 4 * finger + 4):
+            filled[~known, joint] = np.interp(rows[~known], rows[known], joints_rad[known, joint])
     return filled
-
-
-def _status(usable: np.ndarray, converged: np.ndarray) -> UInt8[np.ndarray, " time"]:
-    status = np.full(len(usable), RetargetStatus.SOLVED, dtype=np.uint8)
-    status[~usable.all(axis=1)] = RetargetStatus.PARTIAL
-    status[(usable & ~converged).any(axis=1)] = RetargetStatus.UNCONVERGED
-    status[~usable.any(axis=1)] = RetargetStatus.MISSING
-    return status

@@ -8,8 +8,11 @@ from hypothesis import strategies as st
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
-from services.alignment.retargeting import HandRetargeter, RetargetStatus
-from services.alignment.retargeting.finger_solver import FingerSolver
+from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
+from services.alignment.retargeting.hand_arrays import hand_arrays
+from services.alignment.retargeting.profile_fit import robot_bone_m, unknown_person
+from services.alignment.retargeting.solver.arrays import scratch_for
+from services.alignment.retargeting.solver.points import linearize
 
 HAND = RobotHand("right")
 
@@ -26,34 +29,125 @@ def bending(num_steps):
     return np.linspace(0.1, 0.6, num_steps)[:, None] * np.ones(20)
 
 
-def test_jacobian_is_the_derivative():
-    solver = FingerSolver(HAND)
-    rng = np.random.default_rng(0)
-    joints = rng.uniform(solver.lower_rad, solver.upper_rad, (4, 5, 4))
-    targets = rng.normal(scale=0.05, size=(4, 5, 3, 3))
-    _, jacobian = solver._linearize(joints, targets)
-    for joint in range(4):
-        step = np.zeros(4)
-        step[joint] = 1e-6
-        ahead, _ = solver._linearize(joints + step, targets)
-        behind, _ = solver._linearize(joints - step, targets)
-        np.testing.assert_allclose(jacobian[..., joint], (ahead - behind) / 2e-6, atol=1e-8)
+EXACT = RetargetOptions(temporal_weight_m2=0.0)
 
 
-def test_missing_nodes_are_interpolated_and_told():
+def test_slopes_are_the_derivative():
+    hand = hand_arrays(HAND)
+    person = unknown_person(hand, robot_bone_m(HAND))._replace(
+        travel=np.linspace(0, 1, 5), knuckle_m=np.full((5, 3), 0.01)
+    )
+    work = scratch_for(5)
+    work.scale[:] = [0.7, 0.9, 1.1]
+    joints = np.random.default_rng(0).uniform(hand.lower_rad, hand.upper_rad)
+
+    def points_at(joints_rad, finger):
+        linearize(hand, person, work, finger, joints_rad)
+        return work.point[finger].copy(), work.origin[finger, 4].copy()
+
+    for finger in range(5):
+        points_at(joints[finger], finger)
+        slope, tip_slope = work.slope[finger].copy(), work.tip_slope[finger].copy()
+        for joint in range(4):
+            step = np.zeros(6)
+            step[joint] = 1e-6
+            ahead, tip_ahead = points_at(joints[finger] + step, finger)
+            behind, tip_behind = points_at(joints[finger] - step, finger)
+            np.testing.assert_allclose(slope[:, joint], (ahead - behind) / 2e-6, atol=1e-8)
+            np.testing.assert_allclose(tip_slope[joint], (tip_ahead - tip_behind) / 2e-6, atol=1e-8)
+
+
+def test_points_of_the_solver_are_those_of_the_hand():
+    hand = hand_arrays(HAND)
+    work = scratch_for(5)
+    work.scale[:] = 1.0
+    joints = np.random.default_rng(1).uniform(hand.lower_rad, hand.upper_rad)
+    expected = HAND.chain_points_m(joints[:, :4].reshape(1, 20))[0]
+    for finger in range(5):
+        linearize(hand, unknown_person(hand, robot_bone_m(HAND)), work, finger, joints[finger])
+        np.testing.assert_allclose(work.point[finger], expected[finger], atol=1e-12)
+
+
+def test_missing_nodes_are_filled_and_told():
     joints = bending(9)
     keypoints = keypoints_of(joints)
     keypoints[3:5, NODE_INDEX["ring", "distal"]] = np.nan
+    keypoints[1, [NODE_INDEX["index", "distal"], NODE_INDEX["index", "tip"]]] = np.nan
     valid = np.ones((9, NUM_KEYPOINTS), dtype=bool)
     valid[7] = False
-    result = HandRetargeter("right").retarget(keypoints, valid)
-    assert result.status.tolist() == [0, 0, 0, 1, 1, 0, 0, RetargetStatus.MISSING, 0]
-    assert not result.solved[3, CHAINS.index("ring")]
+    result = HandRetargeter("right", options=EXACT).retarget(keypoints, valid)
+    assert result.status.tolist() == [0, 1, 0, 1, 1, 0, 0, RetargetStatus.MISSING, 0]
+    ring, index = CHAINS.index("ring"), CHAINS.index("index")
+    assert result.finger_status[3, ring] == RetargetStatus.PARTIAL
+    assert result.solved[3, ring]
+    assert result.finger_status[1, index] == RetargetStatus.MISSING
+    assert not result.solved[1, index]
     np.testing.assert_allclose(result.joints_rad, joints, atol=1e-6)
 
 
+def test_live_samples_are_those_of_a_recording():
+    rng = np.random.default_rng(4)
+    keypoints = keypoints_of(bending(30)) + rng.normal(scale=1e-3, size=(30, NUM_KEYPOINTS, 3))
+    profile = HandRetargeter("right").measure(keypoints)
+    whole = HandRetargeter("right", profile).retarget(keypoints)
+    live = HandRetargeter("right", profile)
+    single = np.concatenate([live.step(sample).joints_rad for sample in keypoints])
+    np.testing.assert_array_equal(single, whole.joints_rad)
+    live.reset()
+    np.testing.assert_array_equal(live.step(keypoints[0]).joints_rad[0], single[0])
+
+
+def test_lost_fingers_hold_and_are_searched_again():
+    keypoints = keypoints_of(bending(40))
+    live = HandRetargeter("right", HandRetargeter("right").measure(keypoints), EXACT)
+    for sample in keypoints[:10]:
+        before = live.step(sample)
+    gone = live.step(np.full((NUM_KEYPOINTS, 3), np.nan))
+    assert gone.status[0] == RetargetStatus.MISSING
+    np.testing.assert_array_equal(gone.joints_rad, before.joints_rad)
+    bones = keypoints[20].copy()
+    bones[NODE_INDEX["middle", "tip"]] += 0.05
+    wrong = live.step(bones)
+    middle = CHAINS.index("middle")
+    assert wrong.finger_status[0, middle] == RetargetStatus.IMPLAUSIBLE
+    np.testing.assert_array_equal(
+        wrong.joints_rad[0, 4 * middle :][:4], before.joints_rad[0, 4 * middle :][:4]
+    )
+    again = live.step(keypoints[39], elapsed_s=1.0)
+    assert again.status[0] == RetargetStatus.REACQUIRED
+    np.testing.assert_allclose(again.joints_rad[0], bending(40)[39], atol=1e-6)
+
+
+def test_no_joint_is_faster_than_the_limit():
+    there = keypoints_of(bending(2))[[0] * 5 + [1] * 20]
+    options = RetargetOptions(velocity_limit_rad_s=1.0, temporal_weight_m2=0.0)
+    result = HandRetargeter("right", options=options).retarget(there)
+    steps_rad = np.abs(np.diff(result.joints_rad, axis=0))
+    assert steps_rad.max() == pytest.approx(1 / 60)
+    slow = HandRetargeter("right", options=options).retarget(there, t_s=np.arange(25.0))
+    np.testing.assert_allclose(slow.joints_rad[-1], bending(2)[1], atol=1e-6)
+
+
+def test_times_must_rise():
+    with pytest.raises(InvalidInputError, match="sample 2"):
+        HandRetargeter("right").retarget(keypoints_of(bending(3)), t_s=np.array([0.0, 0.1, 0.1]))
+    with pytest.raises(ShapeError):
+        HandRetargeter("right").retarget(keypoints_of(bending(3)), t_s=np.zeros(2))
+    with pytest.raises(InvalidInputError, match="elapsed_s"):
+        HandRetargeter("right").step(keypoints_of(bending(1))[0], elapsed_s=0.0)
+
+
+def test_options_are_checked():
+    with pytest.raises(InvalidInputError, match=r"num_starts 9 \(expected 1 … 8\)"):
+        RetargetOptions(num_starts=9)
+    with pytest.raises(InvalidInputError, match="pinch_far_m"):
+        RetargetOptions(pinch_far_m=0.001)
+    with pytest.raises(InvalidInputError, match="temporal_weight_m2 nan"):
+        RetargetOptions(temporal_weight_m2=np.nan)
+
+
 def test_single_step_is_enough():
-    result = HandRetargeter("right").retarget(keypoints_of(bending(1)))
+    result = HandRetargeter("right", options=EXACT).retarget(keypoints_of(bending(1)))
     np.testing.assert_allclose(result.joints_rad, bending(1), atol=1e-6)
 
 
@@ -80,7 +174,7 @@ def test_wrong_shapes_are_refused():
 
 def test_limits_hold_exactly_for_hands_bent_too_far():
     hand = RobotHand("right")
-    bent_too_far = np.broadcast_to(hand.upper_rad + 0.5, (4, 20))
+    bent_too_far = np.broadcast_to(hand.upper_rad + 0.2, (4, 20))
     result = HandRetargeter("right").retarget(keypoints_of(bent_too_far))
     assert (result.joints_rad <= hand.upper_rad).all()
     assert (result.joints_rad == hand.upper_rad).any()

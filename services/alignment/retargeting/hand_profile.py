@@ -1,0 +1,97 @@
+"""Keypoints of a person's hand in, what stays the same of that hand out: bones and knuckles.
+
+Tracked points wobble by millimetres; bones do not. Bone lengths and the places of the knuckles in
+the wrist frame are therefore measured once a person, from calibration samples or from a whole
+recording, and later samples are judged by them and solved with them.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands.skeleton import CHAINS
+
+NUM_FINGERS = 5
+# Proximal phalanx of an index finger, children to large adults and robots: outside, the unit is
+# wrong.
+INDEX_PROXIMAL_RANGE_M = (0.025, 0.060)
+BONE_RANGE_M = (0.003, 0.150)
+_INDEX_FINGER = CHAINS.index("index")
+NUM_COLUMNS = 8
+
+
+@dataclass(frozen=True)
+class HandProfile:
+    """What is constant of one person's hand, thumb … little, wrist axes.
+
+    Attributes:
+        bone_m: MCP–PIP, PIP–DIP, DIP–tip (of the thumb CMC–MCP, MCP–IP, IP–tip).
+        knuckle_m: the MCP (of the thumb: the CMC) in the wrist frame.
+        travel: how much of the travel that the robot's knuckle makes with flexion the tracked one
+            makes: 0 for people, whose knuckles turn in place, 1 for the robot hand itself.
+        knuckle_sigma_m: standard deviation, an axis, of what is left of a knuckle's motion.
+        point_sigma_m: standard deviation, an axis, of the tracker's noise.
+    """
+
+    bone_m: Float64[np.ndarray, "5 3"]
+    knuckle_m: Float64[np.ndarray, "5 3"]
+    travel: Float64[np.ndarray, "5"]
+    knuckle_sigma_m: Float64[np.ndarray, "5"]
+    point_sigma_m: float
+
+    def __post_init__(self) -> None:
+        rows = self.to_rows()
+        if not np.isfinite(rows).all() or (rows[:, 7] < 0).any():
+            raise InvalidInputError("hand profile: expected finite numbers, no negative sigma")
+        check_bone_unit(float(self.bone_m[_INDEX_FINGER, 0]), where="hand profile")
+        low, high = BONE_RANGE_M
+        if not ((self.bone_m >= low) & (self.bone_m <= high)).all():
+            raise InvalidInputError(
+                f"hand profile: bones {np.round(self.bone_m, 4).tolist()}, "
+                f"expected {low} … {high} m"
+            )
+
+    def to_rows(self) -> Float64[np.ndarray, "5 8"]:
+        """As a matrix for a recording's calibration: bones, knuckle, travel, sigma ratio column.
+
+        Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m). The tracker's
+        noise is not kept.
+        """
+        return np.column_stack(
+            [self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m]
+        ).astype(np.float64)
+
+    @classmethod
+    def from_rows(
+        cls, rows: Sequence[Sequence[float]], *, point_sigma_m: float = 1e-3
+    ) -> "HandProfile":
+        """From the matrix of `to_rows`.
+
+        Raises:
+            ShapeError: not [5, 8].
+            InvalidInputError: not finite, or no hand.
+        """
+        table = np.asarray(rows, dtype=np.float64)
+        if table.shape != (NUM_FINGERS, NUM_COLUMNS):
+            raise ShapeError(f"hand profile: got shape {table.shape}, expected [5, {NUM_COLUMNS}]")
+        return cls(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7], point_sigma_m)
+
+
+def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
+    """Refuse an index finger's proximal bone that is not 25–60 mm long.
+
+    Raises:
+        InvalidInputError: most likely millimetres, or nodes in another order.
+    """
+    low, high = INDEX_PROXIMAL_RANGE_M
+    if not low <= index_proximal_m <= high:
+        looks = low * 1e3 <= index_proximal_m <= high * 1e3
+        hint = "these look like millimetres" if looks else "check nodes"
+        raise InvalidInputError(
+            f"{where}: the index finger's proximal bone measures {index_proximal_m:.4g}, expected "
+            f"{low} … {high} m ({hint}); send metres in the order of dextouch.hands.skeleton",
+            got=index_proximal_m,
+        )

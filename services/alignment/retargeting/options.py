@@ -1,0 +1,100 @@
+"""What a person may choose about retargeting goes in; checked numbers for the solver come out."""
+
+from dataclasses import dataclass
+
+from dextouch.errors import InvalidInputError
+from services.alignment.retargeting.hand_arrays import STARTS
+from services.alignment.retargeting.solver.arrays import Tuning
+
+
+@dataclass(frozen=True)
+class RetargetOptions:
+    """Options of the solver; the defaults are what `dextouch bench retargeting` measures.
+
+    Args:
+        temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
+            weight; at other rates in proportion to the rate. 0 follows every sample exactly.
+        velocity_limit_rad_s: no joint turns faster from sample to sample.
+        pinch_near_m: below this distance of thumb and fingertip the vector between them has its
+            full weight.
+        pinch_far_m: from here on it has none, and thumb and finger are solved apart.
+        pinch_weight: the full weight, beside points of unit weight.
+        reacquire_after_s: a finger that was lost for so long is searched from several starts.
+        num_starts: of such a search, 1 … 8.
+        keeps_fingers_apart: push neighbouring fingers apart where their capsules overlap; costs
+            microseconds where they do not.
+    """
+
+    temporal_weight_m2: float = 1e-4
+    velocity_limit_rad_s: float = 9.6
+    pinch_near_m: float = 0.005
+    pinch_far_m: float = 0.060
+    pinch_weight: float = 100.0
+    reacquire_after_s: float = 0.1
+    num_starts: int = len(STARTS)
+    keeps_fingers_apart: bool = False
+
+    def __post_init__(self) -> None:
+        wrong = [
+            f"{name} {value:g} (expected {wanted})"
+            for name, value, is_right, wanted in (
+                (
+                    "temporal_weight_m2",
+                    self.temporal_weight_m2,
+                    self.temporal_weight_m2 >= 0,
+                    "≥ 0",
+                ),
+                (
+                    "velocity_limit_rad_s",
+                    self.velocity_limit_rad_s,
+                    self.velocity_limit_rad_s > 0,
+                    "> 0",
+                ),
+                ("pinch_near_m", self.pinch_near_m, self.pinch_near_m > 0, "> 0"),
+                ("pinch_far_m", self.pinch_far_m, self.pinch_far_m > self.pinch_near_m, "> near"),
+                (
+                    "pinch_weight",
+                    self.pinch_weight,
+                    self.pinch_weight > PINCH_WEIGHT_FAR,
+                    "> 0.001",
+                ),
+                ("reacquire_after_s", self.reacquire_after_s, self.reacquire_after_s > 0, "> 0"),
+                (
+                    "num_starts",
+                    self.num_starts,
+                    1 <= self.num_starts <= len(STARTS),
+                    f"1 … {len(STARTS)}",
+                ),
+            )
+            if not is_right
+        ]
+        if wrong:
+            raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
+
+    def tuning(self) -> Tuning:
+        """The numbers that the compiled solver reads."""
+        return Tuning(
+            temporal_weight_m2=float(self.temporal_weight_m2),
+            velocity_limit_rad_s=float(self.velocity_limit_rad_s),
+            pinch_near_m=float(self.pinch_near_m),
+            pinch_far_m=float(self.pinch_far_m),
+            pinch_weight_near=float(self.pinch_weight),
+            pinch_weight_far=PINCH_WEIGHT_FAR,
+            reacquire_after_s=float(self.reacquire_after_s),
+            num_starts=int(self.num_starts),
+            bone_tolerance=BONE_TOLERANCE,
+            bone_tolerance_m=BONE_TOLERANCE_M,
+            knuckle_tolerance_m=KNUCKLE_TOLERANCE_M,
+            max_bend_cosine=MAX_BEND_COSINE,
+            keeps_fingers_apart=bool(self.keeps_fingers_apart),
+        )
+
+
+PINCH_WEIGHT_FAR = 1e-3
+# A bone that differs from the person's by more than both is an error of the tracker.
+BONE_TOLERANCE = 0.3
+BONE_TOLERANCE_M = 0.008
+# So is a knuckle that lies further than this from its place in the wrist frame.
+KNUCKLE_TOLERANCE_M = 0.015
+# And two bones in a row bent by more than 140°; hands and robot stop at 120°.
+MAX_BEND_COSINE = -0.766

@@ -1,0 +1,167 @@
+"""Finger points of one person in, the person's bones and knuckles out."""
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import CHAINS
+from services.alignment.retargeting.finger_points import FingerPoints
+from services.alignment.retargeting.hand_arrays import hand_arrays
+from services.alignment.retargeting.hand_profile import (
+    BONE_RANGE_M,
+    NUM_FINGERS,
+    HandProfile,
+    check_bone_unit,
+)
+from services.alignment.retargeting.options import RetargetOptions
+from services.alignment.retargeting.solver.arrays import (
+    IMPLAUSIBLE,
+    MAX_JOINTS,
+    HandArrays,
+    Memory,
+    Output,
+    PersonArrays,
+)
+from services.alignment.retargeting.solver.samples import retarget_samples
+
+# Samples that are looked at, spread over the recording: 240 know a bone to a tenth of the noise.
+NUM_SAMPLES = 240
+# Below this a tracker's noise makes no difference, and ratios of zeros would come up (metres).
+LEAST_SIGMA_M = 1e-4
+# A robot's knuckle that moved less than this (RMS, metres) tells nothing about its travel.
+LEAST_TRAVEL_M = 1e-3
+UNKNOWN_FREEDOM = 1e6
+# Samples that lie seconds apart: no pinches, no pull.
+EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
+
+
+def unknown_person(hand: HandArrays, robot_bone_m: np.ndarray) -> PersonArrays:
+    """Nothing is known: every sample's own bones, and its own knuckles."""
+    num = len(robot_bone_m)
+    return PersonArrays(
+        bone_m=robot_bone_m,
+        bone_scale=np.ones((num, 3)),
+        knuckle_m=hand.knuckle_m.copy(),
+        travel=np.ones(num),
+        freedom=np.full(num, UNKNOWN_FREEDOM),
+        is_known=False,
+    )
+
+
+def person_arrays(profile: HandProfile, robot_bone_m: np.ndarray) -> PersonArrays:
+    """A profile as the compiled solver reads it."""
+    sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
+    return PersonArrays(
+        bone_m=np.ascontiguousarray(profile.bone_m),
+        bone_scale=profile.bone_m / robot_bone_m,
+        knuckle_m=np.ascontiguousarray(profile.knuckle_m),
+        travel=np.ascontiguousarray(profile.travel),
+        freedom=(profile.knuckle_sigma_m / sigma_m) ** 2,
+        is_known=True,
+    )
+
+
+def robot_bone_m(hand: RobotHand) -> Float64[np.ndarray, "5 3"]:
+    """Lengths from knuckle to PIP, DIP and tip of a robot hand at zero angles."""
+    points = hand.chain_points_m(np.zeros((1, 20)))[0]
+    return np.asarray(np.linalg.norm(np.diff(points, axis=1), axis=-1))
+
+
+def measure_profile(points: FingerPoints, hand: RobotHand) -> HandProfile:
+    """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
+
+    Args:
+        points: any samples of the hand; those with whole fingers count.
+        hand: the robot hand of the same side, whose axes tell how far fingers are bent.
+
+    Raises:
+        InvalidInputError: a finger is whole in no sample, or its bones are no bones (unit, order).
+    """
+    whole = np.asarray(points.usable.all(axis=-1))
+    _check_seen(whole, hand.side)
+    lengths = np.linalg.norm(np.diff(points.points_m, axis=2), axis=-1)
+    lengths = np.where(whole[..., None], lengths, np.nan)
+    index_finger = CHAINS.index("index")
+    check_bone_unit(float(np.nanmedian(lengths[:, index_finger, 0])), where="keypoints")
+    low, high = BONE_RANGE_M
+    lengths[~((lengths >= low) & (lengths <= high)).all(axis=-1)] = np.nan
+    _check_seen(np.isfinite(lengths).all(axis=-1), hand.side)
+    bone_m = np.nanmedian(lengths, axis=0)
+    spread_m = 1.4826 * np.nanmedian(np.abs(lengths - bone_m), axis=0)
+    # The length of a bone has the noise of two points along it.
+    point_sigma_m = float(np.median(spread_m) / np.sqrt(2))
+    rows = _spread(np.flatnonzero(whole.any(axis=1)))
+    moved_m = _knuckle_motion(points.points_m[rows], whole[rows], hand)
+    usable = whole[rows] & np.isfinite(moved_m).all(axis=-1)
+    knuckle_m, travel, sigma_m = np.zeros((NUM_FINGERS, 3)), np.zeros(5), np.zeros(5)
+    for finger in range(NUM_FINGERS):
+        kept = usable[:, finger]
+        if not kept.any():
+            kept = whole[rows, finger]
+        knuckle_m[finger], travel[finger], left_m = _fit_knuckle(
+            points.points_m[rows][kept, finger, 0], moved_m[kept, finger]
+        )
+        sigma_m[finger] = np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0))
+    return HandProfile(bone_m, knuckle_m, travel, sigma_m, point_sigma_m)
+
+
+def _check_seen(whole: np.ndarray, side: str) -> None:
+    never = np.asarray(~whole.any(axis=0))
+    if never.any():
+        names = ", ".join(name for name, gone in zip(CHAINS, never, strict=True) if gone)
+        raise InvalidInputError(
+            f"keypoints of the {side} hand: no step shows all nodes of {names} with bones of "
+            f"{BONE_RANGE_M[0]} … {BONE_RANGE_M[1]} m; expected every finger at least once"
+        )
+
+
+def _spread(rows: np.ndarray) -> np.ndarray:
+    """At most `NUM_SAMPLES` of the rows, evenly."""
+    chosen = np.linspace(0, len(rows) - 1, min(len(rows), NUM_SAMPLES)).round().astype(int)
+    return np.asarray(rows[chosen])
+
+
+def _knuckle_motion(
+    points_m: np.ndarray, whole: np.ndarray, hand: RobotHand
+) -> Float64[np.ndarray, "n 5 3"]:
+    """Where the robot's knuckles are when its fingers point like the tracked ones; NaN: unknown."""
+    # The solver takes keypoints by their number: here there are just the fingers' own, in turn.
+    own = hand_arrays(hand)._replace(nodes=np.arange(20).reshape(5, 4))
+    num = len(points_m)
+    output = Output(
+        joints_rad=np.zeros((num, NUM_FINGERS, MAX_JOINTS)),
+        finger_status=np.zeros((num, NUM_FINGERS), dtype=np.uint8),
+        status=np.zeros(num, dtype=np.uint8),
+        tip_error_m=np.zeros((num, NUM_FINGERS)),
+    )
+    retarget_samples(
+        own,
+        unknown_person(own, robot_bone_m(hand)),
+        EVERY_SAMPLE_ALONE.tuning(),
+        (points_m.reshape(num, 20, 3), np.repeat(whole, 4, axis=1), np.full(num, np.inf)),
+        Memory(np.zeros((NUM_FINGERS, MAX_JOINTS)), np.full(NUM_FINGERS, np.inf)),
+        output,
+    )
+    knuckles = hand.chain_points_m(output.joints_rad[:, :, :4].reshape(num, 20))[:, :, 0]
+    moved_m = knuckles - own.knuckle_m
+    moved_m[output.finger_status >= IMPLAUSIBLE] = np.nan
+    return np.asarray(moved_m)
+
+
+def _fit_knuckle(
+    seen_m: np.ndarray, moved_m: np.ndarray
+) -> tuple[Float64[np.ndarray, "3"], float, float]:
+    """Place, travel and what is left (standard deviation an axis) of one knuckle."""
+    if not np.isfinite(moved_m).all():
+        moved_m = np.zeros_like(seen_m)
+    centred = moved_m - moved_m.mean(axis=0)
+    energy = float((centred**2).sum())
+    travel = 0.0
+    if energy > len(seen_m) * LEAST_TRAVEL_M**2:
+        travel = float((centred * (seen_m - np.median(seen_m, axis=0))).sum() / energy)
+        travel = min(max(travel, 0.0), 1.0)
+    places = seen_m - travel * moved_m
+    place = np.median(places, axis=0)
+    left_m = float(1.4826 * np.median(np.abs(places - place)))
+    return place, travel, left_m

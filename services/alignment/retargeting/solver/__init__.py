@@ -1,0 +1,1 @@
+"""The compiled core of retargeting: samples of tracked fingers in, joint angles out."""

@@ -1,0 +1,112 @@
+"""Keypoints of one sample in, what of them can be believed and which fingers are near out."""
+
+from typing import no_type_check
+
+import numpy as np
+
+from services.alignment.retargeting.solver.arrays import (
+    IMPLAUSIBLE,
+    MISSING,
+    NUM_POINTS,
+    PARTIAL,
+    SOLVED,
+)
+from services.alignment.retargeting.solver.compiled import compiled
+
+
+@compiled
+@no_type_check
+def read_sample(hand, work, keypoints, valid):
+    """The points of every finger into the scratch; a missing one is zero."""
+    for finger in range(len(hand.nodes)):
+        for index in range(NUM_POINTS):
+            node = hand.nodes[finger, index]
+            x, y, z = keypoints[node]
+            seen = valid[node] and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
+            work.usable[finger, index] = seen
+            point = work.measured[finger, index]
+            point[0], point[1], point[2] = (x, y, z) if seen else (0.0, 0.0, 0.0)
+
+
+@compiled
+@no_type_check
+def see_finger(person, tuning, work, finger):
+    """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
+
+    Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
+    errors of the tracker; the whole finger is left out, since the odd point cannot be told.
+    """
+    measured, usable = work.measured[finger], work.usable[finger]
+    count = 0
+    for index in range(NUM_POINTS):
+        count += 1 if usable[index] and index > 0 else 0
+    if count < 2 or (not person.is_known and not (count == 3 and usable[0])):
+        return MISSING
+    for k in range(3):
+        work.scale[finger, k] = person.bone_scale[finger, k]
+    work.freedom[finger] = person.freedom[finger]
+    bones = np.zeros((3, 3))
+    for bone in range(3):
+        if not (usable[bone] and usable[bone + 1]):
+            continue
+        squared = 0.0
+        for k in range(3):
+            bones[bone, k] = measured[bone + 1, k] - measured[bone, k]
+            squared += bones[bone, k] ** 2
+        length = np.sqrt(squared)
+        known = person.bone_m[finger, bone]
+        if person.is_known:
+            allowed = max(tuning.bone_tolerance * known, tuning.bone_tolerance_m)
+            if abs(length - known) > allowed:
+                return IMPLAUSIBLE
+        elif not 0.003 <= length <= 0.150:
+            return IMPLAUSIBLE
+        else:
+            work.scale[finger, bone] *= length / known
+        if length > 0.0:
+            bones[bone] /= length
+    for bone in range(2):
+        cosine = 0.0
+        for k in range(3):
+            cosine += bones[bone, k] * bones[bone + 1, k]
+        if cosine < tuning.max_bend_cosine:
+            return IMPLAUSIBLE
+    if person.is_known and usable[0]:
+        squared = 0.0
+        for k in range(3):
+            squared += (measured[0, k] - person.knuckle_m[finger, k]) ** 2
+        # The robot's own knuckle travels up to its offset, 15 mm.
+        if squared > (tuning.knuckle_tolerance_m + 0.03 * person.travel[finger]) ** 2:
+            return IMPLAUSIBLE
+    return SOLVED if count == 3 and usable[0] else PARTIAL
+
+
+@compiled
+@no_type_check
+def find_pinches(hand, tuning, work, status):
+    """The thumb and all fingers near it into `members`; their vectors and weights.
+
+    The weight goes from that of near to that of far evenly in its logarithm.
+    """
+    thumb, measured, usable = hand.thumb, work.measured, work.usable
+    if thumb < 0 or status[thumb] >= IMPLAUSIBLE or not usable[thumb, 3]:
+        return 0
+    count = 1
+    work.members[0] = thumb
+    for finger in range(len(status)):
+        if finger == thumb or status[finger] >= IMPLAUSIBLE or not usable[finger, 3]:
+            continue
+        squared = 0.0
+        for k in range(3):
+            work.pinch_m[finger, k] = measured[thumb, 3, k] - measured[finger, 3, k]
+            squared += work.pinch_m[finger, k] ** 2
+        gap = np.sqrt(squared)
+        if gap >= tuning.pinch_far_m:
+            continue
+        apart = max(gap - tuning.pinch_near_m, 0.0) / (tuning.pinch_far_m - tuning.pinch_near_m)
+        work.pinch_weight[finger] = (
+            tuning.pinch_weight_near * (tuning.pinch_weight_far / tuning.pinch_weight_near) ** apart
+        )
+        work.members[count] = finger
+        count += 1
+    return count if count > 1 else 0
