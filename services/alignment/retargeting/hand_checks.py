@@ -1,12 +1,11 @@
-"""Keypoints of a tracked hand in; whether unit, order of nodes and side are right, or a refusal.
+"""Keypoints of a tracked hand in any axes come in; its size goes out, or why it is none.
 
-Nothing here depends on the axes of the keypoints: lengths and distances tell unit and order, the
-sense in which fingers curl tells left from right.
+Distances that no posture changes tell the unit and the order of nodes. Other orders, which trackers
+and their users are known to produce, are compared with the mean hand as well: the best is named.
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
-from itertools import combinations, permutations
+from itertools import combinations, pairwise, permutations, product
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -14,9 +13,7 @@ from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, chain_indices
-from dextouch.tactile.layout import Side
 from services.alignment.retargeting.mean_hand import (
-    FINGER_CHAINS,
     KNUCKLE_NODES,
     METACARPAL_NODES,
     PALM_NODES,
@@ -42,10 +39,6 @@ MAX_PULL: Final = 5.0
 # at least 0.7, and among all orders the right one was always best.
 MAX_MISFIT: Final = 1.5
 BETTER_ORDER: Final = 0.7
-# Mean signed sine between bones of a finger. Stretched fingers may bend back by several degrees, so
-# less than this shows no side.
-MIN_CURL: Final = 0.15
-MIN_THUMB_HEIGHT: Final = 0.003
 
 
 class HandShape(NamedTuple):
@@ -57,22 +50,6 @@ class HandShape(NamedTuple):
 
     size: float
     misfit: float
-
-
-@dataclass(frozen=True)
-class SideEvidence:
-    """Which hand the keypoints are of.
-
-    Attributes:
-        side: None where neither fingers nor thumb show it.
-        curl: mean sine by which finger bones bend; above zero as a right hand's do.
-        thumb_height: of the thumb's base over the palm in parts of the mean hand's palm length;
-            above zero as on a right hand.
-    """
-
-    side: Side | None
-    curl: float
-    thumb_height: float
 
 
 def seen_nodes(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
@@ -123,16 +100,17 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> Ha
         ShapeError: not [T ≥ 1, 25, 3].
     """
     distances = _median_distances(seen_samples(keypoints_m, where=where))
-    shape = _compared(distances, np.arange(NUM_KEYPOINTS))
-    if shape is None:
+    sizes, misfits = _compared(distances, _places_of_orders())
+    shape = HandShape(float(sizes[0]), float(misfits[0]))
+    if np.isnan(shape.misfit):
         raise InvalidInputError(
             f"{where}: got too few nodes that are seen together, expected {MIN_PAIRS} bones or "
             "distances of the palm; record the hand where it is seen",
             fault="unseen",
         )
-    others = [(found, name) for name, holds in _orders() if (found := _compared(distances, holds))]
-    best, name = min(others, key=lambda pair: pair[0].misfit, default=(shape, ""))
-    if best.misfit < BETTER_ORDER * shape.misfit and best.misfit < MAX_MISFIT:
+    best = int(np.nanargmin(misfits))
+    if misfits[best] < min(BETTER_ORDER * shape.misfit, MAX_MISFIT):
+        name = _orders()[best][0]
         raise InvalidInputError(
             f"{where}: got nodes in another order: {name}; expected that of "
             "dextouch.hands.skeleton (wrist, then thumb … little, each from the metacarpal to the "
@@ -140,7 +118,7 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> Ha
             fault="node_order",
             found=name,
         )
-    if shape.misfit > MAX_MISFIT or shape.size <= 0:
+    if shape.misfit > MAX_MISFIT:
         raise InvalidInputError(
             f"{where}: got bones and distances that are off those of a hand by {shape.misfit:.1f} "
             f"spreads between people, expected at most {MAX_MISFIT}; check unit and order of nodes",
@@ -194,116 +172,62 @@ def _median_distances(samples: np.ndarray) -> Float64[np.ndarray, "25 25"]:
     return np.fmax(distances, distances.T)
 
 
-def _compared(distances: np.ndarray, holds: np.ndarray) -> HandShape | None:
-    """The mean hand against nodes in the order `holds` (−1: none of ours); None if too few."""
-    places = np.full(NUM_KEYPOINTS, -1)
-    places[holds[holds >= 0]] = np.flatnonzero(holds >= 0)
-    at = places[_PAIRS]
-    found = np.where((at >= 0).all(axis=1), distances[at[:, 0], at[:, 1]], np.nan)
-    is_known = np.isfinite(found)
-    if np.count_nonzero(is_known) < MIN_PAIRS:
-        return None
-    lengths, mean = found[is_known], _PAIR_LENGTHS_M[is_known]
-    size = float(np.median(lengths / mean))
-    if size <= 0:
-        return HandShape(size, np.inf)
-    off = (lengths / size - mean) / (SPREAD_PART * mean + SPREAD_M)
-    return HandShape(size, float(np.sqrt(np.square(np.clip(off, -MAX_PULL, MAX_PULL)).mean())))
+def _compared(
+    distances: np.ndarray, places: np.ndarray
+) -> tuple[Float64[np.ndarray, " orders"], Float64[np.ndarray, " orders"]]:
+    """Size and misfit of the mean hand for each order of nodes; NaN where too little is seen.
+
+    Args:
+        distances: [25, 25] m between the nodes as they came.
+        places: [orders, 25] where each of our nodes is among them; −1 nowhere.
+    """
+    at = places[:, _PAIRS]
+    found = np.where((at >= 0).all(axis=2), distances[at[..., 0], at[..., 1]], np.nan)
+    is_enough = np.isfinite(found).sum(axis=1) >= MIN_PAIRS
+    sizes = np.full(len(places), np.nan)
+    misfits = np.full(len(places), np.nan)
+    sizes[is_enough] = np.nanmedian(found[is_enough] / _PAIR_LENGTHS_M, axis=1)
+    # Nodes that lie upon each other have no size, and fit nothing.
+    misfits[sizes == 0] = np.inf
+    good = sizes > 0
+    off = found[good] / sizes[good, None] - _PAIR_LENGTHS_M
+    off = np.clip(off / (SPREAD_PART * _PAIR_LENGTHS_M + SPREAD_M), -MAX_PULL, MAX_PULL)
+    misfits[good] = np.sqrt(np.nanmean(np.square(off), axis=1))
+    return sizes, misfits
 
 
 @lru_cache(maxsize=1)
-def _orders() -> tuple[tuple[str, np.ndarray], ...]:
-    """Other orders than ours that trackers and their users produce, with a name for each."""
+def _orders() -> tuple[tuple[str, tuple[int, ...]], ...]:
+    """Ours, then other orders that trackers and their users produce: name, and our node of each."""
     orders = []
-    for chains in permutations(CHAINS):
-        for is_turned, is_wrist_last in ((False, False), (True, False), (False, True)):
+    for is_wrist_last, is_turned in product((False, True), repeat=2):
+        for chains in permutations(CHAINS):
             fingers: list[int] = []
             for chain in chains:
                 nodes = chain_indices(chain)
                 fingers += reversed(nodes) if is_turned else nodes
             holds = [*fingers, WRIST_NODE] if is_wrist_last else [WRIST_NODE, *fingers]
-            if holds == list(range(NUM_KEYPOINTS)):
-                continue
-            name = f"{'' if is_wrist_last else 'wrist, '}{', '.join(chains)}"
-            name += ", wrist" if is_wrist_last else ""
+            names = [*chains, "wrist"] if is_wrist_last else ["wrist", *chains]
+            name = ", ".join(names)
             name += ", each from the tip to the metacarpal" if is_turned else ""
-            orders.append((name, np.array(holds)))
+            orders.append((name, tuple(holds)))
     # The base of the metacarpal taken for the knuckle, and so on.
-    shifted = np.full(NUM_KEYPOINTS, -1)
+    shifted = [-1] * NUM_KEYPOINTS
     shifted[WRIST_NODE] = WRIST_NODE
     for chain in CHAINS:
         nodes = chain_indices(chain)
-        shifted[nodes[1:]] = nodes[:-1]
-    orders.append(("every finger one joint off, without its tip", shifted))
+        for place, node in pairwise(reversed(nodes)):
+            shifted[place] = node
+    orders.append(("every finger one joint off, without its tip", tuple(shifted)))
     return tuple(orders)
 
 
-def find_side(samples: np.ndarray) -> SideEvidence:
-    """Which hand keypoints [T, 25, 3] are of, in any axes and unit; NaN where not seen.
-
-    Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
-    hand and away from it on a left one. Where they hardly bend, the base of the thumb tells, which
-    lies on the palm's side of the metacarpals.
-    """
-    across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]
-    votes = []
-    for chain in FINGER_CHAINS:
-        bones = np.diff(samples[:, chain_indices(chain)[1:]], axis=1)
-        turns = np.cross(bones[:, :-1], bones[:, 1:])
-        size = np.linalg.norm(bones[:, :-1], axis=-1) * np.linalg.norm(bones[:, 1:], axis=-1)
-        size = size * np.linalg.norm(across, axis=-1)[:, None]
-        triple = np.einsum("tjx,tx->tj", turns, across)
-        votes.append(np.divide(triple, size, out=np.full_like(size, np.nan), where=size > 0))
-    curl = _mean(np.concatenate(votes, axis=1))
-    height = _thumb_height(samples, across)
-    side: Side | None = None
-    if abs(curl) >= MIN_CURL:
-        side = "right" if curl > 0 else "left"
-    elif abs(height) * np.linalg.norm(_MEAN_HAND_M[KNUCKLE_NODES[1]]) >= MIN_THUMB_HEIGHT:
-        side = "right" if height > 0 else "left"
-    return SideEvidence(side, curl, height)
-
-
-def _thumb_height(samples: np.ndarray, across: np.ndarray) -> float:
-    """Of the thumb's base over wrist and knuckles, along a right hand's palm normal."""
-    knuckles = samples[:, KNUCKLE_NODES].mean(axis=1)
-    palm = knuckles - samples[:, WRIST_NODE]
-    normal = np.cross(across, palm)
-    up = np.einsum("tx,tx->t", samples[:, NODE_INDEX["thumb", "metacarpal"]] - knuckles, normal)
-    size = np.linalg.norm(normal, axis=-1) * np.linalg.norm(palm, axis=-1)
-    return _mean(np.divide(up, size, out=np.full_like(size, np.nan), where=size > 0))
-
-
-def _mean(values: np.ndarray) -> float:
-    """Mean of what is known; zero, which says nothing, where nothing is."""
-    known = values[np.isfinite(values)]
-    return float(known.mean()) if known.size else 0.0
-
-
-def check_handedness(
-    keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
-) -> SideEvidence:
-    """Refuse keypoints of the other hand, which is the mirror image of this one.
-
-    Args:
-        keypoints_m: [T ≥ 1, 25, 3], any axes; NaN where a node is not seen.
-        side: which hand they should be of.
-        where: stream and recording, for the message.
-
-    Returns:
-        What speaks for it; its `side` is None where the hand shows neither.
-
-    Raises:
-        InvalidInputError: they are of the other hand.
-        ShapeError: not [T ≥ 1, 25, 3].
-    """
-    evidence = find_side(seen_samples(keypoints_m, where=where))
-    if evidence.side not in (None, side):
-        raise InvalidInputError(
-            f"{where}: got a {evidence.side} hand, expected a {side} one (bones curl by "
-            f"{evidence.curl:+.2f}, a right hand's above zero); are the gloves or their streams "
-            "swapped, or are the tracker's axes left-handed, which mirrors the hand?",
-            fault="side",
-            found=evidence.side,
-        )
-    return evidence
+@lru_cache(maxsize=1)
+def _places_of_orders() -> Int64[np.ndarray, "orders 25"]:
+    """Where each of our nodes is in each of those orders; −1 nowhere."""
+    places = np.full((len(_orders()), NUM_KEYPOINTS), -1)
+    for index, (_, holds) in enumerate(_orders()):
+        for place, node in enumerate(holds):
+            if node >= 0:
+                places[index, node] = place
+    return places

@@ -1,0 +1,132 @@
+"""A recording's keypoints and calibration come in; keypoints in wrist axes go out, or a refusal.
+
+To be called once for each hand of a recording, before retargeting. Keypoints in other axes are
+never turned by guess: only a calibration turns them, and what it gives is looked at.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
+from dextouch.geometry.transforms import apply, invert
+from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.tactile.layout import Side
+from services.alignment.retargeting.hand_checks import seen_nodes
+from services.alignment.retargeting.wrist_frame import WristFrame, wrist_frame
+
+# What people's palms differ from the mean one's, and what a grip adds, stays below this.
+MAX_OFF_RAD: Final = float(np.deg2rad(20.0))
+RIGID_TOLERANCE: Final = 1e-6
+
+
+@dataclass(frozen=True)
+class KeypointAxes:
+    """Keypoints in wrist axes, and what was seen of them.
+
+    Attributes:
+        keypoints_m: [T, 25, 3] in wrist axes (fingers along -z, thumb side +x), metres; not
+            finite where a node was not seen.
+        is_calibrated: whether the recording's calibration turned them; else they came so.
+        off_rad: how far the palm, compared with the mean one, still is from wrist axes.
+        frame: what the palm shows after that: size, sigma, turns of single samples.
+    """
+
+    keypoints_m: Float64[np.ndarray, "time 25 3"]
+    is_calibrated: bool
+    off_rad: float
+    frame: WristFrame
+
+
+def calibration_name(side: Side) -> str:
+    """Name of the matrix: the wrist frame in the axes of the stream `keypoints_SIDE`."""
+    return f"T_keypoints_{side}_wrist_{side}"
+
+
+def calibration_record(frame: WristFrame, side: Side) -> dict[str, Matrix]:
+    """Matrices that a recording carries of a calibrated wrist frame: 4 × 4, and sigma in rad."""
+    name = calibration_name(side)
+    return {
+        name: matrix_rows(frame.T_tracker_wrist),
+        f"{name}_sigma_rad": matrix_rows(np.array([[frame.sigma_rad]])),
+    }
+
+
+def hand_axes_check(
+    keypoints_m: np.ndarray, side: Side, calibration: Mapping[str, Matrix]
+) -> KeypointAxes:
+    """Keypoints of one hand of a recording in wrist axes.
+
+    Args:
+        keypoints_m: [T ≥ 1, 25, 3], metres, order of `dextouch.hands.skeleton`, in wrist axes or,
+            where the calibration says how they are turned, in others that are fixed to the wrist;
+            NaN where a node is not seen.
+        side: which hand.
+        calibration: the recording's; `T_keypoints_SIDE_wrist_SIDE` is read.
+
+    Raises:
+        InvalidInputError: what `wrist_frame` refuses (unit, order of nodes, the other hand, too
+            little seen, moving axes); keypoints in other axes than the wrist's, with or without
+            calibration; a calibration that is no rigid transform. `details` holds `fault`.
+        ShapeError: not [T ≥ 1, 25, 3].
+    """
+    where = f"keypoints_{side}"
+    T_keypoints_wrist = _calibrated(calibration, side)
+    keypoints = np.asarray(keypoints_m, dtype=np.float64)
+    frame = wrist_frame(keypoints, side, where=where)
+    if T_keypoints_wrist is not None:
+        T_wrist_keypoints = invert(T_keypoints_wrist)
+        keypoints = apply(T_wrist_keypoints, seen_nodes(keypoints))
+        frame = wrist_frame(keypoints, side, where=where)
+    R_wrist_palm = frame.T_tracker_wrist[:3, :3]
+    off_rad = float(rotation_angle(R_wrist_palm))
+    if off_rad > MAX_OFF_RAD:
+        _refuse_axes(R_wrist_palm, off_rad, side, is_calibrated=T_keypoints_wrist is not None)
+    return KeypointAxes(keypoints, T_keypoints_wrist is not None, off_rad, frame)
+
+
+def _calibrated(calibration: Mapping[str, Matrix], side: Side) -> Float64[np.ndarray, "4 4"] | None:
+    name = calibration_name(side)
+    if name not in calibration:
+        return None
+    rows = calibration[name]
+    if [len(row) for row in rows] != [4, 4, 4, 4]:
+        raise InvalidInputError(
+            f"calibration {name!r}: got rows of {[len(row) for row in rows]} numbers, expected 4 "
+            "rows of 4",
+            fault="calibration",
+        )
+    T = np.array(rows, dtype=np.float64)
+    R = T[:3, :3]
+    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=RIGID_TOLERANCE) and np.linalg.det(R) > 0
+    if not is_rotation or T[3].tolist() != [0, 0, 0, 1]:
+        raise InvalidInputError(
+            f"calibration {name!r}: no rigid transform (R Rᵀ is off by "
+            f"{np.abs(R @ R.T - np.eye(3)).max():.1e}, det {np.linalg.det(R):+.2f}, last row "
+            f"{T[3].tolist()}); calibrate the wrist frame again",
+            fault="calibration",
+        )
+    return T
+
+
+def _refuse_axes(R: np.ndarray, off_rad: float, side: Side, *, is_calibrated: bool) -> None:
+    axis = np.round(vector_from_rotation(R) / off_rad, 2).tolist()
+    fingers = np.round(-R[:, 2], 2).tolist()
+    told = (
+        f"the calibration {calibration_name(side)!r} does not fit this recording: lay the hand "
+        "flat and calibrate again, the glove may have slipped"
+        if is_calibrated
+        else f"calibrate from a take of the flat hand (calibrate_wrist) and give its result as "
+        f"calibration {calibration_name(side)!r}"
+    )
+    raise InvalidInputError(
+        f"keypoints_{side}: got keypoints that are turned by {np.rad2deg(off_rad):.0f} degrees "
+        f"about {axis} from the wrist's axes (the palm points along {fingers}, expected "
+        f"[0, 0, -1] within {np.rad2deg(MAX_OFF_RAD):.0f} degrees); {told}",
+        fault="axes",
+        off_deg=float(np.rad2deg(off_rad)),
+    )

@@ -1,0 +1,257 @@
+"""Keypoints in a tracker's own axes come in; our wrist frame in those axes goes out, with sigma.
+
+Wrist, metacarpals and knuckles are laid over the mean hand's by a similarity transform (Umeyama
+1991). One transform serves the whole recording: a frame of its own for each sample would take
+part of the fingers' motion, since the palm gives way with them, and the noise of nine nodes.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.rotations import rotation_angle
+from dextouch.geometry.transforms import transform
+from dextouch.hands.skeleton import chain_indices
+from dextouch.tactile.layout import Side
+from services.alignment.retargeting.hand_checks import (
+    MIN_PALM_NODES,
+    check_hand_shape,
+    seen_nodes,
+    seen_samples,
+)
+from services.alignment.retargeting.hand_side import check_handedness
+from services.alignment.retargeting.mean_hand import (
+    FINGER_CHAINS,
+    PALM_NODES,
+    WRIST_NODE,
+    mean_hand_m,
+)
+
+# Part of the samples in which a node must be seen to count.
+MIN_SEEN_PART: Final = 0.1
+# Samples of a node that lie so many times farther off than the middle one do not count.
+FAR_OFF: Final = 5.0
+# Second spread of the nodes in parts of the first: less is a line (whole palms have 0.5).
+MIN_SECOND_SPREAD: Final = 0.05
+# What noise and the palm's give may turn single samples away from the common frame, RMS.
+MAX_TURN_RAD: Final = float(np.deg2rad(12.0))
+# A hand is flat while no finger bends by more than this, noise included.
+MAX_FLAT_BEND_RAD: Final = float(np.deg2rad(30.0))
+# Of four; trackers lose nodes.
+MIN_KNOWN_FINGERS: Final = 2
+MIN_FLAT_SAMPLES: Final = 30
+MAX_SIGMA_RAD: Final = float(np.deg2rad(12.0))
+
+
+@dataclass(frozen=True)
+class WristFrame:
+    """Where the wrist frame lies in the axes of keypoints, and how well that is known.
+
+    Attributes:
+        T_tracker_wrist: rigid; its origin is the wrist node (where that is not seen, where the
+            palm says it is), its axes ours: fingers along -z, thumb side +x, right palm +y, left
+            palm -y.
+        covariance: [3, 3] of the rotation (rad²), about the wrist's own axes: noise, and what is
+            left between this palm's shape and the mean one's.
+        size: of the hand, 1 is the mean adult's.
+        misfit_m: RMS distance of the palm's nodes from the mean hand's of that size.
+        turn_rad: how far single samples turn from this frame, RMS.
+        num_samples: that it was found from.
+    """
+
+    T_tracker_wrist: Float64[np.ndarray, "4 4"]
+    covariance: Float64[np.ndarray, "3 3"]
+    size: float
+    misfit_m: float
+    turn_rad: float
+    num_samples: int
+
+    @property
+    def sigma_rad(self) -> float:
+        """One sigma of the rotation, length of the three axes' sigmas."""
+        return float(np.sqrt(np.trace(self.covariance)))
+
+
+def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints") -> WristFrame:
+    """The wrist frame from a palm in any posture of the fingers.
+
+    Args:
+        keypoints_m: [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
+            `dextouch.hands.skeleton`; NaN where a node is not seen. Up to 300 samples, evenly
+            spread, are looked at.
+        side: which hand.
+        where: stream and recording, for the message.
+
+    Raises:
+        InvalidInputError: wrong unit, order of nodes or hand (mirror image), too few nodes of the
+            palm or nodes along a line, or axes that are not fixed to the wrist; `details` holds
+            `fault`.
+        ShapeError: not [T ≥ 1, 25, 3].
+    """
+    samples = seen_samples(keypoints_m, where=where)
+    # Nodes along a line have no handedness; that is said before anything that follows from it.
+    palm, is_used = _palm(samples, where)
+    check_hand_shape(samples, where=where)
+    check_handedness(samples, side, where=where)
+    mean = mean_hand_m(side)[list(PALM_NODES)]
+    R, sizes, offsets = _laid_over(mean, palm[None], is_used[None])
+    R_tracker_wrist, size = R[0], float(sizes[0])
+    left_over = palm[is_used] - (size * mean[is_used] @ R_tracker_wrist.T + offsets[0])
+    turn_rad = _turn_of_samples(samples, mean, is_used, R_tracker_wrist)
+    if turn_rad > MAX_TURN_RAD:
+        raise InvalidInputError(
+            f"{where}: the palm turns by {np.rad2deg(turn_rad):.0f} degrees RMS during "
+            f"{len(samples)} samples, expected at most {np.rad2deg(MAX_TURN_RAD):.0f}: these axes "
+            "are not fixed to the wrist; send keypoints relative to the wrist, the wrist's own "
+            "pose as the stream wrist_left or wrist_right",
+            fault="moving_axes",
+        )
+    covariance = _covariance(left_over, size * mean[is_used])
+    sigma_rad = float(np.sqrt(np.trace(covariance)))
+    if sigma_rad > MAX_SIGMA_RAD:
+        raise InvalidInputError(
+            f"{where}: the wrist's axes stay uncertain by {np.rad2deg(sigma_rad):.1f} degrees (one "
+            f"sigma), expected at most {np.rad2deg(MAX_SIGMA_RAD):.0f}; the palm's nodes are off a "
+            f"palm by {np.sqrt(np.square(left_over).sum(1).mean()) * 1e3:.1f} mm RMS",
+            fault="uncertain",
+        )
+    has_wrist = is_used[PALM_NODES.index(WRIST_NODE)]
+    origin = palm[PALM_NODES.index(WRIST_NODE)] if has_wrist else offsets[0]
+    return WristFrame(
+        T_tracker_wrist=transform(R_tracker_wrist, origin),
+        covariance=covariance,
+        size=size,
+        misfit_m=float(np.sqrt(np.square(left_over).sum(axis=1).mean())),
+        turn_rad=turn_rad,
+        num_samples=len(samples),
+    )
+
+
+def calibrate_wrist(
+    keypoints_m: np.ndarray, side: Side, *, where: str = "flat-hand take"
+) -> WristFrame:
+    """The wrist frame from a take in which the hand lies flat, fingers straight.
+
+    Only samples with straight fingers count: in a grip, ring and little metacarpals give way.
+
+    Args:
+        keypoints_m: as for `wrist_frame`; one second of the flat hand is enough.
+        side: which hand.
+        where: the take, for the message.
+
+    Raises:
+        InvalidInputError: as `wrist_frame`, or fewer than 30 samples with straight fingers.
+        ShapeError: not [T ≥ 1, 25, 3].
+    """
+    # Asked for its refusals only.
+    seen_samples(keypoints_m, where=where)
+    samples = seen_nodes(keypoints_m)
+    bends_rad = _bends_rad(samples)
+    is_known = np.isfinite(bends_rad)
+    is_straight = (bends_rad <= MAX_FLAT_BEND_RAD) | ~is_known
+    is_flat = is_straight.all(axis=1) & (is_known.sum(axis=1) >= MIN_KNOWN_FINGERS)
+    num_flat = int(np.count_nonzero(is_flat))
+    if num_flat < MIN_FLAT_SAMPLES:
+        bent = np.median(np.where(is_known, bends_rad, np.pi), axis=0)
+        worst = FINGER_CHAINS[int(np.argmax(bent))]
+        raise InvalidInputError(
+            f"{where}: got {num_flat} samples with straight fingers, expected at least "
+            f"{MIN_FLAT_SAMPLES}; the {worst} finger is bent most, or not seen: lay the hand flat "
+            "for a second, fingers straight",
+            fault="not_flat",
+            found=worst,
+        )
+    return wrist_frame(samples[is_flat], side, where=where)
+
+
+def _palm(
+    samples: np.ndarray, where: str
+) -> tuple[Float64[np.ndarray, "9 3"], Bool[np.ndarray, " 9"]]:
+    """Mean places of the palm's nodes without samples far off, and which nodes count."""
+    seen = samples[:, list(PALM_NODES)]
+    num_seen = np.isfinite(seen[..., 0]).sum(axis=0)
+    is_used = num_seen >= max(1.0, MIN_SEEN_PART * len(samples))
+    if np.count_nonzero(is_used) < MIN_PALM_NODES:
+        raise InvalidInputError(
+            f"{where}: got {np.count_nonzero(is_used)} of the {len(PALM_NODES)} nodes of wrist, "
+            f"metacarpals and knuckles, expected at least {MIN_PALM_NODES}",
+            fault="unseen",
+        )
+    palm = np.full((len(PALM_NODES), 3), np.nan)
+    middle = np.nanmedian(seen[:, is_used], axis=0)
+    distances = np.linalg.norm(seen[:, is_used] - middle, axis=-1)
+    # A mean turns with the axes, and medians of coordinates do not.
+    is_near = distances <= FAR_OFF * np.nanmedian(distances, axis=0)
+    near = np.where(is_near[..., None], seen[:, is_used], 0.0)
+    palm[is_used] = near.sum(axis=0) / is_near.sum(axis=0)[:, None]
+    centred = palm[is_used] - palm[is_used].mean(axis=0)
+    spread = np.linalg.svd(centred, compute_uv=False)
+    if spread[1] <= MIN_SECOND_SPREAD * spread[0]:
+        raise InvalidInputError(
+            f"{where}: the {np.count_nonzero(is_used)} nodes of the palm that are seen lie along a "
+            "line, which shows no turn about it; wrist and knuckles of several fingers are needed",
+            fault="collinear",
+        )
+    return palm, is_used
+
+
+def _laid_over(
+    mean: np.ndarray, palms: np.ndarray, is_used: np.ndarray
+) -> tuple[Float64[np.ndarray, "n 3 3"], Float64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Rotations, sizes and offsets with palm ≈ size · R · mean + offset (Umeyama 1991).
+
+    Args:
+        mean: [9, 3] nodes of the mean palm.
+        palms: [n, 9, 3] in the tracker's axes.
+        is_used: [n, 9] which nodes count.
+    """
+    weights = is_used / is_used.sum(axis=1, keepdims=True)
+    places = np.where(is_used[..., None], palms, 0.0)
+    middle_mean, middle = weights @ mean, np.einsum("nk,nkx->nx", weights, places)
+    centred_mean = mean - middle_mean[:, None]
+    centred = np.where(is_used[..., None], places - middle[:, None], 0.0)
+    H = np.einsum("nk,nkx,nky->nxy", weights, centred, centred_mean)
+    U, stretch, Vt = np.linalg.svd(H)
+    signs = np.ones((len(palms), 3))
+    signs[:, 2] = np.sign(np.linalg.det(U @ Vt))
+    R = (U * signs[:, None]) @ Vt
+    size = (stretch * signs).sum(axis=1) / np.einsum(
+        "nk,nkx,nkx->n", weights, centred_mean, centred_mean
+    )
+    return R, size, middle - size[:, None] * np.einsum("nxy,ny->nx", R, middle_mean)
+
+
+def _turn_of_samples(
+    samples: np.ndarray, mean: np.ndarray, is_used: np.ndarray, R: np.ndarray
+) -> float:
+    """RMS angle between single samples' frames and the common one; 0 where none shows its own."""
+    palms = samples[:, list(PALM_NODES)]
+    seen = np.isfinite(palms[..., 0]) & is_used
+    # A sample with fewer nodes than the common frame says more of what is missing than of turns.
+    whole = seen.sum(axis=1) == np.count_nonzero(is_used)
+    if not whole.any():
+        whole = seen.sum(axis=1) == seen.sum(axis=1).max()
+    Rs, _, _ = _laid_over(mean, palms[whole], seen[whole])
+    return float(np.sqrt(np.square(rotation_angle(R.T @ Rs)).mean()))
+
+
+def _covariance(left_over: np.ndarray, points: np.ndarray) -> Float64[np.ndarray, "3 3"]:
+    """Covariance of the rotation about the wrist's own axes, from what the fit leaves over."""
+    # Rotation, offset and size are seven numbers.
+    variance = np.square(left_over).sum() / (left_over.size - 7)
+    centred = points - points.mean(axis=0)
+    inertia = np.square(centred).sum() * np.eye(3) - centred.T @ centred
+    return np.asarray(variance * np.linalg.inv(inertia))
+
+
+def _bends_rad(samples: np.ndarray) -> Float64[np.ndarray, "time 4"]:
+    """Angle of each finger between its first bone and the rest of it; NaN where not seen."""
+    fingers = samples[:, [chain_indices(chain) for chain in FINGER_CHAINS]]
+    first = fingers[:, :, 2] - fingers[:, :, 1]
+    # As far as the tip, since noise turns short bones far.
+    rest = fingers[:, :, 4] - fingers[:, :, 2]
+    sine = np.linalg.norm(np.cross(first, rest), axis=-1)
+    return np.asarray(np.arctan2(sine, (first * rest).sum(axis=-1)))

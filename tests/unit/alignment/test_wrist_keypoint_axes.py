@@ -1,0 +1,121 @@
+"""Keypoints of a recording come to wrist axes by its calibration, or are refused."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import transform
+from dextouch.schemas.episodes import matrix_rows
+from services.alignment.retargeting import HandRetargeter
+from services.alignment.retargeting.keypoint_axes import (
+    calibration_record,
+    hand_axes_check,
+)
+from services.alignment.retargeting.wrist_frame import calibrate_wrist
+from tests.unit.alignment.tracked_hands import (
+    any_rotation,
+    flat_hand,
+    moving_hand,
+    of_another_person,
+)
+
+SIDES = ("left", "right")
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_keypoints_in_wrist_axes_stay_as_they_are(side):
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        keypoints = of_another_person(moving_hand(side, rng), rng)
+        checked = hand_axes_check(keypoints, side, {})
+        np.testing.assert_array_equal(checked.keypoints_m, keypoints)
+        assert not checked.is_calibrated
+        assert checked.off_rad < np.deg2rad(15)
+
+
+@pytest.mark.parametrize("side", SIDES)
+def test_keypoints_in_other_axes_need_a_calibration(side):
+    rng = np.random.default_rng(1)
+    R, offset = any_rotation(rng), rng.normal(size=3)
+    keypoints = moving_hand(side, rng)
+    keypoints[5, 3] = np.nan
+    keypoints[6, 4, 0] = np.inf
+    tracked = keypoints @ R.T + offset if side == "left" else keypoints @ R.T
+    with pytest.raises(InvalidInputError, match="calibrate from a take of the flat hand") as e:
+        hand_axes_check(tracked[:5], side, {})
+    assert e.value.details["fault"] == "axes"
+
+    flat = flat_hand(side, rng) @ R.T
+    flat += rng.normal(scale=1e-3, size=flat.shape) + (offset if side == "left" else 0.0)
+    record = calibration_record(calibrate_wrist(flat, side), side)
+    assert sorted(record) == [
+        f"T_keypoints_{side}_wrist_{side}",
+        f"T_keypoints_{side}_wrist_{side}_sigma_rad",
+    ]
+    checked = hand_axes_check(tracked, side, record)
+    assert checked.is_calibrated
+    assert np.isnan(checked.keypoints_m[5, 3]).all()
+    assert np.isnan(checked.keypoints_m[6, 4]).all()
+    seen = np.isfinite(checked.keypoints_m).all(axis=-1)
+    assert np.count_nonzero(~seen) == 2
+    assert np.abs(checked.keypoints_m - keypoints)[seen].max() < 2e-3
+    # The other hand's calibration is not taken for this one's.
+    other = "right" if side == "left" else "left"
+    with pytest.raises(InvalidInputError, match="calibrate from a take"):
+        hand_axes_check(
+            tracked[:5], side, {name.replace(side, other): m for name, m in record.items()}
+        )
+
+
+def test_joints_of_a_turned_hand_are_those_of_the_hand():
+    rng = np.random.default_rng(2)
+    keypoints, R = moving_hand("right", rng, 20), any_rotation(rng)
+    record = calibration_record(calibrate_wrist(flat_hand("right", rng) @ R.T, "right"), "right")
+    turned = hand_axes_check(keypoints @ R.T, "right", record).keypoints_m
+    direct = HandRetargeter("right").retarget(keypoints)
+    np.testing.assert_allclose(
+        HandRetargeter("right").retarget(turned).joints_rad, direct.joints_rad, atol=1e-4
+    )
+
+
+def test_a_calibration_that_does_not_fit_is_refused():
+    rng = np.random.default_rng(3)
+    keypoints = moving_hand("right", rng)
+    R = rotation_from_vector(np.array([0.0, 0.0, np.deg2rad(40)]))
+    record = {"T_keypoints_right_wrist_right": matrix_rows(transform(R, np.zeros(3)))}
+    with pytest.raises(InvalidInputError, match=r"turned by 40 degrees.*does not fit") as refusal:
+        hand_axes_check(keypoints, "right", record)
+    assert refusal.value.details["off_deg"] == pytest.approx(40, abs=0.5)
+
+
+@pytest.mark.parametrize(
+    "matrix",
+    [
+        np.eye(3),
+        np.diag([1.0, 1.0, -1.0, 1.0]),
+        1.01 * np.eye(4),
+        np.eye(4) + np.diag([0.0, 0.0, 0.0], k=-1) + 1e-3 * np.eye(4, k=-3),
+    ],
+)
+def test_a_calibration_that_is_no_transform_is_refused(matrix):
+    keypoints = moving_hand("right", np.random.default_rng(4))
+    with pytest.raises(InvalidInputError, match="T_keypoints_right_wrist_right") as refusal:
+        hand_axes_check(keypoints, "right", {"T_keypoints_right_wrist_right": matrix_rows(matrix)})
+    assert refusal.value.details["fault"] == "calibration"
+
+
+@pytest.mark.parametrize(
+    ("break_it", "fault"),
+    [
+        (lambda k: k * 1e3, "unit"),
+        (lambda k: k * [1, -1, 1], "side"),
+        (lambda k: k[:, ::-1], "node_order"),
+        (lambda k: k * np.nan, "unseen"),
+    ],
+)
+def test_broken_recordings_are_refused_by_name(break_it, fault):
+    keypoints = moving_hand("left", np.random.default_rng(5))
+    with pytest.raises(InvalidInputError, match="keypoints_left") as refusal:
+        hand_axes_check(break_it(keypoints), "left", {})
+    assert refusal.value.details["fault"] == fault
