@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample
@@ -13,6 +13,7 @@ from services.acquisition.clock import StationClock
 
 # What is kept between two evaluations, which are a second apart.
 KEPT_S = 4.0
+MIN_ROLLING = 64
 JUDGED_VALUES = ("tactile", "pose", "keypoints")
 
 
@@ -86,27 +87,39 @@ class SampleBlocks:
 
 
 class Rolling:
-    """Numbers with their times, those of the last `span_ns` only."""
+    """Numbers with their times, those of the last `span_ns` only.
+
+    Its arrays grow to what a full span needs and stay as they are: windows that come and go in
+    ever other sizes leave holes that nothing else fits into.
+    """
 
     def __init__(self, span_ns: int) -> None:
         self._span_ns = span_ns
-        self._t_ns = np.empty(0, dtype=np.int64)
-        self._values = np.empty(0, dtype=np.float64)
+        self._t_ns = np.zeros(MIN_ROLLING, dtype=np.int64)
+        self._values = np.zeros(MIN_ROLLING)
+        self._count = 0
 
     def add(self, t_ns: np.ndarray, values: np.ndarray, now_ns: int) -> np.ndarray:
-        """Append, forget what is too old, and give the rest."""
-        self._t_ns = np.concatenate([self._t_ns, t_ns])
-        self._values = np.concatenate([self._values, values.astype(np.float64)])
-        kept = self._t_ns >= now_ns - self._span_ns
-        self._t_ns, self._values = self._t_ns[kept], self._values[kept]
-        return self._values
+        """Append, forget what is too old, and give the rest: a view that the next call changes."""
+        stop = self._count + len(t_ns)
+        while stop > len(self._t_ns):
+            self._t_ns = np.concatenate([self._t_ns, np.zeros_like(self._t_ns)])
+            self._values = np.concatenate([self._values, np.zeros_like(self._values)])
+        self._t_ns[self._count : stop] = t_ns
+        self._values[self._count : stop] = values
+        kept = self._t_ns[:stop] >= now_ns - self._span_ns
+        self._count = int(np.count_nonzero(kept))
+        if self._count < stop:
+            self._t_ns[: self._count] = self._t_ns[:stop][kept]
+            self._values[: self._count] = self._values[:stop][kept]
+        return self.values
 
     @property
-    def values(self) -> np.ndarray:
+    def values(self) -> Float64[np.ndarray, " n"]:
         """What is kept."""
-        return self._values
+        return self._values[: self._count]
 
     @property
-    def t_ns(self) -> np.ndarray:
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
         """Times of what is kept."""
-        return self._t_ns
+        return self._t_ns[: self._count]
