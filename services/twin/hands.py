@@ -61,6 +61,7 @@ class HumanHand(RobotHand):
     def __init__(self, side: str) -> None:
         super().__init__(side)
         self.fingers = human_fingers(self.side)
+        self.name = f"human {side} hand"
 
     def keypoints_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
         """The 25 tracked nodes in wrist coordinates, metres, for joint angles [T, 20]."""

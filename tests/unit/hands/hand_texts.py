@@ -6,6 +6,33 @@ from pathlib import Path
 
 import pytest
 
+# One finger, with what matters in MJCF: default classes, an orientation, a drawn angle, a site.
+FINGER_MJCF = """<mujoco model="finger">
+<compiler angle="radian"/>
+<default><joint axis="1 0 0"/><default class="hinge"><joint range="-0.5 1.5"/></default></default>
+<worldbody>
+<body name="palm" childclass="hinge">
+<body name="near" pos="0 0 -0.09"><joint name="abd" axis="0 1 0"/><joint name="flex"/>
+<body name="mid" pos="0 0 -0.04" euler="0 0 0.1"><joint name="pip"/>
+<body name="far" pos="0 0 -0.03"><joint name="dip" ref="0.1"/>
+<site name="tip" pos="0 0 -0.025"/>
+</body></body></body></body>
+</worldbody>
+<equality><joint joint1="pip" joint2="dip" active="false"/></equality>
+</mujoco>"""
+FINGER_MAPPING = """side = "right"
+[wrist]
+body = "palm"
+fingers_along = [0, 0, -1]
+thumb_side = [1, 0, 0]
+[[fingers]]
+chain = "index"
+joints = ["abd", "flex", "pip", "dip"]
+knuckle = "flex"
+pip = "pip"
+dip = "dip"
+tip = { site = "tip" }
+"""
 DOCUMENT = Path(__file__).parents[3] / "docs" / "hands.md"
 
 

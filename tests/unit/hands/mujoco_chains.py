@@ -42,8 +42,10 @@ class MujocoChains:
         offset = self.data.xmat[body].reshape(3, 3) @ np.asarray(offset_m)
         return self._seen(self.data.xpos[body] + offset)
 
-    def site(self, name):
-        return self._seen(self.data.site_xpos[self.model.site(name).id])
+    def site(self, name, offset_m=(0.0, 0.0, 0.0)):
+        site = self.model.site(name).id
+        offset = self.data.site_xmat[site].reshape(3, 3) @ np.asarray(offset_m)
+        return self._seen(self.data.site_xpos[site] + offset)
 
 
 def hand_hinges(hand, joints_rad):

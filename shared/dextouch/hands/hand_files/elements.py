@@ -16,7 +16,7 @@ from dextouch.hands.hand_files.reading import read_bounded
 
 MAX_BYTES: Final = 8 * 2**20
 MAX_DEPTH: Final = 100
-MAX_ELEMENTS: Final = 100_000
+MAX_ELEMENTS: Final = 20_000
 # Far beyond every length, angle or direction; sums and products of such numbers stay finite.
 MAX_NUMBER: Final = 1e6
 # float() also takes "nan", "inf", "1_0" and digits of other scripts.
@@ -153,7 +153,7 @@ def read_elements(path: Path) -> Element:
 
     Raises:
         NotFoundError, StorageError: no file, or it cannot be read.
-        LimitExceededError: over 8 MiB, 100 levels or 100 000 elements.
+        LimitExceededError: over 8 MiB, 100 levels or 20 000 elements.
         InvalidInputError: broken XML, or a document type.
     """
     return _Builder(path.name).parse(read_bounded(path, MAX_BYTES))
