@@ -46,8 +46,8 @@ class Soak:
                 text=True,
                 env={
                     **os.environ,
-                    # As deployed: see deploy/Dockerfile.
-                    "MALLOC_ARENA_MAX": "2",
+                    # As deployed: see docker-compose.yml and deploy/systemd.
+                    "MALLOC_ARENA_MAX": "1",
                     "PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'shared'}",
                 },
             )

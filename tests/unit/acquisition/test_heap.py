@@ -1,7 +1,10 @@
 """Memory that is free in the process goes back to the system."""
 
 import gc
+import os
 import platform
+import subprocess
+import sys
 import weakref
 from pathlib import Path
 
@@ -57,3 +60,36 @@ def test_what_exists_at_the_start_is_not_looked_through_again(no_collector):
     younger = weakref.ref(Circle())
     give_back_free_memory()
     assert younger() is None
+
+
+SMALL_ARRAYS = """
+import ctypes
+import numpy as np
+from services.acquisition.heap import keep_for_life
+
+FIELDS = "arena ordblks smblks hblks hblkhd usmblks fsmblks uordblks fordblks keepcost".split()
+
+class Figures(ctypes.Structure):
+    _fields_ = [(name, ctypes.c_size_t) for name in FIELDS]
+
+figures = ctypes.CDLL(None).mallinfo2
+figures.restype = Figures
+keep_for_life()
+before = figures().uordblks
+small = [np.ones(size) for size in range(1, 127) for _ in range(5)]
+small.clear()
+print(figures().uordblks - before)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="only glibc tells its figures")
+def test_small_arrays_of_whatever_size_take_no_more_memory():
+    # In a process of its own, since numpy's cache is full once and for all.
+    run = subprocess.run(
+        [sys.executable, "-c", SMALL_ARRAYS],
+        check=True,
+        capture_output=True,
+        text=True,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert int(run.stdout) < 30_000
