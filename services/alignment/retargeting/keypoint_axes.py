@@ -17,11 +17,11 @@ from dextouch.geometry.transforms import apply, invert
 from dextouch.schemas.episodes import Matrix, matrix_rows
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import seen_nodes
+from services.alignment.retargeting.wrist import rigid_transform
 from services.alignment.retargeting.wrist_frame import WristFrame, wrist_frame
 
 # What people's palms differ from the mean one's, and what a grip adds, stays below this.
 MAX_OFF_RAD: Final = float(np.deg2rad(20.0))
-RIGID_TOLERANCE: Final = 1e-6
 
 
 @dataclass(frozen=True)
@@ -56,6 +56,27 @@ def calibration_record(frame: WristFrame, side: Side) -> dict[str, Matrix]:
     }
 
 
+def calibrated_frame(
+    calibration: Mapping[str, Matrix], side: Side
+) -> Float64[np.ndarray, "4 4"] | None:
+    """T_keypoints_wrist of a recording's calibration; None where it has none.
+
+    Raises:
+        ShapeError, NonFiniteError, InvalidInputError: it is no rigid transform.
+    """
+    name = calibration_name(side)
+    if name not in calibration:
+        return None
+    return rigid_transform(calibration[name], what=f"calibration {name!r}")
+
+
+def to_wrist_axes(
+    keypoints_m: np.ndarray, T_keypoints_wrist: np.ndarray
+) -> Float64[np.ndarray, "time 25 3"]:
+    """Keypoints [T, 25, 3] of a tracker's axes in wrist axes; what is not seen becomes NaN."""
+    return apply(invert(T_keypoints_wrist), seen_nodes(keypoints_m))
+
+
 def hand_axes_check(
     keypoints_m: np.ndarray, side: Side, calibration: Mapping[str, Matrix]
 ) -> KeypointAxes:
@@ -71,46 +92,21 @@ def hand_axes_check(
     Raises:
         InvalidInputError: what `wrist_frame` refuses (unit, order of nodes, the other hand, too
             little seen, moving axes); keypoints in other axes than the wrist's, with or without
-            calibration; a calibration that is no rigid transform. `details` holds `fault`.
-        ShapeError: not [T ≥ 1, 25, 3].
+            calibration (`details` holds `fault`); a calibration that is no rigid transform.
+        ShapeError: not [T ≥ 1, 25, 3], or a calibration that is not 4 by 4.
     """
     where = f"keypoints_{side}"
-    T_keypoints_wrist = _calibrated(calibration, side)
+    T_keypoints_wrist = calibrated_frame(calibration, side)
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     frame = wrist_frame(keypoints, side, where=where)
     if T_keypoints_wrist is not None:
-        T_wrist_keypoints = invert(T_keypoints_wrist)
-        keypoints = apply(T_wrist_keypoints, seen_nodes(keypoints))
+        keypoints = to_wrist_axes(keypoints, T_keypoints_wrist)
         frame = wrist_frame(keypoints, side, where=where)
     R_wrist_palm = frame.T_tracker_wrist[:3, :3]
     off_rad = float(rotation_angle(R_wrist_palm))
     if off_rad > MAX_OFF_RAD:
         _refuse_axes(R_wrist_palm, off_rad, side, is_calibrated=T_keypoints_wrist is not None)
     return KeypointAxes(keypoints, T_keypoints_wrist is not None, off_rad, frame)
-
-
-def _calibrated(calibration: Mapping[str, Matrix], side: Side) -> Float64[np.ndarray, "4 4"] | None:
-    name = calibration_name(side)
-    if name not in calibration:
-        return None
-    rows = calibration[name]
-    if [len(row) for row in rows] != [4, 4, 4, 4]:
-        raise InvalidInputError(
-            f"calibration {name!r}: got rows of {[len(row) for row in rows]} numbers, expected 4 "
-            "rows of 4",
-            fault="calibration",
-        )
-    T = np.array(rows, dtype=np.float64)
-    R = T[:3, :3]
-    is_rotation = np.allclose(R @ R.T, np.eye(3), atol=RIGID_TOLERANCE) and np.linalg.det(R) > 0
-    if not is_rotation or T[3].tolist() != [0, 0, 0, 1]:
-        raise InvalidInputError(
-            f"calibration {name!r}: no rigid transform (R Rᵀ is off by "
-            f"{np.abs(R @ R.T - np.eye(3)).max():.1e}, det {np.linalg.det(R):+.2f}, last row "
-            f"{T[3].tolist()}); calibrate the wrist frame again",
-            fault="calibration",
-        )
-    return T
 
 
 def _refuse_axes(R: np.ndarray, off_rad: float, side: Side, *, is_calibrated: bool) -> None:

@@ -162,16 +162,24 @@ def actions_from_poses(
     """Actions of absolute poses, relative to the anchor's poses.
 
     For measured actions the anchor is the trajectory's own first step; commanded actions are
-    relative to the *measured* poses of the anchor step.
+    relative to the *measured* poses of the anchor step. Where a pose is the anchor's own, its
+    action is exactly the identity.
     """
     T_left, T_right, T_camera = anchor.as_tuple()
     return pack_action(
-        wrist_left=pose_to_9d(invert(T_left) @ trajectory.Ts_world_wrist_left),
-        wrist_right=pose_to_9d(invert(T_right) @ trajectory.Ts_world_wrist_right),
+        wrist_left=_relative_9d(T_left, trajectory.Ts_world_wrist_left),
+        wrist_right=_relative_9d(T_right, trajectory.Ts_world_wrist_right),
         joints_left_rad=trajectory.joints_left_rad,
         joints_right_rad=trajectory.joints_right_rad,
-        camera_head=pose_to_9d(invert(T_camera) @ trajectory.Ts_world_camera_head),
+        camera_head=_relative_9d(T_camera, trajectory.Ts_world_camera_head),
     )
+
+
+def _relative_9d(T_world_anchor: np.ndarray, Ts_world_x: np.ndarray) -> Float64[np.ndarray, "n 9"]:
+    relative = pose_to_9d(invert(T_world_anchor) @ Ts_world_x)
+    # A product with the inverse leaves rounding of 1e-16 where nothing moved.
+    relative[(Ts_world_x == T_world_anchor).all(axis=(1, 2))] = IDENTITY_POSE_9D
+    return relative
 
 
 def poses_from_actions(actions: np.ndarray, anchor: AnchorPoses) -> HandTrajectory:
