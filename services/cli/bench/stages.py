@@ -90,6 +90,17 @@ STAGES = {
         "Reports processor time, errors against the truth and how honest our sigmas are; ends with "
         "what calibration promises and whether it holds.",
     ),
+    "retargeting": StageEntry(
+        "services.cli.bench.retargeting.stage",
+        "follow hands with the robot: ours, dex-retargeting, dexi-rs",
+        "Moves the robot's own hands (all joints at once, up to 9 rad/s, free of contact, without "
+        "and with 1 mm of noise) and hands of people of five sizes who pinch, and finds the joint "
+        "angles with our solver and with every objective of its rivals, on the same samples. "
+        "Reports processor time a sample in turns, errors of tips and joints against the truth, "
+        "how far pinches stay open, what is found from nothing and what becomes of samples that a "
+        "tracker loses; ends with what retargeting promises and whether it holds. Rivals are an "
+        "extra: pip install -c constraints.txt '.[bench]'.",
+    ),
 }
 
 

@@ -1,0 +1,1 @@
+"""`dextouch bench retargeting`: hands of known joint angles, followed by ours and by others."""

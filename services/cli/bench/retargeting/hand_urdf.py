@@ -1,0 +1,79 @@
+"""The tables of a robot hand in; the URDF text that rivals read and its links' names out."""
+
+import xml.etree.ElementTree as ET
+from collections.abc import Iterable
+from typing import Final
+
+import numpy as np
+
+from dextouch.geometry.rotations import rotation_from_quaternion
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import CHAINS
+
+WRIST_LINK: Final = "wrist"
+# A URDF must name an effort and a speed; neither is used by anybody here.
+_EFFORT, _VELOCITY = "2", "10"
+
+
+def hand_urdf(hand: RobotHand) -> str:
+    """URDF of one hand: joints by their firmware names, links by `link_name`, no shapes.
+
+    The root link is the wrist frame. Turns that the tables give as quaternions become roll, pitch
+    and yaw, exact to rounding.
+    """
+    robot = ET.Element("robot", name=f"{hand.side}_hand")
+    ET.SubElement(robot, "link", name=WRIST_LINK)
+    for index, finger in enumerate(hand.fingers):
+        parent = WRIST_LINK
+        for joint, row in enumerate(finger.joints):
+            child = link_name(CHAINS[index], joint)
+            element = _joint(robot, row.name, "revolute", (parent, child))
+            R = rotation_from_quaternion(np.array(row.q_wxyz))
+            _origin(element, row.position_m, roll_pitch_yaw(R))
+            ET.SubElement(element, "axis", xyz=_text(row.axis))
+            low, high = row.limits_rad
+            limit = ET.SubElement(element, "limit", effort=_EFFORT, velocity=_VELOCITY)
+            limit.set("lower", repr(float(low)))
+            limit.set("upper", repr(float(high)))
+            parent = child
+        tip = tip_name(CHAINS[index])
+        _origin(_joint(robot, f"{tip}_mount", "fixed", (parent, tip)), finger.tip_m, (0.0,) * 3)
+    return ET.tostring(robot, encoding="unicode")
+
+
+def link_name(chain: str, joint: int) -> str:
+    """The link that a joint of a chain moves; its origin is the joint's."""
+    return f"{chain}_{joint}"
+
+
+def tip_name(chain: str) -> str:
+    """The link at a fingertip."""
+    return f"{chain}_tip"
+
+
+def roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
+    """Angles (rad) about fixed x, then y, then z of a rotation [3, 3], as URDF wants them.
+
+    At a pitch of ±90° roll and yaw are not told apart: all of it goes into roll.
+    """
+    pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
+    if np.hypot(R[0, 0], R[1, 0]) < 1e-9:
+        return float(np.arctan2(-R[1, 2], R[1, 1])), pitch, 0.0
+    return float(np.arctan2(R[2, 1], R[2, 2])), pitch, float(np.arctan2(R[1, 0], R[0, 0]))
+
+
+def _joint(robot: ET.Element, name: str, kind: str, links: tuple[str, str]) -> ET.Element:
+    parent, child = links
+    ET.SubElement(robot, "link", name=child)
+    element = ET.SubElement(robot, "joint", name=name, type=kind)
+    ET.SubElement(element, "parent", link=parent)
+    ET.SubElement(element, "child", link=child)
+    return element
+
+
+def _origin(element: ET.Element, xyz: Iterable[float], rpy: Iterable[float]) -> None:
+    ET.SubElement(element, "origin", xyz=_text(xyz), rpy=_text(rpy))
+
+
+def _text(values: Iterable[float]) -> str:
+    return " ".join(repr(float(value)) for value in values)

@@ -1,0 +1,178 @@
+"""Keypoints in; a rival's joint angles and times out, from a process of its own under a time-out.
+
+A rival that never returns, as one does for a NaN, would take the whole measurement with it. Its
+process therefore sets an alarm before each call; the alarm ends the process, whatever it is in.
+Run as a module this is that process: requests come by its standard input, answers leave by its
+standard output, both as a line of JSON and, behind it, numbers as bytes.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from contextlib import AbstractContextManager
+from pathlib import Path
+from types import TracebackType
+from typing import IO, Any
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableError
+from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
+from dextouch.hands.skeleton import NUM_KEYPOINTS
+from services.cli.bench.retargeting.ours import Timed
+from services.cli.bench.retargeting.rivals import Rival, Setup, find_rival, set_up
+from services.cli.bench.retargeting.sequences import Motion
+
+CALL_LIMIT_S = 2.0
+# Rivals start in the middle of all limits and need samples to come from there; not timed or judged.
+NUM_WARM_UP = 10
+
+
+class RivalProcess(AbstractContextManager["RivalProcess"]):
+    """One rival at work in its own process, started at the first request and after a time-out."""
+
+    def __init__(self, rival: Rival) -> None:
+        self.rival = rival
+        self._process: subprocess.Popen[bytes] | None = None
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._stop()
+
+    def __enter__(self) -> "RivalProcess":
+        return self
+
+    def run(self, motion: Motion, scale: float) -> Timed:
+        """Joint angles of a motion, sample by sample, from a fresh retargeter.
+
+        Raises:
+            LimitExceededError: a call did not return within 2 s.
+            InvalidInputError: the rival refuses the keypoints.
+            UnavailableError: its library is not installed, or the process ended by itself.
+        """
+        process = self._running()
+        if process.stdin is None or process.stdout is None:
+            raise UnavailableError(f"{self.rival.name}: its process has no pipes")
+        head = {"side": motion.side, "scale": scale, "num_samples": len(motion)}
+        try:
+            _send(process.stdin, head, motion.keypoints_m)
+        except BrokenPipeError as error:
+            raise self._ended() from error
+        line = process.stdout.readline()
+        if not line:
+            raise self._ended()
+        answer = json.loads(line)
+        if "refused" in answer:
+            raise InvalidInputError(f"{self.rival.name}: {answer['refused']}")
+        joints = _receive(process.stdout, (len(motion), NUM_JOINTS))
+        return Timed(joints, answer["cpu_s"], np.array(answer["call_s"]))
+
+    def _running(self) -> subprocess.Popen[bytes]:
+        if self._process is None:
+            command = [sys.executable, "-m", __name__, self.rival.name]
+            self._process = subprocess.Popen(  # noqa: S603 (this very module)
+                command,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                env={**os.environ, "OMP_NUM_THREADS": "1"},
+            )
+        return self._process
+
+    def _ended(self) -> LimitExceededError | UnavailableError:
+        """What the end of the process means; the next request starts another."""
+        status = self._stop()
+        if status == -signal.SIGALRM:
+            return LimitExceededError(
+                f"{self.rival.name}: a call did not return within {CALL_LIMIT_S:g} s",
+                limit_s=CALL_LIMIT_S,
+            )
+        return UnavailableError(
+            f"{self.rival.name}: its process ended with status {status}; its words are above"
+        )
+
+    def _stop(self) -> int | None:
+        process, self._process = self._process, None
+        if process is None:
+            return None
+        for pipe in (process.stdin, process.stdout):
+            if pipe is not None:
+                # What a dead process did not read is still in the buffer.
+                try:
+                    pipe.close()
+                except BrokenPipeError:
+                    continue
+        return process.wait()
+
+
+def serve(name: str, requests: IO[bytes], answers: IO[bytes]) -> None:
+    """Answer requests until there are no more; every call of the rival is under the alarm."""
+    rival = find_rival(name)
+    with tempfile.TemporaryDirectory(prefix="dextouch-bench-") as folder:
+        while line := requests.readline():
+            head = json.loads(line)
+            keypoints = _receive(requests, (head["num_samples"], NUM_KEYPOINTS, 3))
+            setup = set_up(rival, keypoints, head["side"], scale=head["scale"], folder=Path(folder))
+            try:
+                joints, times = follow(setup)
+            except (ValueError, RuntimeError) as error:
+                _send(answers, {"refused": str(error)}, np.empty(0))
+                continue
+            names = RobotHand(head["side"]).joint_names
+            _send(answers, times, joints[:, [setup.joint_names.index(name) for name in names]])
+
+
+def follow(setup: Setup) -> tuple[np.ndarray, dict[str, Any]]:
+    """All references through the rival, one call a sample; the first is repeated before.
+
+    Returns:
+        Joint angles [T, joints] in its own order, and the times: `cpu_s` of all calls together,
+        `call_s` each, neither with what lies between the calls.
+    """
+    warm_up = setup.references[:1] * NUM_WARM_UP
+    joints, calls_s, cpus_s = [], [], []
+    try:
+        for reference in [*warm_up, *setup.references]:
+            signal.setitimer(signal.ITIMER_REAL, CALL_LIMIT_S)
+            begun_s, cpu_begun_s = time.perf_counter(), time.process_time()
+            answer = setup.solve(reference)
+            cpus_s.append(time.process_time() - cpu_begun_s)
+            calls_s.append(time.perf_counter() - begun_s)
+            joints.append(np.asarray(answer, dtype=np.float64))
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+    times = {"cpu_s": sum(cpus_s[NUM_WARM_UP:]), "call_s": calls_s[NUM_WARM_UP:]}
+    return np.array(joints[NUM_WARM_UP:]), times
+
+
+def _send(pipe: IO[bytes], head: dict[str, Any], numbers: np.ndarray) -> None:
+    pipe.write(json.dumps(head).encode() + b"\n")
+    pipe.write(np.ascontiguousarray(numbers, dtype=np.float64).tobytes())
+    pipe.flush()
+
+
+def _receive(pipe: IO[bytes], shape: tuple[int, ...]) -> np.ndarray:
+    size = int(np.prod(shape)) * 8
+    content = pipe.read(size)
+    if len(content) != size:
+        raise UnavailableError(f"pipe: got {len(content)} bytes, expected {size}")
+    return np.frombuffer(content, dtype=np.float64).reshape(shape)
+
+
+def _main() -> None:
+    # Libraries print to the standard output, which is the answers' pipe: theirs goes elsewhere.
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    with answers:
+        serve(sys.argv[1], sys.stdin.buffer, answers)
+
+
+if __name__ == "__main__":
+    _main()
