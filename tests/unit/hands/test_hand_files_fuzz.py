@@ -82,9 +82,8 @@ def test_paths_that_are_no_files_are_refused(tmp_path):
         load_hand(tmp_path / "none.urdf", mapping)
     with pytest.raises(InvalidInputError, match="expected a regular file"):
         load_hand(model, tmp_path)
-    os.mkfifo(tmp_path / "pipe")
     with pytest.raises(InvalidInputError, match="expected a regular file"):
-        load_hand(tmp_path / "pipe", mapping)
+        load_hand(os.devnull, mapping)
     with pytest.raises(StorageError, match="cannot be read"):
         load_hand(tmp_path / ("x" * 300), mapping)
 
