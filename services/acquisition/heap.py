@@ -34,8 +34,13 @@ def keep_for_life() -> None:
 
 
 def give_back_free_memory() -> bool:
-    """Between takes: milliseconds. False where the C library has no `malloc_trim` (not glibc)."""
-    gc.collect()
+    """Between takes: milliseconds. False where the C library has no `malloc_trim` (not glibc).
+
+    Circles are looked for after `keep_for_life` only: without it that would hold up readers in the
+    middle of a take, if it is an upload that calls this.
+    """
+    if gc.get_freeze_count():
+        gc.collect()
     if _TRIM is None:
         return False
     _TRIM(ctypes.c_size_t(0))
