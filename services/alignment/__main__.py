@@ -1,47 +1,95 @@
-"""`python -m services.alignment`: recordings to episodes from the shell, or as a service."""
+"""`dextouch align`: recordings to episodes from the shell, or as a service."""
 
 import argparse
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
+from rich.console import Console
+from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import Progress as Bars
+
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import DexTouchError
+from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.schemas.episodes import json_ready
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
-from services.alignment.jobs import align_recording
-from services.alignment.report import AlignmentReport
-from services.alignment.settings import AlignmentSettings
+from services.alignment.jobs import episode_id_of
+from services.alignment.many import Outcome, TellOne, align_many, not_aligned
+from services.alignment.options import AlignmentOptions
+from services.alignment.report import AlignmentReport, report_of
+from services.alignment.report_page import report_line, report_page
+from services.alignment.settings import AlignmentSettings, usable_cores
+from services.alignment.synchronization.progress import Progress
 
 EXIT_REFUSED = 3
-# Taxels of one reason that a line tells; the report has all.
-MAX_TOLD = 12
-USAGE = """usage: python -m services.alignment [serve] [--SETTING VALUE …]
-       python -m services.alignment run RECORDING_ID … [--store FOLDER] [--json PATH]
+EPILOG = """examples:
+  dextouch align run take-7 take-8           align two recordings, side by side
+  dextouch align run --all --workers 2       align whatever has no episode yet
+  dextouch align report take-7               clocks, retargeting, what was left out and why
+  dextouch align serve --port 8082           answer POST /v1/alignments; settings: serve --help
 
-serve (the default) answers POST /v1/alignments; its settings are listed by serve --help.
-run aligns recordings of a store and tells what became of them."""
+An episode's id follows from the recording and the options: aligning again finds it and writes
+nothing, so a run that was interrupted is simply started again."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serve, or align some recordings and stop.
+    """Serve, align some recordings, or tell what became of one.
 
     Returns:
         0, or 3 for a refusal with its reason on stderr.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
-    if arguments[:1] in (["-h"], ["--help"]):
-        print(USAGE)
-        return 0
     try:
-        if arguments[:1] == ["run"]:
-            return _run(arguments[1:])
-        return _serve(arguments[1:] if arguments[:1] == ["serve"] else arguments)
+        if not arguments or arguments[0] == "serve":
+            return _serve(arguments[1:])
+        if arguments[0].startswith("--") and arguments[0] != "--help":
+            return _serve(arguments)
+        settings = load_settings(AlignmentSettings, [])
+        parsed = _parser(settings).parse_args(arguments)
+        return _run(parsed, settings) if parsed.word == "run" else _report(parsed, settings)
     except DexTouchError as error:
         print(f"dextouch align: {error.message}", file=sys.stderr)
         return EXIT_REFUSED
+
+
+def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
+    layout = argparse.RawDescriptionHelpFormatter
+    parser = argparse.ArgumentParser(
+        prog="dextouch align",
+        description="Recordings in; synchronized, retargeted episodes in the same store out.",
+        epilog=EPILOG,
+        formatter_class=layout,
+    )
+    shared = argparse.ArgumentParser(add_help=False)
+    shared.add_argument("--store", default=settings.store_url, help="of recordings and episodes")
+    shared.add_argument("--json", type=Path, metavar="PATH", help="write the reports here too")
+    words = parser.add_subparsers(dest="word", required=True, metavar="{run,report,serve}")
+    running = words.add_parser(
+        "run", parents=[shared], help="align recordings", epilog=EPILOG, formatter_class=layout
+    )
+    running.add_argument("recordings", nargs="*", metavar="RECORDING_ID")
+    running.add_argument("--all", action="store_true", help="all that have no episode yet")
+    running.add_argument(
+        "--workers",
+        type=_positive,
+        default=usable_cores(),
+        metavar="N",
+        help="recordings at once, each in a process of its own (default: one a processor)",
+    )
+    report = words.add_parser("report", parents=[shared], help="what became of a recording")
+    report.add_argument("id", metavar="ID", help="of a recording or of its episode")
+    words.add_parser("serve", help="answer over HTTP (its own --help lists the settings)")
+    return parser
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"got {number}, expected at least 1")
+    return number
 
 
 def _serve(arguments: list[str]) -> int:
@@ -53,43 +101,86 @@ def _serve(arguments: list[str]) -> int:
     return 0
 
 
-def _run(arguments: list[str]) -> int:
-    settings = load_settings(AlignmentSettings, [])
-    parser = argparse.ArgumentParser(prog="python -m services.alignment run")
-    parser.add_argument("recordings", nargs="+", metavar="RECORDING_ID")
-    parser.add_argument("--store", default=settings.store_url, help="folder of the store")
-    parser.add_argument("--json", type=Path, help="write the reports here")
-    parsed = parser.parse_args(arguments)
-    store = EpisodeStore(parsed.store)
-    reports = []
-    for recording_id in parsed.recordings:
-        reports.append(align_recording(store, recording_id, settings.options))
-        print(_line(reports[-1]))
-    if parsed.json is not None:
-        content = json.dumps([json_ready(report) for report in reports], indent=2)
-        parsed.json.write_text(content + "\n", encoding="utf-8")
+def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
+    if parsed.all == bool(parsed.recordings):
+        raise InvalidInputError("run: expected either RECORDING_ID … or --all; see run --help")
+    outcomes: list[Outcome] = []
+    wanted = list(dict.fromkeys(parsed.recordings))
+    if parsed.all:
+        wanted, outcomes = not_aligned(EpisodeStore(parsed.store), settings.options)
+    console = Console(highlight=False, soft_wrap=True)
+    for outcome in outcomes:
+        _tell(outcome, console)
+    with _bars(console, len(wanted)) as tell:
+        for outcome in align_many(
+            parsed.store, wanted, settings.options, num_workers=parsed.workers, tell=tell
+        ):
+            outcomes.append(outcome)
+            _tell(outcome, console)
+    if not outcomes:
+        console.print("nothing to do: every recording has its episode")
+    _write_json(parsed.json, [outcome.report for outcome in outcomes if outcome.report])
+    return EXIT_REFUSED if any(outcome.error for outcome in outcomes) else 0
+
+
+def _tell(outcome: Outcome, console: Console) -> None:
+    if outcome.report is not None:
+        console.print(report_line(outcome.report), markup=False)
+    elif outcome.error is not None:
+        print(f"dextouch align: {outcome.error.message}", file=sys.stderr)
+
+
+@contextmanager
+def _bars(console: Console, num_recordings: int) -> Iterator[TellOne]:
+    """A bar for each recording at work and one for all; nothing where no one watches."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.percentage:>3.0f} %"),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(),
+    )
+    shown: dict[str, TaskID] = {}
+    shares: dict[str, float] = {}
+    with Bars(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
+        whole = bars.add_task(f"{num_recordings} recordings", total=max(num_recordings, 1))
+
+        def tell(recording_id: str, progress: Progress) -> None:
+            if recording_id not in shown:
+                shown[recording_id] = bars.add_task(recording_id, total=1.0)
+            where = f"{recording_id} {progress.stage} {progress.stream or ''}"
+            shares[recording_id] = progress.share
+            bars.update(shown[recording_id], completed=progress.share, description=where)
+            bars.update(whole, completed=sum(shares.values()))
+
+        yield tell
+
+
+def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
+    report = find_report(EpisodeStore(parsed.store), parsed.id, settings.options)
+    Console(highlight=False).print(report_page(report))
+    _write_json(parsed.json, [report])
     return 0
 
 
-def _line(report: AlignmentReport) -> str:
-    verb = "aligned" if report.created else "was aligned already"
-    lost = sum(clock.num_dropped for clock in report.clocks)
-    absent = f"; absent: {', '.join(report.absent)}" if report.absent else ""
-    refused = "".join(
-        f"; {stream}: taxels not measured and zero: {_by_reason(reasons)}"
-        for stream, reasons in report.refused_taxels.items()
-    )
-    return (
-        f"{report.recording_id} {verb}: {report.episode_id}, {report.num_steps} steps, "
-        f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}"
-    )
+def find_report(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> AlignmentReport:
+    """The report of an episode, or of the one that a recording became under these options.
+
+    Raises:
+        NotFoundError: neither; or the recording is not aligned.
+    """
+    if store.exists(item_id):
+        episode = store.open(item_id)
+        recordings = [e.id for e in episode.attributes.lineage if e.kind == "recording"]
+        return report_of(episode, recording_id=(recordings or [item_id])[-1], created=False)
+    episode_id = episode_id_of(store.recording(item_id), options)
+    return report_of(store.open(episode_id), recording_id=item_id, created=False)
 
 
-def _by_reason(reasons: Mapping[str, Sequence[int]]) -> str:
-    return ", ".join(
-        f"{reason} {' '.join(map(str, taxels[:MAX_TOLD]))}{' …' * (len(taxels) > MAX_TOLD)}"
-        for reason, taxels in reasons.items()
-    )
+def _write_json(path: Path | None, reports: Sequence[AlignmentReport]) -> None:
+    if path is not None:
+        content = json.dumps([json_ready(report) for report in reports], indent=2)
+        path.write_text(content + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Settings in, the alignment service's application out."""
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
@@ -19,10 +19,14 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        await jobs.start()
         try:
             yield
         finally:
             await jobs.close()
+
+    async def readiness() -> Sequence[str]:
+        return jobs.waiting_for()
 
     return create_service_app(
         name="alignment",
@@ -30,4 +34,5 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
         settings=settings,
         routers=[alignments_router(jobs)],
         lifespan=lifespan,
+        readiness=readiness,
     )

@@ -1,31 +1,35 @@
 """A recording's id in, its aligned episode in the same store out."""
 
 import hashlib
+from collections.abc import Sequence
 
 import structlog
 
-from dextouch.episodes import EpisodeStore, RecordingReader
-from dextouch.errors import ConflictError
+from dextouch.episodes import EpisodeStore, EpisodeWriter, RecordingReader
+from dextouch.errors import ConflictError, DexTouchError, InvalidInputError, NotFoundError
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.synchronization.episode_builder import (
-    Progress,
+    BuiltEpisode,
     build_episode,
     check_complete,
 )
+from services.alignment.synchronization.progress import Progress, Tell, progress_within
 
 logger = structlog.get_logger(__name__)
 
 # Raised whenever alignment gives other numbers for the same recording and options.
-ALIGNMENT_VERSION = 2
+ALIGNMENT_VERSION = 3
 MAX_STEM = 100
+# Refused recordings whose reason a message tells; its details have all.
+MAX_TOLD = 5
 
 
 def align_recording(
     store: EpisodeStore,
     recording_id: str,
     options: AlignmentOptions,
-    tell: Progress | None = None,
+    tell: Tell | None = None,
 ) -> AlignmentReport:
     """Align one recording and write the episode.
 
@@ -36,7 +40,7 @@ def align_recording(
         store: where the recording lies and the episode goes.
         recording_id: of a finished recording.
         options: of the alignment.
-        tell: called with the progress, 0 … 1.
+        tell: called with the progress, in the caller's thread.
 
     Raises:
         NotFoundError: no such recording.
@@ -63,6 +67,37 @@ def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOp
     return episode_id_of(recording, options)
 
 
+def check_recordings(
+    store: EpisodeStore, recording_ids: Sequence[str], options: AlignmentOptions
+) -> dict[str, str]:
+    """The episode that each recording becomes, after a look at all of them.
+
+    Raises:
+        NotFoundError: no such recording; of several, the message names all that are refused.
+        InvalidInputError: one lacks what every episode needs.
+    """
+    episodes: dict[str, str] = {}
+    refused: dict[str, DexTouchError] = {}
+    for recording_id in recording_ids:
+        try:
+            episodes[recording_id] = check_recording(store, recording_id, options)
+        except (NotFoundError, InvalidInputError) as error:
+            if len(recording_ids) == 1:
+                raise
+            refused[recording_id] = error
+    if refused:
+        reasons = {recording_id: error.message for recording_id, error in refused.items()}
+        told = "; ".join(list(reasons.values())[:MAX_TOLD])
+        more = f"; and {len(reasons) - MAX_TOLD} more" if len(reasons) > MAX_TOLD else ""
+        unknown = all(isinstance(error, NotFoundError) for error in refused.values())
+        raise (NotFoundError if unknown else InvalidInputError)(
+            f"alignments: {len(reasons)} of {len(recording_ids)} recordings cannot be aligned, so "
+            f"none was begun; leave them out: {told}{more}",
+            refused=reasons,
+        )
+    return episodes
+
+
 def episode_id_of(recording: RecordingReader, options: AlignmentOptions) -> str:
     """The id of the episode that a recording becomes under these options."""
     identity = f"{ALIGNMENT_VERSION} {recording.content_sha256} {options.model_dump_json()}"
@@ -75,16 +110,13 @@ def _write(
     recording: RecordingReader,
     episode_id: str,
     options: AlignmentOptions,
-    tell: Progress,
+    tell: Tell,
 ) -> bool:
     episode = build_episode(recording, episode_id=episode_id, options=options, tell=tell)
     try:
         with store.writer(kind="episode", attributes=episode.attributes) as writer:
-            for stream in episode.streams:
-                writer.add_stream(stream.descriptor)
-                writer.append(
-                    stream.descriptor.name, values=stream.values, t_ref_ns=stream.t_ref_ns
-                )
+            _write_streams(writer, episode, tell)
+            writer.set_attributes(episode.complete_attributes())
     except ConflictError:
         # Another process was faster with the very same content.
         return False
@@ -94,5 +126,18 @@ def _write(
     return True
 
 
-def _silent(_: float) -> None:
+def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, tell: Tell) -> None:
+    """Take the samples of every stream and write them; a stream without any is left out."""
+    num_streams = len(episode.streams)
+    for number, stream in enumerate(episode.streams):
+        name, announced = stream.descriptor.name, False
+        for block in stream.blocks():
+            if not announced:
+                writer.add_stream(stream.descriptor)
+                announced = True
+            writer.append(name, values=block.values, t_ref_ns=block.t_ns)
+            tell(progress_within("writing", number / num_streams, name))
+
+
+def _silent(_: Progress) -> None:
     """Nobody asked for progress."""

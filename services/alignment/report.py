@@ -3,11 +3,13 @@
 from collections.abc import Mapping
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from dextouch.episodes import EpisodeReader
 from dextouch.schemas.episodes import ClockReport, Domain, Matrix
+from dextouch.tactile.layout import SIDES
 from services.alignment.calibration.tactile_baseline import REASONS
+from services.alignment.synchronization.refused_parts import RefusedPart, refused_parts
 
 EXPECTED_STREAMS = (
     "tactile_left",
@@ -22,8 +24,11 @@ class AlignmentReport(BaseModel):
     """What became of a recording.
 
     `created` is False where the same recording had been aligned with the same options before.
-    `absent` lists streams that an episode may have and this one has not; `refused_taxels` names, by
-    stream and reason, taxels (anatomical order) that are zero since nobody measured them.
+    `duration_s` is that of the model grid. `absent` lists streams that an episode may have and this
+    one has not; `refused_parts` the stretches of the recording that are not in the episode, and
+    why; `retargeting` figures of each hand: tip error (mean and 95th percentile, mm) and the share
+    of steps by status. `refused_taxels` names, by stream and reason, taxels (anatomical order) that
+    are zero since nobody measured them.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -33,10 +38,13 @@ class AlignmentReport(BaseModel):
     created: bool
     domain: Domain
     num_steps: int
+    duration_s: float = Field(default=0.0, ge=0)
     streams: dict[str, int]
     absent: tuple[str, ...]
     clocks: tuple[ClockReport, ...]
     quality: dict[str, FiniteFloat]
+    retargeting: dict[str, dict[str, FiniteFloat]] = {}
+    refused_parts: tuple[RefusedPart, ...] = ()
     refused_taxels: dict[str, dict[str, tuple[int, ...]]] = {}
     content_sha256: str
 
@@ -50,13 +58,27 @@ def report_of(episode: EpisodeReader, *, recording_id: str, created: bool) -> Al
         created=created,
         domain=attributes.domain,
         num_steps=episode.num_steps,
+        duration_s=episode.num_steps / attributes.model_rate_hz,
         streams={name: episode.num_samples(name) for name in episode.streams},
         absent=tuple(name for name in EXPECTED_STREAMS if name not in episode.streams),
         clocks=attributes.clocks,
         quality=attributes.quality,
+        retargeting=retargeting_figures(attributes.quality),
+        refused_parts=refused_parts(attributes.calibration),
         refused_taxels=refused_taxels(attributes.calibration),
         content_sha256=episode.content_sha256,
     )
+
+
+def retargeting_figures(quality: Mapping[str, float]) -> dict[str, dict[str, float]]:
+    """The figures of an episode's retargeting by side; empty where nothing was retargeted."""
+    found: dict[str, dict[str, float]] = {}
+    for side in SIDES:
+        prefix = f"retargeting_{side}_"
+        mine = {k.removeprefix(prefix): v for k, v in quality.items() if k.startswith(prefix)}
+        if mine:
+            found[side] = mine
+    return found
 
 
 def refused_taxels(

@@ -1,13 +1,23 @@
-"""Alignments over HTTP: start one, see where it stands."""
+"""Alignments over HTTP: start some, see where they stand, cancel one."""
+
+from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response, status
 
 from dextouch.schemas.problems import error_from_problem
 from dextouch.serving.access import RequireScope
 from services.alignment.job_table import JobTable
-from services.alignment.schemas import AlignmentJob, AlignmentList, AlignmentRequest
+from services.alignment.schemas import (
+    ENDED,
+    MAX_BATCH,
+    AlignmentJob,
+    AlignmentList,
+    AlignmentRequest,
+    JobState,
+)
 
 SCOPE = "align"
+PAGE = 100
 
 
 def alignments_router(jobs: JobTable) -> APIRouter:
@@ -21,28 +31,41 @@ def alignments_router(jobs: JobTable) -> APIRouter:
         request: AlignmentRequest,
         response: Response,
         wait: bool = Query(default=False),  # noqa: FBT001 - a query parameter
-    ) -> AlignmentJob:
-        """Start aligning a recording; asked again, the same alignment answers.
+    ) -> AlignmentJob | AlignmentList:
+        """Start aligning recordings; asked again, the same alignments answer.
 
-        With `wait=true` the answer comes when it is done (200), and a failure is the error itself.
+        `recording_id` gives one job, `recording_ids` a list of them, all taken or none. With
+        `wait=true` the answer comes when all have ended (200); the failure of a single one is then
+        the error itself.
         """
-        job = await jobs.submit(request)
+        asked = await jobs.submit(request)
         if wait:
-            job = await jobs.wait(job.alignment_id)
-            if job.problem is not None:
-                raise error_from_problem(job.problem)
-        if job.state == "done":
+            asked = tuple([await jobs.wait(job.alignment_id) for job in asked])
+        if all(job.state in ENDED for job in asked):
             response.status_code = status.HTTP_200_OK
-        return job
+        if request.recording_id is None:
+            return AlignmentList(alignments=asked, num_matching=len(asked))
+        if wait and asked[0].problem is not None:
+            raise error_from_problem(asked[0].problem)
+        return asked[0]
 
     @router.get("")
-    async def listing() -> AlignmentList:
-        """All alignments that this process knows, oldest first."""
-        return AlignmentList(alignments=jobs.all())
+    async def listing(
+        state: JobState | None = None,
+        after: str | None = None,
+        limit: Annotated[int, Query(ge=1, le=MAX_BATCH)] = PAGE,
+    ) -> AlignmentList:
+        """Alignments, oldest first, a page at a time; `after` is the last id of the page before."""
+        return jobs.page(state=state, after=after, limit=limit)
 
     @router.get("/{alignment_id}")
-    async def state(alignment_id: str) -> AlignmentJob:
+    async def one(alignment_id: str) -> AlignmentJob:
         """Where one alignment stands."""
         return jobs.get(alignment_id)
+
+    @router.post("/{alignment_id}/cancel")
+    async def cancel(alignment_id: str) -> AlignmentJob:
+        """End an alignment that waits or runs; one that is done or has failed is a conflict."""
+        return await jobs.cancel(alignment_id)
 
     return router

@@ -1,22 +1,35 @@
 """Environment and flags in (DEXTOUCH_ALIGNMENT_…), store, workers and defaults out."""
 
+import os
+from pathlib import Path
+
 from pydantic import Field
 
 from dextouch.serving.settings import ServiceSettings, service_config
 from services.alignment.options import AlignmentOptions
 
 
+def usable_cores() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0))
+
+
 class AlignmentSettings(ServiceSettings):
     """Which store is read and written, and what happens to recordings.
 
-    `store_url` is the folder that the episode store writes to; `options` are the defaults of a
-    request; `num_workers` alignments run at once, `max_waiting` more may wait.
+    `store_url` is the folder that the episode store writes to; `jobs_folder` holds what was asked,
+    beside the store if not given; `options` are the defaults of a request; `num_workers`
+    alignments run at once, each in a process of its own (as many as processors if not given),
+    `max_waiting` more may wait, `max_kept` are remembered; a job whose process died `max_attempts`
+    times is failed.
     """
 
     model_config = service_config("alignment")
 
     store_url: str = Field(default="data/store", min_length=1)
+    jobs_folder: Path | None = None
     options: AlignmentOptions = AlignmentOptions()
-    num_workers: int = Field(default=1, ge=1, le=64)
-    max_waiting: int = Field(default=256, ge=1, le=100_000)
-    max_kept: int = Field(default=1000, ge=1, le=100_000)
+    num_workers: int = Field(default_factory=usable_cores, ge=1, le=64)
+    max_waiting: int = Field(default=10_000, ge=1, le=100_000)
+    max_kept: int = Field(default=10_000, ge=1, le=100_000)
+    max_attempts: int = Field(default=3, ge=1, le=100)

@@ -98,17 +98,9 @@ class TactileCalibration:
         Args:
             counts: [T, cells] raw readings of the glove; NaN where it sent none.
         """
-        taxels, reasons = self._taxels(counts), self.state.copy()
-        if len(taxels) < MIN_SAMPLES_TO_JUDGE:
-            return reasons
-        missing = 1.0 - np.isfinite(taxels).mean(axis=0)
-        reasons[(reasons == OK) & (missing > MAX_MISSING)] = ABSENT
-        first = taxels[0].astype(np.float64)
-        still = taxels.min(axis=0) == taxels.max(axis=0)
-        offset_kpa = np.abs(first - self.tare_counts[self.cells]) / self._gains()
-        silent = (reasons == OK) & still & (offset_kpa > DEAD_OFFSET_KPA)
-        reasons[silent] = np.where(first[silent] == 0, DEAD, STUCK)
-        return reasons
+        survey = TaxelSurvey(self)
+        survey.add(counts)
+        return survey.refused()
 
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
@@ -123,13 +115,17 @@ class TactileCalibration:
         Raises:
             ShapeError: not [T, cells].
         """
-        offsets = self._taxels(counts).astype(np.float64) - self.tare_counts[self.cells]
-        taxels = np.maximum(offsets / self._gains(), 0.0)
+        offsets = self.taxels(counts).astype(np.float64) - self.tare_counts[self.cells]
+        taxels = np.maximum(offsets / self.gains(), 0.0)
         taxels[:, (self.state if refused is None else refused) != OK] = 0.0
         return taxels.astype(np.float32)
 
-    def _taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time 320"]:
-        """Readings by taxel; where there is no cell, those of any other."""
+    def taxels(self, counts: np.ndarray) -> Shaped[np.ndarray, "time 320"]:
+        """Readings [T, cells] by taxel; where there is no cell, those of any other.
+
+        Raises:
+            ShapeError: not [T, cells].
+        """
         raw = np.asarray(counts)
         if raw.ndim != 2 or raw.shape[1] != len(self.tare_counts):
             raise ShapeError(
@@ -138,9 +134,56 @@ class TactileCalibration:
             )
         return raw[:, self.cells]
 
-    def _gains(self) -> Float64[np.ndarray, "320"]:
+    def gains(self) -> Float64[np.ndarray, "320"]:
         """Gains by taxel; 1 where the taxel is refused and its gain says nothing."""
         return np.where(self.state == OK, self.gain_counts_per_kpa[self.cells], 1.0)
+
+
+class TaxelSurvey:
+    """What `refused_taxels` must know of a take, gathered piece by piece.
+
+    Args:
+        calibration: of the glove.
+    """
+
+    def __init__(self, calibration: TactileCalibration) -> None:
+        self._calibration = calibration
+        self._first: np.ndarray | None = None
+        self._low = self._high = np.zeros(NUM_TAXELS)
+        self._num_finite = np.zeros(NUM_TAXELS, dtype=np.int64)
+        self._num_samples = 0
+
+    def add(self, counts: np.ndarray) -> None:
+        """Take in consecutive raw readings [T, cells].
+
+        Raises:
+            ShapeError: not [T, cells].
+        """
+        taxels = self._calibration.taxels(counts)
+        if not len(taxels):
+            return
+        low, high = taxels.min(axis=0), taxels.max(axis=0)
+        if self._first is None:
+            self._first, self._low, self._high = taxels[0].astype(np.float64), low, high
+        else:
+            self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
+        self._num_finite += np.isfinite(taxels).sum(axis=0)
+        self._num_samples += len(taxels)
+
+    def refused(self) -> UInt8[np.ndarray, "320"]:
+        """Why each taxel is not measured in all that was added; see `refused_taxels`."""
+        calibration = self._calibration
+        reasons = calibration.state.copy()
+        if self._first is None or self._num_samples < MIN_SAMPLES_TO_JUDGE:
+            return reasons
+        missing = 1.0 - self._num_finite / self._num_samples
+        reasons[(reasons == OK) & (missing > MAX_MISSING)] = ABSENT
+        still = self._low == self._high
+        tare_counts = calibration.tare_counts[calibration.cells]
+        offset_kpa = np.abs(self._first - tare_counts) / calibration.gains()
+        silent = (reasons == OK) & still & (offset_kpa > DEAD_OFFSET_KPA)
+        reasons[silent] = np.where(self._first[silent] == 0, DEAD, STUCK)
+        return reasons
 
 
 def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:

@@ -1,10 +1,9 @@
-"""A recording in, an episode on one reference clock out, not yet written anywhere."""
+"""A recording in, an episode on one reference clock out, whose samples come while it is written."""
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Int64, Shaped
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import (
@@ -15,6 +14,11 @@ from dextouch.schemas.episodes import (
 from dextouch.streams.descriptors import StreamDescriptor
 from services.alignment.calibration.lens_record import check_lenses
 from services.alignment.options import AlignmentOptions
+from services.alignment.synchronization.episode_streams import (
+    EpisodeStream,
+    cut_stream,
+    made_stream,
+)
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
     REQUIRED,
@@ -23,10 +27,18 @@ from services.alignment.synchronization.grid_actions import (
     make_actions,
     place_streams,
 )
+from services.alignment.synchronization.progress import Tell, progress_within
 from services.alignment.synchronization.recorded_streams import (
-    AlignedStream,
+    DatedStream,
+    LoadedStream,
     Recording,
-    read_stream,
+    date_stream,
+)
+from services.alignment.synchronization.refused_parts import (
+    RefusedPart,
+    refused_edges,
+    refused_matrices,
+    refused_stretches,
 )
 from services.alignment.synchronization.resampling import (
     EDGE_PERIODS,
@@ -35,27 +47,28 @@ from services.alignment.synchronization.resampling import (
     longest_run,
 )
 
-Progress = Callable[[float], None]
-# How much of the work is done when all streams are read, and when the actions are made.
-READING_SHARE = 0.5
-BUILT_SHARE = 0.8
-
-
-@dataclass(frozen=True)
-class EpisodeStream:
-    """One stream ready to be written."""
-
-    descriptor: StreamDescriptor
-    t_ref_ns: Int64[np.ndarray, " n"]
-    values: Shaped[np.ndarray, "n ..."]
-
 
 @dataclass(frozen=True)
 class BuiltEpisode:
-    """Attributes and streams of an episode."""
+    """Attributes and streams of an episode; `complete_attributes` once all streams were taken."""
 
     attributes: EpisodeAttributes
     streams: tuple[EpisodeStream, ...]
+
+    def complete_attributes(self) -> EpisodeAttributes:
+        """The attributes with the figures that are known when every block was made."""
+        found = {name: n for stream in self.streams for name, n in stream.quality.items()}
+        return self.attributes.model_copy(update={"quality": self.attributes.quality | found})
+
+
+@dataclass(frozen=True)
+class _Stretch:
+    """What of a recording becomes the episode: valid steps, and why the others do not."""
+
+    gridded: GriddedStreams
+    origin_ns: int
+    num_refused: int
+    refused: list[RefusedPart]
 
 
 def build_episode(
@@ -63,51 +76,81 @@ def build_episode(
     *,
     episode_id: str,
     options: AlignmentOptions,
-    tell: Progress = lambda _: None,
+    tell: Tell = lambda _: None,
 ) -> BuiltEpisode:
     """Date all streams, find the longest stretch without a gap, and put actions on its grid.
 
     Streams that the recording lacks are left out. Time 0 of the episode is the first moment at
-    which all streams that make up the action are there.
+    which all streams that make up the action are there. Values of other streams are read only
+    while the episode's blocks are taken.
 
     Raises:
         InvalidInputError: streams or calibration that every episode needs are missing, or no
             stretch without a gap is long enough.
         ClockFitError: a stream whose stamps fit no clock.
     """
-    attributes = recording.attributes
     check_complete(recording)
     streams = {}
     for number, name in enumerate(recording.streams):
-        tell(READING_SHARE * number / len(recording.streams))
-        streams[name] = read_stream(recording, name)
-    tell(READING_SHARE)
-    names = [*REQUIRED[attributes.domain], *COMMANDED_STREAMS]
-    parts = {name: _seen(streams[name]) for name in names if name in streams}
+        tell(progress_within("dating", number / len(recording.streams), name))
+        streams[name] = date_stream(recording, name)
+    stretch = _find_stretch(recording, streams, options, tell)
+    tell(progress_within("retargeting", 0.0))
+    actions = make_actions(stretch.gridded, recording.attributes.domain)
+    tell(progress_within("writing", 0.0))
+    origin_ns = stretch.origin_ns
+    grid_ns = stretch.gridded.grid_ns - stretch.gridded.grid_ns[0]
+    written = [
+        *_action_streams(actions, grid_ns, options),
+        *(cut_stream(stream, origin_ns, int(grid_ns[-1])) for stream in streams.values()),
+    ]
+    quality = {
+        "num_steps_refused": float(stretch.num_refused),
+        "origin_after_start_ns": float(origin_ns - (recording.attributes.started_t_host_ns or 0)),
+        **_stream_quality(streams, options),
+        **actions.quality,
+    }
+    attributes = _episode_attributes(recording, episode_id, actions, streams, quality)
+    more = {
+        "model_rate_hz": options.model_rate_hz,
+        "calibration": attributes.calibration | refused_matrices(stretch.refused),
+    }
+    return BuiltEpisode(attributes.model_copy(update=more), tuple(written))
+
+
+def _find_stretch(
+    recording: Recording,
+    streams: Mapping[str, DatedStream],
+    options: AlignmentOptions,
+    tell: Tell,
+) -> _Stretch:
+    """Load the streams that actions are made of and choose the longest stretch that all share."""
+    attributes = recording.attributes
+    names = [n for n in (*REQUIRED[attributes.domain], *COMMANDED_STREAMS) if n in streams]
+    parts = {}
+    for number, name in enumerate(names):
+        tell(progress_within("placing", number / len(names), name))
+        parts[name] = _seen(streams[name].load())
     origin_ns, gridded = _common_stretch(parts, options, attributes.recording_id)
     run = longest_run(gridded.valid)
     if run[1] - run[0] < options.min_num_steps:
         raise InvalidInputError(_too_short(gridded, run, options, attributes.recording_id))
     chosen = _slice(gridded, run)
-    actions = make_actions(chosen, attributes.domain)
-    tell(BUILT_SHARE)
-    origin_ns += int(chosen.grid_ns[0])
-    grid_ns = chosen.grid_ns - chosen.grid_ns[0]
-    written = [
-        *_action_streams(actions, grid_ns, options),
-        *(_cut(stream.complete(), origin_ns, int(grid_ns[-1])) for stream in streams.values()),
-    ]
-    quality = {
-        "num_steps_refused": float(len(gridded.valid) - len(grid_ns)),
-        "origin_after_start_ns": float(origin_ns - (attributes.started_t_host_ns or 0)),
-        **_stream_quality(streams, options),
-        **actions.quality,
-    }
-    return BuiltEpisode(
-        _episode_attributes(recording, episode_id, actions, streams, quality).model_copy(
-            update={"model_rate_hz": options.model_rate_hz}
-        ),
-        tuple(stream for stream in written if len(stream.t_ref_ns)),
+    start_ns = attributes.started_t_host_ns
+    if start_ns is None:
+        start_ns = min(int(stream.t_ns[0]) for stream in parts.values())
+    edges = refused_edges(
+        {name: int(stream.t_ns[0]) for name, stream in parts.items()},
+        {name: int(stream.t_ns[-1]) for name, stream in parts.items()},
+        start_ns,
+    )
+    valid = {name: place.valid for name, place in gridded.at.items()}
+    inner = refused_stretches(gridded.grid_ns + origin_ns, valid, run, start_ns)
+    return _Stretch(
+        chosen,
+        origin_ns + int(chosen.grid_ns[0]),
+        len(gridded.valid) - len(chosen.valid),
+        [*edges, *inner],
     )
 
 
@@ -115,7 +158,7 @@ def _episode_attributes(
     recording: Recording,
     episode_id: str,
     actions: GridActions,
-    streams: Mapping[str, AlignedStream],
+    streams: Mapping[str, DatedStream],
     quality: dict[str, float],
 ) -> EpisodeAttributes:
     source = recording.attributes
@@ -166,16 +209,22 @@ def check_complete(recording: Recording) -> None:
     check_lenses(attributes.calibration, recording.streams, where=where)
 
 
-def _seen(stream: AlignedStream) -> AlignedStream:
+def _seen(stream: LoadedStream) -> LoadedStream:
     """Without samples that show nothing at all; single missing keypoints stay."""
-    if stream.descriptor.kind != "keypoints":
-        return stream.complete()
-    anything = np.isfinite(stream.values).all(axis=-1).any(axis=-1)
-    return replace(stream, t_ns=stream.t_ns[anything], values=stream.values[anything])
+    if stream.values.dtype.kind != "f":
+        return stream
+    finite = np.isfinite(stream.values)
+    if stream.descriptor.kind == "keypoints":
+        useful = finite.all(axis=-1).any(axis=-1)
+    else:
+        useful = finite.reshape(len(finite), -1).all(axis=1)
+    if useful.all():
+        return stream
+    return LoadedStream(stream.descriptor, stream.t_ns[useful], stream.values[useful])
 
 
 def _common_stretch(
-    parts: Mapping[str, AlignedStream], options: AlignmentOptions, recording_id: str
+    parts: Mapping[str, LoadedStream], options: AlignmentOptions, recording_id: str
 ) -> tuple[int, GriddedStreams]:
     """The first common moment on the host's clock, and the streams on a grid that starts there."""
     empty = [name for name, stream in parts.items() if len(stream.t_ns) < 2]
@@ -190,13 +239,12 @@ def _common_stretch(
     )
     num_steps = int(max(stop_ns - start_ns, 0) * 1e-9 * options.model_rate_hz) + 1
     # Relative to the origin from here on: int64 stays exact, floats stay small.
-    moved = {name: _moved(stream, start_ns) for name, stream in parts.items()}
+    moved = {
+        name: LoadedStream(stream.descriptor, stream.t_ns - start_ns, stream.values)
+        for name, stream in parts.items()
+    }
     grid_ns = grid_times_ns(num_steps, options.model_rate_hz)
     return start_ns, place_streams(moved, grid_ns, max_gap_ns=options.max_gap_ns)
-
-
-def _moved(stream: AlignedStream, origin_ns: int) -> AlignedStream:
-    return replace(stream, t_ns=stream.t_ns - origin_ns)
 
 
 def _slice(gridded: GriddedStreams, run: tuple[int, int]) -> GriddedStreams:
@@ -208,38 +256,25 @@ def _slice(gridded: GriddedStreams, run: tuple[int, int]) -> GriddedStreams:
     return GriddedStreams(gridded.grid_ns[part], gridded.streams, at, gridded.valid[part])
 
 
-def _cut(stream: AlignedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
-    """The samples of the episode's time, with the neighbours that its ends need."""
-    margin_ns = round(EDGE_PERIODS * stream.descriptor.period_ns())
-    t_ref_ns = stream.t_ns - origin_ns
-    inside = (t_ref_ns >= -margin_ns) & (t_ref_ns <= last_ns + margin_ns)
-    return EpisodeStream(stream.descriptor, t_ref_ns[inside], stream.values[inside])
-
-
 def _action_streams(
     actions: GridActions, grid_ns: np.ndarray, options: AlignmentOptions
-) -> list[EpisodeStream]:
+) -> Iterator[EpisodeStream]:
     kinds = {"action": actions.measured, "action_commanded": actions.commanded}
-    return [
-        EpisodeStream(
-            StreamDescriptor(
+    for name, values in kinds.items():
+        if values is not None:
+            descriptor = StreamDescriptor(
                 name=name,
                 kind="robot_state",
                 shape=(67,),
                 dtype="float64",
                 unit="action",
                 nominal_rate_hz=options.model_rate_hz,
-            ),
-            grid_ns,
-            values,
-        )
-        for name, values in kinds.items()
-        if values is not None
-    ]
+            )
+            yield made_stream(descriptor, grid_ns, values)
 
 
 def _stream_quality(
-    streams: Mapping[str, AlignedStream], options: AlignmentOptions
+    streams: Mapping[str, DatedStream], options: AlignmentOptions
 ) -> dict[str, float]:
     quality: dict[str, float] = {}
     for name, stream in streams.items():
@@ -247,9 +282,6 @@ def _stream_quality(
         quality[f"{name}_num_gaps"] = float((np.diff(stream.t_ns) > options.max_gap_ns).sum())
         if stream.timing.num_steps:
             quality[f"{name}_num_clock_steps"] = float(stream.timing.num_steps)
-        incomplete = len(stream.t_ns) - len(stream.complete().t_ns)
-        if incomplete:
-            quality[f"{name}_num_incomplete"] = float(incomplete)
     return quality
 
 

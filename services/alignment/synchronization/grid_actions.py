@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
-from dextouch.hands.robot_hand import NUM_JOINTS
 from dextouch.schemas.episodes import Domain
 from dextouch.tactile.layout import SIDES
-from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetStatus
-from services.alignment.synchronization.recorded_streams import AlignedStream
+from services.alignment.synchronization.hand_joints import retarget_hands
+from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import (
     GridPlacement,
     place_on_grid,
@@ -35,7 +34,7 @@ class GriddedStreams:
     """
 
     grid_ns: Int64[np.ndarray, " n"]
-    streams: Mapping[str, AlignedStream]
+    streams: Mapping[str, LoadedStream]
     at: Mapping[str, GridPlacement]
     valid: Bool[np.ndarray, " n"]
 
@@ -51,7 +50,7 @@ class GridActions:
 
 
 def place_streams(
-    streams: Mapping[str, AlignedStream], grid_ns: np.ndarray, *, max_gap_ns: int
+    streams: Mapping[str, LoadedStream], grid_ns: np.ndarray, *, max_gap_ns: int
 ) -> GriddedStreams:
     """Find every stream's neighbours of every step."""
     at = {
@@ -75,7 +74,8 @@ def make_actions(gridded: GriddedStreams, domain: Domain) -> GridActions:
     """
     left, right, head = (_poses(gridded, name) for name in POSE_STREAMS)
     if domain == "human":
-        joints, quality = _retargeted_joints(gridded)
+        hands = retarget_hands(gridded.streams, gridded.at)
+        joints, quality = hands.joints_rad, hands.quality
     else:
         joints, quality = _joints(gridded, "joints_measured"), {}
     trajectory = _trajectory((left, right, head), joints)
@@ -102,20 +102,3 @@ def _poses(gridded: GriddedStreams, name: str) -> Float64[np.ndarray, "n 4 4"]:
 
 def _joints(gridded: GriddedStreams, name: str) -> Float64[np.ndarray, "n 40"]:
     return vectors_on_grid(gridded.streams[name].values, gridded.at[name])
-
-
-def _retargeted_joints(
-    gridded: GriddedStreams,
-) -> tuple[Float64[np.ndarray, "n 40"], dict[str, float]]:
-    joints = np.empty((len(gridded.grid_ns), 2 * NUM_JOINTS))
-    quality = {}
-    for index, side in enumerate(SIDES):
-        name = f"keypoints_{side}"
-        keypoints_m = vectors_on_grid(gridded.streams[name].values, gridded.at[name])
-        result = HandRetargeter(side).retarget(keypoints_m)
-        joints[:, index * NUM_JOINTS : (index + 1) * NUM_JOINTS] = result.joints_rad
-        unsolved = result.status != RetargetStatus.SOLVED
-        quality[f"retargeting_{side}_num_steps_not_solved"] = float(unsolved.sum())
-        errors_m = result.tip_error_m[result.solved]
-        quality[f"retargeting_{side}_tip_error_mm"] = float(errors_m.mean() * 1e3)
-    return joints, quality

@@ -1,6 +1,12 @@
-"""A recording in, its streams dated on the host's clock and converted to episode units out."""
+"""A recording in, its streams dated on the host's clock and converted to episode units out.
 
-from dataclasses import dataclass, field, replace
+Stamps are read whole, values only where they are asked for, in pieces: an hour of images or
+pressures never lies in memory at once.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -13,7 +19,11 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS
-from services.alignment.calibration.tactile_baseline import REASONS, TactileCalibration
+from services.alignment.calibration.tactile_baseline import (
+    REASONS,
+    TactileCalibration,
+    TaxelSurvey,
+)
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 
 # Where the tracked body sits in what the tracker follows, by stream.
@@ -22,6 +32,10 @@ MOUNTS = {
     "wrist_right": "T_tracker_right_wrist_right",
     "head": "T_tracker_head_camera_head",
 }
+# Bytes of values that are read at once, as the episode holds them.
+PIECE_BYTES = 16 << 20
+# From raw values to those of the episode.
+Conversion = Callable[[np.ndarray], np.ndarray]
 
 
 @runtime_checkable
@@ -40,23 +54,46 @@ class Recording(Protocol):
     def content_sha256(self) -> str:
         """Content hash."""
 
-    def read(self, name: str) -> SampleBatch:
-        """All samples of a stream."""
+    def stamps(self, name: str) -> SampleBatch:
+        """All stamps of a stream, without values."""
+
+    def values(self, name: str, start: int, stop: int) -> np.ndarray:
+        """Values of samples start … stop−1, images decoded."""
+
+    def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
+        """Images start … stop−1 of a `jpeg` or `h264` stream as they are stored."""
 
 
 @dataclass(frozen=True)
-class AlignedStream:
-    """One stream on a common clock, in the units of an episode.
+class Block:
+    """Consecutive samples of one stream as the episode holds them; finite."""
 
-    `values` may hold NaN (keypoints that were not seen); `quality` are figures for the record, and
-    `calibration` matrices that the episode carries beside those of the recording.
-    """
+    t_ns: Int64[np.ndarray, " n"]
+    values: Shaped[np.ndarray, "n ..."]
+
+
+@dataclass(frozen=True)
+class LoadedStream:
+    """A stream with all its values; they may hold NaN (keypoints that were not seen)."""
 
     descriptor: StreamDescriptor
     t_ns: Int64[np.ndarray, " n"]
     values: Shaped[np.ndarray, "n ..."]
+
+
+@dataclass(frozen=True)
+class DatedStream:
+    """One stream on the host's clock whose values are read when they are asked for.
+
+    `descriptor` is that of the episode; `quality` are figures for the record, and `calibration`
+    matrices that the episode carries beside those of the recording.
+    """
+
+    recording: Recording
+    descriptor: StreamDescriptor
     timing: TimedStream
-    quality: dict[str, float]
+    convert: Conversion
+    quality: dict[str, float] = field(default_factory=dict)
     calibration: dict[str, Matrix] = field(default_factory=dict)
 
     @property
@@ -64,43 +101,64 @@ class AlignedStream:
         """The stream's name."""
         return self.descriptor.name
 
-    def complete(self) -> "AlignedStream":
-        """Without samples that hold NaN or infinity."""
-        if self.values.dtype.kind != "f":
-            return self
-        whole = np.isfinite(self.values).reshape(len(self.values), -1).all(axis=1)
-        return replace(self, t_ns=self.t_ns[whole], values=self.values[whole])
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """Times of all samples that have one of their own, on the host's clock."""
+        return self.timing.t_host_ns
+
+    def pieces(self, first: int = 0, stop: int | None = None) -> Iterator[Block]:
+        """Samples first … stop−1 of those that have a time, in pieces; values may hold NaN."""
+        kept = self.timing.kept[first:stop]
+        t_ns = self.t_ns[first:stop]
+        rows = piece_rows(self.descriptor)
+        for low in range(0, len(kept), rows):
+            part = kept[low : low + rows]
+            start = int(part[0])
+            raw = self.recording.values(self.name, start, int(part[-1]) + 1)
+            if len(raw) != len(part):
+                raw = raw[part - start]
+            yield Block(t_ns[low : low + rows], self.convert(raw))
+
+    def load(self) -> LoadedStream:
+        """All samples at once: for the streams that actions are made of."""
+        pieces = [piece.values for piece in self.pieces()]
+        empty = np.empty((0, *self.descriptor.shape), dtype=self.descriptor.numpy_dtype())
+        values = np.concatenate(pieces) if pieces else empty
+        return LoadedStream(self.descriptor, self.t_ns, values)
 
 
-def read_stream(recording: Recording, name: str) -> AlignedStream:
-    """Read, date and convert one stream.
+def piece_rows(descriptor: StreamDescriptor) -> int:
+    """How many samples of a stream are read at once."""
+    row_bytes = int(np.prod(descriptor.shape)) * descriptor.numpy_dtype().itemsize
+    return max(1, PIECE_BYTES // max(row_bytes, 1))
+
+
+def date_stream(recording: Recording, name: str) -> DatedStream:
+    """Read the stamps of one stream, date them and find how its values become the episode's.
 
     Raises:
         ClockFitError: its stamps fit no clock.
         InvalidInputError: calibration is missing or of the wrong shape.
         UnknownNameError: the recording has no such stream.
     """
-    descriptor, batch = recording.streams[name], recording.read(name)
-    calibration = recording.attributes.calibration
+    descriptor, calibration = recording.streams[name], recording.attributes.calibration
     latency_ns = _nanoseconds(calibration, f"{name}_latency_ns")
     timing = time_stream(
-        batch,
+        recording.stamps(name),
         descriptor,
         latency_ns=round(latency_ns or 0.0),
         latency_sigma_ns=_nanoseconds(calibration, f"{name}_latency_sigma_ns"),
     )
-    values = batch.values[timing.kept]
+    convert: Conversion = _as_it_is
     if descriptor.kind == "tactile" and descriptor.unit != "kPa":
-        raw = AlignedStream(descriptor, timing.t_host_ns, values, timing, {})
+        raw = DatedStream(recording, descriptor, timing, _as_it_is)
         return _pressures(raw, calibration)
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
-        values = values.astype(np.float64)
+        convert = _as_float64
     elif descriptor.kind == "pose" and MOUNTS.get(name) in calibration:
-        values = _move_to_body(values, calibration[MOUNTS[name]])
-    elif descriptor.kind == "image":
-        descriptor = descriptor.model_copy(update={"unit": "rgb8"})
-    return AlignedStream(descriptor, timing.t_host_ns, values, timing, {})
+        convert = partial(_move_to_body, T_tracker_body=_mount(calibration[MOUNTS[name]]))
+    return DatedStream(recording, descriptor, timing, convert)
 
 
 def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
@@ -113,37 +171,53 @@ def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
     return float(matrix[0][0])
 
 
-def _pressures(stream: AlignedStream, calibration: dict[str, Matrix]) -> AlignedStream:
+def _as_it_is(values: np.ndarray) -> np.ndarray:
+    return values
+
+
+def _as_float64(values: np.ndarray) -> np.ndarray:
+    return values.astype(np.float64)
+
+
+def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
     """Raw readings of any maker's glove as kPa; what is not measured is zero, named and counted."""
-    name, side = stream.name, stream.descriptor.side
+    name, side = raw.name, raw.descriptor.side
     if side is None:
         raise InvalidInputError(f"stream {name!r}: has no side, expected left or right")
-    if len(stream.descriptor.shape) != 1:
+    if len(raw.descriptor.shape) != 1:
         raise InvalidInputError(
-            f"stream {name!r}: got samples of {stream.descriptor.shape}, expected a row of cells"
+            f"stream {name!r}: got samples of {raw.descriptor.shape}, expected a row of cells"
         )
-    num_cells = stream.descriptor.shape[0]
+    num_cells = raw.descriptor.shape[0]
     glove = TactileCalibration.from_record(calibration, side, num_cells=num_cells)
-    refused = glove.refused_taxels(stream.values)
+    survey = TaxelSurvey(glove)
+    for piece in raw.pieces():
+        survey.add(piece.values)
+    refused = survey.refused()
     numbers = np.bincount(refused, minlength=len(REASONS)).tolist()
     counted = {
         f"{name}_num_{reason}_taxels": float(number)
         for reason, number in zip(REASONS[1:], numbers[1:], strict=True)
         if number
     }
-    return replace(
-        stream,
-        descriptor=stream.descriptor.model_copy(
+    return DatedStream(
+        raw.recording,
+        raw.descriptor.model_copy(
             update={"shape": (NUM_TAXELS,), "dtype": "float32", "unit": "kPa"}
         ),
-        values=glove.to_kpa(stream.values, refused=refused),
+        raw.timing,
+        partial(glove.to_kpa, refused=refused),
         quality={f"{name}_num_refused_taxels": float(np.count_nonzero(refused))} | counted,
         calibration={f"{name}_refused_taxels": matrix_rows(refused[None].astype(np.float64))},
     )
 
 
-def _move_to_body(poses: np.ndarray, mount: Matrix) -> np.ndarray:
-    T_tracker_body = np.array(mount)
+def _mount(rows: Matrix) -> np.ndarray:
+    T_tracker_body = np.array(rows)
     if T_tracker_body.shape != (4, 4):
         raise InvalidInputError(f"calibration: a mount is {T_tracker_body.shape}, expected (4, 4)")
+    return T_tracker_body
+
+
+def _move_to_body(poses: np.ndarray, *, T_tracker_body: np.ndarray) -> np.ndarray:
     return pose_from_transform(transform_from_pose(poses) @ T_tracker_body)

@@ -65,13 +65,14 @@ def poses_on_grid(poses: np.ndarray, at: GridPlacement) -> Float64[np.ndarray, "
     return interpolate_poses(transform_from_pose(poses), at.left, at.weight)
 
 
-def longest_run(valid: np.ndarray) -> tuple[int, int]:
-    """First and one past the last index of the longest stretch of True; (0, 0) if there is none."""
+def runs_of(valid: np.ndarray) -> list[tuple[int, int]]:
+    """First and one past the last index of every stretch of True, in order."""
     edges = np.flatnonzero(
         np.diff(np.concatenate([[False], np.asarray(valid, dtype=bool), [False]]))
     )
-    runs = edges.reshape(-1, 2)
-    if not len(runs):
-        return 0, 0
-    start, stop = runs[np.argmax(runs[:, 1] - runs[:, 0])]
-    return int(start), int(stop)
+    return [(int(start), int(stop)) for start, stop in edges.reshape(-1, 2)]
+
+
+def longest_run(valid: np.ndarray) -> tuple[int, int]:
+    """First and one past the last index of the longest stretch of True; (0, 0) if there is none."""
+    return max(runs_of(valid), key=lambda run: run[1] - run[0], default=(0, 0))

@@ -46,6 +46,35 @@ class RecordingReader(GroupReader[RecordingAttributes]):
         )
         return SampleBatch(t_host_ns, t_device_ns, sequence, self._values(name, low, high))
 
+    def stamps(self, name: str) -> SampleBatch:
+        """All stamps of a stream, without the values (which are [n, 0] here).
+
+        Raises:
+            UnknownNameError: no such stream.
+            CorruptDataError: damaged bytes.
+        """
+        t_host_ns = self.stamps_ns(name).copy()
+        # Not kept as the first column is: nobody asks for them twice.
+        t_device_ns, sequence = (
+            self._contents.shard(f"{name}_{stamp}").read() for stamp in STAMPS["recording"][1:]
+        )
+        return SampleBatch(t_host_ns, t_device_ns, sequence, np.empty((len(t_host_ns), 0)))
+
+    def values(self, name: str, start: int, stop: int) -> np.ndarray:
+        """Values of samples start … stop−1; images come decoded.
+
+        Raises:
+            UnknownNameError: no such stream.
+            InvalidInputError: samples outside the stream.
+            CorruptDataError: damaged bytes.
+        """
+        if not 0 <= start <= stop <= self.num_samples(name):
+            raise InvalidInputError(
+                f"{self._what}: got samples {start} … {stop} of {name!r}, expected within "
+                f"0 … {self.num_samples(name)}"
+            )
+        return self._values(name, start, stop)
+
 
 class EpisodeReader(GroupReader[EpisodeAttributes]):
     """An episode: streams on one reference clock, actions on the model grid."""

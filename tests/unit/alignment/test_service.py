@@ -1,83 +1,138 @@
-"""Alignments over HTTP and from the shell: started once, told, refused with a reason."""
+"""Alignments over HTTP: started once, told, listed, cancelled, refused with a reason."""
 
-import json
+import asyncio
 import threading
 
-import numpy as np
 import pytest
 from httpx import ASGITransport, AsyncClient
 
 from dextouch.episodes import EpisodeStore
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.errors import ConflictError, UnavailableError
 from services.alignment import job_table
-from services.alignment.__main__ import main
 from services.alignment.app import create_app
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentSettings
+from services.alignment.synchronization.progress import Progress
+from tests.unit.alignment.recordings import write_recording
 
-K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
-POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
+
+class FakeWorker:
+    """Aligns in its thread; the test can hold it back, or let it die."""
+
+    held = threading.Event()
+    dies = False
+
+    def __init__(self, store_url):
+        self._store = EpisodeStore(store_url)
+        self._killed, self._talking = threading.Event(), threading.Lock()
+
+    def start(self):
+        pass
+
+    def run(self, recording_id, options, tell):
+        with self._talking:
+            tell(Progress(0.25, "dating", "head"))
+            while not type(self).held.wait(0.005) and not self._killed.is_set():
+                pass
+            if self._killed.is_set():
+                raise UnavailableError("the process died")
+            if type(self).dies:
+                raise UnavailableError("the process that aligned it died (killed)")
+            return align_recording(self._store, recording_id, options, tell)
+
+    def stop(self):
+        self._killed.set()
+        with self._talking:
+            self._killed.clear()
 
 
-def write_recording(store, recording_id, *, streams=("wrist_left", "wrist_right", "head")):
-    attributes = RecordingAttributes(
-        recording_id=recording_id,
-        task="stand-bottle",
-        instruction="",
-        domain="robot",
-        station="test",
-        calibration={"K_head": K_HEAD},
-    )
-    t_host_ns = np.arange(200, dtype=np.int64) * 10_000_000 + 10**12
-    with store.writer(kind="recording", attributes=attributes) as writer:
-        for name in (*streams, "joints_measured"):
-            row = POSE if name != "joints_measured" else np.full(40, 0.25)
-            stream = StreamDescriptor(
-                name=name,
-                kind="pose" if len(row) == 7 else "robot_state",
-                shape=row.shape,
-                dtype="float64",
-                unit="pose_m_wxyz" if len(row) == 7 else "rad",
-                nominal_rate_hz=100,
-            )
-            writer.add_stream(stream)
-            values = np.repeat(row[None], len(t_host_ns), axis=0)
-            writer.append(name, values=values, t_host_ns=t_host_ns, t_device_ns=t_host_ns - 10**11)
+@pytest.fixture
+def worker(monkeypatch):
+    kind = type("Worker", (FakeWorker,), {"held": threading.Event()})
+    kind.held.set()
+    monkeypatch.setattr(job_table, "AlignmentWorker", kind)
+    return kind
 
 
 @pytest.fixture
 def store(tmp_path):
     store = EpisodeStore(tmp_path / "store")
     write_recording(store, "take")
+    write_recording(store, "other")
     write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
     return store
 
 
 @pytest.fixture
-def client(store):
-    app = create_app(AlignmentSettings(store_url=str(store.root)))
-    transport = ASGITransport(app, raise_app_exceptions=False)
-    return AsyncClient(transport=transport, base_url="http://alignment")
+def serve(store, worker):
+    """Opens the service as often as a test wants to."""
+
+    class Service:
+        def __init__(self, **settings):
+            self._app = create_app(AlignmentSettings(store_url=str(store.root), **settings))
+
+        async def __aenter__(self):
+            self._lifespan = self._app.router.lifespan_context(self._app)
+            await self._lifespan.__aenter__()
+            transport = ASGITransport(self._app, raise_app_exceptions=False)
+            self.client = AsyncClient(transport=transport, base_url="http://alignment")
+            return self.client
+
+        async def __aexit__(self, *error):
+            await self.client.aclose()
+            await self._lifespan.__aexit__(None, None, None)
+
+    return Service
 
 
-async def test_alignment_runs_once_and_is_told(client, store):
-    started = await client.post("/v1/alignments", json={"recording_id": "take"})
-    assert started.status_code == 202
-    done = await client.post("/v1/alignments?wait=true", json={"recording_id": "take"})
-    assert (done.status_code, done.json()["state"], done.json()["progress"]) == (200, "done", 1.0)
-    alignment_id = started.json()["alignment_id"]
-    again = await client.get(f"/v1/alignments/{alignment_id}")
-    assert again.json() == done.json()
-    assert len((await client.get("/v1/alignments")).json()["alignments"]) == 1
-    assert store.list(kind="episode") == [alignment_id] == [again.json()["report"]["episode_id"]]
-    assert again.json()["report"]["num_steps"] == store.open(alignment_id).num_steps
+async def poll(client, alignment_id, wanted):
+    for _ in range(2000):
+        job = (await client.get(f"/v1/alignments/{alignment_id}")).json()
+        if wanted(job):
+            return job
+        await asyncio.sleep(0.005)
+    raise AssertionError(job)
 
 
-async def test_other_options_are_another_episode(client, store):
-    for rate_hz in (15, 30):
-        body = {"recording_id": "take", "options": {"model_rate_hz": rate_hz}}
-        assert (await client.post("/v1/alignments?wait=true", json=body)).status_code == 200
+async def test_alignment_runs_once_and_is_told(serve, store):
+    async with serve() as client:
+        started = await client.post("/v1/alignments", json={"recording_id": "take"})
+        assert started.status_code == 202
+        done = await client.post("/v1/alignments?wait=true", json={"recording_id": "take"})
+        assert (done.status_code, done.json()["state"]) == (200, "done")
+        alignment_id = started.json()["alignment_id"]
+        job = (await client.get(f"/v1/alignments/{alignment_id}")).json()
+        assert job == done.json()
+        assert (job["progress"], job["attempts"]) == (1.0, 1)
+        assert job["submitted_at"] <= job["started_at"] <= job["ended_at"]
+        assert store.list(kind="episode") == [alignment_id] == [job["report"]["episode_id"]]
+        assert job["report"]["num_steps"] == store.open(alignment_id).num_steps
+        assert (await client.get("/v1/alignments")).json()["num_matching"] == 1
+
+
+async def test_many_recordings_are_all_taken_or_none(serve, store):
+    async with serve(num_workers=2) as client:
+        body = {"recording_ids": ["take", "headless", "nothing"]}
+        refused = await client.post("/v1/alignments", json=body)
+        assert refused.status_code == 422
+        assert set(refused.json()["details"]["refused"]) == {"headless", "nothing"}
+        assert (await client.get("/v1/alignments")).json()["num_matching"] == 0
+        body = {"recording_ids": ["nothing", "nobody"]}
+        assert (await client.post("/v1/alignments", json=body)).status_code == 404
+        body = {"recording_ids": ["take", "other", "take"]}
+        done = await client.post("/v1/alignments?wait=true", json=body)
+        assert done.status_code == 200
+        assert [job["state"] for job in done.json()["alignments"]] == ["done", "done"]
+    assert len(store.list(kind="episode")) == 2
+
+
+async def test_other_options_are_another_episode(serve, store):
+    async with serve() as client:
+        for rate_hz in (15, 30):
+            body = {"recording_id": "take", "options": {"model_rate_hz": rate_hz}}
+            answer = await client.post("/v1/alignments?wait=true", json=body)
+            assert answer.status_code == 200
+            assert answer.json()["options"]["model_rate_hz"] == rate_hz
     assert len(store.list(kind="episode")) == 2
 
 
@@ -89,53 +144,142 @@ async def test_other_options_are_another_episode(client, store):
         ({"recording_id": "../etc"}, 422, "recording_id"),
         ({"recording_id": "take", "options": {"max_gap_ms": -1}}, 422, "max_gap_ms"),
         ({"recording_id": "take", "extra": 1}, 422, "extra"),
+        ({"recording_id": "take", "recording_ids": ["take"]}, 422, "exactly one"),
+        ({}, 422, "exactly one"),
+        ({"recording_ids": []}, 422, "recording_ids"),
+        ({"recording_ids": [f"take-{n}" for n in range(1001)]}, 422, "1000"),
     ],
 )
-async def test_bad_requests_say_why(client, body, status, word):
-    answer = await client.post("/v1/alignments", json=body)
+async def test_bad_requests_say_why(serve, body, status, word):
+    async with serve() as client:
+        answer = await client.post("/v1/alignments", json=body)
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
     assert word in answer.json()["detail"]
 
 
-async def test_failure_during_the_work_is_kept_and_raised(client):
+async def test_failure_during_the_work_is_kept_raised_and_may_be_tried_again(serve):
     body = {"recording_id": "take", "options": {"min_num_steps": 500}}
-    answer = await client.post("/v1/alignments?wait=true", json=body)
-    assert answer.status_code == 422
-    assert "without a gap" in answer.json()["detail"]
-    jobs = (await client.get("/v1/alignments")).json()["alignments"]
-    assert [job["state"] for job in jobs] == ["failed"]
-    assert "without a gap" in jobs[0]["problem"]["detail"]
+    async with serve() as client:
+        answer = await client.post("/v1/alignments?wait=true", json=body)
+        assert answer.status_code == 422
+        assert "without a gap" in answer.json()["detail"]
+        (job,) = (await client.get("/v1/alignments?state=failed")).json()["alignments"]
+        assert "without a gap" in job["problem"]["detail"]
+        again = await client.post("/v1/alignments", json=body)
+        assert (again.status_code, again.json()["state"]) == (202, "waiting")
 
 
-async def test_unknown_alignment_is_not_found(client):
-    assert (await client.get("/v1/alignments/nothing")).status_code == 404
+async def test_dead_worker_fails_its_job_alone(serve, worker):
+    worker.dies = True
+    async with serve() as client:
+        answer = await client.post("/v1/alignments?wait=true", json={"recording_id": "take"})
+        assert answer.status_code == 503
+        assert "killed" in answer.json()["detail"]
+        worker.dies = False
+        other = await client.post("/v1/alignments?wait=true", json={"recording_id": "other"})
+        assert other.json()["state"] == "done"
 
 
-async def test_queue_is_bounded(store, monkeypatch):
-    released = threading.Event()
+async def test_unknown_alignment_is_not_found(serve):
+    async with serve() as client:
+        assert (await client.get("/v1/alignments/nothing")).status_code == 404
+        assert (await client.post("/v1/alignments/nothing/cancel")).status_code == 404
+        assert (await client.get("/v1/alignments?after=nothing")).status_code == 404
 
-    def held_back(*arguments):
-        released.wait(10)
-        return align_recording(*arguments)
 
-    monkeypatch.setattr(job_table, "align_recording", held_back)
-    app = create_app(AlignmentSettings(store_url=str(store.root), num_workers=1, max_waiting=1))
-    bodies = [{"recording_id": "take", "options": {"min_num_steps": n}} for n in (17, 18, 19)]
-    async with AsyncClient(transport=ASGITransport(app), base_url="http://alignment") as client:
+async def test_progress_moves_and_what_runs_or_waits_can_be_cancelled(serve, store, worker):
+    worker.held.clear()
+    async with serve(num_workers=1) as client:
+        body = {"recording_ids": ["take", "other"]}
+        first, second = (await client.post("/v1/alignments", json=body)).json()["alignments"]
+        path = f"/v1/alignments/{first['alignment_id']}"
+        job = await poll(client, first["alignment_id"], lambda job: job["progress"] > 0)
+        assert (job["state"], job["stage"], job["stream"]) == ("running", "dating", "head")
+        assert job["eta_s"] >= 0
+        second_path = f"/v1/alignments/{second['alignment_id']}"
+        assert (await client.post(f"{second_path}/cancel")).json()["state"] == "cancelled"
+        assert (await client.post(f"{path}/cancel")).json()["state"] == "cancelled"
+        assert (await client.post(f"{path}/cancel")).status_code == 200
+        worker.held.set()
+        # The worker goes on with what comes next.
+        done = await client.post("/v1/alignments?wait=true", json={"recording_id": "other"})
+        assert done.json()["state"] == "done"
+        assert (await client.get(path)).json()["state"] == "cancelled"
+        conflict = await client.post(f"{second_path}/cancel")
+        assert (conflict.status_code, "done" in conflict.json()["detail"]) == (409, True)
+    assert store.list(kind="episode") == [second["alignment_id"]]
+
+
+async def test_pages_and_states(serve, worker):
+    worker.held.clear()
+    async with serve(num_workers=1) as client:
+        for number in range(5):
+            body = {"recording_id": "take", "options": {"min_num_steps": 10 + number}}
+            await client.post("/v1/alignments", json=body)
+        everything = (await client.get("/v1/alignments")).json()
+        ids = [job["alignment_id"] for job in everything["alignments"]]
+        await poll(client, ids[0], lambda job: job["state"] == "running")
+        seen, after = [], None
+        while True:
+            params = {"limit": 2} | ({"after": after} if after else {})
+            page = (await client.get("/v1/alignments", params=params)).json()
+            assert page["num_matching"] == 5
+            seen += [job["alignment_id"] for job in page["alignments"]]
+            after = page["next_after"]
+            if after is None:
+                break
+        assert seen == ids
+        waiting = (await client.get("/v1/alignments?state=waiting&limit=3")).json()
+        assert [job["alignment_id"] for job in waiting["alignments"]] == ids[1:4]
+        assert (waiting["num_matching"], waiting["next_after"]) == (4, ids[3])
+        assert (await client.get("/v1/alignments?limit=0")).status_code == 422
+        worker.held.set()
+
+
+async def test_queue_is_bounded(serve, worker):
+    worker.held.clear()
+    async with serve(num_workers=1, max_waiting=1) as client:
+        bodies = [{"recording_id": "take", "options": {"min_num_steps": n}} for n in (17, 18, 19)]
         answers = [await client.post("/v1/alignments", json=body) for body in bodies]
         assert [answer.status_code for answer in answers] == [202, 202, 429]
         assert "retry-after" in answers[2].headers
-        released.set()
+        worker.held.set()
         late = await client.post("/v1/alignments?wait=true", json=bodies[1])
         assert late.json()["state"] == "done"
 
 
-def test_shell_aligns_and_writes_json(store, tmp_path, capsys):
-    path = tmp_path / "reports.json"
-    arguments = ["run", "take", "--store", str(store.root), "--json", str(path)]
-    assert main(arguments) == 0
-    assert "take aligned" in capsys.readouterr().out
-    assert json.loads(path.read_text())[0]["created"] is True
-    assert main(["run", "headless", "--store", str(store.root)]) == 3
-    assert "head" in capsys.readouterr().err
+async def test_jobs_outlive_the_service_and_go_on_by_themselves(serve, store, worker):
+    worker.held.clear()
+    async with serve(num_workers=1) as client:
+        body = {"recording_ids": ["take", "other"]}
+        jobs = (await client.post("/v1/alignments", json=body)).json()["alignments"]
+        ids = [job["alignment_id"] for job in jobs]
+        await poll(client, ids[0], lambda job: job["state"] == "running")
+    assert store.list(kind="episode") == []
+    worker.held.set()
+    async with serve(num_workers=1) as client:
+        for alignment_id in ids:
+            job = await poll(client, alignment_id, lambda job: job["state"] == "done")
+            # Being stopped in order is no failed attempt.
+            assert job["attempts"] == 1
+    async with serve() as client:
+        assert (await client.get("/v1/alignments?state=done")).json()["num_matching"] == 2
+    assert store.list(kind="episode") == sorted(ids)
+
+
+async def test_two_services_do_not_share_jobs(serve):
+    async with serve():
+        with pytest.raises(ConflictError, match="another alignment service"):
+            await serve().__aenter__()
+
+
+async def test_ready_once_a_worker_is(serve):
+    async with serve() as client:
+        for _ in range(1000):
+            answer = await client.get("/readyz")
+            if answer.status_code == 200:
+                break
+            assert answer.json()["waiting_for"] == ["solver"]
+            await asyncio.sleep(0.005)
+        assert answer.json()["ready"]

@@ -1,0 +1,130 @@
+"""Reports in, what a person reads at a terminal out: one line a recording, or a whole page."""
+
+from collections.abc import Mapping, Sequence
+
+from rich.console import Group
+from rich.table import Table
+from rich.text import Text
+
+from services.alignment.report import AlignmentReport
+from services.alignment.synchronization.refused_parts import RefusedPart
+
+# Taxels of one reason, and refused parts, that a page tells; the report has all.
+MAX_TOLD = 12
+WHY = {
+    "late_start": "began later than the others",
+    "early_end": "ended earlier than the others",
+    "gap": "no samples",
+    "shorter": "a longer stretch without a gap was taken",
+}
+
+
+def report_line(report: AlignmentReport) -> str:
+    """One line."""
+    verb = "aligned" if report.created else "was aligned already"
+    lost = sum(clock.num_dropped for clock in report.clocks)
+    absent = f"; absent: {', '.join(report.absent)}" if report.absent else ""
+    refused = "".join(
+        f"; {stream}: taxels not measured and zero: {_by_reason(reasons)}"
+        for stream, reasons in report.refused_taxels.items()
+    )
+    return (
+        f"{report.recording_id} {verb}: {report.episode_id}, {report.num_steps} steps, "
+        f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}"
+    )
+
+
+def report_page(report: AlignmentReport) -> Group:
+    """Everything that the report says, as tables."""
+    parts: list[Text | Table] = [
+        Text(f"{report.recording_id} → {report.episode_id}", style="bold"),
+        Text(
+            f"{report.domain}, {report.num_steps} steps, {report.duration_s:.1f} s; absent: "
+            f"{', '.join(report.absent) or 'nothing'}"
+        ),
+        _clocks(report),
+    ]
+    if report.retargeting:
+        parts.append(_retargeting(report.retargeting))
+    parts.append(_refused(report.refused_parts))
+    parts += [
+        Text(f"{stream}: taxels not measured and zero: {_by_reason(reasons)}")
+        for stream, reasons in report.refused_taxels.items()
+    ]
+    return Group(*parts)
+
+
+def _clocks(report: AlignmentReport) -> Table:
+    table = Table(title="streams", title_justify="left")
+    table.add_column("stream")
+    for name in (
+        "samples",
+        "in episode",
+        "dropped",
+        "gaps",
+        "residual ms",
+        "latency ms",
+        "drift ppm",
+    ):
+        table.add_column(name, justify="right")
+    table.add_column("dated by")
+    for clock in report.clocks:
+        sigma = "" if clock.latency_sigma_ms is None else f" ± {clock.latency_sigma_ms:.2f}"
+        table.add_row(
+            clock.stream,
+            str(clock.num_samples),
+            str(report.streams.get(clock.stream, 0)),
+            str(clock.num_dropped),
+            f"{report.quality.get(f'{clock.stream}_num_gaps', 0):.0f}",
+            _number(clock.residual_rms_ms, 3),
+            f"{_number(clock.latency_ms, 2)}{sigma}",
+            _number(clock.skew_ppm, 1),
+            clock.method or "-",
+        )
+    return table
+
+
+def _retargeting(figures: Mapping[str, Mapping[str, float]]) -> Table:
+    table = Table(title="retargeting", title_justify="left")
+    table.add_column("hand")
+    table.add_column("tip error mm", justify="right")
+    table.add_column("95 % below", justify="right")
+    table.add_column("steps by status")
+    for side, mine in figures.items():
+        shares = {k.removeprefix("share_"): v for k, v in mine.items() if k.startswith("share_")}
+        told = ", ".join(f"{name} {share:.2%}" for name, share in shares.items() if share)
+        table.add_row(
+            side,
+            _number(mine.get("tip_error_mm"), 2),
+            _number(mine.get("tip_error_p95_mm"), 2),
+            told,
+        )
+    return table
+
+
+def _refused(parts: Sequence[RefusedPart]) -> Table | Text:
+    if not parts:
+        return Text("the whole recording is in the episode")
+    table = Table(title="not in the episode", title_justify="left")
+    for name in ("from s", "to s", "for s"):
+        table.add_column(name, justify="right")
+    table.add_column("why")
+    longest = sorted(parts, key=lambda part: part.start_s - part.stop_s)[:MAX_TOLD]
+    for part in sorted(longest, key=lambda part: part.start_s):
+        why = WHY[part.reason] if part.stream is None else f"{part.stream}: {WHY[part.reason]}"
+        length_s = part.stop_s - part.start_s
+        table.add_row(f"{part.start_s:.2f}", f"{part.stop_s:.2f}", f"{length_s:.2f}", why)
+    if len(parts) > MAX_TOLD:
+        table.caption = f"and {len(parts) - MAX_TOLD} shorter ones"
+    return table
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _by_reason(reasons: Mapping[str, Sequence[int]]) -> str:
+    return ", ".join(
+        f"{reason} {' '.join(map(str, taxels[:MAX_TOLD]))}{' …' * (len(taxels) > MAX_TOLD)}"
+        for reason, taxels in reasons.items()
+    )

@@ -1,0 +1,94 @@
+"""Tracked keypoints at their own rate in, the robot's joint angles on the grid with figures out."""
+
+from collections.abc import Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.tactile.layout import SIDES
+from services.alignment.retargeting.hand_retargeter import (
+    HandRetargeter,
+    RetargetResult,
+    RetargetStatus,
+)
+from services.alignment.synchronization.recorded_streams import LoadedStream
+from services.alignment.synchronization.resampling import GridPlacement, vectors_on_grid
+
+NS_PER_S = 1e9
+
+
+@dataclass(frozen=True)
+class HandJoints:
+    """Both hands' joints on the grid, left before right, and figures about the retargeting."""
+
+    joints_rad: Float64[np.ndarray, "n 40"]
+    quality: dict[str, float]
+
+
+def retarget_hands(
+    streams: Mapping[str, LoadedStream], at: Mapping[str, GridPlacement]
+) -> HandJoints:
+    """Retarget both hands, each in a thread of its own, and bring the joints to the grid.
+
+    Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
+    take the line between their two neighbours, which `at` has found to be in no gap.
+
+    Args:
+        streams: `keypoints_left` and `keypoints_right`.
+        at: of both, valid at every step; at least one step.
+
+    Raises:
+        InvalidInputError: keypoints that are no hand, see `HandRetargeter.retarget`.
+    """
+    with ThreadPoolExecutor(len(SIDES), thread_name_prefix="retarget") as threads:
+        hands = list(
+            threads.map(
+                lambda side: _retarget(side, streams[f"keypoints_{side}"], at[f"keypoints_{side}"]),
+                SIDES,
+            )
+        )
+    joints_rad = np.concatenate([joints for joints, _ in hands], axis=1)
+    return HandJoints(joints_rad, hands[0][1] | hands[1][1])
+
+
+def _retarget(
+    side: str, stream: LoadedStream, at: GridPlacement
+) -> tuple[Float64[np.ndarray, "n 20"], dict[str, float]]:
+    first, stop = int(at.left.min()), int(at.left.max()) + 2
+    keypoints_m = stream.values[first:stop]
+    t_ns = stream.t_ns[first:stop]
+    # int64 first, so that seconds stay exact to the nanosecond.
+    t_s = (t_ns - t_ns[0]).astype(np.float64) / NS_PER_S
+    result = HandRetargeter(side).retarget(keypoints_m, t_s=t_s)
+    near = GridPlacement(at.left - first, at.weight, at.valid)
+    # Beyond the first or last sample the line goes on, and could leave the limits.
+    hand = RobotHand(side)
+    joints_rad = np.clip(vectors_on_grid(result.joints_rad, near), hand.lower_rad, hand.upper_rad)
+    return joints_rad, _quality(side, result, near)
+
+
+def _quality(side: str, result: RetargetResult, at: GridPlacement) -> dict[str, float]:
+    status = status_on_grid(result.status, at)
+    name = f"retargeting_{side}"
+    figures = {f"{name}_num_steps_not_solved": float((status != RetargetStatus.SOLVED).sum())}
+    again = result.finger_status == RetargetStatus.REACQUIRED
+    figures[f"{name}_num_fingers_reacquired"] = float(again.sum())
+    errors_mm = result.tip_error_m[result.solved] * 1e3
+    if errors_mm.size:
+        figures[f"{name}_tip_error_mm"] = float(errors_mm.mean())
+        figures[f"{name}_tip_error_p95_mm"] = float(np.percentile(errors_mm, 95))
+    shares = {
+        f"{name}_share_{kind.name.lower()}": float((status == kind).mean())
+        for kind in RetargetStatus
+    }
+    return figures | shares
+
+
+def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, " n"]:
+    """The worse status of the samples that each step is made of."""
+    left = np.where(at.weight == 1, at.left + 1, at.left)
+    right = np.where(at.weight == 0, at.left, at.left + 1)
+    return np.maximum(status[left], status[right]).astype(np.uint8)

@@ -1,0 +1,39 @@
+"""How far an alignment is: the share of the work that is done, the stage, and the stream."""
+
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+Stage = Literal["dating", "placing", "retargeting", "writing"]
+STAGES: tuple[Stage, ...] = ("dating", "placing", "retargeting", "writing")
+# Where each stage begins, as a share of the whole; by the seconds of an hour's recording.
+STAGE_BEGINS: dict[Stage, float] = {
+    "dating": 0.0,
+    "placing": 0.35,
+    "retargeting": 0.37,
+    "writing": 0.55,
+}
+
+
+class Progress(NamedTuple):
+    """Where an alignment stands: `share` from 0 to 1 never goes back."""
+
+    share: float
+    stage: Stage
+    stream: str | None = None
+
+
+Tell = Callable[[Progress], None]
+
+
+def progress_within(stage: Stage, done: float, stream: str | None = None) -> Progress:
+    """Progress of one stage.
+
+    Args:
+        stage: that is at work.
+        done: of this stage, 0 … 1.
+        stream: that is worked on.
+    """
+    number = STAGES.index(stage)
+    begin = STAGE_BEGINS[stage]
+    end = STAGE_BEGINS[STAGES[number + 1]] if number + 1 < len(STAGES) else 1.0
+    return Progress(begin + min(max(done, 0.0), 1.0) * (end - begin), stage, stream)

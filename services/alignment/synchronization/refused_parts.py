@@ -1,0 +1,119 @@
+"""A gridded recording and the stretch that was taken in, what is not in the episode and why out.
+
+An episode carries the refused parts as matrices beside its calibration, one a reason and stream:
+`refused_<reason>_<stream>_s`, rows of start and stop in seconds after the recording's start.
+"""
+
+import re
+from collections.abc import Mapping
+from typing import Literal, get_args
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, FiniteFloat
+
+from dextouch.schemas.episodes import Matrix, matrix_rows
+from services.alignment.synchronization.resampling import runs_of
+
+# late_start, early_end: a stream that actions need begins later or ends earlier than the others;
+# gap: a stream has no samples there; shorter: nothing is wrong but that a longer stretch exists.
+RefusedReason = Literal["late_start", "early_end", "gap", "shorter"]
+_KEY = re.compile(rf"refused_({'|'.join(get_args(RefusedReason))})(?:_(\w+))?_s")
+NS_PER_S = 1e9
+
+
+class RefusedPart(BaseModel):
+    """A stretch of the recording that is not in the episode.
+
+    `start_s` and `stop_s` count from the recording's start; `stream` is the one to blame, None
+    where none is.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    start_s: FiniteFloat
+    stop_s: FiniteFloat
+    reason: RefusedReason
+    stream: str | None = None
+
+
+def refused_edges(
+    first_ns: Mapping[str, int], last_ns: Mapping[str, int], start_ns: int
+) -> list[RefusedPart]:
+    """What the streams do not share at the recording's ends.
+
+    Args:
+        first_ns: of the first sample of each stream that actions are made of.
+        last_ns: of the last.
+        start_ns: of the recording; all on one clock.
+    """
+    latest = max(first_ns, key=lambda name: first_ns[name])
+    earliest = min(last_ns, key=lambda name: last_ns[name])
+    return [
+        _part(min(first_ns.values()), first_ns[latest], start_ns, ("late_start", latest)),
+        _part(last_ns[earliest], max(last_ns.values()), start_ns, ("early_end", earliest)),
+    ]
+
+
+def refused_stretches(
+    t_ns: np.ndarray, valid: Mapping[str, np.ndarray], taken: tuple[int, int], start_ns: int
+) -> list[RefusedPart]:
+    """Steps of the grid that are not taken.
+
+    Args:
+        t_ns: of the steps, at least two, on the clock of `start_ns`.
+        valid: of each stream, whether it can be read at each step.
+        taken: first and one past the last step of the episode.
+        start_ns: of the recording.
+    """
+    step_ns = int(t_ns[1] - t_ns[0])
+    parts = []
+
+    def add(run: tuple[int, int], why: tuple[RefusedReason, str | None]) -> None:
+        parts.append(_part(int(t_ns[run[0]]), int(t_ns[run[1] - 1]) + step_ns, start_ns, why))
+
+    for name, mine in valid.items():
+        for run in runs_of(~mine):
+            add(run, ("gap", name))
+    good = np.logical_and.reduce(list(valid.values()))
+    for run in runs_of(good):
+        if run != taken:
+            add(run, ("shorter", None))
+    return parts
+
+
+def refused_matrices(parts: list[RefusedPart]) -> dict[str, Matrix]:
+    """The parts as an episode carries them."""
+    rows: dict[str, list[tuple[float, float]]] = {}
+    for part in parts:
+        if part.stop_s > part.start_s:
+            middle = part.reason if part.stream is None else f"{part.reason}_{part.stream}"
+            rows.setdefault(f"refused_{middle}_s", []).append((part.start_s, part.stop_s))
+    return {name: matrix_rows(np.array(stretches)) for name, stretches in rows.items()}
+
+
+def refused_parts(calibration: Mapping[str, Matrix]) -> tuple[RefusedPart, ...]:
+    """The refused parts that an episode carries, in order of time."""
+    parts = []
+    for name, rows in calibration.items():
+        match = _KEY.fullmatch(name)
+        if match is None:
+            continue
+        reason, stream = match.groups()
+        parts += [
+            RefusedPart.model_validate(
+                {"start_s": start_s, "stop_s": stop_s, "reason": reason, "stream": stream}
+            )
+            for start_s, stop_s in rows
+        ]
+    return tuple(sorted(parts, key=lambda part: (part.start_s, part.stop_s, part.stream or "")))
+
+
+def _part(
+    begin_ns: int, end_ns: int, start_ns: int, why: tuple[RefusedReason, str | None]
+) -> RefusedPart:
+    return RefusedPart(
+        start_s=(begin_ns - start_ns) / NS_PER_S,
+        stop_s=(end_ns - start_ns) / NS_PER_S,
+        reason=why[0],
+        stream=why[1],
+    )

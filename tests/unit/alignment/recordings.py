@@ -1,0 +1,47 @@
+"""Small robot recordings for tests of jobs and services."""
+
+import numpy as np
+
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+
+K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
+POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])
+START_NS = 10**12
+
+
+def write_recording(
+    store, recording_id, *, streams=("wrist_left", "wrist_right", "head"), seconds=2.0, lost=()
+):
+    """A robot that stands still; `lost` are (stream, first, last) samples that never arrived."""
+    attributes = RecordingAttributes(
+        recording_id=recording_id,
+        task="stand-bottle",
+        instruction="",
+        domain="robot",
+        station="test",
+        started_t_host_ns=START_NS,
+        calibration={"K_head": K_HEAD},
+    )
+    t_ns = np.arange(round(seconds * 100), dtype=np.int64) * 10_000_000
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name in (*streams, "joints_measured"):
+            row = POSE if name != "joints_measured" else np.full(40, 0.25)
+            stream = StreamDescriptor(
+                name=name,
+                kind="pose" if len(row) == 7 else "robot_state",
+                shape=row.shape,
+                dtype="float64",
+                unit="pose_m_wxyz" if len(row) == 7 else "rad",
+                nominal_rate_hz=100,
+            )
+            writer.add_stream(stream)
+            arrived = np.ones(len(t_ns), dtype=bool)
+            for stream_name, first, last in lost:
+                arrived[first:last] &= stream_name != name
+            writer.append(
+                name,
+                values=np.repeat(row[None], len(t_ns), axis=0)[arrived],
+                t_host_ns=t_ns[arrived] + START_NS,
+                t_device_ns=t_ns[arrived] + 9 * 10**11,
+            )

@@ -1,0 +1,147 @@
+"""Images go from recording to episode as the bytes they are, groups of pictures as a whole."""
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes.image_codecs import ImageChunks
+from dextouch.images import jpeg
+from dextouch.streams.descriptors import StreamDescriptor
+from services.alignment.jobs import align_recording
+from services.alignment.options import AlignmentOptions
+from services.alignment.synchronization import episode_streams, recorded_streams
+from tests.system.long_take import encode_images
+from tests.unit.alignment.recordings import START_NS, write_recording
+
+IMAGES = encode_images()
+OPTIONS = AlignmentOptions()
+ROBOT = ("wrist_left", "wrist_right", "head", "joints_measured")
+
+
+def add_camera(store, recording_id, unit, t_ns, values):
+    """The same recording with a camera, under another id."""
+    old = store.recording(recording_id)
+    attributes = old.attributes.model_copy(
+        update={"recording_id": f"{recording_id}-camera", "streams": ()}
+    )
+    camera = StreamDescriptor(
+        name="camera_head",
+        kind="image",
+        shape=(240, 320, 3),
+        dtype="uint8",
+        unit=unit,
+        nominal_rate_hz=30,
+    )
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, stream in old.streams.items():
+            batch = old.read(name)
+            writer.add_stream(stream)
+            writer.append(
+                name,
+                values=batch.values,
+                t_host_ns=batch.t_host_ns,
+                t_device_ns=batch.t_device_ns,
+            )
+        writer.add_stream(camera)
+        writer.append(
+            "camera_head", values=values, t_host_ns=t_ns, t_device_ns=t_ns - START_NS + 10**6
+        )
+    return f"{recording_id}-camera"
+
+
+def camera_times_ns(num):
+    return np.rint(np.arange(num) * (1e9 / 30)).astype(np.int64) + START_NS
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = EpisodeStore(tmp_path)
+    # The head is late, so the episode begins in the middle of a group of pictures.
+    write_recording(store, "take", seconds=3.0, lost=(("head", 0, 50),))
+    return store
+
+
+@pytest.fixture
+def no_decoding(monkeypatch):
+    def refuse(*_, **__):
+        raise AssertionError("an image was decoded or encoded")
+
+    monkeypatch.setattr(ImageChunks, "decode", refuse)
+    monkeypatch.setattr(jpeg, "encode_jpeg", refuse)
+    monkeypatch.setattr("dextouch.episodes.stream_writer.encode_jpeg", refuse)
+    monkeypatch.setattr("dextouch.episodes.stream_writer.GopEncoder", refuse)
+
+
+@pytest.mark.parametrize("unit", ["jpeg", "h264"])
+def test_encoded_images_are_copied_byte_for_byte(store, unit, no_decoding):
+    t_ns = camera_times_ns(90)
+    name = add_camera(store, "take", unit, t_ns, IMAGES[unit][:90])
+    episode = store.open(align_recording(store, name, OPTIONS).episode_id)
+    assert episode.streams["camera_head"].unit == unit
+    num = episode.num_samples("camera_head")
+    copied = episode.encoded_images("camera_head", 0, num)
+    origin_ns = START_NS + round(episode.attributes.quality["origin_after_start_ns"])
+    numbers = np.rint((episode.stamps_ns("camera_head") + origin_ns - START_NS) * 30e-9)
+    original = list(IMAGES[unit][:90])
+    assert copied == [original[int(number)] for number in numbers]
+    # From the group that the first needed image is in.
+    first_needed = round((origin_ns - START_NS) * 30e-9) - 1
+    expected = first_needed // GOP_IMAGES * GOP_IMAGES if unit == "h264" else first_needed
+    assert int(numbers[0]) == expected
+    assert int(numbers[-1]) == 89
+
+
+def test_a_group_with_an_image_that_has_no_time_is_encoded_anew(store):
+    t_ns = camera_times_ns(90)
+    t_ns[40] = t_ns[39]
+    name = add_camera(store, "take", "h264", t_ns, IMAGES["h264"][:90])
+    report = align_recording(store, name, OPTIONS)
+    episode = store.open(report.episode_id)
+    assert report.quality["camera_head_num_images_encoded_anew"] == report.streams["camera_head"]
+    stamps = episode.stamps_ns("camera_head")
+    assert len(stamps) > 70
+    # Still the right pictures at the right times, a generation of coding later.
+    origin_ns = START_NS + round(report.quality["origin_after_start_ns"])
+    number = round((int(stamps[-1]) + origin_ns - START_NS) * 30e-9)
+    before = store.recording(name).images("camera_head", number, number + 1)
+    after = episode.images("camera_head", len(stamps) - 1)
+    assert np.abs(before.astype(float) - after).mean() < 4
+
+
+def test_pieces_of_any_size_give_the_same_episode(tmp_path, monkeypatch):
+    store = EpisodeStore(tmp_path)
+    write_recording(store, "take", seconds=3.0, lost=(("head", 0, 50),))
+    hashes = []
+    for number, (num_bytes, num_images) in enumerate([(16 << 20, 64), (3000, 8)]):
+        monkeypatch.setattr(recorded_streams, "PIECE_BYTES", num_bytes)
+        monkeypatch.setattr(episode_streams, "IMAGES_AT_ONCE", num_images)
+        report = align_recording(store, "take", OPTIONS)
+        episode = store.open(report.episode_id)
+        hashes.append({name: episode.array_sha256(name) for name in (*ROBOT, "action")})
+        assert report.created, number
+        store.delete(report.episode_id, for_good=True)
+    assert hashes[0] == hashes[1]
+
+
+def test_missing_values_are_left_out_and_counted(tmp_path):
+    store = EpisodeStore(tmp_path)
+    write_recording(store, "take", seconds=3.0)
+    old = store.recording("take")
+    attributes = old.attributes.model_copy(update={"recording_id": "holes", "streams": ()})
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, stream in old.streams.items():
+            batch = old.read(name)
+            values = batch.values.copy()
+            if name == "head":
+                values[[0, 100, 101]] = np.nan
+            writer.add_stream(stream)
+            writer.append(
+                name,
+                values=values,
+                t_host_ns=batch.t_host_ns,
+                t_device_ns=batch.t_device_ns,
+            )
+    report = align_recording(store, "holes", OPTIONS)
+    assert report.quality["head_num_incomplete"] == 3
+    assert report.streams["head"] == report.streams["wrist_left"] - 3

@@ -1,0 +1,96 @@
+"""A worker process: reports and problems come back, and a killed one takes one recording along."""
+
+import os
+import signal
+import threading
+
+import psutil
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import InvalidInputError, UnavailableError
+from services.alignment.many import align_many, not_aligned
+from services.alignment.options import AlignmentOptions
+from services.alignment.worker import AlignmentWorker
+from tests.unit.alignment.recordings import write_recording
+
+OPTIONS = AlignmentOptions()
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = EpisodeStore(tmp_path / "store")
+    write_recording(store, "take")
+    write_recording(store, "other")
+    write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
+    return store
+
+
+def test_one_process_aligns_refuses_dies_and_is_replaced(store):
+    worker = AlignmentWorker(str(store.root))
+    try:
+        told = []
+        report = worker.run("take", OPTIONS, told.append)
+        assert store.list() == [report.episode_id]
+        assert told
+        assert told[0].stage == "dating"
+        pid = worker.pid
+        with pytest.raises(InvalidInputError, match="head"):
+            worker.run("headless", OPTIONS, told.append)
+        assert worker.pid == pid
+
+        def kill_it(_):
+            os.kill(worker.pid, signal.SIGKILL)
+
+        with pytest.raises(UnavailableError, match=r"'other'.*killed.*ask for it again"):
+            worker.run("other", OPTIONS, kill_it)
+        assert len(store.list()) == 1
+        assert worker.run("other", OPTIONS, told.append).created
+        assert worker.pid != pid
+    finally:
+        worker.stop()
+    assert worker.pid is None
+    assert not psutil.Process().children()
+
+
+def test_stopping_from_another_thread_ends_it_at_once(store):
+    worker = AlignmentWorker(str(store.root))
+    worker.start()
+    process = psutil.Process(worker.pid)
+    process.suspend()
+    failed = []
+
+    def run():
+        try:
+            worker.run("take", OPTIONS, lambda _: None)
+        except UnavailableError as error:
+            failed.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    worker.stop()
+    thread.join(30)
+    # Stopped before or after the order reached it: a fresh process may have taken it.
+    worker.stop()
+    assert not thread.is_alive()
+    assert failed or store.list()
+    assert store.sweep() == 0
+
+
+def test_many_recordings_side_by_side(store):
+    wanted, hopeless = not_aligned(store, OPTIONS)
+    assert (wanted, [outcome.recording_id for outcome in hopeless]) == (
+        ["other", "take"],
+        ["headless"],
+    )
+    outcomes = list(
+        align_many(
+            str(store.root), [*wanted, "headless"], OPTIONS, num_workers=2, tell=lambda *_: None
+        )
+    )
+    found = {outcome.recording_id: outcome for outcome in outcomes}
+    assert set(found) == {"take", "other", "headless"}
+    assert "head" in found["headless"].error.message
+    assert found["take"].report.created
+    assert not_aligned(store, OPTIONS)[0] == []
+    assert not psutil.Process().children()
