@@ -1,11 +1,12 @@
 """A robot hand in, the arrays out that the compiled solver reads."""
 
 import numpy as np
+from jaxtyping import Float64
 
 from dextouch.geometry.rotations import rotation_from_quaternion
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, solver_indices
-from services.alignment.retargeting.solver.arrays import MAX_JOINTS, HandArrays
+from dextouch.hands.skeleton import solver_indices
+from services.alignment.retargeting.solver.arrays import HAND, MAX_JOINTS, MAX_STARTS
 
 # Phalanges of the robot's fingers as capsules.
 PHALANX_RADIUS_M = 0.0085
@@ -23,32 +24,30 @@ STARTS = (
 )
 
 
-def hand_arrays(hand: RobotHand) -> HandArrays:
-    """The hand's tables, padded to six joints a finger."""
-    num = len(hand.fingers)
-    rotation = np.zeros((num, MAX_JOINTS, 3, 3))
-    position_m, axis = np.zeros((num, MAX_JOINTS, 3)), np.zeros((num, MAX_JOINTS, 3))
-    lower_rad, upper_rad = np.zeros((num, MAX_JOINTS)), np.zeros((num, MAX_JOINTS))
+def hand_arrays(hand: RobotHand) -> np.ndarray:
+    """The hand's tables as one record `HAND`, shape [1]."""
+    record = np.zeros(1, dtype=HAND)
+    row = record[0]
+    row["num_fingers"] = len(hand.fingers)
+    row["thumb"] = next((f for f, one in enumerate(hand.fingers) if one.chain == "thumb"), -1)
+    fractions = np.full((MAX_STARTS, 1, MAX_JOINTS), 0.5)
+    fractions[:, 0, :4] = STARTS
     for index, finger in enumerate(hand.fingers):
-        for joint, row in enumerate(finger.joints):
-            rotation[index, joint] = rotation_from_quaternion(np.array(row.q_wxyz))
-            position_m[index, joint] = row.position_m
-            axis[index, joint] = np.array(row.axis) / np.linalg.norm(row.axis)
-            lower_rad[index, joint], upper_rad[index, joint] = row.limits_rad
-    fractions = np.full((len(STARTS), MAX_JOINTS), 0.5)
-    fractions[:, :4] = STARTS
-    return HandArrays(
-        num_joints=np.array([len(finger.joints) for finger in hand.fingers], dtype=np.int64),
-        rotation=rotation,
-        position_m=position_m,
-        axis=axis,
-        point_joints=np.array([[1, 2, 3]] * num, dtype=np.int64),
-        tip_m=np.array([finger.tip_m for finger in hand.fingers], dtype=np.float64),
-        lower_rad=lower_rad,
-        upper_rad=upper_rad,
-        knuckle_m=hand.chain_points_m(np.zeros((1, 20)))[0, :, 0].copy(),
-        starts_rad=lower_rad + fractions[:, None] * (upper_rad - lower_rad),
-        radius_m=np.full((num, 3), PHALANX_RADIUS_M),
-        nodes=np.array([solver_indices(chain) for chain in CHAINS], dtype=np.int64),
-        thumb=CHAINS.index("thumb"),
-    )
+        row["num_joints"][index] = len(finger.joints)
+        row["point_joints"][index] = finger.points
+        row["tip_m"][index] = finger.tip_m
+        row["radius_m"][index] = PHALANX_RADIUS_M
+        row["nodes"][index] = solver_indices(finger.chain)
+        for joint, one in enumerate(finger.joints):
+            row["rotation"][index, joint] = rotation_from_quaternion(np.array(one.q_wxyz))
+            row["position_m"][index, joint] = one.position_m
+            row["axis"][index, joint] = np.array(one.axis) / np.linalg.norm(one.axis)
+            row["lower_rad"][index, joint], row["upper_rad"][index, joint] = one.limits_rad
+    row["starts_rad"] = row["lower_rad"] + fractions * (row["upper_rad"] - row["lower_rad"])
+    row["knuckle_m"][: len(hand.fingers)] = zero_points_m(hand)[:, 0]
+    return record
+
+
+def zero_points_m(hand: RobotHand) -> Float64[np.ndarray, "fingers 4 3"]:
+    """Knuckle, PIP, DIP and tip of every finger at zero angles."""
+    return hand.chain_points_m(np.zeros((1, len(hand.joint_names))))[0]

@@ -22,10 +22,9 @@ from services.alignment.retargeting.profile_fit import (
 from services.alignment.retargeting.solver import arrays
 from services.alignment.retargeting.solver.arrays import (
     MAX_JOINTS,
+    SCRATCH,
     Memory,
     Output,
-    PersonArrays,
-    Tuning,
 )
 from services.alignment.retargeting.solver.samples import retarget_samples
 
@@ -155,8 +154,10 @@ class HandRetargeter:
         if self.profile is None:
             person = self._person_of(measure_profile(finger_points(keypoints, valid), self.hand))
         # Of slow trackers, not every sample is a loss.
-        lost_s = max(self._tuning.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
-        tuning = self._tuning._replace(reacquire_after_s=lost_s)
+        tuning = self._tuning.copy()
+        tuning["reacquire_after_s"] = max(
+            self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s))
+        )
         memory, self._memory = self._memory, self._blank()
         try:
             result = self._follow((keypoints, trusted, elapsed_s), person, tuning)
@@ -185,20 +186,20 @@ class HandRetargeter:
         """
         return measure_profile(finger_points(keypoints_m, valid), self.hand)
 
-    def _person_of(self, profile: HandProfile | None) -> PersonArrays:
+    def _person_of(self, profile: HandProfile | None) -> np.ndarray:
         if profile is None:
             return unknown_person(self._arrays, self._robot_bone_m)
         return person_arrays(profile, self._robot_bone_m)
 
     def _blank(self) -> Memory:
-        rest = np.clip(0.0, self._arrays.lower_rad, self._arrays.upper_rad)
+        rest = np.clip(0.0, self._arrays["lower_rad"][0], self._arrays["upper_rad"][0])
         return Memory(rest, np.full(NUM_FINGERS, np.inf))
 
     def _follow(
         self,
         samples: tuple[np.ndarray, np.ndarray, np.ndarray],
-        person: PersonArrays,
-        tuning: Tuning,
+        person: np.ndarray,
+        tuning: np.ndarray,
     ) -> RetargetResult:
         num = len(samples[0])
         output = Output(
@@ -207,7 +208,8 @@ class HandRetargeter:
             status=np.empty(num, dtype=np.uint8),
             tip_error_m=np.empty((num, NUM_FINGERS)),
         )
-        retarget_samples(self._arrays, person, tuning, samples, self._memory, output)
+        tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
+        retarget_samples(tables, samples, self._memory, output)
         return RetargetResult(
             joints_rad=output.joints_rad[:, :, :4].reshape(num, NUM_JOINTS),
             status=output.status,

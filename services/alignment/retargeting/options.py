@@ -2,9 +2,11 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from dextouch.errors import InvalidInputError
 from services.alignment.retargeting.hand_arrays import STARTS
-from services.alignment.retargeting.solver.arrays import Tuning
+from services.alignment.retargeting.solver.arrays import TUNING
 
 
 @dataclass(frozen=True)
@@ -71,23 +73,23 @@ class RetargetOptions:
         if wrong:
             raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
 
-    def tuning(self) -> Tuning:
-        """The numbers that the compiled solver reads."""
-        return Tuning(
-            temporal_weight_m2=float(self.temporal_weight_m2),
-            velocity_limit_rad_s=float(self.velocity_limit_rad_s),
-            pinch_near_m=float(self.pinch_near_m),
-            pinch_far_m=float(self.pinch_far_m),
-            pinch_weight_near=float(self.pinch_weight),
-            pinch_weight_far=PINCH_WEIGHT_FAR,
-            reacquire_after_s=float(self.reacquire_after_s),
-            num_starts=int(self.num_starts),
-            bone_tolerance=BONE_TOLERANCE,
-            bone_tolerance_m=BONE_TOLERANCE_M,
-            knuckle_tolerance_m=KNUCKLE_TOLERANCE_M,
-            max_bend_cosine=MAX_BEND_COSINE,
-            keeps_fingers_apart=bool(self.keeps_fingers_apart),
-        )
+    def tuning(self) -> np.ndarray:
+        """The numbers that the compiled solver reads: one record `TUNING`, shape [1]."""
+        record = np.zeros(1, dtype=TUNING)
+        record["temporal_weight_m2"] = self.temporal_weight_m2
+        record["velocity_limit_rad_s"] = self.velocity_limit_rad_s
+        record["pinch_near_m"] = self.pinch_near_m
+        record["pinch_far_m"] = self.pinch_far_m
+        record["pinch_weight_near"] = self.pinch_weight
+        record["pinch_weight_far"] = PINCH_WEIGHT_FAR
+        record["reacquire_after_s"] = self.reacquire_after_s
+        record["num_starts"] = self.num_starts
+        record["bone_tolerance"] = BONE_TOLERANCE
+        record["bone_tolerance_m"] = BONE_TOLERANCE_M
+        record["knuckle_tolerance_m"] = KNUCKLE_TOLERANCE_M
+        record["max_bend_cosine"] = MAX_BEND_COSINE
+        record["keeps_fingers_apart"] = self.keeps_fingers_apart
+        return record
 
 
 PINCH_WEIGHT_FAR = 1e-3

@@ -7,7 +7,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import CHAINS
 from services.alignment.retargeting.finger_points import FingerPoints
-from services.alignment.retargeting.hand_arrays import hand_arrays
+from services.alignment.retargeting.hand_arrays import hand_arrays, zero_points_m
 from services.alignment.retargeting.hand_profile import (
     BONE_RANGE_M,
     NUM_FINGERS,
@@ -18,10 +18,10 @@ from services.alignment.retargeting.options import RetargetOptions
 from services.alignment.retargeting.solver.arrays import (
     IMPLAUSIBLE,
     MAX_JOINTS,
-    HandArrays,
+    PERSON,
+    SCRATCH,
     Memory,
     Output,
-    PersonArrays,
 )
 from services.alignment.retargeting.solver.samples import retarget_samples
 
@@ -36,36 +36,34 @@ UNKNOWN_FREEDOM = 1e6
 EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
 
 
-def unknown_person(hand: HandArrays, robot_bone_m: np.ndarray) -> PersonArrays:
-    """Nothing is known: every sample's own bones, and its own knuckles."""
+def unknown_person(hand: np.ndarray, robot_bone_m: np.ndarray) -> np.ndarray:
+    """Nothing is known: every sample's own bones, and its own knuckles. One record `PERSON`."""
+    record = np.zeros(1, dtype=PERSON)
     num = len(robot_bone_m)
-    return PersonArrays(
-        bone_m=robot_bone_m,
-        bone_scale=np.ones((num, 3)),
-        knuckle_m=hand.knuckle_m.copy(),
-        travel=np.ones(num),
-        freedom=np.full(num, UNKNOWN_FREEDOM),
-        is_known=False,
-    )
+    record["bone_m"][0, :num] = robot_bone_m
+    record["bone_scale"] = 1.0
+    record["knuckle_m"] = hand["knuckle_m"]
+    record["travel"] = 1.0
+    record["freedom"] = UNKNOWN_FREEDOM
+    return record
 
 
-def person_arrays(profile: HandProfile, robot_bone_m: np.ndarray) -> PersonArrays:
-    """A profile as the compiled solver reads it."""
+def person_arrays(profile: HandProfile, robot_bone_m: np.ndarray) -> np.ndarray:
+    """A profile as the compiled solver reads it: one record `PERSON`, shape [1]."""
     sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
-    return PersonArrays(
-        bone_m=np.ascontiguousarray(profile.bone_m),
-        bone_scale=profile.bone_m / robot_bone_m,
-        knuckle_m=np.ascontiguousarray(profile.knuckle_m),
-        travel=np.ascontiguousarray(profile.travel),
-        freedom=(profile.knuckle_sigma_m / sigma_m) ** 2,
-        is_known=True,
-    )
+    record = np.zeros(1, dtype=PERSON)
+    record["is_known"] = True
+    record["bone_m"] = profile.bone_m
+    record["bone_scale"] = profile.bone_m / robot_bone_m
+    record["knuckle_m"] = profile.knuckle_m
+    record["travel"] = profile.travel
+    record["freedom"] = (profile.knuckle_sigma_m / sigma_m) ** 2
+    return record
 
 
 def robot_bone_m(hand: RobotHand) -> Float64[np.ndarray, "5 3"]:
     """Lengths from knuckle to PIP, DIP and tip of a robot hand at zero angles."""
-    points = hand.chain_points_m(np.zeros((1, 20)))[0]
-    return np.asarray(np.linalg.norm(np.diff(points, axis=1), axis=-1))
+    return np.asarray(np.linalg.norm(np.diff(zero_points_m(hand), axis=1), axis=-1))
 
 
 def measure_profile(points: FingerPoints, hand: RobotHand) -> HandProfile:
@@ -86,7 +84,7 @@ def measure_profile(points: FingerPoints, hand: RobotHand) -> HandProfile:
     check_bone_unit(float(np.nanmedian(lengths[:, index_finger, 0])), where="keypoints")
     low, high = BONE_RANGE_M
     lengths[~((lengths >= low) & (lengths <= high)).all(axis=-1)] = np.nan
-    _check_seen(np.isfinite(lengths).all(axis=-1), hand.side)
+    _check_seen(np.asarray(np.isfinite(lengths).all(axis=-1)), hand.side)
     bone_m = np.nanmedian(lengths, axis=0)
     spread_m = 1.4826 * np.nanmedian(np.abs(lengths - bone_m), axis=0)
     # The length of a bone has the noise of two points along it.
@@ -127,7 +125,8 @@ def _knuckle_motion(
 ) -> Float64[np.ndarray, "n 5 3"]:
     """Where the robot's knuckles are when its fingers point like the tracked ones; NaN: unknown."""
     # The solver takes keypoints by their number: here there are just the fingers' own, in turn.
-    own = hand_arrays(hand)._replace(nodes=np.arange(20).reshape(5, 4))
+    own = hand_arrays(hand)
+    own["nodes"] = np.arange(20).reshape(5, 4)
     num = len(points_m)
     output = Output(
         joints_rad=np.zeros((num, NUM_FINGERS, MAX_JOINTS)),
@@ -136,15 +135,18 @@ def _knuckle_motion(
         tip_error_m=np.zeros((num, NUM_FINGERS)),
     )
     retarget_samples(
-        own,
-        unknown_person(own, robot_bone_m(hand)),
-        EVERY_SAMPLE_ALONE.tuning(),
+        (
+            own,
+            unknown_person(own, robot_bone_m(hand)),
+            EVERY_SAMPLE_ALONE.tuning(),
+            np.zeros(1, dtype=SCRATCH),
+        ),
         (points_m.reshape(num, 20, 3), np.repeat(whole, 4, axis=1), np.full(num, np.inf)),
         Memory(np.zeros((NUM_FINGERS, MAX_JOINTS)), np.full(NUM_FINGERS, np.inf)),
         output,
     )
     knuckles = hand.chain_points_m(output.joints_rad[:, :, :4].reshape(num, 20))[:, :, 0]
-    moved_m = knuckles - own.knuckle_m
+    moved_m = knuckles - own["knuckle_m"][0]
     moved_m[output.finger_status >= IMPLAUSIBLE] = np.nan
     return np.asarray(moved_m)
 

@@ -11,7 +11,7 @@ from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_in
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from services.alignment.retargeting.hand_arrays import hand_arrays
 from services.alignment.retargeting.profile_fit import robot_bone_m, unknown_person
-from services.alignment.retargeting.solver.arrays import scratch_for
+from services.alignment.retargeting.solver.arrays import SCRATCH
 from services.alignment.retargeting.solver.points import linearize
 
 HAND = RobotHand("right")
@@ -34,20 +34,19 @@ EXACT = RetargetOptions(temporal_weight_m2=0.0)
 
 def test_slopes_are_the_derivative():
     hand = hand_arrays(HAND)
-    person = unknown_person(hand, robot_bone_m(HAND))._replace(
-        travel=np.linspace(0, 1, 5), knuckle_m=np.full((5, 3), 0.01)
-    )
-    work = scratch_for(5)
-    work.scale[:] = [0.7, 0.9, 1.1]
-    joints = np.random.default_rng(0).uniform(hand.lower_rad, hand.upper_rad)
+    person = unknown_person(hand, robot_bone_m(HAND))
+    person["travel"], person["knuckle_m"] = np.linspace(0, 1, 5), 0.01
+    work = np.zeros(1, dtype=SCRATCH)
+    work["scale"] = [0.7, 0.9, 1.1]
+    joints = np.random.default_rng(0).uniform(hand["lower_rad"][0], hand["upper_rad"][0])
 
     def points_at(joints_rad, finger):
-        linearize(hand, person, work, finger, joints_rad)
-        return work.point[finger].copy(), work.origin[finger, 4].copy()
+        linearize(hand[0], person[0], work[0], finger, joints_rad)
+        return work["point"][0, finger].copy(), work["origin"][0, finger, 4].copy()
 
     for finger in range(5):
         points_at(joints[finger], finger)
-        slope, tip_slope = work.slope[finger].copy(), work.tip_slope[finger].copy()
+        slope, tip_slope = (work[name][0, finger].copy() for name in ("slope", "tip_slope"))
         for joint in range(4):
             step = np.zeros(6)
             step[joint] = 1e-6
@@ -59,13 +58,14 @@ def test_slopes_are_the_derivative():
 
 def test_points_of_the_solver_are_those_of_the_hand():
     hand = hand_arrays(HAND)
-    work = scratch_for(5)
-    work.scale[:] = 1.0
-    joints = np.random.default_rng(1).uniform(hand.lower_rad, hand.upper_rad)
+    person = unknown_person(hand, robot_bone_m(HAND))
+    work = np.zeros(1, dtype=SCRATCH)
+    work["scale"] = 1.0
+    joints = np.random.default_rng(1).uniform(hand["lower_rad"][0], hand["upper_rad"][0])
     expected = HAND.chain_points_m(joints[:, :4].reshape(1, 20))[0]
     for finger in range(5):
-        linearize(hand, unknown_person(hand, robot_bone_m(HAND)), work, finger, joints[finger])
-        np.testing.assert_allclose(work.point[finger], expected[finger], atol=1e-12)
+        linearize(hand[0], person[0], work[0], finger, joints[finger])
+        np.testing.assert_allclose(work["point"][0, finger], expected[finger], atol=1e-12)
 
 
 def test_missing_nodes_are_filled_and_told():

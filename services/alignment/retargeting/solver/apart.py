@@ -48,8 +48,8 @@ def robot_point(hand, work, finger, index):
 
 @compiled
 @no_type_check
-def push(hand, work, finger, phalanx, along, push_m):
-    """Move a finger's measured points sideways, more the further they are from the knuckle."""
+def push(hand, work, finger, phalanx, along, distance_m):
+    """Move a finger's measured points along `push_m`, more the further from the knuckle."""
     knuckle = robot_point(hand, work, finger, 0)
     before, after = (
         robot_point(hand, work, finger, phalanx),
@@ -66,7 +66,7 @@ def push(hand, work, finger, phalanx, along, push_m):
             squared += (point[k] - knuckle[k]) ** 2
         lever = min(np.sqrt(squared) / arm, 3.0) * work.scale[finger, 0]
         for k in range(3):
-            work.measured[finger, index, k] += lever * push_m[k]
+            work.measured[finger, index, k] += lever * distance_m * work.push_m[k]
 
 
 @compiled
@@ -74,8 +74,8 @@ def push(hand, work, finger, phalanx, along, push_m):
 def push_apart(hand, work, status):
     """Move the targets of neighbouring fingers that touch apart by what is missing; whether any."""
     touched = False
-    push_m = np.zeros(3)
-    for a in range(len(status) - 1):
+    push_m = work.push_m
+    for a in range(hand.num_fingers - 1):
         b = a + 1
         if hand.thumb in (a, b) or status[a] >= IMPLAUSIBLE or status[b] >= IMPLAUSIBLE:
             continue
@@ -95,7 +95,6 @@ def push_apart(hand, work, status):
                     push_m[0], push_m[1], push_m[2] = x / gap, y / gap, z / gap
         if depth > TOUCH_M:
             touched = True
-            push_m *= 0.5 * depth
-            push(hand, work, b, at_b, along_b, push_m)
-            push(hand, work, a, at_a, along_a, -push_m)
+            push(hand, work, b, at_b, along_b, 0.5 * depth)
+            push(hand, work, a, at_a, along_a, -0.5 * depth)
     return touched

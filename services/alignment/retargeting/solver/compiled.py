@@ -22,4 +22,6 @@ def _name_of_code() -> str:
 # NUMBA_CACHE_DIR, which numba reads, may name another place; containers bring their code along.
 config.CACHE_DIR = str(Path(config.CACHE_DIR or "~/.cache/dextouch").expanduser() / _name_of_code())
 
-compiled = njit(cache=True, nogil=True, error_model="numpy")
+# Inner functions are kept within the outer one that calls them.
+compiled = njit(nogil=True, error_model="numpy")
+compiled_once = njit(cache=True, nogil=True, error_model="numpy")

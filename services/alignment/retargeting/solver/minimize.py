@@ -97,25 +97,25 @@ def damped_step(hand, work, group, joints, damping):
         solved = work.solved[finger]
         factor(work.hessian[finger], own)
         for b in range(own):
-            solved[b, MAX_JOINTS] = work.gradient[finger, b]
+            solved[MAX_JOINTS, b] = work.gradient[finger, b]
             for a in range(size):
-                solved[b, a] = work.coupling[finger, a, b]
-        substitute(work.hessian[finger], own, solved[:, MAX_JOINTS])
+                solved[a, b] = work.coupling[finger, a, b]
+        substitute(work.hessian[finger], own, solved[MAX_JOINTS])
         for a in range(size):
-            substitute(work.hessian[finger], own, solved[:, a])
+            substitute(work.hessian[finger], own, solved[a])
         for a in range(size):
             for b in range(own):
-                right[a] += work.coupling[finger, a, b] * solved[b, MAX_JOINTS]
+                right[a] += work.coupling[finger, a, b] * solved[MAX_JOINTS, b]
                 for c in range(size):
-                    reduced[a, c] -= work.coupling[finger, a, b] * solved[b, c]
+                    reduced[a, c] -= work.coupling[finger, a, b] * solved[c, b]
     factor(reduced, size)
     substitute(reduced, size, right)
     for finger in group[1:]:
         solved = work.solved[finger]
         for b in range(hand.num_joints[finger]):
-            change = -solved[b, MAX_JOINTS]
+            change = -solved[MAX_JOINTS, b]
             for a in range(size):
-                change -= solved[b, a] * right[a]
+                change -= solved[a, b] * right[a]
             work.step[finger, b] = change
 
 
@@ -157,9 +157,10 @@ def minimize(hand, person, work, group, joints):
 @no_type_check
 def solve_cold(hand, person, work, finger, joints, num_starts):
     """The best of several starts of one finger alone."""
-    group = np.array([finger])
+    group = work.members[-1:]
+    group[0] = finger
     best = np.inf
-    kept = np.empty(MAX_JOINTS)
+    kept = work.best
     for start in range(num_starts):
         for joint in range(hand.num_joints[finger]):
             angle = hand.starts_rad[start, finger, joint]
@@ -170,7 +171,9 @@ def solve_cold(hand, person, work, finger, joints, num_starts):
         # A hair of difference is rounding, not another minimum: keep the first.
         if cost < best * (1.0 - 1e-6):
             best = cost
-            kept[:] = joints[finger]
+            for joint in range(MAX_JOINTS):
+                kept[joint] = joints[finger, joint]
         if best < EXACT_COST_M2:
             break
-    joints[finger] = kept
+    for joint in range(MAX_JOINTS):
+        joints[finger, joint] = kept[joint]

@@ -29,14 +29,16 @@ def place_joints(hand, finger, joints, origin, axis, turn):
                     + r[row, 1] * fixed[1, column]
                     + r[row, 2] * fixed[2, column]
                 )
-        x, y, z = hand.axis[finger, joint]
+        x = hand.axis[finger, joint, 0]
+        y = hand.axis[finger, joint, 1]
+        z = hand.axis[finger, joint, 2]
         c, s = np.cos(joints[joint]), np.sin(joints[joint])
         v = 1.0 - c
         own[0, 0], own[0, 1], own[0, 2] = c + v * x * x, v * x * y - s * z, v * x * z + s * y
         own[1, 0], own[1, 1], own[1, 2] = v * x * y + s * z, c + v * y * y, v * y * z - s * x
         own[2, 0], own[2, 1], own[2, 2] = v * x * z - s * y, v * y * z + s * x, c + v * z * z
         for row in range(3):
-            t0, t1, t2 = turned[row]
+            t0, t1, t2 = turned[row, 0], turned[row, 1], turned[row, 2]
             axis[joint, row] = t0 * x + t1 * y + t2 * z
             for column in range(3):
                 r[row, column] = t0 * own[0, column] + t1 * own[1, column] + t2 * own[2, column]
@@ -59,7 +61,7 @@ def linearize(hand, person, work, finger, joints):
         now, before = index % 2, (index + 1) % 2
         for joint in range(last):
             if joint < at:
-                ax, ay, az = axis[joint]
+                ax, ay, az = axis[joint, 0], axis[joint, 1], axis[joint, 2]
                 dx = origin[at, 0] - origin[joint, 0]
                 dy = origin[at, 1] - origin[joint, 1]
                 dz = origin[at, 2] - origin[joint, 2]

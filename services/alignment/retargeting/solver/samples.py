@@ -18,9 +18,8 @@ from services.alignment.retargeting.solver.arrays import (
     PARTIAL,
     REACQUIRED,
     UNCONVERGED,
-    scratch_for,
 )
-from services.alignment.retargeting.solver.compiled import compiled
+from services.alignment.retargeting.solver.compiled import compiled, compiled_once
 from services.alignment.retargeting.solver.minimize import minimize, solve_cold
 from services.alignment.retargeting.solver.seen import find_pinches, read_sample, see_finger
 
@@ -79,40 +78,40 @@ def worst_of(status):
 @no_type_check
 def solve_sample(hand, person, work, joints, num_near, status):
     """The thumb with the fingers near it (`members`), then every other finger alone."""
-    if num_near:
-        _, at_rest = minimize(hand, person, work, work.members[:num_near], joints)
-        for finger in work.members[:num_near]:
-            if not at_rest:
-                status[finger] = UNCONVERGED
-    for finger in range(len(status)):
-        is_near = False
-        for member in work.members[:num_near]:
-            is_near = is_near or member == finger
-        if is_near or status[finger] >= IMPLAUSIBLE:
-            continue
-        work.members[-1] = finger
-        _, at_rest = minimize(hand, person, work, work.members[-1:], joints)
+    for number in range(-1, hand.num_fingers):
+        if number < 0:
+            group = work.members[:num_near]
+            if num_near == 0:
+                continue
+        else:
+            work.members[-1] = number
+            group = work.members[-1:]
+            is_near = False
+            for member in work.members[:num_near]:
+                is_near = is_near or member == number
+            if is_near or status[number] >= IMPLAUSIBLE:
+                continue
+        _, at_rest = minimize(hand, person, work, group, joints)
         if not at_rest:
-            status[finger] = UNCONVERGED
+            for finger in group:
+                status[finger] = UNCONVERGED
 
 
-@compiled
+@compiled_once
 @no_type_check
-def retarget_samples(hand, person, tuning, samples, memory, output):
+def retarget_samples(tables, samples, memory, output):
     """Follow a tracked hand through T samples.
 
     Args:
-        hand: `HandArrays`.
-        person: `PersonArrays`.
-        tuning: `Tuning`.
+        tables: (hand, person, tuning, scratch), records of one element each.
         samples: (keypoints [T, K, 3] m in wrist axes, NaN or infinite where missing; valid bool
             [T, K]; elapsed_s [T], since the sample before).
         memory: `Memory`, of the sample before the first; afterwards of the last.
         output: `Output`, filled.
     """
     keypoints, valid, elapsed_s = samples
-    num_fingers = len(hand.num_joints)
-    work = scratch_for(num_fingers)
+    hand, person, tuning, work = tables[0][0], tables[1][0], tables[2][0], tables[3][0]
+    num_fingers = hand.num_fingers
     joints = memory.joints_rad
     for t in range(len(keypoints)):
         status = output.finger_status[t]

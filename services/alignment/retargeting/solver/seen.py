@@ -18,14 +18,16 @@ from services.alignment.retargeting.solver.compiled import compiled
 @no_type_check
 def read_sample(hand, work, keypoints, valid):
     """The points of every finger into the scratch; a missing one is zero."""
-    for finger in range(len(hand.nodes)):
+    for finger in range(hand.num_fingers):
         for index in range(NUM_POINTS):
             node = hand.nodes[finger, index]
-            x, y, z = keypoints[node]
+            x, y, z = keypoints[node, 0], keypoints[node, 1], keypoints[node, 2]
             seen = valid[node] and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
             work.usable[finger, index] = seen
             point = work.measured[finger, index]
-            point[0], point[1], point[2] = (x, y, z) if seen else (0.0, 0.0, 0.0)
+            point[0] = x if seen else 0.0
+            point[1] = y if seen else 0.0
+            point[2] = z if seen else 0.0
 
 
 @compiled
@@ -45,7 +47,8 @@ def see_finger(person, tuning, work, finger):
     for k in range(3):
         work.scale[finger, k] = person.bone_scale[finger, k]
     work.freedom[finger] = person.freedom[finger]
-    bones = np.zeros((3, 3))
+    bones = work.bones
+    bones[:] = 0.0
     for bone in range(3):
         if not (usable[bone] and usable[bone + 1]):
             continue
@@ -64,7 +67,8 @@ def see_finger(person, tuning, work, finger):
         else:
             work.scale[finger, bone] *= length / known
         if length > 0.0:
-            bones[bone] /= length
+            for k in range(3):
+                bones[bone, k] /= length
     for bone in range(2):
         cosine = 0.0
         for k in range(3):
@@ -93,7 +97,7 @@ def find_pinches(hand, tuning, work, status):
         return 0
     count = 1
     work.members[0] = thumb
-    for finger in range(len(status)):
+    for finger in range(hand.num_fingers):
         if finger == thumb or status[finger] >= IMPLAUSIBLE or not usable[finger, 3]:
             continue
         squared = 0.0
