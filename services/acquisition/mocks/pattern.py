@@ -1,15 +1,18 @@
 """A length comes in; made-up streams of two moving, pressing hands go out."""
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
 from dextouch.geometry.cameras import pinhole_matrix
-from dextouch.hands.skeleton import CHAINS, NUM_KEYPOINTS, chain_indices
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.hands.mean_hand import mean_hand_m
+from dextouch.hands.skeleton import CHAINS, chain_indices
 from dextouch.schemas.episodes import Matrix, matrix_rows
 from dextouch.streams.descriptors import StreamDescriptor, StreamKind
-from dextouch.tactile.layout import NUM_TAXELS, SIDES, join_pads
+from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side, join_pads
 from services.acquisition.mocks.replay import ReplayStream
 
 IMAGE_PX = 64
@@ -30,8 +33,8 @@ def pattern_streams(round_s: float = ROUND_S) -> list[ReplayStream]:
         def tactile(turn_rad: np.ndarray, phase_rad: float = phase_rad) -> np.ndarray:
             return _pressures(turn_rad + phase_rad)
 
-        def keypoints(turn_rad: np.ndarray, mirror: float = 1.0 - 2.0 * index) -> np.ndarray:
-            return _keypoints(turn_rad) * np.array([mirror, 1.0, 1.0])
+        def keypoints(turn_rad: np.ndarray, side: Side = side) -> np.ndarray:
+            return _keypoints(turn_rad, side)
 
         def wrist(turn_rad: np.ndarray, x_m: float = 0.4 * index - 0.2) -> np.ndarray:
             return _poses(turn_rad, np.array([x_m, 0.3, 1.0]))
@@ -96,17 +99,20 @@ def _pressures(turn_rad: np.ndarray) -> Float32[np.ndarray, "n 320"]:
     return pressures.reshape(len(turn_rad), NUM_TAXELS).astype(np.float32)
 
 
-def _keypoints(turn_rad: np.ndarray) -> Float64[np.ndarray, "n 25 3"]:
-    """A hand that opens and closes: each chain bends towards +y."""
-    points = np.zeros((len(turn_rad), NUM_KEYPOINTS, 3))
-    bend_rad = 0.35 * (1 - np.cos(turn_rad))
-    for chain_index, chain in enumerate(CHAINS):
-        position = np.tile([0.03 - 0.018 * chain_index, 0.0, -0.03], (len(turn_rad), 1))
-        for joint, keypoint in enumerate(chain_indices(chain)):
-            points[:, keypoint] = position
-            angle_rad = joint * bend_rad
-            step = np.stack([0 * angle_rad, np.sin(angle_rad), -np.cos(angle_rad)], axis=-1)
-            position = position + 0.03 * step
+def _keypoints(turn_rad: np.ndarray, side: Side) -> Float64[np.ndarray, "n 25 3"]:
+    """The mean hand opens and closes: each finger bends towards the palm, in wrist axes."""
+    hand = mean_hand_m(side)
+    points = np.repeat(hand[None], len(turn_rad), axis=0)
+    palm = 1.0 if side == "right" else -1.0
+    bend_rad = palm * 0.35 * (1 - np.cos(turn_rad))
+    for chain in CHAINS:
+        # The three bones beyond the palm, or beyond the base of the thumb.
+        nodes = chain_indices(chain)[-4:]
+        for joint, (parent, node) in enumerate(pairwise(nodes), start=1):
+            turned = np.zeros((len(turn_rad), 3))
+            turned[:, 0] = joint * bend_rad
+            bone = hand[node] - hand[parent]
+            points[:, node] = points[:, parent] + rotation_from_vector(turned) @ bone
     return points
 
 

@@ -12,14 +12,14 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, chain_indices
-from services.alignment.retargeting.mean_hand import (
+from dextouch.hands.mean_hand import (
     KNUCKLE_NODES,
     METACARPAL_NODES,
     PALM_NODES,
     WRIST_NODE,
     mean_hand_m,
 )
+from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, chain_indices
 
 # Many samples say no more about a shape than some hundred do.
 MAX_SAMPLES: Final = 300

@@ -9,15 +9,15 @@ from typing import Final
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands.skeleton import NODE_INDEX, chain_indices
-from dextouch.tactile.layout import Side
-from services.alignment.retargeting.hand_checks import seen_samples
-from services.alignment.retargeting.mean_hand import (
+from dextouch.hands.mean_hand import (
     FINGER_CHAINS,
     KNUCKLE_NODES,
     WRIST_NODE,
     mean_hand_m,
 )
+from dextouch.hands.skeleton import NODE_INDEX, chain_indices
+from dextouch.tactile.layout import Side
+from services.alignment.retargeting.hand_checks import seen_samples
 
 # Mean signed sine between bones of a finger. Stretched fingers may bend back by several degrees, so
 # less than this shows no side.

@@ -14,6 +14,12 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.geometry.transforms import transform
+from dextouch.hands.mean_hand import (
+    FINGER_CHAINS,
+    PALM_NODES,
+    WRIST_NODE,
+    mean_hand_m,
+)
 from dextouch.hands.skeleton import chain_indices
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import (
@@ -23,12 +29,6 @@ from services.alignment.retargeting.hand_checks import (
     seen_samples,
 )
 from services.alignment.retargeting.hand_side import check_handedness
-from services.alignment.retargeting.mean_hand import (
-    FINGER_CHAINS,
-    PALM_NODES,
-    WRIST_NODE,
-    mean_hand_m,
-)
 
 # Part of the samples in which a node must be seen to count.
 MIN_SEEN_PART: Final = 0.1

@@ -8,13 +8,13 @@ from hypothesis import strategies as st
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.geometry.transforms import apply, invert
-from dextouch.hands.skeleton import NODE_INDEX
-from services.alignment.retargeting.mean_hand import (
+from dextouch.hands.mean_hand import (
     KNUCKLE_NODES,
     METACARPAL_NODES,
     PALM_NODES,
     WRIST_NODE,
 )
+from dextouch.hands.skeleton import NODE_INDEX
 from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
+from dextouch.hands.mean_hand import METACARPAL_NODES, PALM_NODES, mean_hand_m
 from dextouch.hands.skeleton import CHAINS, NODE_INDEX, chain_indices
 from services.alignment.retargeting.hand_checks import check_hand_shape
 from services.alignment.retargeting.hand_side import check_handedness
-from services.alignment.retargeting.mean_hand import METACARPAL_NODES, PALM_NODES, mean_hand_m
 from services.twin.hands import HumanHand
 from tests.unit.alignment.tracked_hands import (
     any_rotation,
