@@ -1,10 +1,10 @@
 """A robot hand in, the arrays out that the compiled solver reads."""
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64
 
 from dextouch.geometry.rotations import rotation_from_quaternion
-from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.robot_hand import HandModel
 from dextouch.hands.skeleton import solver_indices
 from services.alignment.retargeting.solver.arrays import HAND, MAX_JOINTS, MAX_STARTS
 
@@ -24,7 +24,7 @@ STARTS = (
 )
 
 
-def hand_arrays(hand: RobotHand) -> np.ndarray:
+def hand_arrays(hand: HandModel) -> np.ndarray:
     """The hand's tables as one record `HAND`, shape [1]."""
     record = np.zeros(1, dtype=HAND)
     row = record[0]
@@ -38,6 +38,10 @@ def hand_arrays(hand: RobotHand) -> np.ndarray:
         row["tip_m"][index] = finger.tip_m
         row["radius_m"][index] = PHALANX_RADIUS_M
         row["nodes"][index] = solver_indices(finger.chain)
+        for point in (1, 2):
+            # A finger with fewer joints: one bone follows two of the person's.
+            if finger.points[point] == finger.points[point - 1]:
+                row["nodes"][index, point] = -1
         for joint, one in enumerate(finger.joints):
             row["rotation"][index, joint] = rotation_from_quaternion(np.array(one.q_wxyz))
             row["position_m"][index, joint] = one.position_m
@@ -48,6 +52,12 @@ def hand_arrays(hand: RobotHand) -> np.ndarray:
     return record
 
 
-def zero_points_m(hand: RobotHand) -> Float64[np.ndarray, "fingers 4 3"]:
+def joint_places(hand: HandModel) -> Bool[np.ndarray, "fingers 6"]:
+    """Which places of the solver's [fingers, 6] angles are joints, in the order of the hand's."""
+    counts = np.array([len(finger.joints) for finger in hand.fingers])
+    return np.asarray(np.arange(MAX_JOINTS) < counts[:, None])
+
+
+def zero_points_m(hand: HandModel) -> Float64[np.ndarray, "fingers 4 3"]:
     """Knuckle, PIP, DIP and tip of every finger at zero angles."""
     return hand.chain_points_m(np.zeros((1, len(hand.joint_names))))[0]

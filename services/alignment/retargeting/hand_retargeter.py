@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from dextouch.hands.skeleton import CHAINS, NUM_KEYPOINTS
+from dextouch.hands.robot_hand import HandModel, RobotHand
+from dextouch.hands.skeleton import NUM_KEYPOINTS
 from services.alignment.retargeting.finger_points import checked_keypoints, finger_points
-from services.alignment.retargeting.hand_arrays import hand_arrays
+from services.alignment.retargeting.hand_arrays import hand_arrays, joint_places
 from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.options import RetargetOptions
 from services.alignment.retargeting.profile_fit import (
@@ -53,7 +53,7 @@ class RetargetResult:
     """Joint angles over time, always finite and inside the limits.
 
     Attributes:
-        joints_rad: 20 angles a sample in firmware order.
+        joints_rad: angles in the order of the hand's joints (Wuji: 20, firmware order).
         status: `RetargetStatus` a sample.
         finger_status: `RetargetStatus` of every finger.
         tip_error_m: distance of each fingertip from its measured place, both seen from the
@@ -61,18 +61,18 @@ class RetargetResult:
         solved: which fingers followed points of this sample.
     """
 
-    joints_rad: Float64[np.ndarray, "time 20"]
+    joints_rad: Float64[np.ndarray, "time joints"]
     status: UInt8[np.ndarray, " time"]
-    finger_status: UInt8[np.ndarray, "time 5"]
-    tip_error_m: Float64[np.ndarray, "time 5"]
-    solved: Bool[np.ndarray, "time 5"]
+    finger_status: UInt8[np.ndarray, "time fingers"]
+    tip_error_m: Float64[np.ndarray, "time fingers"]
+    solved: Bool[np.ndarray, "time fingers"]
 
 
 class HandRetargeter:
     """Follows a tracked hand with the robot hand of the same side.
 
     Args:
-        side: "left" or "right".
+        hand: "left" or "right" for the Wuji hand, or any hand with keypoints of its side.
         profile: of the person; None measures it from what is retargeted (`retarget`), or goes by
             each sample alone (`step`).
         options: of the solver.
@@ -83,15 +83,15 @@ class HandRetargeter:
 
     def __init__(
         self,
-        side: str,
+        hand: str | HandModel,
         profile: HandProfile | None = None,
         options: RetargetOptions | None = None,
     ) -> None:
-        self.hand = RobotHand(side)
+        self.hand = RobotHand(hand) if isinstance(hand, str) else hand
         self.profile = profile
         self.options = options or RetargetOptions()
         self._arrays = hand_arrays(self.hand)
-        self._robot_bone_m = robot_bone_m(self.hand)
+        self._is_joint = joint_places(self.hand)
         self._tuning = self.options.tuning()
         self._person = self._person_of(profile)
         self._memory = self._blank()
@@ -165,13 +165,15 @@ class HandRetargeter:
             self._memory = memory
         never = np.asarray(~result.solved.any(axis=0))
         if never.any():
-            names = ", ".join(name for name, gone in zip(CHAINS, never, strict=True) if gone)
+            names = ", ".join(
+                finger.chain for finger, gone in zip(self.hand.fingers, never, strict=True) if gone
+            )
             raise InvalidInputError(
                 f"keypoints of the {self.hand.side} hand: {names} followed in no sample (bones "
                 "or knuckles are not those of the profile, or nodes are missing); expected every "
                 "finger at least once"
             )
-        return replace(result, joints_rad=_fill(result.joints_rad, result.solved))
+        return replace(result, joints_rad=self._fill(result.joints_rad, result.solved))
 
     def measure(self, keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> HandProfile:
         """The profile of a person from calibration samples.
@@ -188,12 +190,13 @@ class HandRetargeter:
 
     def _person_of(self, profile: HandProfile | None) -> np.ndarray:
         if profile is None:
-            return unknown_person(self._arrays, self._robot_bone_m)
-        return person_arrays(profile, self._robot_bone_m)
+            return unknown_person(self._arrays, robot_bone_m(self.hand))
+        return person_arrays(profile, self.hand)
 
     def _blank(self) -> Memory:
         rest = np.clip(0.0, self._arrays["lower_rad"][0], self._arrays["upper_rad"][0])
-        return Memory(rest, np.full(NUM_FINGERS, np.inf))
+        num = len(self.hand.fingers)
+        return Memory(rest[:num], np.full(num, np.inf))
 
     def _follow(
         self,
@@ -201,22 +204,37 @@ class HandRetargeter:
         person: np.ndarray,
         tuning: np.ndarray,
     ) -> RetargetResult:
-        num = len(samples[0])
+        num, num_fingers = len(samples[0]), len(self.hand.fingers)
         output = Output(
-            joints_rad=np.empty((num, NUM_FINGERS, MAX_JOINTS)),
-            finger_status=np.empty((num, NUM_FINGERS), dtype=np.uint8),
+            joints_rad=np.empty((num, num_fingers, MAX_JOINTS)),
+            finger_status=np.empty((num, num_fingers), dtype=np.uint8),
             status=np.empty(num, dtype=np.uint8),
-            tip_error_m=np.empty((num, NUM_FINGERS)),
+            tip_error_m=np.empty((num, num_fingers)),
         )
         tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
         retarget_samples(tables, samples, self._memory, output)
         return RetargetResult(
-            joints_rad=output.joints_rad[:, :, :4].reshape(num, NUM_JOINTS),
+            joints_rad=output.joints_rad[:, self._is_joint],
             status=output.status,
             finger_status=output.finger_status,
             tip_error_m=output.tip_error_m,
             solved=output.finger_status < RetargetStatus.IMPLAUSIBLE,
         )
+
+    def _fill(
+        self, joints_rad: np.ndarray, solved: np.ndarray
+    ) -> Float64[np.ndarray, "time joints"]:
+        """Untracked stretches of fingers, linearly between the samples around; held at ends."""
+        filled = joints_rad.copy()
+        rows = np.arange(len(filled))
+        finger_of = np.nonzero(self._is_joint)[0]
+        for joint, finger in enumerate(finger_of):
+            known = solved[:, finger]
+            if not known.all():
+                filled[~known, joint] = np.interp(
+                    rows[~known], rows[known], joints_rad[known, joint]
+                )
+        return filled
 
 
 def warm_up() -> None:
@@ -250,14 +268,3 @@ def _elapsed_s(num_samples: int, t_s: np.ndarray | None) -> Float64[np.ndarray, 
                 "rising times"
             )
     return elapsed
-
-
-def _fill(joints_rad: np.ndarray, solved: np.ndarray) -> Float64[np.ndarray, "time 20"]:
-    """Untracked stretches of a finger, linearly between the samples around; held at the ends."""
-    filled = joints_rad.copy()
-    rows = np.arange(len(filled))
-    for finger in np.flatnonzero(~solved.all(axis=0)):
-        known = solved[:, finger]
-        for joint in range(4 * finger, 4 * finger + 4):
-            filled[~known, joint] = np.interp(rows[~known], rows[known], joints_rad[known, joint])
-    return filled

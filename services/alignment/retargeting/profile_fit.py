@@ -4,10 +4,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.robot_hand import HandModel
 from dextouch.hands.skeleton import CHAINS
 from services.alignment.retargeting.finger_points import FingerPoints
-from services.alignment.retargeting.hand_arrays import hand_arrays, zero_points_m
+from services.alignment.retargeting.hand_arrays import (
+    hand_arrays,
+    joint_places,
+    zero_points_m,
+)
 from services.alignment.retargeting.hand_profile import (
     BONE_RANGE_M,
     NUM_FINGERS,
@@ -32,6 +36,8 @@ LEAST_SIGMA_M = 1e-4
 # A robot's knuckle that moved less than this (RMS, metres) tells nothing about its travel.
 LEAST_TRAVEL_M = 1e-3
 UNKNOWN_FREEDOM = 1e6
+# Of a robot's finger; shorter is none.
+LEAST_BONE_M = 1e-6
 # Samples that lie seconds apart: no pinches, no pull.
 EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
 
@@ -48,25 +54,36 @@ def unknown_person(hand: np.ndarray, robot_bone_m: np.ndarray) -> np.ndarray:
     return record
 
 
-def person_arrays(profile: HandProfile, robot_bone_m: np.ndarray) -> np.ndarray:
-    """A profile as the compiled solver reads it: one record `PERSON`, shape [1]."""
+def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
+    """A profile, of the fingers that the hand has, as the solver reads it: one record `PERSON`."""
     sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
     record = np.zeros(1, dtype=PERSON)
+    rows, num = chains_of(hand), len(hand.fingers)
     record["is_known"] = True
-    record["bone_m"] = profile.bone_m
-    record["bone_scale"] = profile.bone_m / robot_bone_m
-    record["knuckle_m"] = profile.knuckle_m
-    record["travel"] = profile.travel
-    record["freedom"] = (profile.knuckle_sigma_m / sigma_m) ** 2
+    own_m, bone_m = robot_bone_m(hand), profile.bone_m[rows].copy()
+    for finger, bone in zip(*np.nonzero(own_m[:, :2] < LEAST_BONE_M), strict=True):
+        # Two bones of the person in a row are one of the robot's.
+        bone_m[finger, bone + 1] += bone_m[finger, bone]
+        bone_m[finger, bone] = 0.0
+    record["bone_m"][0, :num] = bone_m
+    record["bone_scale"][0, :num] = bone_m / np.maximum(own_m, LEAST_BONE_M)
+    record["knuckle_m"][0, :num] = profile.knuckle_m[rows]
+    record["travel"][0, :num] = profile.travel[rows]
+    record["freedom"][0, :num] = (profile.knuckle_sigma_m[rows] / sigma_m) ** 2
     return record
 
 
-def robot_bone_m(hand: RobotHand) -> Float64[np.ndarray, "5 3"]:
+def chains_of(hand: HandModel) -> list[int]:
+    """Which chain of the tracked skeleton (thumb … little) each of the hand's fingers follows."""
+    return [CHAINS.index(finger.chain) for finger in hand.fingers]
+
+
+def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
     """Lengths from knuckle to PIP, DIP and tip of a robot hand at zero angles."""
     return np.asarray(np.linalg.norm(np.diff(zero_points_m(hand), axis=1), axis=-1))
 
 
-def measure_profile(points: FingerPoints, hand: RobotHand) -> HandProfile:
+def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
     """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
 
     Args:
@@ -121,18 +138,19 @@ def _spread(rows: np.ndarray) -> np.ndarray:
 
 
 def _knuckle_motion(
-    points_m: np.ndarray, whole: np.ndarray, hand: RobotHand
+    points_m: np.ndarray, whole: np.ndarray, hand: HandModel
 ) -> Float64[np.ndarray, "n 5 3"]:
     """Where the robot's knuckles are when its fingers point like the tracked ones; NaN: unknown."""
     # The solver takes keypoints by their number: here there are just the fingers' own, in turn.
-    own = hand_arrays(hand)
-    own["nodes"] = np.arange(20).reshape(5, 4)
+    own, rows = hand_arrays(hand), chains_of(hand)
+    nodes = own["nodes"][0, : len(rows)]
+    nodes[:] = np.where(nodes >= 0, np.arange(20).reshape(5, 4)[rows], -1)
     num = len(points_m)
     output = Output(
-        joints_rad=np.zeros((num, NUM_FINGERS, MAX_JOINTS)),
-        finger_status=np.zeros((num, NUM_FINGERS), dtype=np.uint8),
+        joints_rad=np.zeros((num, len(rows), MAX_JOINTS)),
+        finger_status=np.zeros((num, len(rows)), dtype=np.uint8),
         status=np.zeros(num, dtype=np.uint8),
-        tip_error_m=np.zeros((num, NUM_FINGERS)),
+        tip_error_m=np.zeros((num, len(rows))),
     )
     retarget_samples(
         (
@@ -142,13 +160,15 @@ def _knuckle_motion(
             np.zeros(1, dtype=SCRATCH),
         ),
         (points_m.reshape(num, 20, 3), np.repeat(whole, 4, axis=1), np.full(num, np.inf)),
-        Memory(np.zeros((NUM_FINGERS, MAX_JOINTS)), np.full(NUM_FINGERS, np.inf)),
+        Memory(np.zeros((len(rows), MAX_JOINTS)), np.full(len(rows), np.inf)),
         output,
     )
-    knuckles = hand.chain_points_m(output.joints_rad[:, :, :4].reshape(num, 20))[:, :, 0]
-    moved_m = knuckles - own["knuckle_m"][0]
-    moved_m[output.finger_status >= IMPLAUSIBLE] = np.nan
-    return np.asarray(moved_m)
+    is_joint = joint_places(hand)
+    knuckles = hand.chain_points_m(output.joints_rad[:, is_joint])[:, :, 0]
+    moved_m = np.full((num, NUM_FINGERS, 3), np.nan)
+    moved_m[:, rows] = knuckles - own["knuckle_m"][0, : len(rows)]
+    moved_m[:, rows][output.finger_status >= IMPLAUSIBLE] = np.nan
+    return moved_m
 
 
 def _fit_knuckle(

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.robot_hand import HandModel, RobotHand
 from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from services.alignment.retargeting.hand_arrays import hand_arrays
@@ -126,6 +126,36 @@ def test_no_joint_is_faster_than_the_limit():
     assert steps_rad.max() == pytest.approx(1 / 60)
     slow = HandRetargeter("right", options=options).retarget(there, t_s=np.arange(25.0))
     np.testing.assert_allclose(slow.joints_rad[-1], bending(2)[1], atol=1e-6)
+
+
+def test_hands_of_other_fingers_and_joints_are_followed():
+    thumb, index, middle, *_ = HAND.fingers
+    extra = index.joints[0]._replace(name="twist", position_m=(0.0, 0.0, 0.0), axis=(0.0, 0.0, 1.0))
+    twisted = middle._replace(joints=(extra, *middle.joints), points=(2, 3, 4))
+    hand = HandModel("right", (thumb, index, twisted), name="three fingers")
+    low, high = 0.8 * hand.lower_rad, 0.8 * hand.upper_rad
+    waves = np.sin(np.arange(120)[:, None] / 15 + np.arange(13))
+    joints = low + (high - low) * (0.5 + 0.4 * waves)
+    points = hand.chain_points_m(joints)
+    keypoints = keypoints_of(np.zeros((120, 20)))
+    for finger, table in enumerate(hand.fingers):
+        keypoints[:, solver_indices(table.chain)] = points[:, finger]
+    result = HandRetargeter(hand, options=EXACT).retarget(keypoints)
+    assert result.joints_rad.shape == (120, 13)
+    assert result.finger_status.shape == (120, 3)
+    reached = hand.chain_points_m(result.joints_rad)
+    np.testing.assert_allclose(reached, points, atol=1e-6)
+
+
+def test_two_bones_may_be_one_of_the_robots():
+    thumb, index, *others = HAND.fingers
+    stiff = index._replace(joints=index.joints[:3], points=(1, 2, 2), tip_m=(0.0, 0.0, -0.05425))
+    hand = HandModel("right", (thumb, stiff, *others), name="stiff index")
+    joints = bending(20)
+    joints[:, 7] = 0.0
+    result = HandRetargeter(hand, options=EXACT).retarget(keypoints_of(joints))
+    assert (result.status == RetargetStatus.SOLVED).all()
+    np.testing.assert_allclose(result.joints_rad, np.delete(joints, 7, axis=1), atol=1e-6)
 
 
 def test_times_must_rise():

@@ -41,7 +41,7 @@ HAND: Final = np.dtype(
         ("starts_rad", np.float64, (MAX_STARTS, _F, _J)),
         # Phalanges as capsules, from knuckle to tip.
         ("radius_m", np.float64, (_F, 3)),
-        # Which keypoints are knuckle, PIP, DIP and tip.
+        # Which keypoints are knuckle, PIP, DIP and tip; -1 where the finger has no such joint.
         ("nodes", np.int64, (_F, _P)),
     ]
 )

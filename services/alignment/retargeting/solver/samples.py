@@ -118,7 +118,7 @@ def retarget_samples(tables, samples, memory, output):
         read_sample(hand, work, keypoints[t], valid[t])
         for finger in range(num_fingers):
             memory.unsolved_s[finger] += elapsed_s[t]
-            status[finger] = see_finger(person, tuning, work, finger)
+            status[finger] = see_finger(hand, person, tuning, work, finger)
             if status[finger] < IMPLAUSIBLE and set_box(hand, tuning, work, finger, memory):
                 solve_cold(hand, person, work, finger, joints, tuning.num_starts)
                 if np.isfinite(memory.unsolved_s[finger]):

@@ -22,7 +22,9 @@ def read_sample(hand, work, keypoints, valid):
         for index in range(NUM_POINTS):
             node = hand.nodes[finger, index]
             x, y, z = keypoints[node, 0], keypoints[node, 1], keypoints[node, 2]
-            seen = valid[node] and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
+            seen = (
+                node >= 0 and valid[node] and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
+            )
             work.usable[finger, index] = seen
             point = work.measured[finger, index]
             point[0] = x if seen else 0.0
@@ -32,17 +34,19 @@ def read_sample(hand, work, keypoints, valid):
 
 @compiled
 @no_type_check
-def see_finger(person, tuning, work, finger):
+def see_finger(hand, person, tuning, work, finger):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
     Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
     errors of the tracker; the whole finger is left out, since the odd point cannot be told.
     """
     measured, usable = work.measured[finger], work.usable[finger]
-    count = 0
-    for index in range(NUM_POINTS):
-        count += 1 if usable[index] and index > 0 else 0
-    if count < 2 or (not person.is_known and not (count == 3 and usable[0])):
+    count, expected = 0, 0
+    for index in range(1, NUM_POINTS):
+        count += 1 if usable[index] else 0
+        expected += 1 if hand.nodes[finger, index] >= 0 else 0
+    is_whole = count == expected and usable[0]
+    if count < 2 or (not person.is_known and not is_whole):
         return MISSING
     for k in range(3):
         work.scale[finger, k] = person.bone_scale[finger, k]
@@ -82,7 +86,7 @@ def see_finger(person, tuning, work, finger):
         # The robot's own knuckle travels up to its offset, 15 mm.
         if squared > (tuning.knuckle_tolerance_m + 0.03 * person.travel[finger]) ** 2:
             return IMPLAUSIBLE
-    return SOLVED if count == 3 and usable[0] else PARTIAL
+    return SOLVED if is_whole else PARTIAL
 
 
 @compiled
