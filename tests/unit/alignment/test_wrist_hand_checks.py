@@ -1,5 +1,7 @@
 """Unit, order of nodes and side of tracked hands are recognised by the hand itself."""
 
+from itertools import permutations, product
+
 import numpy as np
 import pytest
 
@@ -100,6 +102,24 @@ def test_other_orders_are_named(seed):
     # Both at once: the order comes first, since sizes of mixed bones mean nothing.
     with pytest.raises(InvalidInputError, match="another order: wrist, little, thumb"):
         check_hand_shape(keypoints[:, order(linux)] * 1e3)
+
+
+def test_every_order_of_chains_and_joints_is_named():
+    keypoints = tracked("right", 7)[:20]
+    num_orders = 0
+    for chains in permutations(CHAINS):
+        for is_turned, is_wrist_last in product((False, True), repeat=2):
+            nodes = order(chains, is_turned=is_turned, is_wrist_last=is_wrist_last)
+            if nodes == list(range(25)):
+                continue
+            num_orders += 1
+            with pytest.raises(InvalidInputError) as refusal:
+                check_hand_shape(keypoints[:, nodes])
+            found = refusal.value.details["found"]
+            names = [*chains, "wrist"] if is_wrist_last else ["wrist", *chains]
+            assert found.startswith(", ".join(names))
+            assert found.endswith("to the metacarpal") is is_turned
+    assert num_orders == 479
 
 
 @pytest.mark.parametrize("seed", range(4))
