@@ -25,6 +25,8 @@ from services.alignment.settings import AlignmentSettings, usable_cores
 from services.alignment.synchronization.progress import Progress
 
 EXIT_REFUSED = 3
+# Of a report that goes to a file or another program.
+PAGE_WIDTH = 110
 EPILOG = """examples:
   dextouch align run take-7 take-8           align two recordings, side by side
   dextouch align run --all --workers 2       align whatever has no episode yet
@@ -158,7 +160,8 @@ def _bars(console: Console, num_recordings: int) -> Iterator[TellOne]:
 
 def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     report = find_report(EpisodeStore(parsed.store), parsed.id, settings.options)
-    Console(highlight=False).print(report_page(report))
+    width = None if sys.stdout.isatty() else PAGE_WIDTH
+    Console(highlight=False, width=width).print(report_page(report))
     _write_json(parsed.json, [report])
     return 0
 

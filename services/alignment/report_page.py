@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 
+from rich.box import SIMPLE_HEAD
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
@@ -55,7 +56,7 @@ def report_page(report: AlignmentReport) -> Group:
 
 
 def _clocks(report: AlignmentReport) -> Table:
-    table = Table(title="streams", title_justify="left")
+    table = Table(title="streams", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("stream")
     for name in (
         "samples",
@@ -85,7 +86,7 @@ def _clocks(report: AlignmentReport) -> Table:
 
 
 def _retargeting(figures: Mapping[str, Mapping[str, float]]) -> Table:
-    table = Table(title="retargeting", title_justify="left")
+    table = Table(title="retargeting", title_justify="left", box=SIMPLE_HEAD)
     table.add_column("hand")
     table.add_column("tip error mm", justify="right")
     table.add_column("95 % below", justify="right")
@@ -105,7 +106,7 @@ def _retargeting(figures: Mapping[str, Mapping[str, float]]) -> Table:
 def _refused(parts: Sequence[RefusedPart]) -> Table | Text:
     if not parts:
         return Text("the whole recording is in the episode")
-    table = Table(title="not in the episode", title_justify="left")
+    table = Table(title="not in the episode", title_justify="left", box=SIMPLE_HEAD)
     for name in ("from s", "to s", "for s"):
         table.add_column(name, justify="right")
     table.add_column("why")

@@ -56,12 +56,12 @@ def alignments_router(jobs: JobTable) -> APIRouter:
         limit: Annotated[int, Query(ge=1, le=MAX_BATCH)] = PAGE,
     ) -> AlignmentList:
         """Alignments, oldest first, a page at a time; `after` is the last id of the page before."""
-        return jobs.page(state=state, after=after, limit=limit)
+        return jobs.book.page(state=state, after=after, limit=limit)
 
     @router.get("/{alignment_id}")
     async def one(alignment_id: str) -> AlignmentJob:
         """Where one alignment stands."""
-        return jobs.get(alignment_id)
+        return jobs.book.get(alignment_id)
 
     @router.post("/{alignment_id}/cancel")
     async def cancel(alignment_id: str) -> AlignmentJob:

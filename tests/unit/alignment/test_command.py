@@ -1,0 +1,97 @@
+"""`dextouch align` from the shell: recordings aligned and told, refused with a reason, reported."""
+
+import json
+import threading
+
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from services.alignment import __main__ as command
+from services.alignment import many
+from tests.unit.alignment.recordings import write_recording
+from tests.unit.alignment.test_service import FakeWorker
+
+
+@pytest.fixture(autouse=True)
+def worker(monkeypatch):
+    """The same work in a thread; `test_worker.py` has real processes."""
+    go_on = threading.Event()
+    go_on.set()
+    monkeypatch.setattr(many, "AlignmentWorker", type("Worker", (FakeWorker,), {"held": go_on}))
+
+
+@pytest.fixture
+def store(tmp_path):
+    store = EpisodeStore(tmp_path / "store")
+    write_recording(store, "take", seconds=10.0, lost=(("wrist_left", 300, 400),))
+    write_recording(store, "other")
+    write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
+    return store
+
+
+def test_recordings_are_aligned_and_told(store, tmp_path, capsys):
+    path = tmp_path / "reports.json"
+    arguments = ["run", "take", "--store", str(store.root), "--json", str(path)]
+    assert command.main(arguments) == 0
+    assert "take aligned" in capsys.readouterr().out
+    assert json.loads(path.read_text())[0]["created"] is True
+    assert command.main(arguments) == 0
+    assert "take was aligned already" in capsys.readouterr().out
+
+
+def test_a_failure_is_told_and_the_others_are_aligned(store, capsys):
+    arguments = ["run", "headless", "take", "--workers", "2", "--store", str(store.root)]
+    assert command.main(arguments) == 3
+    told = capsys.readouterr()
+    assert "take aligned" in told.out
+    assert "head" in told.err
+
+
+def test_all_aligns_what_has_no_episode(store, capsys):
+    assert command.main(["run", "other", "--store", str(store.root)]) == 0
+    capsys.readouterr()
+    assert command.main(["run", "--all", "--store", str(store.root)]) == 3
+    told = capsys.readouterr()
+    assert "take aligned" in told.out
+    assert "other" not in told.out
+    assert "headless" in told.err
+    store.delete("headless", kind="recording")
+    assert command.main(["run", "--all", "--store", str(store.root)]) == 0
+    assert "nothing to do" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("which", ["take", "episode"])
+def test_report_of_a_recording_or_its_episode(store, tmp_path, capsys, which):
+    command.main(["run", "take", "--store", str(store.root)])
+    item_id = "take" if which == "take" else store.list()[0]
+    capsys.readouterr()
+    path = tmp_path / "report.json"
+    arguments = ["report", item_id, "--store", str(store.root), "--json", str(path)]
+    assert command.main(arguments) == 0
+    page = capsys.readouterr().out
+    for word in ("not in the episode", "wrist_left: no samples", "residual", "latency", "dropped"):
+        assert word in page
+    (report,) = json.loads(path.read_text())
+    assert {part["reason"] for part in report["refused_parts"]} == {"gap", "shorter"}
+    assert report["recording_id"] == "take"
+
+
+def test_report_of_what_is_not_aligned(store, capsys):
+    assert command.main(["report", "other", "--store", str(store.root)]) == 3
+    assert "other" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments", [["run"], ["run", "take", "--all"], ["report", "nothing"], ["run", "nothing"]]
+)
+def test_refusals(store, capsys, arguments):
+    assert command.main([*arguments, "--store", str(store.root)]) == 3
+    assert capsys.readouterr().err.startswith("dextouch align: ")
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]])
+def test_help_teaches(capsys, arguments):
+    with pytest.raises(SystemExit) as stop:
+        command.main(arguments)
+    assert stop.value.code == 0
+    assert "dextouch align run --all" in capsys.readouterr().out
