@@ -6,7 +6,9 @@ import pytest
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import transform
+from dextouch.hands.skeleton import NODE_INDEX
 from dextouch.schemas.episodes import matrix_rows
+from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.retargeting import HandRetargeter
 from services.alignment.retargeting.keypoint_axes import (
     calibration_record,
@@ -79,6 +81,15 @@ def test_joints_of_a_turned_hand_are_those_of_the_hand():
     )
 
 
+def test_the_made_up_hands_of_mock_stations_are_hands_in_wrist_axes():
+    made_up = [s for s in pattern_streams() if s.descriptor.kind == "keypoints"]
+    assert len(made_up) == len(SIDES)
+    for stream in made_up:
+        checked = hand_axes_check(stream.values, stream.descriptor.name.split("_")[1], {})
+        assert checked.off_rad < 1e-6
+        assert np.ptp(stream.values[:, NODE_INDEX["index", "tip"]], axis=0).max() > 0.05
+
+
 def test_a_calibration_that_does_not_fit_is_refused():
     rng = np.random.default_rng(3)
     keypoints = moving_hand("right", rng)
@@ -119,3 +130,50 @@ def test_broken_recordings_are_refused_by_name(break_it, fault):
     with pytest.raises(InvalidInputError, match="keypoints_left") as refusal:
         hand_axes_check(break_it(keypoints), "left", {})
     assert refusal.value.details["fault"] == fault
+
+
+def corrupted(keypoints, rng):
+    """One fault of those that trackers and their users make, in some of the nodes."""
+    hit = rng.random(keypoints.shape[:2]) < rng.choice([0.02, 0.3, 0.9])
+    broken = keypoints.copy()
+    kind = rng.integers(6)
+    if kind == 0:
+        broken[hit] = rng.choice([np.nan, np.inf, 0.0, 1e300, 5e-324])
+    elif kind == 1:
+        broken = broken * rng.choice([1e3, 1e-3, 0.0, 1e-310])
+    elif kind == 2:
+        broken[hit] += rng.normal(scale=0.05, size=3)
+    elif kind == 3:
+        broken = broken[:, rng.permutation(25)]
+    elif kind == 4:
+        broken = np.repeat(broken[:1], len(broken), axis=0)
+    else:
+        broken[:, rng.integers(0, 25, 3)] = broken[:, rng.integers(0, 25, 3)]
+    return broken
+
+
+def test_whatever_comes_is_an_answer_without_nan_or_a_refusal():
+    num_answers = num_refusals = 0
+    for seed in range(150):
+        rng = np.random.default_rng(seed)
+        keypoints = corrupted(moving_hand("left", rng, 40), rng)
+        for call in (_checked_frame, _calibrated_frame):
+            try:
+                frame = call(keypoints)
+            except InvalidInputError as refusal:
+                assert refusal.details["fault"]
+                num_refusals += 1
+                continue
+            num_answers += 1
+            assert np.isfinite(frame.T_tracker_wrist).all()
+            assert np.isfinite(frame.sigma_rad)
+    assert num_answers > 20
+    assert num_refusals > 100
+
+
+def _checked_frame(keypoints):
+    return hand_axes_check(keypoints, "left", {}).frame
+
+
+def _calibrated_frame(keypoints):
+    return calibrate_wrist(keypoints, "left")
