@@ -1,6 +1,6 @@
 """Samples come in from the reader threads; blocks of stamps and values go out, for the judges."""
 
-from collections import deque
+import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -36,11 +36,53 @@ class Block:
 
 
 class _Queue:
+    """A ring of one stream's newest stamps and values; any thread may add and take.
+
+    It takes its memory once, whatever waits in it.
+    """
+
     def __init__(self, descriptor: StreamDescriptor) -> None:
-        size = max(16, round(KEPT_S * descriptor.nominal_rate_hz))
-        self.keeps_values = descriptor.kind in JUDGED_VALUES
-        self.samples: deque[tuple[int, int, int, np.ndarray | None]] = deque(maxlen=size)
-        self.latencies_ns: deque[int] = deque(maxlen=size)
+        self._size = max(16, round(KEPT_S * descriptor.nominal_rate_hz))
+        self._keeps_values = descriptor.kind in JUDGED_VALUES
+        self._stamps = np.zeros((self._size, 3), dtype=np.int64)
+        self._latencies_ns = np.zeros(self._size, dtype=np.int64)
+        # Made of the first sample: its device decides on their type.
+        self._values: np.ndarray | None = None
+        self._num_added = self._num_taken = 0
+        self._num_latencies = self._num_latencies_taken = 0
+        self._lock = threading.Lock()
+
+    def add(self, samples: Sequence[Sample], latency_ns: int | None) -> int:
+        """Append samples; how many older ones fell out."""
+        if self._values is None and self._keeps_values:
+            first = samples[0].values
+            self._values = np.zeros((self._size, *first.shape), dtype=first.dtype)
+        with self._lock:
+            for sample in samples:
+                place = self._num_added % self._size
+                self._stamps[place] = (sample.t_host_ns, sample.t_device_ns, sample.sequence)
+                if self._values is not None:
+                    self._values[place] = sample.values
+                self._num_added += 1
+            if latency_ns is not None:
+                self._latencies_ns[self._num_latencies % self._size] = latency_ns
+                self._num_latencies += 1
+            dropped = max(0, self._num_added - self._num_taken - self._size)
+            self._num_taken += dropped
+        return dropped
+
+    def take(self) -> Block:
+        """Everything that waits, oldest first."""
+        with self._lock:
+            places = np.arange(self._num_taken, self._num_added) % self._size
+            first = max(self._num_latencies_taken, self._num_latencies - self._size)
+            latencies_ns = self._latencies_ns[np.arange(first, self._num_latencies) % self._size]
+            stamps = np.ascontiguousarray(self._stamps[places].T)
+            values = None
+            if self._values is not None and len(places):
+                values = self._values[places]
+            self._num_taken, self._num_latencies_taken = self._num_added, self._num_latencies
+        return Block(stamps[0], stamps[1], stamps[2], latencies_ns, values)
 
 
 class SampleBlocks:
@@ -61,29 +103,14 @@ class SampleBlocks:
 
     def add(self, stream: str, samples: Sequence[Sample]) -> None:
         """Append (called by the reader threads, after the samples were spooled)."""
-        queue = self._queues[stream]
+        latency_ns = None
         if self._clock is not None:
-            queue.latencies_ns.append(self._clock.now_ns() - samples[-1].t_host_ns)
-        kept = queue.samples
-        self.dropped += max(0, len(kept) + len(samples) - (kept.maxlen or 0))
-        if queue.keeps_values:
-            kept.extend((s.t_host_ns, s.t_device_ns, s.sequence, s.values) for s in samples)
-        else:
-            kept.extend((s.t_host_ns, s.t_device_ns, s.sequence, None) for s in samples)
+            latency_ns = self._clock.now_ns() - samples[-1].t_host_ns
+        self.dropped += self._queues[stream].add(samples, latency_ns)
 
     def take(self, stream: str) -> Block:
-        """What came since the last call."""
-        queue = self._queues[stream]
-        taken = [queue.samples.popleft() for _ in range(len(queue.samples))]
-        latencies = [queue.latencies_ns.popleft() for _ in range(len(queue.latencies_ns))]
-        values = [value for *_, value in taken if value is not None]
-        return Block(
-            np.array([item[0] for item in taken], dtype=np.int64),
-            np.array([item[1] for item in taken], dtype=np.int64),
-            np.array([item[2] for item in taken], dtype=np.int64),
-            np.array(latencies, dtype=np.int64),
-            np.stack(values) if values else None,
-        )
+        """Everything since the last call, oldest first."""
+        return self._queues[stream].take()
 
 
 class Rolling:
