@@ -8,16 +8,19 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.tactile.layout import SIDES
+from dextouch.tactile.layout import SIDES, Side
 from services.alignment.retargeting.hand_retargeter import (
     HandRetargeter,
     RetargetResult,
     RetargetStatus,
 )
+from services.alignment.retargeting.keypoint_axes import hand_axes_check
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import GridPlacement, vectors_on_grid
 
 NS_PER_S = 1e9
+# Samples of a recording that are looked at to tell a hand's axes, side and unit.
+MAX_CHECKED = 2000
 
 
 @dataclass(frozen=True)
@@ -41,7 +44,8 @@ def retarget_hands(
         at: of both, valid at every step; at least one step.
 
     Raises:
-        InvalidInputError: keypoints that are no hand, see `HandRetargeter.retarget`.
+        InvalidInputError: keypoints that are no hand, of the other side or in other axes, see
+            `hand_axes_check` and `HandRetargeter.retarget`.
     """
     with ThreadPoolExecutor(len(SIDES), thread_name_prefix="retarget") as threads:
         hands = list(
@@ -55,10 +59,12 @@ def retarget_hands(
 
 
 def _retarget(
-    side: str, stream: LoadedStream, at: GridPlacement
+    side: Side, stream: LoadedStream, at: GridPlacement
 ) -> tuple[Float64[np.ndarray, "n 20"], dict[str, float]]:
     first, stop = int(at.left.min()), int(at.left.max()) + 2
     keypoints_m = stream.values[first:stop]
+    # What the calibration turns was turned when the stream was read: the rest is refused.
+    hand_axes_check(keypoints_m[:: 1 + len(keypoints_m) // MAX_CHECKED], side, {})
     t_ns = stream.t_ns[first:stop]
     # int64 first, so that seconds stay exact to the nanosecond.
     t_s = (t_ns - t_ns[0]).astype(np.float64) / NS_PER_S

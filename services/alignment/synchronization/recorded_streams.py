@@ -24,6 +24,7 @@ from services.alignment.calibration.tactile_baseline import (
     TactileCalibration,
     TaxelSurvey,
 )
+from services.alignment.retargeting.keypoint_axes import calibrated_frame, to_wrist_axes
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 
 # Where the tracked body sits in what the tracker follows, by stream.
@@ -155,7 +156,7 @@ def date_stream(recording: Recording, name: str) -> DatedStream:
         return _pressures(raw, calibration)
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
-        convert = _as_float64
+        convert = _keypoints_conversion(descriptor, calibration)
     elif descriptor.kind == "pose" and MOUNTS.get(name) in calibration:
         convert = partial(_move_to_body, T_tracker_body=_mount(calibration[MOUNTS[name]]))
     return DatedStream(recording, descriptor, timing, convert)
@@ -173,6 +174,18 @@ def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
 
 def _as_it_is(values: np.ndarray) -> np.ndarray:
     return values
+
+
+def _keypoints_conversion(
+    descriptor: StreamDescriptor, calibration: dict[str, Matrix]
+) -> Conversion:
+    """To wrist axes where the calibration says how the tracker's are turned; else as they came."""
+    if descriptor.side is None:
+        return _as_float64
+    T_keypoints_wrist = calibrated_frame(calibration, descriptor.side)
+    if T_keypoints_wrist is None:
+        return _as_float64
+    return partial(to_wrist_axes, T_keypoints_wrist=T_keypoints_wrist)
 
 
 def _as_float64(values: np.ndarray) -> np.ndarray:
