@@ -196,7 +196,7 @@ class HandRetargeter:
     def _blank(self) -> Memory:
         rest = np.clip(0.0, self._arrays["lower_rad"][0], self._arrays["upper_rad"][0])
         num = len(self.hand.fingers)
-        return Memory(rest[:num], np.full(num, np.inf))
+        return Memory(rest[:num], rest[:num].copy(), np.full(num, np.inf))
 
     def _follow(
         self,

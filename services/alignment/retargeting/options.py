@@ -21,6 +21,7 @@ class RetargetOptions:
             full weight.
         pinch_far_m: from here on it has none, and thumb and finger are solved apart.
         pinch_weight: the full weight, beside points of unit weight.
+        posture_weight_m2: pull of joints in a pinch towards what their own points ask for, m²/rad².
         reacquire_after_s: a finger that was lost for so long is searched from several starts.
         num_starts: of such a search, 1 … 8.
         keeps_fingers_apart: push neighbouring fingers apart where their capsules overlap; costs
@@ -32,6 +33,7 @@ class RetargetOptions:
     pinch_near_m: float = 0.005
     pinch_far_m: float = 0.060
     pinch_weight: float = 100.0
+    posture_weight_m2: float = 3e-3
     reacquire_after_s: float = 0.1
     num_starts: int = len(STARTS)
     keeps_fingers_apart: bool = False
@@ -46,6 +48,7 @@ class RetargetOptions:
                     self.temporal_weight_m2 >= 0,
                     "≥ 0",
                 ),
+                ("posture_weight_m2", self.posture_weight_m2, self.posture_weight_m2 >= 0, "≥ 0"),
                 (
                     "velocity_limit_rad_s",
                     self.velocity_limit_rad_s,
@@ -82,6 +85,7 @@ class RetargetOptions:
         record["pinch_far_m"] = self.pinch_far_m
         record["pinch_weight_near"] = self.pinch_weight
         record["pinch_weight_far"] = PINCH_WEIGHT_FAR
+        record["posture_weight_m2"] = self.posture_weight_m2
         record["reacquire_after_s"] = self.reacquire_after_s
         record["num_starts"] = self.num_starts
         record["bone_tolerance"] = BONE_TOLERANCE
@@ -96,7 +100,8 @@ PINCH_WEIGHT_FAR = 1e-3
 # A bone that differs from the person's by more than both is an error of the tracker.
 BONE_TOLERANCE = 0.3
 BONE_TOLERANCE_M = 0.008
-# So is a knuckle that lies further than this from its place in the wrist frame.
-KNUCKLE_TOLERANCE_M = 0.015
+# So is a knuckle that lies further than this from its place in the wrist frame; neighbours are
+# 16 mm or more apart.
+KNUCKLE_TOLERANCE_M = 0.012
 # And two bones in a row bent by more than 140°; hands and robot stop at 120°.
 MAX_BEND_COSINE = -0.766

@@ -160,7 +160,11 @@ def _knuckle_motion(
             np.zeros(1, dtype=SCRATCH),
         ),
         (points_m.reshape(num, 20, 3), np.repeat(whole, 4, axis=1), np.full(num, np.inf)),
-        Memory(np.zeros((len(rows), MAX_JOINTS)), np.full(len(rows), np.inf)),
+        Memory(
+            np.zeros((len(rows), MAX_JOINTS)),
+            np.zeros((len(rows), MAX_JOINTS)),
+            np.full(len(rows), np.inf),
+        ),
         output,
     )
     is_joint = joint_places(hand)

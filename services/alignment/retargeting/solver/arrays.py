@@ -71,6 +71,7 @@ TUNING: Final = np.dtype(
         ("pinch_far_m", np.float64),
         ("pinch_weight_near", np.float64),
         ("pinch_weight_far", np.float64),
+        ("posture_weight_m2", np.float64),
         ("reacquire_after_s", np.float64),
         ("num_starts", np.int64),
         ("bone_tolerance", np.float64),
@@ -107,6 +108,9 @@ SCRATCH: Final = np.dtype(
         ("upper", np.float64, (_F, _J)),
         ("before", np.float64, (_F, _J)),
         ("pull_m2", np.float64, (_F,)),
+        # The posture that the points alone ask for, and how strongly a pinch keeps to it.
+        ("posture", np.float64, (_F, _J)),
+        ("posture_weight_m2", np.float64, (_F,)),
         ("scale", np.float64, (_F, 3)),
         ("freedom", np.float64, (_F,)),
         # Vector from fingertip to thumb tip and its weight; the fingers that are solved together.
@@ -125,12 +129,16 @@ SCRATCH: Final = np.dtype(
 
 
 class Memory(NamedTuple):
-    """What one sample leaves for the next, changed in place: angles [5, 6], seconds unsolved [5].
+    """What one sample leaves for the next, changed in place.
 
-    A finger that was never solved has infinite seconds.
+    Attributes:
+        joints_rad: [F, 6], what came out.
+        alone_rad: [F, 6], what fingers would do if there were no pinch.
+        unsolved_s: [F] since a finger was solved; infinite if it never was.
     """
 
     joints_rad: np.ndarray
+    alone_rad: np.ndarray
     unsolved_s: np.ndarray
 
 

@@ -29,23 +29,17 @@ MAX_PUSHES = 4
 
 @compiled
 @no_type_check
-def set_box(hand, tuning, work, finger, memory):
-    """Where the joints of a finger may go in this sample, and how strongly they are pulled back."""
-    unsolved_s = memory.unsolved_s[finger]
+def set_box(hand, tuning, work, finger, before_rad, unsolved_s):
+    """Where the joints of a finger may go in this sample: limits, and what time allows."""
     reach = tuning.velocity_limit_rad_s * unsolved_s
     for joint in range(hand.num_joints[finger]):
-        now = memory.joints_rad[finger, joint]
+        before = before_rad[finger, joint]
         lower, upper = hand.lower_rad[finger, joint], hand.upper_rad[finger, joint]
         if np.isfinite(reach):
-            lower, upper = max(lower, now - reach), min(upper, now + reach)
+            lower, upper = max(lower, before - reach), min(upper, before + reach)
         work.lower[finger, joint] = lower
         work.upper[finger, joint] = upper
-        work.before[finger, joint] = now
-    is_cold = unsolved_s >= tuning.reacquire_after_s
-    work.pull_m2[finger] = (
-        0.0 if is_cold else tuning.temporal_weight_m2 * NOMINAL_PERIOD_S / unsolved_s
-    )
-    return is_cold
+        work.before[finger, joint] = before
 
 
 @compiled
@@ -76,24 +70,65 @@ def worst_of(status):
 
 @compiled
 @no_type_check
-def solve_sample(hand, person, work, joints, num_near, status):
-    """The thumb with the fingers near it (`members`), then every other finger alone."""
-    for number in range(-1, hand.num_fingers):
-        if number < 0:
-            group = work.members[:num_near]
-            if num_near == 0:
-                continue
+def solve_alone(hand, person, tuning, work, memory, output):
+    """Every finger by its own points, as if there were no pinch."""
+    status, errors_m = output
+    alone = work.members[-1:]
+    for finger in range(hand.num_fingers):
+        if status[finger] >= IMPLAUSIBLE:
+            errors_m[finger] = 0.0
+            continue
+        unsolved_s = memory.unsolved_s[finger]
+        set_box(hand, tuning, work, finger, memory.alone_rad, unsolved_s)
+        work.posture_weight_m2[finger] = 0.0
+        work.pull_m2[finger] = 0.0
+        if unsolved_s >= tuning.reacquire_after_s:
+            solve_cold(hand, person, work, finger, memory.alone_rad, tuning.num_starts)
+            if np.isfinite(unsolved_s):
+                status[finger] = REACQUIRED
         else:
-            work.members[-1] = number
-            group = work.members[-1:]
-            is_near = False
-            for member in work.members[:num_near]:
-                is_near = is_near or member == number
-            if is_near or status[number] >= IMPLAUSIBLE:
-                continue
-        _, at_rest = minimize(hand, person, work, group, joints)
+            work.pull_m2[finger] = tuning.temporal_weight_m2 * NOMINAL_PERIOD_S / unsolved_s
+        alone[0] = finger
+        _, at_rest = minimize(hand, person, work, alone, memory.alone_rad)
         if not at_rest:
-            for finger in group:
+            status[finger] = UNCONVERGED
+        errors_m[finger] = tip_error(work, finger)
+
+
+@compiled
+@no_type_check
+def solve_pinches(hand, person, tuning, work, memory, output):
+    """The thumb and the fingers near it together, close to what each does alone.
+
+    The others as they are; no joint leaves the box around what came out before.
+    """
+    status, errors_m = output
+    joints, alone = memory.joints_rad, memory.alone_rad
+    for finger in range(hand.num_fingers):
+        if status[finger] >= IMPLAUSIBLE:
+            continue
+        set_box(hand, tuning, work, finger, joints, memory.unsolved_s[finger])
+        work.posture_weight_m2[finger] = tuning.posture_weight_m2
+        for joint in range(hand.num_joints[finger]):
+            work.posture[finger, joint] = alone[finger, joint]
+    num_near = find_pinches(hand, tuning, work, status)
+    group = work.members[:num_near]
+    for finger in range(hand.num_fingers):
+        if status[finger] >= IMPLAUSIBLE:
+            continue
+        is_near = False
+        for member in group:
+            is_near = is_near or member == finger
+        if is_near and memory.unsolved_s[finger] < tuning.reacquire_after_s:
+            continue
+        for joint in range(hand.num_joints[finger]):
+            lower, upper = work.lower[finger, joint], work.upper[finger, joint]
+            joints[finger, joint] = min(max(alone[finger, joint], lower), upper)
+    if num_near:
+        _, at_rest = minimize(hand, person, work, group, joints)
+        for finger in group:
+            errors_m[finger] = tip_error(work, finger)
+            if not at_rest:
                 status[finger] = UNCONVERGED
 
 
@@ -115,27 +150,22 @@ def retarget_samples(tables, samples, memory, output):
     joints = memory.joints_rad
     for t in range(len(keypoints)):
         status = output.finger_status[t]
+        found = (status, output.tip_error_m[t])
         read_sample(hand, work, keypoints[t], valid[t])
         for finger in range(num_fingers):
             memory.unsolved_s[finger] += elapsed_s[t]
-            status[finger] = see_finger(hand, person, tuning, work, finger)
-            if status[finger] < IMPLAUSIBLE and set_box(hand, tuning, work, finger, memory):
-                solve_cold(hand, person, work, finger, joints, tuning.num_starts)
-                if np.isfinite(memory.unsolved_s[finger]):
-                    status[finger] = REACQUIRED
-        num_near = find_pinches(hand, tuning, work, status)
-        solve_sample(hand, person, work, joints, num_near, status)
-        for finger in range(num_fingers):
-            is_solved = status[finger] < IMPLAUSIBLE
-            output.tip_error_m[t, finger] = tip_error(work, finger) if is_solved else 0.0
-            if is_solved:
-                memory.unsolved_s[finger] = 0.0
+            status[finger] = see_finger(hand, person, tuning, work, finger, memory)
+        solve_alone(hand, person, tuning, work, memory, found)
+        solve_pinches(hand, person, tuning, work, memory, found)
         if tuning.keeps_fingers_apart:
             for _ in range(MAX_PUSHES):
                 if not push_apart(hand, work, status):
                     break
-                solve_sample(hand, person, work, joints, num_near, status)
+                solve_alone(hand, person, tuning, work, memory, found)
+                solve_pinches(hand, person, tuning, work, memory, found)
         for finger in range(num_fingers):
+            if status[finger] < IMPLAUSIBLE:
+                memory.unsolved_s[finger] = 0.0
             for joint in range(hand.num_joints[finger]):
                 output.joints_rad[t, finger, joint] = joints[finger, joint]
         output.status[t] = worst_of(status)

@@ -12,6 +12,7 @@ from services.alignment.retargeting.solver.arrays import (
     SOLVED,
 )
 from services.alignment.retargeting.solver.compiled import compiled
+from services.alignment.retargeting.solver.points import place_joints
 
 
 @compiled
@@ -34,7 +35,7 @@ def read_sample(hand, work, keypoints, valid):
 
 @compiled
 @no_type_check
-def see_finger(hand, person, tuning, work, finger):
+def see_finger(hand, person, tuning, work, finger, memory):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
     Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
@@ -80,13 +81,30 @@ def see_finger(hand, person, tuning, work, finger):
         if cosine < tuning.max_bend_cosine:
             return IMPLAUSIBLE
     if person.is_known and usable[0]:
-        squared = 0.0
-        for k in range(3):
-            squared += (measured[0, k] - person.knuckle_m[finger, k]) ** 2
-        # The robot's own knuckle travels up to its offset, 15 mm.
-        if squared > (tuning.knuckle_tolerance_m + 0.03 * person.travel[finger]) ** 2:
+        error_m = knuckle_error_m(hand, person, tuning, work, finger, memory)
+        if error_m > tuning.knuckle_tolerance_m:
             return IMPLAUSIBLE
     return SOLVED if is_whole else PARTIAL
+
+
+@compiled
+@no_type_check
+def knuckle_error_m(hand, person, tuning, work, finger, memory):
+    """How far a measured knuckle is from where it was, less what it may have travelled since."""
+    travel = person.travel[finger]
+    base = hand.point_joints[finger, 0]
+    origin = work.origin[finger]
+    if travel > 0.0:
+        place_joints(hand, finger, memory.joints_rad[finger], origin, work.axis[finger], work.turn)
+    squared, arm = 0.0, 0.0
+    for k in range(3):
+        expected = person.knuckle_m[finger, k]
+        if travel > 0.0:
+            expected += travel * (origin[base, k] - hand.knuckle_m[finger, k])
+            arm += (origin[base, k] - origin[0, k]) ** 2
+        squared += (work.measured[finger, 0, k] - expected) ** 2
+    turned = min(tuning.velocity_limit_rad_s * memory.unsolved_s[finger], 2.0)
+    return np.sqrt(squared) - travel * np.sqrt(arm) * turned
 
 
 @compiled

@@ -46,12 +46,13 @@ def finger_terms(work, finger, num_joints, joints):
                 gradient[joint] += row[joint] * residual
                 for other in range(joint + 1):
                     hessian[joint, other] += row[joint] * row[other]
-    pull = work.pull_m2[finger]
+    pull, keep = work.pull_m2[finger], work.posture_weight_m2[finger]
     for joint in range(num_joints):
         moved = joints[joint] - work.before[finger, joint]
-        cost += pull * moved * moved
-        gradient[joint] += pull * moved
-        hessian[joint, joint] += pull
+        bent = joints[joint] - work.posture[finger, joint]
+        cost += pull * moved * moved + keep * bent * bent
+        gradient[joint] += pull * moved + keep * bent
+        hessian[joint, joint] += pull + keep
         for other in range(joint):
             hessian[other, joint] = hessian[joint, other]
     return cost
