@@ -1,6 +1,7 @@
 """`dextouch bench retargeting`: a quick run, its rivals and its verdicts."""
 
 import json
+import signal
 import subprocess
 import sys
 import xml.etree.ElementTree as ET
@@ -112,6 +113,8 @@ def rotation(roll, pitch, yaw):
 @pytest.mark.parametrize("pitch", [-np.pi / 2, -1.5, 0.0, 0.7, np.pi / 2])
 def test_angles_of_a_rotation(pitch):
     R = rotation(0.4, pitch, -2.5)
+    # Upright, what is left of a cosine by rounding must not be taken for an angle.
+    R[np.abs(R) < 1e-12] = 0.0
     np.testing.assert_allclose(rotation(*roll_pitch_yaw(R)), R, atol=1e-12)
 
 
@@ -138,6 +141,18 @@ def test_a_rivals_joints_are_put_in_order_by_name(monkeypatch, tmp_path):
         assert len(json.loads(answers.readline())["call_s"]) == 3
         joints = rival_process._receive(answers, (3, 20))
     assert [sorted(names)[int(value)] for value in joints[2]] == names
+
+
+def test_no_alarm_is_left_by_a_refusal():
+    def solve(_):
+        raise ValueError("not this one")
+
+    try:
+        with pytest.raises(ValueError, match="not this one"):
+            rival_process.follow(rivals.Setup([np.zeros(45)], solve, []))
+        assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 CHILD = """

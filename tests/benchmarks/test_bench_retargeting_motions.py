@@ -6,6 +6,7 @@ import pytest
 from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import NODE_INDEX
+from services.cli.bench.retargeting import sequences
 from services.cli.bench.retargeting.collisions import segment_distance_m, touching
 from services.cli.bench.retargeting.pinches import (
     BONE_SPREAD,
@@ -49,6 +50,18 @@ def test_robot_motions_are_fast_free_of_contact_and_inside_limits(side, natural)
     assert not np.allclose(motion.joints_rad, other.joints_rad)
     with pytest.raises(InvalidInputError, match="got 1 samples"):
         robot_motion(side, 1, 0, natural=natural)
+
+
+def test_motions_that_are_too_fast_are_played_more_slowly(monkeypatch):
+    usual = robot_motion("right", 120, 0, natural=False)
+    fastest = np.abs(np.diff(usual.joints_rad, axis=0)).max() * RATE_HZ
+    monkeypatch.setattr(sequences, "MAX_SPEED_RAD_S", 0.5 * fastest)
+    slow = robot_motion("right", 120, 0, natural=False)
+    assert np.abs(np.diff(slow.joints_rad, axis=0)).max() * RATE_HZ <= 0.5 * fastest
+    np.testing.assert_allclose(slow.joints_rad[0], usual.joints_rad[0], atol=0.5)
+    monkeypatch.setattr(sequences, "_MAX_TRIES", 1)
+    with pytest.raises(LimitExceededError, match="another seed"):
+        robot_motion("right", 120, 0, natural=False)
 
 
 @pytest.mark.parametrize("side", SIDES)
