@@ -145,3 +145,23 @@ def test_missing_values_are_left_out_and_counted(tmp_path):
     report = align_recording(store, "holes", OPTIONS)
     assert report.quality["head_num_incomplete"] == 3
     assert report.streams["head"] == report.streams["wrist_left"] - 3
+
+
+def test_a_sample_without_a_time_of_its_own_takes_no_other_along(store):
+    old = store.recording("take")
+    attributes = old.attributes.model_copy(update={"recording_id": "repeat", "streams": ()})
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        for name, stream in old.streams.items():
+            batch = old.read(name)
+            values, t_device_ns = batch.values.copy(), batch.t_device_ns.copy()
+            if name == "joints_measured":
+                values += np.arange(len(values))[:, None] * 1e-3
+                t_device_ns[150] = t_device_ns[149]
+            writer.add_stream(stream)
+            writer.append(name, values=values, t_host_ns=batch.t_host_ns, t_device_ns=t_device_ns)
+    episode = store.open(align_recording(store, "repeat", OPTIONS).episode_id)
+    origin_ns = START_NS + round(episode.attributes.quality["origin_after_start_ns"])
+    data = episode.read("joints_measured")
+    numbers = np.rint((data.t_ref_ns + origin_ns - START_NS) * 1e-7)
+    assert 150 not in numbers
+    np.testing.assert_allclose(data.values[:, 0], 0.25 + numbers * 1e-3, atol=1e-9)
