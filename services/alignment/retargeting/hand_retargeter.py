@@ -29,6 +29,8 @@ from services.alignment.retargeting.solver.arrays import (
 from services.alignment.retargeting.solver.samples import retarget_samples
 
 NOMINAL_PERIOD_S = arrays.NOMINAL_PERIOD_S
+ALL_TRUSTED = np.ones((1, NUM_KEYPOINTS), dtype=bool)
+IMPLAUSIBLE = arrays.IMPLAUSIBLE
 
 
 class RetargetStatus(IntEnum):
@@ -71,6 +73,9 @@ class RetargetResult:
 class HandRetargeter:
     """Follows a tracked hand with the robot hand of the same side.
 
+    `retarget` may run in several threads at once; `step` goes on from the sample before and
+    belongs to one.
+
     Args:
         hand: "left" or "right" for the Wuji hand, or any hand with keypoints of its side.
         profile: of the person; None measures it from what is retargeted (`retarget`), or goes by
@@ -95,6 +100,9 @@ class HandRetargeter:
         self._tuning = self.options.tuning()
         self._person = self._person_of(profile)
         self._memory = self._blank()
+        # Of `step`, which is called often: what need not be made anew.
+        self._scratch = np.zeros(1, dtype=SCRATCH)
+        self._elapsed_s = np.zeros(1)
 
     def reset(self) -> None:
         """Forget all samples: the next `step` searches from several starts."""
@@ -125,9 +133,12 @@ class HandRetargeter:
             raise ShapeError(f"keypoints: got shape {keypoints.shape}, expected [25, 3]")
         if not 0 < elapsed_s < np.inf:
             raise InvalidInputError(f"elapsed_s: got {elapsed_s}, expected a positive time")
-        trusted = _trusted(keypoints[None], valid if valid is None else np.asarray(valid)[None])
-        elapsed = np.array([elapsed_s], dtype=np.float64)
-        return self._follow((keypoints[None], trusted, elapsed), self._person, self._tuning)
+        trusted = ALL_TRUSTED
+        if valid is not None:
+            trusted = _trusted(keypoints[None], np.asarray(valid)[None])
+        self._elapsed_s[0] = elapsed_s
+        tables = (self._arrays, self._person, self._tuning, self._scratch)
+        return self._follow(tables, (keypoints[None], trusted, self._elapsed_s), self._memory)
 
     def retarget(
         self,
@@ -158,11 +169,8 @@ class HandRetargeter:
         tuning["reacquire_after_s"] = max(
             self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s))
         )
-        memory, self._memory = self._memory, self._blank()
-        try:
-            result = self._follow((keypoints, trusted, elapsed_s), person, tuning)
-        finally:
-            self._memory = memory
+        tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
+        result = self._follow(tables, (keypoints, trusted, elapsed_s), self._blank())
         never = np.asarray(~result.solved.any(axis=0))
         if never.any():
             names = ", ".join(
@@ -200,9 +208,9 @@ class HandRetargeter:
 
     def _follow(
         self,
-        samples: tuple[np.ndarray, np.ndarray, np.ndarray],
-        person: np.ndarray,
-        tuning: np.ndarray,
+        tables: tuple[np.ndarray, ...],
+        samples: tuple[np.ndarray, ...],
+        memory: Memory,
     ) -> RetargetResult:
         num, num_fingers = len(samples[0]), len(self.hand.fingers)
         output = Output(
@@ -211,14 +219,13 @@ class HandRetargeter:
             status=np.empty(num, dtype=np.uint8),
             tip_error_m=np.empty((num, num_fingers)),
         )
-        tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
-        retarget_samples(tables, samples, self._memory, output)
+        retarget_samples(tables, samples, memory, output)
         return RetargetResult(
             joints_rad=output.joints_rad[:, self._is_joint],
             status=output.status,
             finger_status=output.finger_status,
             tip_error_m=output.tip_error_m,
-            solved=output.finger_status < RetargetStatus.IMPLAUSIBLE,
+            solved=output.finger_status < IMPLAUSIBLE,
         )
 
     def _fill(

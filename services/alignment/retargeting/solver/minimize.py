@@ -15,6 +15,7 @@ from services.alignment.retargeting.solver.compiled import compiled
 from services.alignment.retargeting.solver.terms import evaluate
 
 MAX_ITERATIONS = 40
+# The step below it is still made: what is left is its square, or a tenth of it with residuals.
 STEP_TOLERANCE_RAD = 1e-5
 DAMPING_START = 1e-6
 DAMPING_RANGE = (1e-12, 1e3)
