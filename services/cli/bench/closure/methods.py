@@ -48,7 +48,7 @@ TWIN_SERVOS: Final = HandServos(
     wrist_n_m=WRIST_STIFFNESS_N_M,
     wrist_nm_rad=WRIST_STIFFNESS_NM_RAD,
 )
-_GRID_NS: Final = grid_times_ns(NUM_GRID_STEPS, MODEL_RATE_HZ)
+_GRID_NS: Final = grid_times_ns(NUM_GRID_STEPS, float(MODEL_RATE_HZ))
 _NS_PER_S: Final = 1e9
 _GRID_S: Final = _GRID_NS / _NS_PER_S
 
