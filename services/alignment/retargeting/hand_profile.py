@@ -5,7 +5,7 @@ the wrist frame are therefore measured once a person, from calibration samples o
 recording, and later samples are judged by them and solved with them.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ NUM_FINGERS = 5
 INDEX_PROXIMAL_RANGE_M = (0.025, 0.060)
 BONE_RANGE_M = (0.003, 0.150)
 _INDEX_FINGER = CHAINS.index("index")
-NUM_COLUMNS = 8
+NUM_COLUMNS = 9
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class HandProfile:
 
     def __post_init__(self) -> None:
         rows = self.to_rows()
-        if not np.isfinite(rows).all() or (rows[:, 7] < 0).any():
+        if not np.isfinite(rows).all() or (rows[:, 7:] < 0).any():
             raise InvalidInputError("hand profile: expected finite numbers, no negative sigma")
         check_bone_unit(float(self.bone_m[_INDEX_FINGER, 0]), where="hand profile")
         low, high = BONE_RANGE_M
@@ -54,30 +54,51 @@ class HandProfile:
                 f"expected {low} … {high} m"
             )
 
-    def to_rows(self) -> Float64[np.ndarray, "5 8"]:
-        """As a matrix for a recording's calibration: bones, knuckle, travel, sigma ratio column.
+    def to_rows(self) -> Float64[np.ndarray, "5 9"]:
+        """As a matrix for a recording's calibration.
 
-        Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m). The tracker's
-        noise is not kept.
+        Columns: 3 bones (m), 3 knuckle coordinates (m), travel, knuckle sigma (m), the tracker's
+        noise (m; the same in every row).
         """
         return np.column_stack(
-            [self.bone_m, self.knuckle_m, self.travel, self.knuckle_sigma_m]
+            [
+                self.bone_m,
+                self.knuckle_m,
+                self.travel,
+                self.knuckle_sigma_m,
+                np.full(NUM_FINGERS, self.point_sigma_m),
+            ]
         ).astype(np.float64)
 
     @classmethod
-    def from_rows(
-        cls, rows: Sequence[Sequence[float]], *, point_sigma_m: float = 1e-3
-    ) -> "HandProfile":
+    def from_rows(cls, rows: Sequence[Sequence[float]]) -> "HandProfile":
         """From the matrix of `to_rows`.
 
         Raises:
-            ShapeError: not [5, 8].
+            ShapeError: not [5, 9].
             InvalidInputError: not finite, or no hand.
         """
         table = np.asarray(rows, dtype=np.float64)
         if table.shape != (NUM_FINGERS, NUM_COLUMNS):
             raise ShapeError(f"hand profile: got shape {table.shape}, expected [5, {NUM_COLUMNS}]")
-        return cls(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7], point_sigma_m)
+        return cls(table[:, :3], table[:, 3:6], table[:, 6], table[:, 7], float(table[0, 8]))
+
+
+def profile_name(side: str) -> str:
+    """Name of the matrix in a recording's calibration."""
+    return f"hand_profile_{side}"
+
+
+def calibrated_profile(
+    calibration: Mapping[str, Sequence[Sequence[float]]], side: str
+) -> HandProfile | None:
+    """The person's hand of a recording's calibration; None where it has none.
+
+    Raises:
+        ShapeError, InvalidInputError: it is no hand.
+    """
+    rows = calibration.get(profile_name(side))
+    return None if rows is None else HandProfile.from_rows(rows)
 
 
 def check_bone_unit(index_proximal_m: float, *, where: str) -> None:

@@ -96,7 +96,9 @@ def build_episode(
         streams[name] = date_stream(recording, name)
     stretch = _find_stretch(recording, streams, options, tell)
     tell(progress_within("retargeting", 0.0))
-    actions = make_actions(stretch.gridded, recording.attributes.domain)
+    actions = make_actions(
+        stretch.gridded, recording.attributes.domain, recording.attributes.calibration
+    )
     tell(progress_within("writing", 0.0))
     origin_ns = stretch.origin_ns
     grid_ns = stretch.gridded.grid_ns - stretch.gridded.grid_ns[0]

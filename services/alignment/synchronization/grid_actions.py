@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
-from dextouch.schemas.episodes import Domain
+from dextouch.schemas.episodes import Domain, Matrix
 from dextouch.tactile.layout import SIDES
 from services.alignment.synchronization.hand_joints import retarget_hands
 from services.alignment.synchronization.recorded_streams import LoadedStream
@@ -65,16 +65,19 @@ def place_streams(
     return GriddedStreams(grid_ns, streams, at, valid)
 
 
-def make_actions(gridded: GriddedStreams, domain: Domain) -> GridActions:
+def make_actions(
+    gridded: GriddedStreams, domain: Domain, calibration: Mapping[str, Matrix]
+) -> GridActions:
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
     Args:
         gridded: valid at every step.
         domain: "human" hands are retargeted, "robot" joints taken as they are.
+        calibration: of the recording.
     """
     left, right, head = (_poses(gridded, name) for name in POSE_STREAMS)
     if domain == "human":
-        hands = retarget_hands(gridded.streams, gridded.at)
+        hands = retarget_hands(gridded.streams, gridded.at, calibration)
         joints, quality = hands.joints_rad, hands.quality
     else:
         joints, quality = _joints(gridded, "joints_measured"), {}

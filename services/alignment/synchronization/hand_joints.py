@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from dextouch.hands.robot_hand import RobotHand
-from dextouch.tactile.layout import SIDES, Side
+from dextouch.schemas.episodes import Matrix
+from dextouch.tactile.layout import SIDES
+from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.hand_retargeter import (
     HandRetargeter,
     RetargetResult,
@@ -32,7 +33,9 @@ class HandJoints:
 
 
 def retarget_hands(
-    streams: Mapping[str, LoadedStream], at: Mapping[str, GridPlacement]
+    streams: Mapping[str, LoadedStream],
+    at: Mapping[str, GridPlacement],
+    calibration: Mapping[str, Matrix],
 ) -> HandJoints:
     """Retarget both hands, each in a thread of its own, and bring the joints to the grid.
 
@@ -42,6 +45,8 @@ def retarget_hands(
     Args:
         streams: `keypoints_left` and `keypoints_right`.
         at: of both, valid at every step; at least one step.
+        calibration: of the recording; `hand_profile_SIDE` is the person's hand, which is measured
+            from the recording itself where it is absent.
 
     Raises:
         InvalidInputError: keypoints that are no hand, of the other side or in other axes, see
@@ -50,7 +55,11 @@ def retarget_hands(
     with ThreadPoolExecutor(len(SIDES), thread_name_prefix="retarget") as threads:
         hands = list(
             threads.map(
-                lambda side: _retarget(side, streams[f"keypoints_{side}"], at[f"keypoints_{side}"]),
+                lambda side: _retarget(
+                    HandRetargeter(side, calibrated_profile(calibration, side)),
+                    streams[f"keypoints_{side}"],
+                    at[f"keypoints_{side}"],
+                ),
                 SIDES,
             )
         )
@@ -59,8 +68,9 @@ def retarget_hands(
 
 
 def _retarget(
-    side: Side, stream: LoadedStream, at: GridPlacement
+    retargeter: HandRetargeter, stream: LoadedStream, at: GridPlacement
 ) -> tuple[Float64[np.ndarray, "n 20"], dict[str, float]]:
+    side = retargeter.hand.side
     first, stop = int(at.left.min()), int(at.left.max()) + 2
     keypoints_m = stream.values[first:stop]
     # What the calibration turns was turned when the stream was read: the rest is refused.
@@ -68,10 +78,10 @@ def _retarget(
     t_ns = stream.t_ns[first:stop]
     # int64 first, so that seconds stay exact to the nanosecond.
     t_s = (t_ns - t_ns[0]).astype(np.float64) / NS_PER_S
-    result = HandRetargeter(side).retarget(keypoints_m, t_s=t_s)
+    result = retargeter.retarget(keypoints_m, t_s=t_s)
     near = GridPlacement(at.left - first, at.weight, at.valid)
     # Beyond the first or last sample the line goes on, and could leave the limits.
-    hand = RobotHand(side)
+    hand = retargeter.hand
     joints_rad = np.clip(vectors_on_grid(result.joints_rad, near), hand.lower_rad, hand.upper_rad)
     return joints_rad, _quality(side, result, near)
 

@@ -1,0 +1,133 @@
+"""What stays the same of a person's hand: measured, written down, read again, refused."""
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import CHAINS, NODE_INDEX
+from services.alignment.retargeting import HandProfile, HandRetargeter, RetargetOptions
+from services.alignment.retargeting.hand_profile import calibrated_profile, profile_name
+from services.cli.bench.retargeting.pinches import people, pinch_motion
+from services.cli.bench.retargeting.sequences import robot_motion
+
+NOISE_M = 1e-3
+
+
+@pytest.fixture(scope="module")
+def pinches():
+    person = people("right", 2)[1]
+    return person, pinch_motion(person, "right")
+
+
+def measured(motion, noise_m=0.0):
+    rng = np.random.default_rng(3)
+    keypoints = motion.keypoints_m + rng.normal(scale=noise_m, size=motion.keypoints_m.shape)
+    return HandRetargeter(motion.side).measure(keypoints)
+
+
+def test_bones_and_knuckles_of_a_person(pinches):
+    person, motion = pinches
+    truth = person.chain_points_m(motion.joints_rad)
+    bones = np.linalg.norm(np.diff(truth, axis=2), axis=-1)[0]
+    exact, noisy = measured(motion), measured(motion, NOISE_M)
+    np.testing.assert_allclose(exact.bone_m, bones, atol=1e-9)
+    np.testing.assert_allclose(exact.knuckle_m, truth[0, :, 0], atol=1e-9)
+    # Medians of 440 samples; the length of a noisy bone is longer by sigma² / length.
+    np.testing.assert_allclose(noisy.bone_m, bones, atol=0.3e-3)
+    np.testing.assert_allclose(noisy.knuckle_m, truth[0, :, 0], atol=0.3e-3)
+    assert noisy.point_sigma_m == pytest.approx(NOISE_M, rel=0.15)
+    # Where fingers turn in place, nothing of the robot's knuckle travel is seen.
+    assert noisy.travel.max() <= 0.1
+
+
+def test_the_robots_own_knuckles_travel():
+    profile = measured(robot_motion("left", 600, 1, natural=True))
+    np.testing.assert_allclose(profile.travel, 1.0, atol=1e-6)
+    np.testing.assert_allclose(profile.knuckle_sigma_m, 0.0, atol=1e-6)
+
+
+def test_outliers_do_not_make_bones(pinches):
+    _, motion = pinches
+    keypoints = motion.keypoints_m.copy()
+    keypoints[::5, NODE_INDEX["index", "tip"]] += 0.05
+    profile = HandRetargeter("right").measure(keypoints)
+    np.testing.assert_allclose(profile.bone_m, measured(motion).bone_m, atol=1e-6)
+
+
+def test_profile_goes_through_a_calibration(pinches):
+    _, motion = pinches
+    profile = measured(motion, NOISE_M)
+    rows = tuple(tuple(row) for row in profile.to_rows().tolist())
+    read = calibrated_profile({profile_name("right"): rows}, "right")
+    np.testing.assert_array_equal(read.to_rows(), profile.to_rows())
+    assert calibrated_profile({profile_name("right"): rows}, "left") is None
+    same = [HandRetargeter("right", one).retarget(motion.keypoints_m) for one in (profile, read)]
+    np.testing.assert_array_equal(same[0].joints_rad, same[1].joints_rad)
+
+
+def test_what_is_no_hand_is_refused(pinches):
+    rows = measured(pinches[1]).to_rows()
+    with pytest.raises(ShapeError, match="hand profile"):
+        HandProfile.from_rows(rows[:, :8].tolist())
+    with pytest.raises(InvalidInputError, match="millimetres"):
+        HandProfile.from_rows((rows * 1e3).tolist())
+    broken = rows.copy()
+    broken[2, 4] = np.nan
+    with pytest.raises(InvalidInputError, match="finite"):
+        HandProfile.from_rows(broken.tolist())
+    broken = rows.copy()
+    broken[3, 1] = 0.5
+    with pytest.raises(InvalidInputError, match="bones"):
+        HandProfile.from_rows(broken.tolist())
+
+
+def test_another_persons_hand_is_not_followed(pinches):
+    _, motion = pinches
+    profile = measured(motion)
+    rows = profile.to_rows()
+    rows[CHAINS.index("ring"), 3:6] += 0.03
+    with pytest.raises(InvalidInputError, match="ring followed in no sample"):
+        HandRetargeter("right", HandProfile.from_rows(rows.tolist())).retarget(motion.keypoints_m)
+
+
+def penetration_mm(hand, joints_rad, radius_m=0.0085):
+    """Deepest overlap of neighbouring fingers' capsules, from 21 points a phalanx."""
+    points = hand.chain_points_m(joints_rad)
+    share = np.linspace(0, 1, 21)[:, None]
+    lines = points[:, :, :-1, None] + share * (points[:, :, 1:, None] - points[:, :, :-1, None])
+    lines = lines.reshape(len(joints_rad), 5, -1, 3)
+    deepest = 0.0
+    for finger in range(1, 4):
+        for row in range(len(joints_rad)):
+            apart = lines[row, finger, :, None] - lines[row, finger + 1, None]
+            gap = np.linalg.norm(apart, axis=-1).min()
+            deepest = max(deepest, 2 * radius_m - gap)
+    return deepest * 1e3
+
+
+def test_fingers_are_kept_apart():
+    hand = RobotHand("right")
+    joints = np.zeros((60, 20))
+    # Index and middle finger lean into one another; firmware order S1 … S4 of each.
+    lean = np.linspace(0.0, 0.25, 60)
+    joints[:, 5], joints[:, 9] = lean, -lean
+    joints[:, [4, 6, 8, 10]] = 0.3
+    points = hand.chain_points_m(joints)
+    keypoints = np.zeros((60, 25, 3))
+    for finger, chain in enumerate(CHAINS):
+        for index, node in enumerate(("proximal", "intermediate", "distal", "tip")):
+            name = ("metacarpal", "proximal", "distal", "tip")[index] if chain == "thumb" else node
+            keypoints[:, NODE_INDEX[chain, name]] = points[:, finger, index]
+    found = {}
+    for keeps in (False, True):
+        options = RetargetOptions(temporal_weight_m2=0.0, keeps_fingers_apart=keeps)
+        profile = HandRetargeter("right").measure(keypoints)
+        result = HandRetargeter("right", profile, options).retarget(keypoints)
+        assert (result.joints_rad <= hand.upper_rad).all()
+        assert np.abs(np.diff(result.joints_rad, axis=0)).max() <= 9.6 / 60 + 1e-9
+        found[keeps] = penetration_mm(hand, result.joints_rad), result.joints_rad
+    assert found[False][0] > 3.0
+    assert found[True][0] < 0.5
+    # Where nothing touches, nothing changes.
+    np.testing.assert_array_equal(found[True][1][:5], found[False][1][:5])
