@@ -8,6 +8,7 @@ from dextouch.hands.robot_hand import HandModel
 from dextouch.hands.skeleton import solver_indices
 from services.alignment.retargeting.solver.arrays import HAND, MAX_JOINTS, MAX_STARTS
 
+NO_TURN = (1.0, 0.0, 0.0, 0.0)
 # Phalanges of the robot's fingers as capsules.
 PHALANX_RADIUS_M = 0.0085
 # Where cold searches begin, as fractions from lower to upper limit, knuckle to tip. The first two
@@ -45,7 +46,12 @@ def hand_arrays(hand: HandModel) -> np.ndarray:
         for joint, one in enumerate(finger.joints):
             row["rotation"][index, joint] = rotation_from_quaternion(np.array(one.q_wxyz))
             row["position_m"][index, joint] = one.position_m
-            row["axis"][index, joint] = np.array(one.axis) / np.linalg.norm(one.axis)
+            axis = np.array(one.axis) / np.linalg.norm(one.axis)
+            row["axis"][index, joint] = axis
+            row["is_turned"][index, joint] = tuple(one.q_wxyz) != NO_TURN
+            along = int(np.argmax(np.abs(axis)))
+            row["axis_kind"][index, joint] = along if abs(axis[along]) == 1.0 else 3
+            row["axis_sign"][index, joint] = np.sign(axis[along])
             row["lower_rad"][index, joint], row["upper_rad"][index, joint] = one.limits_rad
     row["starts_rad"] = row["lower_rad"] + fractions * (row["upper_rad"] - row["lower_rad"])
     row["knuckle_m"][: len(hand.fingers)] = zero_points_m(hand)[:, 0]

@@ -56,13 +56,29 @@ def test_slopes_are_the_derivative():
             np.testing.assert_allclose(tip_slope[joint], (tip_ahead - tip_behind) / 2e-6, atol=1e-8)
 
 
-def test_points_of_the_solver_are_those_of_the_hand():
-    hand = hand_arrays(HAND)
-    person = unknown_person(hand, robot_bone_m(HAND))
+def slanted(hand):
+    """The same fingers with hinges about other axes, of all kinds."""
+    axes = [(0.0, 0.0, 1.0), (0.6, -0.8, 0.0), (0.0, -1.0, 0.0), (-1.0, 0.0, 0.0)]
+    fingers = [
+        finger._replace(
+            joints=tuple(
+                row._replace(axis=axes[(number + joint) % 4])
+                for joint, row in enumerate(finger.joints)
+            )
+        )
+        for number, finger in enumerate(hand.fingers)
+    ]
+    return HandModel("right", fingers, name="slanted")
+
+
+@pytest.mark.parametrize("model", [HAND, slanted(HAND)], ids=["Wuji", "slanted"])
+def test_points_of_the_solver_are_those_of_the_hand(model):
+    hand = hand_arrays(model)
+    person = unknown_person(hand, robot_bone_m(model))
     work = np.zeros(1, dtype=SCRATCH)
     work["scale"] = 1.0
     joints = np.random.default_rng(1).uniform(hand["lower_rad"][0], hand["upper_rad"][0])
-    expected = HAND.chain_points_m(joints[:, :4].reshape(1, 20))[0]
+    expected = model.chain_points_m(joints[:, :4].reshape(1, 20))[0]
     for finger in range(5):
         linearize(hand[0], person[0], work[0], finger, joints[finger])
         np.testing.assert_allclose(work["point"][0, finger], expected[finger], atol=1e-12)

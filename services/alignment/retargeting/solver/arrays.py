@@ -30,6 +30,11 @@ HAND: Final = np.dtype(
         ("rotation", np.float64, (_F, _J, 3, 3)),
         ("position_m", np.float64, (_F, _J, 3)),
         ("axis", np.float64, (_F, _J, 3)),
+        # Short cuts: whether (1) that frame is turned at all; which axis (0, 1, 2) it is or the
+        # opposite of, with its sign, or 3.
+        ("is_turned", np.uint8, (_F, _J)),
+        ("axis_kind", np.int64, (_F, _J)),
+        ("axis_sign", np.float64, (_F, _J)),
         # The joints whose origins are knuckle, PIP and DIP; the tip, in the last joint's frame.
         ("point_joints", np.int64, (_F, 3)),
         ("tip_m", np.float64, (_F, 3)),
@@ -118,7 +123,7 @@ SCRATCH: Final = np.dtype(
         ("pinch_weight", np.float64, (_F,)),
         ("members", np.int64, (_F + 1,)),
         # Of the innermost loops.
-        ("turn", np.float64, (3, 3, 3)),
+        ("turn", np.float64, (2, 3, 3)),
         ("own_slope", np.float64, (2, _J, 3)),
         ("row", np.float64, (2, _J)),
         ("bones", np.float64, (3, 3)),

@@ -53,6 +53,8 @@ _FOLDER = folder_of_code(
 if _FOLDER is not None:
     config.CACHE_DIR = str(_FOLDER)
 
+# Sums in any order and fused products, but NaN and infinity as they are.
+_MATH = {"reassoc", "contract", "arcp", "nsz"}
 # Inner functions are kept within the outer one that calls them.
-compiled = njit(nogil=True, error_model="numpy")
-compiled_once = njit(cache=_FOLDER is not None, nogil=True, error_model="numpy")
+compiled = njit(nogil=True, error_model="numpy", fastmath=_MATH)
+compiled_once = njit(cache=_FOLDER is not None, nogil=True, error_model="numpy", fastmath=_MATH)

@@ -16,7 +16,7 @@ from services.alignment.retargeting.solver.terms import evaluate
 
 MAX_ITERATIONS = 40
 # The step below it is still made: what is left is its square, or a tenth of it with residuals.
-STEP_TOLERANCE_RAD = 1e-5
+STEP_TOLERANCE_RAD = 3e-4
 DAMPING_START = 1e-6
 DAMPING_RANGE = (1e-12, 1e3)
 # Keeps a joint that moves nothing where it is; far below what the points see (m²/rad²).
@@ -139,7 +139,9 @@ def minimize(hand, person, work, group, joints):
             # So small a step needs no look at its cost.
             for finger in group:
                 for joint in range(hand.num_joints[finger]):
-                    joints[finger, joint] = work.trial[finger, joint]
+                    trial = work.trial[finger, joint]
+                    work.step[finger, joint] = trial - joints[finger, joint]
+                    joints[finger, joint] = trial
             return cost, True
         new_cost = evaluate(hand, person, work, group, work.trial)
         if new_cost <= cost:
@@ -151,6 +153,8 @@ def minimize(hand, person, work, group, joints):
         else:
             damping = min(8.0 * damping, DAMPING_RANGE[1])
             evaluate(hand, person, work, group, joints)
+    for finger in group:
+        work.step[finger, :] = 0.0
     return cost, False
 
 

@@ -10,9 +10,19 @@ from services.alignment.retargeting.solver.compiled import compiled
 
 @compiled
 @no_type_check
+def set_turn(turn, x, y, z, c, s):
+    """The rotation about a unit vector by an angle of that cosine and sine (Rodrigues)."""
+    v = 1.0 - c
+    turn[0, 0], turn[0, 1], turn[0, 2] = c + v * x * x, v * x * y - s * z, v * x * z + s * y
+    turn[1, 0], turn[1, 1], turn[1, 2] = v * x * y + s * z, c + v * y * y, v * y * z - s * x
+    turn[2, 0], turn[2, 1], turn[2, 2] = v * x * z - s * y, v * y * z + s * x, c + v * z * z
+
+
+@compiled
+@no_type_check
 def place_joints(hand, finger, joints, origin, axis, turn):
     """Origins and axes of a finger's joints and its tip, wrist coordinates."""
-    r, turned, own = turn[0], turn[1], turn[2]
+    r, own = turn[0], turn[1]
     r[:] = 0.0
     r[0, 0] = r[1, 1] = r[2, 2] = 1.0
     place = origin[hand.num_joints[finger]]
@@ -20,28 +30,34 @@ def place_joints(hand, finger, joints, origin, axis, turn):
     last = hand.num_joints[finger]
     for joint in range(last):
         offset, fixed = hand.position_m[finger, joint], hand.rotation[finger, joint]
-        for row in range(3):
-            place[row] += r[row, 0] * offset[0] + r[row, 1] * offset[1] + r[row, 2] * offset[2]
-            origin[joint, row] = place[row]
-            for column in range(3):
-                turned[row, column] = (
-                    r[row, 0] * fixed[0, column]
-                    + r[row, 1] * fixed[1, column]
-                    + r[row, 2] * fixed[2, column]
-                )
+        is_turned = hand.is_turned[finger, joint] == 1
+        kind = hand.axis_kind[finger, joint]
         x = hand.axis[finger, joint, 0]
         y = hand.axis[finger, joint, 1]
         z = hand.axis[finger, joint, 2]
         c, s = np.cos(joints[joint]), np.sin(joints[joint])
-        v = 1.0 - c
-        own[0, 0], own[0, 1], own[0, 2] = c + v * x * x, v * x * y - s * z, v * x * z + s * y
-        own[1, 0], own[1, 1], own[1, 2] = v * x * y + s * z, c + v * y * y, v * y * z - s * x
-        own[2, 0], own[2, 1], own[2, 2] = v * x * z - s * y, v * y * z + s * x, c + v * z * z
+        if kind == 3:
+            set_turn(own, x, y, z, c, s)
+        s *= hand.axis_sign[finger, joint]
         for row in range(3):
-            t0, t1, t2 = turned[row, 0], turned[row, 1], turned[row, 2]
+            r0, r1, r2 = r[row, 0], r[row, 1], r[row, 2]
+            place[row] += r0 * offset[0] + r1 * offset[1] + r2 * offset[2]
+            origin[joint, row] = place[row]
+            t0, t1, t2 = r0, r1, r2
+            if is_turned:
+                t0 = r0 * fixed[0, 0] + r1 * fixed[1, 0] + r2 * fixed[2, 0]
+                t1 = r0 * fixed[0, 1] + r1 * fixed[1, 1] + r2 * fixed[2, 1]
+                t2 = r0 * fixed[0, 2] + r1 * fixed[1, 2] + r2 * fixed[2, 2]
             axis[joint, row] = t0 * x + t1 * y + t2 * z
-            for column in range(3):
-                r[row, column] = t0 * own[0, column] + t1 * own[1, column] + t2 * own[2, column]
+            if kind == 0:
+                r[row, 0], r[row, 1], r[row, 2] = t0, c * t1 + s * t2, c * t2 - s * t1
+            elif kind == 1:
+                r[row, 0], r[row, 1], r[row, 2] = c * t0 - s * t2, t1, s * t0 + c * t2
+            elif kind == 2:
+                r[row, 0], r[row, 1], r[row, 2] = c * t0 + s * t1, c * t1 - s * t0, t2
+            else:
+                for column in range(3):
+                    r[row, column] = t0 * own[0, column] + t1 * own[1, column] + t2 * own[2, column]
     tip = hand.tip_m[finger]
     for row in range(3):
         place[row] += r[row, 0] * tip[0] + r[row, 1] * tip[1] + r[row, 2] * tip[2]

@@ -44,15 +44,22 @@ def set_box(hand, tuning, work, finger, before_rad, unsolved_s):
 
 @compiled
 @no_type_check
-def tip_error(work, finger):
-    """Distance of the virtual tip from the measured one, both seen from the knuckle if it was."""
+def tip_error(work, finger, num_joints):
+    """Distance of the virtual tip from the measured one, both seen from the knuckle if it was.
+
+    Points are those before the last step, which is small enough for their slopes.
+    """
     if not work.usable[finger, 3]:
         return 0.0
     squared = 0.0
     for k in range(3):
         error = work.point[finger, 3, k] - work.measured[finger, 3, k]
+        for joint in range(num_joints):
+            error += work.slope[finger, 3, joint, k] * work.step[finger, joint]
         if work.usable[finger, 0]:
             error -= work.point[finger, 0, k] - work.measured[finger, 0, k]
+            for joint in range(num_joints):
+                error -= work.slope[finger, 0, joint, k] * work.step[finger, joint]
         squared += error * error
     return np.sqrt(squared)
 
@@ -92,7 +99,7 @@ def solve_alone(hand, person, tuning, work, memory, output):
         _, at_rest = minimize(hand, person, work, alone, memory.alone_rad)
         if not at_rest:
             status[finger] = UNCONVERGED
-        errors_m[finger] = tip_error(work, finger)
+        errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
 
 
 @compiled
@@ -127,7 +134,7 @@ def solve_pinches(hand, person, tuning, work, memory, output):
     if num_near:
         _, at_rest = minimize(hand, person, work, group, joints)
         for finger in group:
-            errors_m[finger] = tip_error(work, finger)
+            errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
             if not at_rest:
                 status[finger] = UNCONVERGED
 
