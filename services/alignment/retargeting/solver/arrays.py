@@ -122,6 +122,7 @@ SCRATCH: Final = np.dtype(
         ("pinch_m", np.float64, (_F, 3)),
         ("pinch_weight", np.float64, (_F,)),
         ("members", np.int64, (_F + 1,)),
+        ("is_near", np.uint8, (_F,)),
         # Of the innermost loops.
         ("turn", np.float64, (2, 3, 3)),
         ("own_slope", np.float64, (2, _J, 3)),

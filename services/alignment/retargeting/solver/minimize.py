@@ -17,6 +17,8 @@ from services.alignment.retargeting.solver.terms import evaluate
 MAX_ITERATIONS = 40
 # The step below it is still made: what is left is its square, or a tenth of it with residuals.
 STEP_TOLERANCE_RAD = 3e-4
+# A posture that a pinch only keeps near to need not be so exact.
+POSTURE_TOLERANCE_RAD = 3e-3
 DAMPING_START = 1e-6
 DAMPING_RANGE = (1e-12, 1e3)
 # Keeps a joint that moves nothing where it is; far below what the points see (m²/rad²).
@@ -122,7 +124,7 @@ def damped_step(hand, work, group, joints, damping):
 
 @compiled
 @no_type_check
-def minimize(hand, person, work, group, joints):
+def minimize(hand, person, work, group, joints, tolerance_rad):
     """Least cost of a group inside its box, from where its joints are; cost and whether at rest."""
     cost = evaluate(hand, person, work, group, joints)
     damping = DAMPING_START
@@ -135,7 +137,7 @@ def minimize(hand, person, work, group, joints):
                 wanted = min(max(wanted, work.lower[finger, joint]), work.upper[finger, joint])
                 work.trial[finger, joint] = wanted
                 moved = max(moved, abs(wanted - joints[finger, joint]))
-        if moved < STEP_TOLERANCE_RAD:
+        if moved < tolerance_rad:
             # So small a step needs no look at its cost.
             for finger in group:
                 for joint in range(hand.num_joints[finger]):
@@ -172,7 +174,7 @@ def solve_cold(hand, person, work, finger, joints, num_starts):
             joints[finger, joint] = min(
                 max(angle, work.lower[finger, joint]), work.upper[finger, joint]
             )
-        cost, _ = minimize(hand, person, work, group, joints)
+        cost, _ = minimize(hand, person, work, group, joints, STEP_TOLERANCE_RAD)
         # A hair of difference is rounding, not another minimum: keep the first.
         if cost < best * (1.0 - 1e-6):
             best = cost

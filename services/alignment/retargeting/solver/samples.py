@@ -20,7 +20,12 @@ from services.alignment.retargeting.solver.arrays import (
     UNCONVERGED,
 )
 from services.alignment.retargeting.solver.compiled import compiled, compiled_once
-from services.alignment.retargeting.solver.minimize import minimize, solve_cold
+from services.alignment.retargeting.solver.minimize import (
+    POSTURE_TOLERANCE_RAD,
+    STEP_TOLERANCE_RAD,
+    minimize,
+    solve_cold,
+)
 from services.alignment.retargeting.solver.seen import find_pinches, read_sample, see_finger
 
 # How often fingers are pushed apart in one sample.
@@ -96,7 +101,8 @@ def solve_alone(hand, person, tuning, work, memory, output):
         else:
             work.pull_m2[finger] = tuning.temporal_weight_m2 * NOMINAL_PERIOD_S / unsolved_s
         alone[0] = finger
-        _, at_rest = minimize(hand, person, work, alone, memory.alone_rad)
+        tolerance_rad = POSTURE_TOLERANCE_RAD if work.is_near[finger] else STEP_TOLERANCE_RAD
+        _, at_rest = minimize(hand, person, work, alone, memory.alone_rad, tolerance_rad)
         if not at_rest:
             status[finger] = UNCONVERGED
         errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
@@ -104,7 +110,7 @@ def solve_alone(hand, person, tuning, work, memory, output):
 
 @compiled
 @no_type_check
-def solve_pinches(hand, person, tuning, work, memory, output):
+def solve_pinches(hand, person, tuning, work, memory, num_near, output):
     """The thumb and the fingers near it together, close to what each does alone.
 
     The others as they are; no joint leaves the box around what came out before.
@@ -118,21 +124,17 @@ def solve_pinches(hand, person, tuning, work, memory, output):
         work.posture_weight_m2[finger] = tuning.posture_weight_m2
         for joint in range(hand.num_joints[finger]):
             work.posture[finger, joint] = alone[finger, joint]
-    num_near = find_pinches(hand, tuning, work, status)
     group = work.members[:num_near]
     for finger in range(hand.num_fingers):
         if status[finger] >= IMPLAUSIBLE:
             continue
-        is_near = False
-        for member in group:
-            is_near = is_near or member == finger
-        if is_near and memory.unsolved_s[finger] < tuning.reacquire_after_s:
+        if work.is_near[finger] and memory.unsolved_s[finger] < tuning.reacquire_after_s:
             continue
         for joint in range(hand.num_joints[finger]):
             lower, upper = work.lower[finger, joint], work.upper[finger, joint]
             joints[finger, joint] = min(max(alone[finger, joint], lower), upper)
     if num_near:
-        _, at_rest = minimize(hand, person, work, group, joints)
+        _, at_rest = minimize(hand, person, work, group, joints, STEP_TOLERANCE_RAD)
         for finger in group:
             errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
             if not at_rest:
@@ -162,14 +164,15 @@ def retarget_samples(tables, samples, memory, output):
         for finger in range(num_fingers):
             memory.unsolved_s[finger] += elapsed_s[t]
             status[finger] = see_finger(hand, person, tuning, work, finger, memory)
+        num_near = find_pinches(hand, tuning, work, status)
         solve_alone(hand, person, tuning, work, memory, found)
-        solve_pinches(hand, person, tuning, work, memory, found)
+        solve_pinches(hand, person, tuning, work, memory, num_near, found)
         if tuning.keeps_fingers_apart:
             for _ in range(MAX_PUSHES):
                 if not push_apart(hand, work, status):
                     break
                 solve_alone(hand, person, tuning, work, memory, found)
-                solve_pinches(hand, person, tuning, work, memory, found)
+                solve_pinches(hand, person, tuning, work, memory, num_near, found)
         for finger in range(num_fingers):
             if status[finger] < IMPLAUSIBLE:
                 memory.unsolved_s[finger] = 0.0

@@ -110,11 +110,12 @@ def knuckle_error_m(hand, person, tuning, work, finger, memory):
 @compiled
 @no_type_check
 def find_pinches(hand, tuning, work, status):
-    """The thumb and all fingers near it into `members`; their vectors and weights.
+    """The thumb and all fingers near it into `members` and `is_near`; vectors and weights.
 
     The weight goes from that of near to that of far evenly in its logarithm.
     """
     thumb, measured, usable = hand.thumb, work.measured, work.usable
+    work.is_near[:] = 0
     if thumb < 0 or status[thumb] >= IMPLAUSIBLE or not usable[thumb, 3]:
         return 0
     count = 1
@@ -134,5 +135,6 @@ def find_pinches(hand, tuning, work, status):
             tuning.pinch_weight_near * (tuning.pinch_weight_far / tuning.pinch_weight_near) ** apart
         )
         work.members[count] = finger
+        work.is_near[finger] = work.is_near[thumb] = 1
         count += 1
     return count if count > 1 else 0

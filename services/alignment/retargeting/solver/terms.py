@@ -60,28 +60,39 @@ def finger_terms(work, finger, num_joints, joints):
 
 @compiled
 @no_type_check
-def pinch_terms(hand, work, finger):
-    """Cost of the vector from a fingertip to the thumb's; its terms are added to the scratch."""
-    thumb = hand.thumb
-    tip = work.origin[finger, hand.num_joints[finger]]
-    thumb_tip = work.origin[thumb, hand.num_joints[thumb]]
-    weight, cost = work.pinch_weight[finger], 0.0
-    work.coupling[finger, :] = 0.0
+def pinch_terms(hand, work, group):
+    """Cost of the vectors from fingertips to the thumb's; their terms are added to the scratch."""
+    thumb = group[0]
+    thumb_joints = hand.num_joints[thumb]
+    thumb_tip, thumb_slope = work.origin[thumb, thumb_joints], work.tip_slope[thumb]
+    pushed = work.push_m
+    pushed[:] = 0.0
+    cost, total = 0.0, 0.0
+    for finger in group[1:]:
+        num_joints = hand.num_joints[finger]
+        tip, tip_slope = work.origin[finger, num_joints], work.tip_slope[finger]
+        hessian, coupling = work.hessian[finger], work.coupling[finger]
+        gradient = work.gradient[finger]
+        weight = work.pinch_weight[finger]
+        total += weight
+        coupling[:] = 0.0
+        for k in range(3):
+            residual = thumb_tip[k] - tip[k] - work.pinch_m[finger, k]
+            cost += weight * residual * residual
+            pushed[k] += weight * residual
+            for b in range(num_joints):
+                slope = weight * tip_slope[b, k]
+                gradient[b] -= slope * residual
+                for a in range(thumb_joints):
+                    coupling[a, b] -= slope * thumb_slope[a, k]
+                for other in range(num_joints):
+                    hessian[b, other] += slope * tip_slope[other, k]
     for k in range(3):
-        residual = thumb_tip[k] - tip[k] - work.pinch_m[finger, k]
-        cost += weight * residual * residual
-        for a in range(hand.num_joints[thumb]):
-            slope = weight * work.tip_slope[thumb, a, k]
-            work.gradient[thumb, a] += slope * residual
-            for b in range(hand.num_joints[thumb]):
-                work.hessian[thumb, a, b] += slope * work.tip_slope[thumb, b, k]
-            for b in range(hand.num_joints[finger]):
-                work.coupling[finger, a, b] -= slope * work.tip_slope[finger, b, k]
-        for a in range(hand.num_joints[finger]):
-            slope = weight * work.tip_slope[finger, a, k]
-            work.gradient[finger, a] -= slope * residual
-            for b in range(hand.num_joints[finger]):
-                work.hessian[finger, a, b] += slope * work.tip_slope[finger, b, k]
+        for a in range(thumb_joints):
+            slope = total * thumb_slope[a, k]
+            work.gradient[thumb, a] += pushed[k] * thumb_slope[a, k]
+            for b in range(thumb_joints):
+                work.hessian[thumb, a, b] += slope * thumb_slope[b, k]
     return cost
 
 
@@ -93,6 +104,6 @@ def evaluate(hand, person, work, group, joints):
     for finger in group:
         linearize(hand, person, work, finger, joints[finger])
         cost += finger_terms(work, finger, hand.num_joints[finger], joints[finger])
-    for finger in group[1:]:
-        cost += pinch_terms(hand, work, finger)
+    if len(group) > 1:
+        cost += pinch_terms(hand, work, group)
     return cost

@@ -14,7 +14,7 @@ from services.cli.bench.retargeting.compare import (
     RobotScores,
     Speed,
 )
-from services.cli.bench.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
+from services.cli.bench.retargeting.ours import OURS, OURS_EXACT, ColdStart
 from services.cli.bench.retargeting.rivals import DEX, DEXI, VECTOR, Rival
 from services.cli.bench.retargeting.scores import PinchScore, RobotScore
 from services.cli.bench.retargeting.sequences import RATE_HZ
@@ -58,13 +58,12 @@ def velocity_limit_deg() -> float:
 def _speed(speeds: Sequence[Speed]) -> list[Requirement]:
     return [
         Requirement(
-            f"{ours}: times as fast as {Rival(library, VECTOR).name}",
-            worst_ratio(speeds, ours, Rival(library, VECTOR).name),
+            f"{OURS}: times as fast as {Rival(library, VECTOR).name}",
+            worst_ratio(speeds, OURS, Rival(library, VECTOR).name),
             "at least",
             bound,
         )
         for library, bound in PROMISED_SPEED
-        for ours in (OURS, OURS_LIVE)
     ]
 
 
