@@ -26,6 +26,15 @@ def store(tmp_path):
     return store
 
 
+@pytest.fixture
+def no_process_is_left():
+    """Of those that the test starts; other tests of this run may keep theirs."""
+    before = set(psutil.Process().children())
+    yield
+    assert set(psutil.Process().children()) <= before
+
+
+@pytest.mark.usefixtures("no_process_is_left")
 def test_one_process_aligns_refuses_dies_and_is_replaced(store):
     worker = AlignmentWorker(str(store.root))
     try:
@@ -50,7 +59,6 @@ def test_one_process_aligns_refuses_dies_and_is_replaced(store):
     finally:
         worker.stop()
     assert worker.pid is None
-    assert not psutil.Process().children()
 
 
 def test_stopping_from_another_thread_ends_it_at_once(store):
@@ -77,6 +85,7 @@ def test_stopping_from_another_thread_ends_it_at_once(store):
     assert store.sweep() == 0
 
 
+@pytest.mark.usefixtures("no_process_is_left")
 def test_many_recordings_side_by_side(store):
     wanted, hopeless = not_aligned(store, OPTIONS)
     assert (wanted, [outcome.recording_id for outcome in hopeless]) == (
@@ -93,4 +102,3 @@ def test_many_recordings_side_by_side(store):
     assert "head" in found["headless"].error.message
     assert found["take"].report.created
     assert not_aligned(store, OPTIONS)[0] == []
-    assert not psutil.Process().children()
