@@ -10,7 +10,7 @@ from functools import partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Int64, Shaped
+from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
@@ -25,6 +25,7 @@ from services.alignment.calibration.tactile_baseline import (
     TaxelSurvey,
 )
 from services.alignment.retargeting.keypoint_axes import calibrated_frame, to_wrist_axes
+from services.alignment.retargeting.wrist import rigid_transform
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 
 # Where the tracked body sits in what the tracker follows, by stream.
@@ -33,6 +34,9 @@ MOUNTS = {
     "wrist_right": "T_tracker_right_wrist_right",
     "head": "T_tracker_head_camera_head",
 }
+# A robot may tell its wrists in its own base; where that stands in the world is calibrated.
+BASE_FRAME = "base"
+BASE_NAME = "T_world_base"
 # Bytes of values that are read at once, as the episode holds them.
 PIECE_BYTES = 16 << 20
 # From raw values to those of the episode.
@@ -157,8 +161,13 @@ def date_stream(recording: Recording, name: str) -> DatedStream:
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
         convert = _keypoints_conversion(descriptor, calibration)
-    elif descriptor.kind == "pose" and MOUNTS.get(name) in calibration:
-        convert = partial(_move_to_body, T_tracker_body=_mount(calibration[MOUNTS[name]]))
+    elif descriptor.kind == "pose":
+        if MOUNTS.get(name) in calibration:
+            convert = partial(_move_to_body, T_tracker_body=_rigid(calibration, MOUNTS[name]))
+        if descriptor.frame == BASE_FRAME:
+            T_world_base = _base_of(calibration, name)
+            convert = partial(_move_to_world, before=convert, T_world_base=T_world_base)
+            descriptor = descriptor.model_copy(update={"frame": "world"})
     return DatedStream(recording, descriptor, timing, convert)
 
 
@@ -225,12 +234,26 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
     )
 
 
-def _mount(rows: Matrix) -> np.ndarray:
-    T_tracker_body = np.array(rows)
-    if T_tracker_body.shape != (4, 4):
-        raise InvalidInputError(f"calibration: a mount is {T_tracker_body.shape}, expected (4, 4)")
-    return T_tracker_body
+def _rigid(calibration: dict[str, Matrix], name: str) -> Float64[np.ndarray, "4 4"]:
+    return rigid_transform(calibration[name], what=f"calibration {name!r}")
+
+
+def _base_of(calibration: dict[str, Matrix], stream: str) -> Float64[np.ndarray, "4 4"]:
+    if BASE_NAME not in calibration:
+        raise InvalidInputError(
+            f"stream {stream!r}: poses are in the robot's base, and calibration {BASE_NAME!r} "
+            "(4 by 4) is missing; solve it from paired poses (docs/calibration.md), or send poses "
+            "in the world",
+            missing=[BASE_NAME],
+        )
+    return _rigid(calibration, BASE_NAME)
 
 
 def _move_to_body(poses: np.ndarray, *, T_tracker_body: np.ndarray) -> np.ndarray:
     return pose_from_transform(transform_from_pose(poses) @ T_tracker_body)
+
+
+def _move_to_world(
+    poses: np.ndarray, *, before: Conversion, T_world_base: np.ndarray
+) -> np.ndarray:
+    return pose_from_transform(T_world_base @ transform_from_pose(before(poses)))
