@@ -39,39 +39,20 @@ class RetargetOptions:
     keeps_fingers_apart: bool = False
 
     def __post_init__(self) -> None:
+        ranges = {
+            "temporal_weight_m2": (0.0, MAX_WEIGHT),
+            "velocity_limit_rad_s": (LEAST, np.inf),
+            "pinch_near_m": (LEAST, 1.0),
+            "pinch_far_m": (self.pinch_near_m + LEAST, 1.0),
+            "pinch_weight": (PINCH_WEIGHT_FAR, MAX_WEIGHT),
+            "posture_weight_m2": (0.0, MAX_WEIGHT),
+            "reacquire_after_s": (LEAST, np.inf),
+            "num_starts": (1, len(STARTS)),
+        }
         wrong = [
-            f"{name} {value:g} (expected {wanted})"
-            for name, value, is_right, wanted in (
-                (
-                    "temporal_weight_m2",
-                    self.temporal_weight_m2,
-                    self.temporal_weight_m2 >= 0,
-                    "≥ 0",
-                ),
-                ("posture_weight_m2", self.posture_weight_m2, self.posture_weight_m2 >= 0, "≥ 0"),
-                (
-                    "velocity_limit_rad_s",
-                    self.velocity_limit_rad_s,
-                    self.velocity_limit_rad_s > 0,
-                    "> 0",
-                ),
-                ("pinch_near_m", self.pinch_near_m, self.pinch_near_m > 0, "> 0"),
-                ("pinch_far_m", self.pinch_far_m, self.pinch_far_m > self.pinch_near_m, "> near"),
-                (
-                    "pinch_weight",
-                    self.pinch_weight,
-                    self.pinch_weight > PINCH_WEIGHT_FAR,
-                    "> 0.001",
-                ),
-                ("reacquire_after_s", self.reacquire_after_s, self.reacquire_after_s > 0, "> 0"),
-                (
-                    "num_starts",
-                    self.num_starts,
-                    1 <= self.num_starts <= len(STARTS),
-                    f"1 … {len(STARTS)}",
-                ),
-            )
-            if not is_right
+            f"{name} {getattr(self, name):g} (expected {low:g} … {high:g})"
+            for name, (low, high) in ranges.items()
+            if not low <= getattr(self, name) <= high
         ]
         if wrong:
             raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
@@ -97,6 +78,9 @@ class RetargetOptions:
 
 
 PINCH_WEIGHT_FAR = 1e-3
+# Beyond, products of weights and distances drown what the points say.
+MAX_WEIGHT = 1e6
+LEAST = 1e-6
 # A bone that differs from the person's by more than both is an error of the tracker.
 BONE_TOLERANCE = 0.3
 BONE_TOLERANCE_M = 0.008

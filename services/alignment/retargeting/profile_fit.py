@@ -169,9 +169,10 @@ def _knuckle_motion(
     )
     is_joint = joint_places(hand)
     knuckles = hand.chain_points_m(output.joints_rad[:, is_joint])[:, :, 0]
+    moved_own_m = knuckles - own["knuckle_m"][0, : len(rows)]
+    moved_own_m[output.finger_status >= IMPLAUSIBLE] = np.nan
     moved_m = np.full((num, NUM_FINGERS, 3), np.nan)
-    moved_m[:, rows] = knuckles - own["knuckle_m"][0, : len(rows)]
-    moved_m[:, rows][output.finger_status >= IMPLAUSIBLE] = np.nan
+    moved_m[:, rows] = moved_own_m
     return moved_m
 
 

@@ -55,6 +55,20 @@ def test_outliers_do_not_make_bones(pinches):
     np.testing.assert_allclose(profile.bone_m, measured(motion).bone_m, atol=1e-6)
 
 
+def test_samples_that_are_no_fingers_tell_nothing_of_knuckles():
+    motion = robot_motion("left", 600, 1, natural=True)
+    keypoints = motion.keypoints_m.copy()
+    # The last bone of a nearly straight joint folded back: its length is right, its bend none that
+    # a finger makes.
+    rows = np.flatnonzero(motion.joints_rad[:, 7] < 0.6)
+    assert 100 < len(rows) < 500
+    distal, tip = (keypoints[rows, NODE_INDEX["index", name]] for name in ("distal", "tip"))
+    keypoints[rows, NODE_INDEX["index", "tip"]] = 2 * distal - tip
+    profile = HandRetargeter("left").measure(keypoints)
+    np.testing.assert_allclose(profile.travel, 1.0, atol=1e-6)
+    np.testing.assert_allclose(profile.knuckle_sigma_m, 0.0, atol=1e-6)
+
+
 def test_profile_goes_through_a_calibration(pinches):
     _, motion = pinches
     profile = measured(motion, NOISE_M)
