@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import interpolation, rotations, transforms
@@ -33,6 +34,35 @@ def test_6d_and_quaternion_round_trips(vector):
     )
     q = rotations.quaternion_from_rotation(R)
     np.testing.assert_allclose(rotations.rotation_from_quaternion(q), R, atol=1e-12)
+
+
+def test_vectors_and_quaternions_are_those_of_scipy():
+    # Random rotations of every kind, half turns among them: scipy's vectors have 0 … π, its
+    # canonical quaternions w ≥ 0.
+    theirs = Rotation.random(2000, random_state=7)
+    R = theirs.as_matrix()
+    vectors = rotations.vector_from_rotation(R)
+    np.testing.assert_allclose(vectors, theirs.as_rotvec(), atol=1e-7)
+    assert np.linalg.norm(vectors, axis=-1).max() <= np.pi
+    x, y, z, w = theirs.as_quat(canonical=True).T
+    q_wxyz = rotations.quaternion_from_rotation(R)
+    np.testing.assert_allclose(q_wxyz, np.stack([w, x, y, z], axis=-1), atol=1e-12)
+    np.testing.assert_allclose(rotations.rotation_angle(R), theirs.magnitude(), atol=1e-7)
+    np.testing.assert_allclose(rotations.rotation_from_vector(theirs.as_rotvec()), R, atol=1e-12)
+
+
+def test_nearly_parallel_columns_still_give_orthogonal_matrices():
+    rng = np.random.default_rng(3)
+    first = rng.normal(size=(500, 3))
+    first /= np.linalg.norm(first, axis=-1, keepdims=True)
+    second = first + 2e-6 * rng.normal(size=(500, 3)) / np.sqrt(3)
+    sine = np.linalg.norm(np.cross(first, second), axis=-1)
+    columns = np.concatenate([first, second], axis=-1)[sine > 1.1e-6]
+    R = rotations.rotation_from_6d(columns)
+    assert len(R) > 100
+    np.testing.assert_allclose(
+        np.swapaxes(R, 1, 2) @ R, np.broadcast_to(np.eye(3), R.shape), atol=1e-14
+    )
 
 
 @pytest.mark.parametrize(

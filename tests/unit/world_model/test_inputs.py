@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from dextouch.errors import (
     DegenerateRotationError,
@@ -13,8 +14,10 @@ from dextouch.errors import (
     ShapeError,
     UnknownNameError,
 )
+from dextouch.geometry.transforms import transform
 from dextouch.hands.actions import AnchorPoses
 from dextouch.hands.robot_hand import RobotHand
+from services.world_model.network.conditioning import SceneEncoder
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.instruction import NO_WORD, hash_words
 from services.world_model.network.mirroring import (
@@ -23,8 +26,11 @@ from services.world_model.network.mirroring import (
     hand_features,
     left_joint_signs,
 )
-from services.world_model.network.pose_raster import blots
+from services.world_model.network.pose_raster import blots, pose_raster
 from services.world_model.training.dataset import cut_window
+
+# The rotation columns of both wrists and the head camera in a 67-D action.
+POSE_COLUMNS = np.array([[*range(3, 9)], [*range(12, 18)], [*range(61, 67)]])
 
 
 @pytest.fixture
@@ -75,6 +81,55 @@ def test_the_raster_shows_the_hands_where_they_are(toy_episode, tiny_config):
         assert raster[0, hand, int(row), int(column)] > 0.4
     assert raster.min() >= 0
     assert raster.max() <= 1
+
+
+def test_the_raster_moves_against_the_head():
+    # Both wrists 1 m in front of a camera of 200 px focal length, whose head then moves 100 mm to
+    # its right: the wrist moves 20 of 100 px, so 10 of 50 cells, to the left in the image, and the
+    # fingertips, 0.2 m nearer along the wrist's -z, 12.5 cells.
+    actions = np.zeros((1, 2, 67))
+    actions[..., POSE_COLUMNS] = [1, 0, 0, 0, 1, 0]
+    actions[0, 1, 58] = 0.1
+    wrist = transform(np.eye(3), np.array([0.0, 0.0, 1.0]))
+    anchors = np.stack([wrist, wrist, np.eye(4)])[None]
+    K_head = np.array([[[200.0, 0, 50], [0, 200.0, 50], [0, 0, 1]]])
+    raster = pose_raster(actions, anchors, K_head, image_px=100, cells=50)[0]
+    weight = raster / raster.sum(axis=(-2, -1), keepdims=True)
+    columns = (weight.sum(axis=-2) * np.arange(50)).sum(axis=-1)
+    rows = (weight.sum(axis=-1) * np.arange(50)).sum(axis=-1)
+    shift = columns[1] - columns[0]
+    assert ((shift > -12.5) & (shift < -10.0)).all()
+    np.testing.assert_allclose(rows[1], rows[0], atol=0.1)
+
+
+def test_the_left_hands_place_is_mirrored_into_the_rights(request_, tiny_config):
+    # A left hand that is the mirror image of the right one, in a camera that looks along +z.
+    R = Rotation.from_rotvec([0.4, -0.7, 0.2]).as_matrix()
+    T_camera_right = transform(R, np.array([0.11, 0.06, 0.42]))
+    mirror_camera = np.diag([-1.0, 1.0, 1.0])
+    mirror_wrist = np.diag([1.0, -1.0, 1.0])
+    T_camera_left = transform(mirror_camera @ R @ mirror_wrist, np.array([-0.11, 0.06, 0.42]))
+    T_world_camera = np.asarray(request_.anchor.T_world_camera_head)
+    anchor = AnchorPoses(
+        T_world_camera @ T_camera_left, T_world_camera @ T_camera_right, T_world_camera
+    )
+    layout = build_inputs([replace(request_, anchor=anchor)], tiny_config).layout[0].numpy()
+    expected = [0.11, 0.06, 0.42, *R[:, 0], *R[:, 1]]
+    np.testing.assert_allclose(layout[1], expected, atol=1e-6)
+    np.testing.assert_allclose(layout[0], expected, atol=1e-6)
+
+
+def test_the_left_hand_sees_the_scene_mirrored(request_, tiny_config):
+    inputs = build_inputs([request_], tiny_config)
+    mirrored = replace(
+        inputs, first_image=inputs.first_image.flip(2), raster=inputs.raster.flip(2).flip(-1)
+    )
+    torch.manual_seed(0)
+    scene = SceneEncoder(8)
+    here, there = scene(inputs)[0], scene(mirrored)[0]
+    torch.testing.assert_close(there[0], here[1], rtol=0, atol=1e-5)
+    torch.testing.assert_close(there[1], here[0], rtol=0, atol=1e-5)
+    assert (here[0] - here[1]).abs().max() > 1e-3
 
 
 def test_points_behind_the_camera_leave_no_blot():

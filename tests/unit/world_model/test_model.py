@@ -103,30 +103,36 @@ def test_silent_and_saturated_touch_give_finite_futures(model, inputs, noisy, pr
     assert torch.isfinite(future.images).all()
 
 
-def test_actions_condition_at_two_rates(model, inputs):
+@pytest.mark.parametrize("part", ["hands", "camera"])
+def test_each_step_conditions_its_own_latent_and_its_own_touch(model, inputs, part):
+    # Equation 4 of the paper: video latent j sees a[4j-3 … 4j], touch at step t sees a_t, index 0
+    # sees no action. Step s therefore moves latent ceil(s / 4), touch s, and nothing else.
+    times_video, times_tactile = torch.full((3, 5), 0.5), torch.full((3, 17), 0.5)
+    before = model.normalizer(inputs)
+    video = model.video_condition(inputs, before, times_video)
+    tactile = model.tactile_condition(inputs, before, times_tactile)
+    for step in range(17):
+        changed = getattr(inputs, part).clone()
+        changed[:, step] += 0.3
+        after = model.normalizer(replace(inputs, **{part: changed}))
+        moved_video = (model.video_condition(inputs, after, times_video) - video).abs()
+        moved_tactile = (model.tactile_condition(inputs, after, times_tactile) - tactile).abs()
+        latents = [] if step == 0 else [-(-step // 4)]
+        assert moved_video.amax((0, 2)).gt(1e-4).nonzero().flatten().tolist() == latents
+        steps = [] if step == 0 else [step]
+        assert moved_tactile.amax((0, 2, 3)).gt(1e-4).nonzero().flatten().tolist() == steps
+
+
+def test_the_condition_of_index_zero_holds_no_action_term(model, inputs):
+    # c_0 = 0: whatever the action layers put out, index 0 is time, words and scene alone.
     features = model.normalizer(inputs)
-    moved_hands = inputs.hands.clone()
-    moved_hands[:, 6] += 0.3
-    moved = model.normalizer(replace(inputs, hands=moved_hands))
-    video, tactile = torch.full((3, 5), 0.5), torch.full((3, 17), 0.5)
-    change = model.video_condition(inputs, moved, video) - model.video_condition(
-        inputs, features, video
-    )
-    # Step 6 lies in a[5 … 8]: latent 2 and no other.
-    assert change.abs().amax((0, 2)).gt(1e-4).tolist() == [False, False, True, False, False]
-    change = model.tactile_condition(inputs, moved, tactile) - model.tactile_condition(
-        inputs, features, tactile
-    )
-    assert change.abs().amax((0, 2, 3)).gt(1e-4).nonzero().flatten().tolist() == [6]
-
-
-def test_index_zero_has_no_action(model, inputs):
-    moved_hands = inputs.hands.clone()
-    moved_hands[:, 0] += 0.3
-    a = model.normalizer(inputs)
-    b = model.normalizer(replace(inputs, hands=moved_hands))
-    t = torch.full((3, 17), 0.5)
-    assert torch.equal(model.tactile_condition(inputs, a, t), model.tactile_condition(inputs, b, t))
+    for condition, steps in ((model.video_condition, 5), (model.tactile_condition, 17)):
+        t = torch.full((3, steps), 0.5)
+        before = condition(inputs, features, t)
+        condition.actions[-1].bias += 1.0
+        change = (condition(inputs, features, t) - before).flatten(2).abs().amax((0, 2))
+        assert change[0] == 0.0
+        assert change[1:].min() > 0.5
 
 
 def test_words_kind_and_layout_matter(model, inputs, noisy):
