@@ -11,7 +11,8 @@ from fastapi.staticfiles import StaticFiles
 from dextouch import __version__
 from dextouch.serving.app import create_service_app
 from services.dashboard.feeds import Feeds
-from services.dashboard.routes import api_router, live_router, page_router
+from services.dashboard.pages import page_router
+from services.dashboard.routes import api_router, live_router
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.topics import run_topics
@@ -54,7 +55,7 @@ def create_app(
         name="dashboard",
         version=__version__,
         settings=settings,
-        routers=[page_router(settings), api_router(settings), live_router()],
+        routers=[page_router(), api_router(settings), live_router()],
         lifespan=lifespan,
     )
     app.state.settings = settings

@@ -1,36 +1,22 @@
-"""The page, its live websocket and its recorder buttons: requests in, answers of the feeds out."""
+"""What the page asks for: its data, its live websocket and its recorder buttons."""
 
 import asyncio
 import json
 from contextlib import suppress
-from pathlib import Path
 from typing import Annotated, Literal
-from urllib.parse import parse_qs
 
 from fastapi import APIRouter, Body, Depends, Request, Response, WebSocket, WebSocketDisconnect
-from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse
-from jinja2 import Environment, FileSystemLoader
+from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 
 from dextouch.errors import AccessDeniedError
 from services.dashboard.feeds import Feeds
-from services.dashboard.sessions import COOKIE, Sessions, check_same_site
+from services.dashboard.sessions import Sessions, check_same_site
 from services.dashboard.settings import DashboardSettings
 from services.dashboard.topics import Viewer
 from services.dashboard.views import heatmap_layout
 
-TEMPLATES = Path(__file__).parent / "templates"
-CONTENT_SECURITY_POLICY = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
-    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
-)
-PAGE_HEADERS = {
-    "content-security-policy": CONTENT_SECURITY_POLICY,
-    "x-content-type-options": "nosniff",
-    "referrer-policy": "no-referrer",
-    "cache-control": "no-store",
-}
 MAX_VIEW_CHARACTERS = 1000
 WEBSOCKET_REFUSED = 1008
 
@@ -54,46 +40,6 @@ def guard(connection: HTTPConnection) -> None:
     check_same_site(connection, settings.allowed_hosts)
     if not sessions.allows(connection):
         raise AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
-
-
-def page_router(settings: DashboardSettings) -> APIRouter:
-    """The page and signing in."""
-    router = APIRouter(include_in_schema=False)
-    # Jinja2 escapes everything it fills in; no part of a page is built from strings elsewhere.
-    templates = Environment(loader=FileSystemLoader(TEMPLATES), autoescape=True)
-
-    def page(name: str, status: int = 200, **values: object) -> HTMLResponse:
-        text = templates.get_template(name).render(station=settings.station, **values)
-        return HTMLResponse(text, status, headers=PAGE_HEADERS)
-
-    @router.get("/")
-    async def index(request: Request) -> Response:
-        check_same_site(request, settings.allowed_hosts)
-        if not request.app.state.sessions.allows(request):
-            return page("sign_in.html", reason="")
-        return page("index.html", tasks=settings.tasks)
-
-    @router.post("/sign_in")
-    async def sign_in(request: Request) -> Response:
-        check_same_site(request, settings.allowed_hosts)
-        fields = parse_qs((await request.body()).decode("utf-8", "replace"))
-        sessions: Sessions = request.app.state.sessions
-        try:
-            token = sessions.sign_in(fields.get("key", [""])[0])
-        except AccessDeniedError as error:
-            return page("sign_in.html", 401, reason=error.message)
-        answer = RedirectResponse("/", 303)
-        answer.set_cookie(
-            COOKIE,
-            token,
-            max_age=int(sessions.lifetime_s),
-            httponly=True,
-            samesite="strict",
-            secure=request.url.scheme == "https",
-        )
-        return answer
-
-    return router
 
 
 def api_router(settings: DashboardSettings) -> APIRouter:

@@ -47,6 +47,10 @@ class Sessions:
         self._ends_s[token] = now_s + self.lifetime_s
         return token
 
+    def sign_out(self, connection: HTTPConnection) -> None:
+        """End the session of this browser; its cookie opens nothing any more."""
+        self._ends_s.pop(connection.cookies.get(COOKIE, ""), None)
+
     def allows(self, connection: HTTPConnection) -> bool:
         """Whether this request or websocket comes from a session that is still open."""
         if not self.needs_key:

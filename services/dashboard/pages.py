@@ -1,0 +1,102 @@
+"""The pages for people: the station, signing in and out, and what is refused, in words."""
+
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs
+
+from fastapi import APIRouter, Depends, Request, Response
+from fastapi.responses import HTMLResponse, RedirectResponse
+from fastapi.routing import APIRoute
+from jinja2 import Environment, FileSystemLoader
+
+from dextouch.errors import AccessDeniedError
+from dextouch.schemas.problems import status_of
+from services.dashboard.sessions import COOKIE, Sessions, check_same_site
+from services.dashboard.settings import DashboardSettings
+
+CONTENT_SECURITY_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self'; connect-src 'self'; "
+    "form-action 'self'; frame-ancestors 'none'; base-uri 'none'"
+)
+PAGE_HEADERS = {
+    "content-security-policy": CONTENT_SECURITY_POLICY,
+    "x-content-type-options": "nosniff",
+    # Under "no-referrer" browsers post the sign-in with "Origin: null", which is refused.
+    "referrer-policy": "same-origin",
+    "cache-control": "no-store",
+}
+# Jinja2 escapes everything it fills in; no part of a page is built from strings elsewhere.
+TEMPLATES = Environment(
+    loader=FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True
+)
+
+
+class PageRoute(APIRoute):
+    """A route that answers a refusal with a page instead of problem+json."""
+
+    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
+        """The route's handler around which refusals are caught."""
+        handle = super().get_route_handler()
+
+        async def answer(request: Request) -> Response:
+            try:
+                return await handle(request)
+            except AccessDeniedError as error:
+                return _page(request, "refused.html", status_of(error), reason=error.message)
+
+        return answer
+
+
+def page_router() -> APIRouter:
+    """The station's page, signing in and signing out."""
+    router = APIRouter(
+        include_in_schema=False, route_class=PageRoute, dependencies=[Depends(_check_site)]
+    )
+
+    @router.get("/")
+    async def index(request: Request) -> Response:
+        sessions: Sessions = request.app.state.sessions
+        if not sessions.allows(request):
+            return _page(request, "sign_in.html", reason="")
+        tasks = request.app.state.settings.tasks
+        return _page(request, "index.html", tasks=tasks, signed_in=sessions.needs_key)
+
+    @router.post("/sign_in")
+    async def sign_in(request: Request) -> Response:
+        fields = parse_qs((await request.body()).decode("utf-8", "replace"))
+        sessions: Sessions = request.app.state.sessions
+        try:
+            token = sessions.sign_in(fields.get("key", [""])[0])
+        except AccessDeniedError as error:
+            return _page(request, "sign_in.html", 401, reason=error.message)
+        answer = RedirectResponse("/", 303)
+        answer.set_cookie(
+            COOKIE,
+            token,
+            max_age=int(sessions.lifetime_s),
+            httponly=True,
+            samesite="strict",
+            secure=request.url.scheme == "https",
+        )
+        return answer
+
+    @router.post("/sign_out")
+    async def sign_out(request: Request) -> Response:
+        sessions: Sessions = request.app.state.sessions
+        sessions.sign_out(request)
+        answer = RedirectResponse("/", 303)
+        answer.delete_cookie(COOKIE)
+        return answer
+
+    return router
+
+
+def _page(request: Request, name: str, status: int = 200, **values: object) -> HTMLResponse:
+    settings: DashboardSettings = request.app.state.settings
+    text = TEMPLATES.get_template(name).render(station=settings.station, **values)
+    return HTMLResponse(text, status, headers=PAGE_HEADERS)
+
+
+def _check_site(request: Request) -> None:
+    check_same_site(request, request.app.state.settings.allowed_hosts)

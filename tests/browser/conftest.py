@@ -1,0 +1,141 @@
+"""Pages in a real Chromium, served by real servers on loopback; failing tests leave screenshots.
+
+The browser is Debian's `chromium`, or the program that DEXTOUCH_CHROMIUM names. Every wait of a
+page ends after 30 s, so that a loaded machine is slow and a broken page is still an error.
+"""
+
+import asyncio
+import os
+import shutil
+import threading
+from contextlib import ExitStack, contextmanager
+
+import pytest
+from playwright.sync_api import Error, expect, sync_playwright
+
+from services.cli.servers import bind, serve_all
+
+PATIENCE_S = 30
+FLAGS = (
+    "--no-sandbox",
+    "--disable-gpu",
+    "--disable-quic",
+    "--no-first-run",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+)
+expect.set_options(timeout=1000 * PATIENCE_S)
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    report = yield
+    if call.when == "call" and report.failed:
+        for path, page in item.funcargs.get("open_pages", {}).items():
+            try:
+                page.screenshot(path=path)
+                report.sections.append(("page", f"{page.url}, see {path}"))
+            except Error as error:
+                report.sections.append(("page", f"no screenshot: {error}"))
+    return report
+
+
+@pytest.fixture(scope="module")
+def chromium():
+    """One browser a module: playwright's loop must be gone before other modules run theirs."""
+    program = os.environ.get("DEXTOUCH_CHROMIUM") or shutil.which("chromium")
+    if program is None:
+        pytest.skip("no chromium on the PATH; install it, or name one in DEXTOUCH_CHROMIUM")
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(
+            executable_path=program, args=list(FLAGS), timeout=1000 * PATIENCE_S
+        )
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def open_pages():
+    """The test's pages by where their screenshots go if it fails."""
+    return {}
+
+
+@pytest.fixture
+def open_page(chromium, open_pages, tmp_path):
+    """Make a page in a profile of its own; arguments as those of `browser.new_context`."""
+    contexts = []
+
+    def make(**options):
+        context = chromium.new_context(**options)
+        context.set_default_timeout(1000 * PATIENCE_S)
+        contexts.append(context)
+        page = context.new_page()
+        open_pages[tmp_path / f"page_{len(open_pages)}.png"] = page
+        return page
+
+    yield make
+    for context in contexts:
+        context.close()
+
+
+@pytest.fixture
+def page(open_page):
+    """A page in a fresh profile."""
+    return open_page()
+
+
+@contextmanager
+def _served(make_app):
+    place = bind("tested", host="127.0.0.1", port=0)
+    stop, ready, failures = asyncio.Event(), threading.Event(), []
+    loop = asyncio.new_event_loop()
+
+    async def tell(answering):
+        await answering.wait()
+        ready.set()
+
+    async def serve():
+        answering = asyncio.Event()
+        telling = asyncio.create_task(tell(answering))
+        try:
+            await serve_all([(place, make_app(place.url))], stop=stop, ready=answering, grace_s=1)
+        finally:
+            telling.cancel()
+
+    def run():
+        try:
+            with asyncio.Runner(loop_factory=lambda: loop) as runner:
+                runner.run(serve())
+        except BaseException as error:  # noqa: BLE001 - told to the test
+            failures.append(error)
+        finally:
+            ready.set()
+
+    thread = threading.Thread(target=run, name="served", daemon=True)
+    thread.start()
+    assert ready.wait(PATIENCE_S), "the server did not start"
+    try:
+        assert not failures, failures
+        yield place.url
+    finally:
+        if not failures:
+            loop.call_soon_threadsafe(stop.set)
+        thread.join(PATIENCE_S)
+    assert not thread.is_alive(), "the server did not stop"
+    assert not failures, failures
+
+
+@pytest.fixture
+def serve():
+    """Serve an application until the test ends; gives its address.
+
+    Takes the application, or a function that makes it from its own address.
+    """
+    with ExitStack() as held:
+
+        def start(app):
+            make_app = app if not hasattr(app, "router") else lambda _: app
+            return held.enter_context(_served(make_app))
+
+        yield start
