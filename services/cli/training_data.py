@@ -1,8 +1,9 @@
-"""A range of seeds in; the mixed twin episodes that all networks are trained on, in a store, out.
+"""Twin episodes to train and test networks on: `dextouch train data`.
 
 About a third of the demonstrations are exact, the others up to 25 mm wrong, and every fifth is a
 miss: the same motion without its objects. Misses teach the model to look instead of guessing
-contact from motion habits.
+contact from motion habits. With `--ladder` the seeds take errors of 0 … 40 mm in turn, so that
+successes and near misses are about equally many: use it for the success probe.
 """
 
 import argparse
@@ -11,6 +12,7 @@ import multiprocessing
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
@@ -26,17 +28,50 @@ from services.twin.tasks import TASK_NAMES
 
 EXACT_FRACTION = 0.35
 MAX_NOISE_M = 0.025
+# Success is decided within about 5 mm, so the ladder is dense there.
+LADDER_M = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.040)
+# Takes that stop do so within these steps; before the first nothing has been reached.
+FIRST_FROZEN_STEP, LAST_FROZEN_STEP = 8, 69
 CAMERAS = ("camera_head",)
 
 
-def options_of(
-    task: str, seed: int, *, miss_fraction: float, exact_fraction: float = EXACT_FRACTION
-) -> TakeOptions:
+@dataclass(frozen=True)
+class Mix:
+    """How the episodes of a data set differ from each other.
+
+    `miss_fraction` have their objects elsewhere. `still_fraction` stop midway, or, half of them,
+    never begin. With `ladder` the error is `LADDER_M` in turn of seeds; without it
+    `exact_fraction` are exact and the others up to `MAX_NOISE_M` wrong.
+    """
+
+    miss_fraction: float = 0.2
+    exact_fraction: float = EXACT_FRACTION
+    still_fraction: float = 0.0
+    ladder: bool = False
+
+    def __post_init__(self) -> None:
+        for name in ("miss_fraction", "exact_fraction", "still_fraction"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise InvalidInputError(
+                    f"training data: got {name} {getattr(self, name)}, expected 0 … 1"
+                )
+
+
+def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
     """How the episode of a task and seed is made; the same every time."""
     draw = np.random.default_rng([seed, len(task)])
-    exact = draw.random() < exact_fraction
-    noise_m = 0.0 if exact else float(np.round(draw.uniform(0, MAX_NOISE_M), 3))
-    return TakeOptions(noise_m, bool(draw.random() < miss_fraction), CAMERAS)
+    if mix.ladder:
+        noise_m = LADDER_M[seed % len(LADDER_M)]
+    else:
+        exact = draw.random() < mix.exact_fraction
+        noise_m = 0.0 if exact else float(np.round(draw.uniform(0, MAX_NOISE_M), 3))
+    miss = bool(draw.random() < mix.miss_fraction)
+    frozen_from_step = None
+    if draw.random() < mix.still_fraction:
+        midway = bool(draw.random() < 0.5)
+        step = int(draw.integers(FIRST_FROZEN_STEP, LAST_FROZEN_STEP + 1))
+        frozen_from_step = step if midway else 0
+    return TakeOptions(noise_m, miss, CAMERAS, frozen_from_step)
 
 
 @lru_cache(maxsize=4)
@@ -55,12 +90,7 @@ def _make(order: tuple[str, int, TakeOptions, str]) -> bool | None:
 
 
 def make_training_data(
-    store: str,
-    seeds: range,
-    *,
-    miss_fraction: float,
-    exact_fraction: float = EXACT_FRACTION,
-    num_jobs: int | None = None,
+    store: str, seeds: range, mix: Mix, *, num_jobs: int | None = None
 ) -> dict[str, int]:
     """Record one episode a task and seed; what the store has already is kept.
 
@@ -68,16 +98,12 @@ def make_training_data(
         How many episodes were `made`, `kept`, and how many of those made `succeeded`.
 
     Raises:
-        InvalidInputError: no seeds, or a fraction outside 0 … 1.
+        InvalidInputError: no seeds.
     """
-    if len(seeds) == 0 or not 0 <= miss_fraction <= 1:
-        raise InvalidInputError(
-            f"training data: got seeds {seeds} and miss fraction {miss_fraction}, expected at "
-            "least one seed and 0 … 1"
-        )
-    mix = {"miss_fraction": miss_fraction, "exact_fraction": exact_fraction}
+    if len(seeds) == 0:
+        raise InvalidInputError(f"training data: got seeds {seeds}, expected at least one")
     orders = [
-        (task, seed, options_of(task, seed, **mix), store) for seed in seeds for task in TASK_NAMES
+        (task, seed, options_of(task, seed, mix), store) for seed in seeds for task in TASK_NAMES
     ]
     processes = num_jobs or os.cpu_count() or 1
     # Spawned, not forked: threads and locks of the caller must not be copied half-way.
@@ -96,18 +122,23 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")
     parser.add_argument("--count", type=int, default=130, help="seeds a task (%(default)s)")
     parser.add_argument("--miss-fraction", type=float, default=0.2, help="(%(default)s)")
-    parser.add_argument("--exact", action="store_true", help="no noise at all")
+    errors = parser.add_mutually_exclusive_group()
+    errors.add_argument("--exact", action="store_true", help="no errors at all")
+    errors.add_argument("--ladder", action="store_true", help="errors of 0 … 40 mm in turn")
+    parser.add_argument(
+        "--still-fraction", type=float, default=0.0, help="stop midway or never begin (%(default)s)"
+    )
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
     parser.add_argument("--json", type=Path, help="write the counts here")
     arguments = parser.parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
-    counts = make_training_data(
-        arguments.store,
-        seeds,
-        miss_fraction=arguments.miss_fraction,
-        exact_fraction=1.0 if arguments.exact else EXACT_FRACTION,
-        num_jobs=arguments.jobs,
+    mix = Mix(
+        arguments.miss_fraction,
+        1.0 if arguments.exact else EXACT_FRACTION,
+        arguments.still_fraction,
+        arguments.ladder,
     )
+    counts = make_training_data(arguments.store, seeds, mix, num_jobs=arguments.jobs)
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
     if arguments.json:
         arguments.json.write_text(json.dumps(counts, indent=2), encoding="utf-8")

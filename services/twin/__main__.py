@@ -79,6 +79,7 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--domain", default="robot", choices=DOMAINS)
     make.add_argument("--noise", default=0.0, type=float, help="demonstrator's error, metres")
     make.add_argument("--miss-fraction", default=0.0, type=float, help="takes without the objects")
+    make.add_argument("--freeze-from", type=int, help="step 0 … 80 from which on nothing moves")
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS)
     make.add_argument("--store", required=True, help="folder or file:///… of the episode store")
     make.add_argument("--jobs", default=1, type=int, help="processes")
@@ -97,7 +98,10 @@ def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
     for seed in arguments.seeds:
         draw = np.random.default_rng([seed, _MISS_DRAW]).random()
         options = TakeOptions(
-            arguments.noise, bool(draw < arguments.miss_fraction), tuple(arguments.cameras)
+            arguments.noise,
+            bool(draw < arguments.miss_fraction),
+            tuple(arguments.cameras),
+            arguments.freeze_from,
         )
         orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
     return orders

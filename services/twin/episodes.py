@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import UnknownNameError
+from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
 from services.twin.cameras import CAMERAS
@@ -39,14 +39,22 @@ class TakeOptions:
     """How a demonstration is made, apart from task, domain and seed.
 
     `noise_m` is the demonstrator's error (0 … 0.2 m), `miss` moves or removes the objects while
-    the motion stays, `images` are the cameras to record.
+    the motion stays, `images` are the cameras to record. From `frozen_from_step` (0 … 80) on the
+    commands no longer change: 0 holds still from the start.
     """
 
     noise_m: float = 0.0
     miss: bool = False
     images: tuple[str, ...] = CAMERAS
+    frozen_from_step: int | None = None
 
     def __post_init__(self) -> None:
+        frozen = self.frozen_from_step
+        if frozen is not None and not 0 <= frozen < NUM_GRID_STEPS:
+            raise InvalidInputError(
+                f"twin: got commands frozen from step {frozen}, expected a step "
+                f"0 … {NUM_GRID_STEPS - 1}"
+            )
         for camera in self.images:
             if camera not in CAMERAS:
                 raise UnknownNameError("camera", camera, list(CAMERAS))
@@ -76,6 +84,8 @@ def record(stage: Stage, seed: int, options: TakeOptions) -> TruthEpisode:
     anchor = stage.start(plan)
     # The take obeys exactly the numbers that its `action_commanded` holds: through 67-D and back.
     actions_commanded = actions_from_poses(plan.commands, anchor)
+    if options.frozen_from_step is not None:
+        actions_commanded[options.frozen_from_step :] = actions_commanded[options.frozen_from_step]
     commands = poses_from_actions(actions_commanded, anchor)
     recorder, grid = Recorder(stage, images=options.images), GridLog(stage)
     recorder.sample(0)
@@ -99,6 +109,8 @@ def episode_id(task: str, domain: Domain, seed: int, options: TakeOptions) -> st
         parts.append(f"n{round(options.noise_m * 1e6)}um")
     if options.miss:
         parts.append("miss")
+    if options.frozen_from_step is not None:
+        parts.append(f"f{options.frozen_from_step}")
     return "-".join(parts)
 
 
@@ -109,6 +121,7 @@ def _attributes(
         f"T_wrist_{hand.side}_camera_wrist_{hand.side}": matrix_rows(mount)
         for hand, mount in zip(stage.simulation.scene.hands, stage.rig.mounts, strict=True)
     }
+    frozen = options.frozen_from_step
     return EpisodeAttributes(
         episode_id=episode_id(stage.task.name, stage.domain, seed, options),
         task=stage.task.name,
@@ -124,6 +137,7 @@ def _attributes(
             f"dextouch twin record --task {stage.task.name} --domain {stage.domain} "
             f"--seeds {seed}:{seed + 1} --noise {options.noise_m!r} "
             f"--miss-fraction {float(options.miss)!r}"
+            + ("" if frozen is None else f" --freeze-from {frozen}")
         ),
         object_names=stage.task.object_names,
         calibration=mounts,

@@ -12,7 +12,7 @@ from services.cli.bench.machine import describe_machine
 from services.cli.bench.report import ResultTable, StageReport
 from services.cli.bench.rounds import interleaved
 from services.cli.bench.stages import Bar
-from services.cli.training_data import make_training_data
+from services.cli.training_data import Mix, make_training_data
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def _ignoring_round(work: Callable[[], float]) -> Callable[[int], float]:
 
 def _make_episodes(folder: Path, num_episodes: int) -> str:
     seeds = range(-(-num_episodes // len(TASK_NAMES)))
-    make_training_data(str(folder), seeds, miss_fraction=0.2)
+    make_training_data(str(folder), seeds, Mix())
     return str(folder)
 
 

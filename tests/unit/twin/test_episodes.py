@@ -103,6 +103,18 @@ def test_a_miss_keeps_the_motion_and_loses_the_touch(bottle_stage, robot_take):
     assert miss.pad_forces_n.sum() < 0.2 * robot_take.pad_forces_n.sum()
 
 
+def test_a_frozen_take_stops_where_it_is(bottle_stage, robot_take):
+    frozen = record(bottle_stage, 3, TakeOptions(images=(), frozen_from_step=30))
+    commanded = frozen.streams["action_commanded"].values
+    whole = robot_take.streams["action_commanded"].values
+    np.testing.assert_array_equal(commanded[:31], whole[:31])
+    assert (commanded[31:] == whole[30]).all()
+    wrist_m = frozen.streams["action"].values[:, 9:12]
+    assert np.abs(wrist_m[-1] - wrist_m[45]).max() < 0.01 < np.abs(wrist_m[30] - wrist_m[0]).max()
+    assert frozen.attributes.success is False
+    assert frozen.attributes.generator_command.endswith("--freeze-from 30")
+
+
 def test_pads_press_while_the_bottle_is_held(robot_take):
     held = robot_take.pad_forces_n[round(2.0 * 60), 1]
     assert held[0] > 1.0
@@ -123,7 +135,8 @@ def test_an_episode_goes_through_the_store(robot_take, tmp_path):
 
 def test_ids_differ_for_every_way_to_make_an_episode():
     options = [TakeOptions(), TakeOptions(noise_m=0.01), TakeOptions(miss=True)]
-    assert len({episode_id("stand_bottle", "robot", 1, option) for option in options}) == 3
+    options += [TakeOptions(frozen_from_step=step) for step in (0, 40)]
+    assert len({episode_id("stand_bottle", "robot", 1, option) for option in options}) == 5
 
 
 def test_bad_requests_are_refused(bottle_stage):
@@ -131,6 +144,9 @@ def test_bad_requests_are_refused(bottle_stage):
         bottle_stage.plan(0, noise_m=1.0)
     with pytest.raises(InvalidInputError, match="seed"):
         bottle_stage.plan(-1)
+    for step in (-1, 81):
+        with pytest.raises(InvalidInputError, match=r"frozen from step .*0 … 80"):
+            TakeOptions(frozen_from_step=step)
     with pytest.raises(UnknownNameError, match="camera_head"):
         TakeOptions(images=("camera_foot",))
     with pytest.raises(UnknownNameError, match="stand_bottle"):
