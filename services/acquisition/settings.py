@@ -5,6 +5,7 @@ from typing import Annotated, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, model_validator
 
+from dextouch.data_folder import default_spool
 from dextouch.serving.settings import ServiceSettings, service_config
 from dextouch.tactile.layout import Side
 from services.acquisition.mocks.links import MockLinks
@@ -186,7 +187,7 @@ class AcquisitionSettings(ServiceSettings):
     model_config = service_config("acquisition")
 
     station: str = Field(default="station", min_length=1, max_length=128)
-    spool: Path = Path("spool")
+    spool: Path = Field(default_factory=default_spool)
     flush_period_s: float = Field(default=SpoolSafety.flush_period_s, gt=0, le=3600)
     min_free_bytes: int = Field(default=SpoolSafety.min_free_bytes, ge=0)
     mock: bool = False

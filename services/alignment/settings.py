@@ -5,6 +5,7 @@ from pathlib import Path
 
 from pydantic import Field
 
+from dextouch.data_folder import default_store
 from dextouch.serving.settings import ServiceSettings, service_config
 from services.alignment.options import AlignmentOptions
 
@@ -26,7 +27,7 @@ class AlignmentSettings(ServiceSettings):
 
     model_config = service_config("alignment")
 
-    store_url: str = Field(default="data/store", min_length=1)
+    store_url: str = Field(default_factory=default_store, min_length=1)
     jobs_folder: Path | None = None
     options: AlignmentOptions = AlignmentOptions()
     num_workers: int = Field(default_factory=usable_cores, ge=1, le=64)

@@ -13,6 +13,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import track
 
+from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
 from dextouch.errors import (
     ConflictError,
@@ -32,18 +33,18 @@ formats:
   rrd      one file an episode or recording, every sample; opens in Rerun (cannot be imported)
 
 examples:
-  dextouch export --format mcap --store data/store stand-bottle-0003 --to take.mcap
-  dextouch export --format mcap --store data/store --kind recording --operator p17 --to takes/
-  dextouch export --format lerobot --store data/store --task stand_bottle --to data/lerobot
-  dextouch export --format umi --store data/store --domain robot --to robot.zarr.zip
-  dextouch export --format rrd --store data/store stand-bottle-0003 --to take.rrd
+  dextouch export --format mcap stand-bottle-0003 --to take.mcap
+  dextouch export --format mcap --kind recording --operator p17 --to takes/
+  dextouch export --format lerobot --task stand_bottle --to data/lerobot
+  dextouch export --format umi --domain robot --to robot.zarr.zip
+  dextouch export --format rrd stand-bottle-0003 --to take.rrd
 """
 _IMPORT_HELP = """\
 examples:
-  dextouch import --format mcap take.mcap --store data/store
-  dextouch import --format mcap takes/ --store data/store
-  dextouch import --format umi robot.zarr.zip --store data/store
-  dextouch import --format lerobot data/lerobot --store data/store --id-prefix theirs-
+  dextouch import --format mcap take.mcap
+  dextouch import --format mcap takes/
+  dextouch import --format umi robot.zarr.zip
+  dextouch import --format lerobot data/lerobot --id-prefix theirs-
 
 What each format keeps and loses: docs/bridges.md
 """
@@ -262,7 +263,9 @@ def _parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
         epilog=textwrap.dedent(more),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--store", metavar="URL", required=True, help="folder of the store")
+    parser.add_argument(
+        "--store", metavar="URL", default=default_store(), help="the store (%(default)s)"
+    )
     parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
     return parser
 

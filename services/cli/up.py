@@ -11,6 +11,7 @@ from fastapi import FastAPI
 from pydantic import AliasChoices, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from dextouch.data_folder import data_folder
 from dextouch.errors import UnknownNameError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings
@@ -36,7 +37,10 @@ class UpSettings(BaseSettings):
         cli_kebab_case=False,
     )
 
-    data: Path = Path("runs/up")
+    data: Path = Field(
+        default_factory=data_folder,
+        description="folder of store and spool (DEXTOUCH_DATA, else data)",
+    )
     station: str = Field(default="mock station", min_length=1, max_length=64)
     mock_episode_id: str | None = None
     without: tuple[str, ...] = Field(default=(), description="services to leave out")

@@ -2,6 +2,7 @@
 
 from pydantic import Field
 
+from dextouch.data_folder import default_store
 from dextouch.serving.settings import ServiceSettings, service_config
 
 
@@ -17,7 +18,7 @@ class EpisodeStoreSettings(ServiceSettings):
 
     model_config = service_config("episode_store")
 
-    store_url: str = Field(default="data/store", min_length=1)
+    store_url: str = Field(default_factory=default_store, min_length=1)
     sync_uploads: bool = True
     max_open_uploads: int = Field(default=16, ge=1, le=1024)
     max_batches_in_flight: int = Field(default=32, ge=1, le=1024)

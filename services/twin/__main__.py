@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
 from services.twin.cameras import CAMERAS
@@ -81,7 +82,9 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--miss-fraction", default=0.0, type=float, help="takes without the objects")
     make.add_argument("--freeze-from", type=int, help="step 0 … 80 from which on nothing moves")
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS)
-    make.add_argument("--store", required=True, help="folder or file:///… of the episode store")
+    make.add_argument(
+        "--store", default=default_store(), help="where episodes go (%(default)s)", metavar="URL"
+    )
     make.add_argument("--jobs", default=1, type=int, help="processes")
     make.add_argument("--json", type=Path, help="write a summary here")
     commands.add_parser("serve", help="serve the twin as a world; flags: serve --help")

@@ -1,12 +1,77 @@
-"""The whole demo as a user starts it: exit 0, and every figure that is promised in its report."""
+"""The README's first commands as a user types them, and every figure that the demo promises."""
 
 import json
+import os
+import re
+import shlex
+import signal
 import subprocess
 import sys
+import time
+from pathlib import Path
 
+import httpx
 import pytest
 
 pytestmark = [pytest.mark.slow, pytest.mark.system]
+
+README = Path(__file__).parents[2] / "README.md"
+DEXTOUCH = [sys.executable, "-m", "services.cli.main"]
+
+
+def commands_of_the_readme():
+    """The commands of its first two blocks, without what `make` installs."""
+    section = README.read_text(encoding="utf-8").split("## Try it")[1].split("\n## ")[0]
+    lines = "\n".join(re.findall(r"```\n(.*?)```", section, re.DOTALL)).splitlines()
+    typed = [shlex.split(line, comments=True) for line in lines]
+    quick = {("make", "demo"): ["dextouch", "demo", "--seeds", "1"], ("make", "test"): []}
+    return [quick.get(tuple(words), [Path(words[0]).name, *words[1:]]) for words in typed]
+
+
+def in_folder(folder, words, **more):
+    environment = {name: v for name, v in os.environ.items() if name != "DEXTOUCH_DATA"}
+    return subprocess.Popen(
+        [*DEXTOUCH, *words], cwd=folder, text=True, env=environment, stdout=subprocess.PIPE, **more
+    )
+
+
+def episodes_of_up(folder):
+    """What the store service of `dextouch up` lists once all services answer."""
+    running = in_folder(folder, ["up", "--json", "urls.json"])
+    try:
+        while not (urls := folder / "urls.json").exists() or not urls.read_text().endswith("\n"):
+            assert running.poll() is None, "dextouch up ended by itself"
+            time.sleep(0.1)
+        address = json.loads(urls.read_text())["episode_store"]
+        listed = httpx.get(f"{address}/v1/episodes", trust_env=False, timeout=60).json()
+    finally:
+        running.send_signal(signal.SIGINT)
+        running.communicate()
+    assert running.returncode == 0
+    return [episode["episode_id"] for episode in listed["episodes"]]
+
+
+def test_commands_of_the_readme_run_in_order_and_twice(tmp_path):
+    wanted = [words for words in commands_of_the_readme() if words]
+    assert ["dextouch", "up"] in wanted
+    for _ in range(2):
+        listed = []
+        for _, *words in wanted:
+            if words == ["up"]:
+                assert episodes_of_up(tmp_path) == listed
+                continue
+            running = in_folder(tmp_path, words)
+            out, _ = running.communicate(timeout=900)
+            assert running.returncode == 0, words
+            if words == ["store", "list"]:
+                listed = [line.split()[0] for line in out.splitlines()]
+        names = [re.fullmatch(r"demo-(human|robot)-[0-9a-f]{12}", name)[1] for name in listed]
+        assert names == ["human", "robot"]
+    report = json.loads((tmp_path / "demo" / "report.json").read_text())
+    robot = report["takes"]["robot"]["episode_id"]
+    export = in_folder(tmp_path, ["export", "--format", "mcap", "--to", "demo/robot.mcap", robot])
+    export.communicate(timeout=120)
+    assert (export.returncode, robot in listed) == (0, True)
 
 
 def test_demo_ends_well_and_keeps_its_promises(tmp_path):

@@ -5,6 +5,7 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from dextouch.data_folder import default_spool
 from dextouch.errors import InvalidInputError
 from services.cli.calibrate.boards import BOARD_HELP, parse_board
 
@@ -23,7 +24,7 @@ Measure what a station must know of its devices. Everything goes into one folder
 A whole calibration:
   1. glove     at a running station, which records rest and known pressures as you are told
                dextouch station calibrate glove --side left --url http://127.0.0.1:8083 \\
-                 --spool spool --to calibration
+                 --to calibration
   2. camera    25 photos of a printed board, everywhere in the image, near and far, tilted
                dextouch station calibrate camera --camera head --photos photos/head \\
                  --board charuco:5x7:30mm:22mm --to calibration
@@ -193,7 +194,7 @@ def _add_glove(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--spool",
         type=Path,
-        default=Path("spool"),
+        default=default_spool(),
         metavar="FOLDER",
         help="the station's takes, with --url (%(default)s)",
     )

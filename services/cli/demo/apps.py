@@ -18,22 +18,22 @@ from services.world_model.checkpoints import Checkpoint
 from services.world_model.world import ModelWorld
 
 
-def build_apps(store_folder: Path, world_model: Checkpoint) -> dict[str, FastAPI]:
+def build_apps(store: str, jobs_folder: Path, world_model: Checkpoint) -> dict[str, FastAPI]:
     """Store, alignment, the twin as the real world, and the imagined worlds.
 
     Args:
-        store_folder: where recordings and episodes lie.
+        store: where recordings and episodes lie.
+        jobs_folder: of the alignments.
         world_model: served beside the copy-first baseline.
     """
-    url = str(store_folder)
     model = ModelWorld(world_model)
     imagined: dict[str, World[Any]] = {
         "world_model": model,
         "copy-first": CopyFirstWorld.beside(model.description),
     }
     return {
-        "episode_store": create_store(EpisodeStoreSettings(store_url=url)),
-        "alignment": create_alignment(AlignmentSettings(store_url=url)),
+        "episode_store": create_store(EpisodeStoreSettings(store_url=store)),
+        "alignment": create_alignment(AlignmentSettings(store_url=store, jobs_folder=jobs_folder)),
         "twin": create_world_app(
             {"twin": TwinWorld(TwinSettings(cameras=("camera_head",)))},
             WorldServiceSettings(),

@@ -11,6 +11,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from dextouch import __version__
 from dextouch.clients.policy import Policy
+from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
 from dextouch.serving.logs import configure_logging
 from services.cli.demo.apps import build_apps
@@ -19,7 +20,14 @@ from services.cli.demo.judging import judge, ladder
 from services.cli.demo.models import Models, committed_models, train_models, use_one_thread
 from services.cli.demo.pictures import collect
 from services.cli.demo.prediction import PredictionResult, measure_prediction
-from services.cli.demo.recording import Take, align, measure, record_take, upload
+from services.cli.demo.recording import (
+    Take,
+    align,
+    forget_take,
+    measure,
+    record_take,
+    upload,
+)
 from services.cli.demo.settings import DemoPlan, parse
 from services.cli.demo.stages import Stages
 from services.cli.demo.table import show
@@ -49,6 +57,11 @@ def main(argv: Sequence[str]) -> int:
             path.write_text(text, encoding="utf-8")
     show(report)
     print(f"\nreport: {plan.output / 'report.html'}")
+    robot = report["takes"]["robot"]["episode_id"]
+    print(f"store:  {default_store()}, with both takes as recordings and as episodes; go on with")
+    print("  dextouch store list")
+    print(f"  dextouch export --format mcap --to {plan.output / 'robot.mcap'} {robot}")
+    print("  dextouch up")
     return 0
 
 
@@ -59,14 +72,16 @@ class Demo:
         self.plan = plan
         self.stages = Stages()
         self._truth_folder = folder / "truth"
-        self._store_folder = folder / "store"
+        self._store = default_store()
         self._spool = folder / "spool"
+        # Apart from the store, whose own alignment service may be running.
+        self._jobs = folder / "alignments"
 
     def run(self) -> dict[str, Any]:
         """All stages; the report as `report.json` holds it."""
         truth = self._make_truth()
         models = self._models()
-        apps = build_apps(self._store_folder, models.world_model)
+        apps = build_apps(self._store, self._jobs, models.world_model)
         with served(apps) as urls:
             takes = self._record(truth, urls)
             prediction = self._predict(truth, models)
@@ -91,12 +106,13 @@ class Demo:
 
     def _record(self, truth: Truth, urls: Mapping[str, str]) -> dict[str, Take]:
         truths = EpisodeStore(self._truth_folder)
-        aligned = EpisodeStore(self._store_folder)
+        aligned = EpisodeStore(self._store)
         takes = {}
         for seed, (domain, episode_id) in enumerate(truth.takes.items()):
             true_episode = truths.open(episode_id)
             with self.stages.stage(f"record_{domain}", f"recording a {domain} take"):
                 recorded, devices = record_take(true_episode, self._spool, seed=seed)
+                forget_take(aligned, recorded.recording_id)
                 upload(self._spool, urls["episode_store"])
             with self.stages.stage(f"align_{domain}", f"aligning the {domain} take"):
                 job = align(urls["alignment"], recorded.recording_id)
@@ -137,7 +153,12 @@ class Demo:
             "stages": self.stages.rows(),
             "errors": worst_errors({name: take.errors for name, take in takes.items()}),
             "takes": {
-                name: {**take.errors, "devices": take.devices} for name, take in takes.items()
+                name: {
+                    **take.errors,
+                    "devices": take.devices,
+                    "episode_id": take.episode.attributes.episode_id,
+                }
+                for name, take in takes.items()
             },
             "world_model": prediction.figures,
             **scores,

@@ -4,6 +4,7 @@ The whole way is the real one: mock devices speak packets, real drivers decode t
 spools, the uploader sends over HTTP, the alignment service makes the episode.
 """
 
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes.inspection import UPLOADS
 from dextouch.errors import InvalidInputError, UnavailableError
 from dextouch.schemas.problems import Problem, error_from_problem
 from services.acquisition.clock import VirtualClock
@@ -82,6 +84,18 @@ def _device_row(take: MockTake, counters: dict[str, Any]) -> dict[str, Any]:
         "counted_lost": counters["lost"],
         "counted_crc_errors": counters["crc_errors"],
     }
+
+
+def forget_take(store: EpisodeStore, recording_id: str) -> None:
+    """Remove a take of an earlier run, whole or half sent, and the episodes made from it."""
+    shutil.rmtree(store.root / UPLOADS / recording_id, ignore_errors=True)
+    for episode_id in store.list():
+        if episode_id.startswith(f"{recording_id}-"):
+            lineage = store.open(episode_id).attributes.lineage
+            if recording_id in {entry.id for entry in lineage if entry.kind == "recording"}:
+                store.delete(episode_id, for_good=True)
+    if store.exists(recording_id, kind="recording"):
+        store.delete(recording_id, kind="recording", for_good=True)
 
 
 def upload(spool_root: Path, store_url: str) -> None:

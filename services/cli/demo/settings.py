@@ -5,6 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dextouch.data_folder import default_store
+
 TASKS = ("stand_bottle", "stack_bowls")
 # Seeds below this are for training; the demo and every judgement use seeds from here on.
 FIRST_HELD_OUT_SEED = 10_000
@@ -37,7 +39,9 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         prog="dextouch demo",
         description="Record a human and a robot take through mock devices, align them, compare "
         "with the twin's truth, predict with the world model, and score policies in the twin and "
-        "in the world model. Ends with a table, report.json and report.html.",
+        "in the world model. Ends with a table, report.json and report.html; both takes stay in "
+        f"the store {default_store()}, where the next run replaces them (DEXTOUCH_DATA names "
+        "another data folder).",
     )
     parser.add_argument(
         "--output", type=Path, default=Path("demo"), help="folder of the results (%(default)s)"

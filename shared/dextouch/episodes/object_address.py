@@ -9,6 +9,7 @@ from urllib.parse import parse_qsl, unquote, urlsplit
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from dextouch.data_folder import data_folder
 from dextouch.errors import InvalidInputError, UnknownNameError
 
 MIB = 1 << 20
@@ -60,11 +61,11 @@ class ObjectAddress:
 
     @property
     def work_folder(self) -> Path:
-        """The folder that was given, or one below `data/work` that no other address has."""
+        """The folder that was given, or one below the data folder that no other address has."""
         if self.options.work_folder is not None:
             return self.options.work_folder
         name = re.sub(r"[^a-z0-9]+", "-", str(self).removeprefix("s3://").lower()).strip("-")
-        return Path("data/work") / f"{name[:80]}-{self.fingerprint[:8]}"
+        return data_folder() / "work" / f"{name[:80]}-{self.fingerprint[:8]}"
 
     @property
     def fingerprint(self) -> str:

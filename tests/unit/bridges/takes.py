@@ -49,7 +49,14 @@ def images_of(count, size_px, offset=0):
 
 
 def write_episode(
-    store, episode_id="stand-bottle-0003", *, num_steps=21, unit="rgb8", seed=3, cameras=CAMERAS
+    store,
+    episode_id="stand-bottle-0003",
+    *,
+    num_steps=21,
+    unit="rgb8",
+    seed=3,
+    cameras=CAMERAS,
+    lineage=(),
 ):
     """A robot episode with everything a twin writes; its reader comes back."""
     rng = np.random.default_rng(seed)
@@ -110,6 +117,7 @@ def write_episode(
         success=True,
         quality={"coverage": 0.75},
         created_at=datetime(2026, 1, 2, tzinfo=UTC),
+        lineage=lineage,
     )
     with store.writer(attributes=attributes) as writer:
         for described, t_ref_ns, values in streams.values():

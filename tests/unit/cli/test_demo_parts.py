@@ -6,13 +6,33 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.schemas.episodes import LineageEntry
 from services.cli import training_data
 from services.cli.demo.background import served
 from services.cli.demo.command import worst_errors
+from services.cli.demo.recording import forget_take
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.demo.stages import Stages
 from services.cli.demo.table import show
+from tests.unit.bridges.takes import write_episode, write_recording
+
+
+def test_a_take_of_an_earlier_run_is_replaced_with_its_episodes(tmp_path):
+    store = EpisodeStore(tmp_path)
+    for recording_id in ("demo-human", "demo-human-of-mine"):
+        write_recording(store, recording_id, count=5)
+    made = LineageEntry(kind="recording", id="demo-human", sha256="0" * 64)
+    write_episode(store, "demo-human-0123456789ab", num_steps=3, lineage=(made,))
+    write_episode(store, "demo-human-of-mine-0123", num_steps=3)
+    (tmp_path / ".uploads" / "demo-human").mkdir(parents=True)
+    for _ in range(2):
+        forget_take(store, "demo-human")
+        assert store.list() == ["demo-human-of-mine-0123"]
+        assert store.list(kind="recording") == ["demo-human-of-mine"]
+    assert store.trash_list() == []
+    assert list((tmp_path / ".uploads").iterdir()) == []
 
 
 def errors(scale):
