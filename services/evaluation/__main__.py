@@ -17,6 +17,7 @@ from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
+from services.evaluation.reporting.sections import figure
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
@@ -125,7 +126,12 @@ def _print_scores(report: Mapping[str, Any]) -> None:
     for row in report["policies"]:
         print(f"{row['task']:<16}{row['policy']:<22}{row['real']:>6.2f}{row['imagined']:>10.2f}")
     for task, figures in report["agreement"].items():
-        print(f"{task:<16}pearson {figures['pearson']}  mmrv {figures['mmrv']}")
+        print(
+            f"\n{task}: Pearson {figure(figures['pearson'])}, MMRV {figure(figures['mmrv'])} "
+            f"with ties counted, {figure(figures['mmrv_paper'])} by the paper's rule"
+        )
+        for comment in report["comments"][task]:
+            print(f"  {comment}")
 
 
 def _write_json(path: Path | None, content: Mapping[str, Any]) -> None:

@@ -9,10 +9,10 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.policy import bias, kendall, mean_absolute_error, mmrv, pearson, spearman
+from services.evaluation.comments import UNDEFINED, task_comments
 from services.evaluation.statistics import bootstrap_agreement, wilson_interval
 
 REAL = "real"
-UNDEFINED = "undefined"
 _BOOTSTRAP_SEED = 0
 
 
@@ -93,7 +93,11 @@ class ClosedLoopReport:
         }
 
     def agreement(self, world: str) -> dict[str, dict[str, Any]]:
-        """How the policies' success rates in a world agree with the real ones, by task."""
+        """How the policies' success rates in a world agree with the real ones, by task.
+
+        `mmrv` counts ties (`ties="simpler"`); `mmrv_paper` does not, so it is 0 for a world that
+        gives every policy the same score.
+        """
         return {task: self._agreement(world, task) for task in self.tasks}
 
     def _agreement(self, world: str, task: str) -> dict[str, Any]:
@@ -101,7 +105,8 @@ class ClosedLoopReport:
         pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
         found: dict[str, Any] = {
             "pearson": defined(pearson(**pair)),
-            "mmrv": defined(mmrv(**pair)),
+            "mmrv": defined(mmrv(**pair, ties="simpler")),
+            "mmrv_paper": defined(mmrv(**pair, ties="paper")),
             "spearman": defined(spearman(**pair)),
             "kendall": defined(kendall(**pair)),
             "bias": bias(**pair),
@@ -129,9 +134,14 @@ class ClosedLoopReport:
     def to_report(self) -> dict[str, Any]:
         """What a report holds of it: `policies`, `agreement` and the rest, as plain JSON."""
         first, *others = self.imagined_worlds
+        rows, agreement = self.policy_rows(), self.agreement(first)
         return {
-            "policies": self.policy_rows(),
-            "agreement": self.agreement(first),
+            "policies": rows,
+            "agreement": agreement,
+            "comments": {
+                task: task_comments([r for r in rows if r["task"] == task], found, first)
+                for task, found in agreement.items()
+            },
             "agreement_of_other_worlds": {world: self.agreement(world) for world in others},
             "imagined_world": first,
             "probe_accuracy_on_real": self.probe_accuracy(),

@@ -12,7 +12,7 @@ from dextouch.metrics.policy import mmrv, pearson
 
 AGREEMENT_MEASURES: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
     "pearson": lambda real, imagined: pearson(real=real, imagined=imagined),
-    "mmrv": lambda real, imagined: mmrv(real=real, imagined=imagined),
+    "mmrv": lambda real, imagined: mmrv(real=real, imagined=imagined, ties="simpler"),
 }
 
 
@@ -97,7 +97,7 @@ def bootstrap_agreement(
     Args:
         real: scores [policies, starts]; column k of both arrays began from the same start.
         imagined: scores [policies, starts].
-        measure: "pearson" or "mmrv" of the policies' means.
+        measure: "pearson", or "mmrv" with ties counted, of the policies' means.
         generator: source of the draws; every policy sees the same drawn starts.
         num_draws: number of draws.
 

@@ -18,6 +18,10 @@ def show(report: Mapping[str, Any]) -> None:
     console.print(f"Imagined success is told by a learned probe, right on {accuracy:.0%} of the")
     console.print("held-out true and imagined endings.\n")
     console.print(_agreement(report["agreement"]))
+    for task, comments in report["comments"].items():
+        console.print(f"\n{task}", style="bold")
+        for comment in comments:
+            console.print(f"- {comment}")
 
 
 def _table(title: str, *columns: str) -> Table:
@@ -79,9 +83,20 @@ def _policies(rows: list[dict[str, Any]]) -> Table:
 
 
 def _agreement(agreement: Mapping[str, Mapping[str, Any]]) -> Table:
-    table = _table("Agreement of real and imagined scores", "task", "Pearson", "MMRV")
+    columns = (
+        "task",
+        "policies",
+        "starts N",
+        "Pearson",
+        "MMRV, ties counted",
+        "MMRV, paper's rule",
+    )
+    table = _table("Agreement of real and imagined scores", *columns)
     for task, row in agreement.items():
-        table.add_row(task, _maybe(row["pearson"]), _maybe(row["mmrv"]))
+        size = (str(row["num_policies"]), str(row["num_starts"]))
+        table.add_row(
+            task, *size, *(_maybe(row[name]) for name in ("pearson", "mmrv", "mmrv_paper"))
+        )
     return table
 
 

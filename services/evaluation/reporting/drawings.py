@@ -16,7 +16,7 @@ from services.evaluation.reporting.pictures import (
     ReportPictures,
     moments,
 )
-from services.evaluation.reporting.sections import is_number
+from services.evaluation.reporting.sections import AgreementFigure, agreement_figures, is_number
 
 # S2 of every finger is abduction; the other three hinges bend it.
 _FLEXION_HINGES = [0, 2, 3]
@@ -33,11 +33,12 @@ class NamedChart:
 
 @dataclass(frozen=True)
 class PolicyPanel:
-    """One task: its policies, its agreement and its chart."""
+    """One task: its policies, its agreement, sentences about it, and its chart."""
 
     task: str
     rows: list[Mapping[str, Any]]
-    agreement: Mapping[str, Any]
+    agreement: list[AgreementFigure]
+    comments: list[str]
     chart: Markup | None
 
 
@@ -111,7 +112,7 @@ def _flexion_rad(actions: np.ndarray, side: str) -> np.ndarray:
 def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
     """Scores of the policies and the agreement of the worlds, one panel a task."""
     entries = report.get("policies", [])
-    agreement = report.get("agreement", {})
+    agreement, comments = report.get("agreement", {}), report.get("comments", {})
     panels = []
     for task in dict.fromkeys(str(e["task"]) for e in entries):
         rows = [e for e in entries if e["task"] == task]
@@ -128,7 +129,8 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
             if is_number(entry.get("real")) and is_number(entry.get("imagined"))
         ]
         chart = agreement_chart(points) if points else None
-        panels.append(PolicyPanel(task, rows, agreement.get(task, {}), chart))
+        figures = agreement_figures(agreement.get(task, {}))
+        panels.append(PolicyPanel(task, rows, figures, comments.get(task, []), chart))
     return panels
 
 

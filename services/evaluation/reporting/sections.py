@@ -15,6 +15,15 @@ ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("fingertip_error_mm", "Fingertip error", "mm", None),
 )
 CLOCK_BOUND_MS = 1.0
+AGREEMENT: tuple[tuple[str, str], ...] = (
+    ("pearson", "Pearson"),
+    ("mmrv", "MMRV, ties counted"),
+    ("mmrv_paper", "MMRV, paper's rule"),
+    ("spearman", "Spearman"),
+    ("kendall", "Kendall"),
+    ("bias", "mean of imagined less real"),
+    ("mean_absolute_error", "mean absolute error"),
+)
 # Title, unit, what is better, and the bars: figure and name.
 COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
     (
@@ -79,6 +88,15 @@ class ErrorRow:
 
 
 @dataclass(frozen=True)
+class AgreementFigure:
+    """One figure of agreement, with its 95 % interval where it has one."""
+
+    name: str
+    value: Any
+    interval: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
 class Tile:
     """One headline figure."""
 
@@ -138,6 +156,17 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
             holds = value >= bound[1] if bound[0] == "≥" else value <= bound[1]
         rows.append(ErrorRow(name, value, unit, f"{bound[0]} {bound[1]:g}" if bound else "", holds))
     return rows
+
+
+def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
+    """The figures of agreement that a task has."""
+    found = []
+    for key, name in AGREEMENT:
+        if key in agreement:
+            interval = agreement.get(f"{key}_interval")
+            known = (interval[0], interval[1]) if isinstance(interval, list) else None
+            found.append(AgreementFigure(name, agreement[key], known))
+    return found
 
 
 def tiles(report: Mapping[str, Any]) -> list[Tile]:

@@ -155,7 +155,18 @@ def test_the_table_shows_undefined_agreement(capsys):
                 1.0,
             ),
             "policies": [{"policy": "hold", "task": "t", "real": 0.0, "imagined": 0.5}],
-            "agreement": {"t": {"pearson": "undefined", "mmrv": 0.1}},
+            "agreement": {
+                "t": {
+                    "pearson": "undefined",
+                    "mmrv": 0.1,
+                    "mmrv_paper": 0.0,
+                    "num_policies": 5,
+                    "num_starts": 6,
+                }
+            },
+            "comments": {"t": ["It flatters."]},
         }
     )
-    assert "undefined" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    for words in ("undefined", "0.100", "0.000", "It flatters."):
+        assert words in shown

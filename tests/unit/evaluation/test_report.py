@@ -44,7 +44,11 @@ REPORT = {
          "real_interval": [0.7, 1.0], "imagined_interval": [0.6, 0.98]},
         {"policy": "hold", "task": "stand_bottle", "real": 0.0, "imagined": float("nan")},
     ],
-    "agreement": {"stand_bottle": {"pearson": "undefined", "mmrv": 0.0}},
+    "agreement": {"stand_bottle": {
+        "pearson": "undefined", "mmrv": 0.45, "mmrv_interval": [0.21, 0.68], "mmrv_paper": 0.0,
+        "pearson_interval": "undefined",
+    }},
+    "comments": {"stand_bottle": ["The dream flatters."]},
 }  # fmt: skip
 PICTURES = ReportPictures(
     episodes=(EpisodePicture("an episode", TIMES, IMAGES, TOUCH),),
@@ -120,6 +124,15 @@ def test_undefined_figures_say_so(tmp_path):
     shown = text.split("<details")[0]
     assert "undefined" in shown
     assert not re.search(r"\bnan\b", shown, re.IGNORECASE)
+
+
+def test_agreement_counts_ties_and_says_what_it_means(tmp_path):
+    text, _ = page(tmp_path, REPORT)
+    words = re.sub(r"<[^>]*>|\s+", " ", text.split("<details")[0])
+    assert re.search(r"MMRV, ties counted +0\.450 +0\.21.0\.68", words)
+    assert re.search(r"MMRV, paper&#39;s rule +0\.0 ", words)
+    assert "The dream flatters." in words
+    assert "pearson_interval" not in words
 
 
 def test_raw_figures_come_along(tmp_path):

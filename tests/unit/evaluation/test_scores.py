@@ -44,7 +44,8 @@ def test_agreement_by_hand():
     found = report(GOOD).agreement("model")["stand"]
     real, imagined = [1, 0.5, 0], [0.75, 0.75, 0.25]
     assert found["pearson"] == pytest.approx(np.corrcoef(real, imagined)[0, 1])
-    assert found["mmrv"] == 0.0
+    # Nothing is put in the opposite order, but a is put no higher than b: (0.5 + 0 + 0) / 3.
+    assert (found["mmrv"], found["mmrv_paper"]) == (pytest.approx(0.5 / 3), 0.0)
     assert found["bias"] == pytest.approx(0.25 / 3)
 
 
@@ -53,9 +54,50 @@ def test_a_world_without_spread_is_undefined_in_plain_json():
     copy = whole["agreement_of_other_worlds"]["copy"]["stand"]
     assert copy["pearson"] == "undefined"
     assert copy["pearson_interval"] == "undefined"
-    assert copy["mmrv"] == 0.0
+    # By hand: a (1.0) and b (0.5) are not put above anyone they beat, c beats nobody.
+    assert copy["mmrv"] == pytest.approx((1.0 + 0.5 + 0.0) / 3)
+    assert copy["mmrv_paper"] == 0.0
     assert whole["imagined_world"] == "model"
     json.dumps(whole, allow_nan=False)
+
+
+ALL_ONE = {
+    "real": {"a": "111111", "b": "100000", "c": "000000"},
+    "dream": {"a": "111111", "b": "111111", "c": "111111"},
+}
+
+
+def test_a_world_that_calls_everything_a_success_is_not_perfect():
+    whole = report(ALL_ONE).to_report()
+    found = whole["agreement"]["stand"]
+    assert found["mmrv"] == pytest.approx((1 + 1 / 6 + 0) / 3)
+    assert found["mmrv_interval"][1] > 0.3
+    size, flatters, overrated, undefined = whole["comments"]["stand"]
+    assert size.startswith("3 policies, N = 6 starts each")
+    # By hand: (0 + 5/6 + 1) / 3 = 0.61.
+    assert flatters == (
+        "dream flatters: its success rates are 0.61 above the real ones on average."
+    )
+    assert "overrates 2 of 3 policies" in overrated
+    assert "'c': 0.00 real, 1.00 imagined" in overrated
+    assert undefined == (
+        "Pearson is undefined: every policy has the same success rate (1.00) in dream, so there "
+        "is nothing to correlate."
+    )
+
+
+def test_comments_on_strict_and_fair_worlds():
+    strict = {"real": ALL_ONE["dream"], "dream": ALL_ONE["real"]}
+    sentences = " ".join(report(strict).to_report()["comments"]["stand"])
+    assert "dream is too strict: its success rates are 0.61 below" in sentences
+    assert "underrates 2 of 3 policies" in sentences
+    assert "same success rate (1.00) in the real world" in sentences
+    fair = report({"real": ALL_ONE["real"], "dream": ALL_ONE["real"]}).to_report()
+    assert fair["comments"]["stand"][1:] == [
+        "On average the success rates of dream are +0.00 from the real ones."
+    ]
+    alone = report({"real": {"a": "10"}, "dream": {"a": "10"}}).to_report()
+    assert alone["comments"]["stand"][-1].endswith("at least two policies.")
 
 
 def test_probe_is_judged_on_real_rollouts():
