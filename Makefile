@@ -7,7 +7,7 @@ LEROBOT_VENV ?= .venv-lerobot
 STAGE ?= store loader acquisition clocks calibration retargeting
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz fix clean bench bench-lerobot check-lerobot-export
+.PHONY: demo test check slow vm fuzz mutants fix clean bench bench-lerobot check-lerobot-export
 .DEFAULT_GOAL := demo
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
@@ -36,6 +36,9 @@ vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get i
 
 fuzz: $(VENV)/.dev       ## mutate packets of all gloves, guided by coverage; ARGS="--seconds 600"
 	PYTHONPATH=.:shared $(BIN)/python -m tests.fuzz.mutate $(ARGS)
+
+mutants: $(VENV)/.dev    ## plant known bugs one by one and count those that a test notices; ARGS="--area geometry"
+	PYTHONPATH=.:shared $(BIN)/python -m tests.mutants.run $(ARGS)
 
 check: $(VENV)/.dev      ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .

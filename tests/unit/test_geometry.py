@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry import interpolation, rotations, transforms
+from dextouch.geometry import cameras, interpolation, rotations, transforms
 
 vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
 
@@ -79,6 +79,30 @@ def test_tiny_and_huge_columns_survive():
     np.testing.assert_allclose(
         R @ np.swapaxes(R, 1, 2), np.broadcast_to(np.eye(3), (2, 3, 3)), atol=1e-14
     )
+
+
+def test_a_quarter_of_the_way_is_three_parts_of_the_earlier_sample():
+    t_ns, at_ns = np.array([0, 100, 200]), np.array([25, 100, 150])
+    left, weight, valid = interpolation.bracket(t_ns, at_ns, max_gap_ns=100)
+    assert valid.all()
+    values = interpolation.interpolate_linear(np.array([0.0, 8.0, 10.0]), left, weight)
+    np.testing.assert_allclose(values, [2.0, 8.0, 9.0])
+
+
+def test_the_nearest_sample_of_two_equally_near_ones_is_the_earlier():
+    t_ns = np.array([0, 10, 20])
+    at_ns = np.array([-3, 4, 5, 6, 15, 16, 99])
+    assert interpolation.nearest_index(t_ns, at_ns).tolist() == [0, 0, 0, 1, 1, 2, 2]
+
+
+def test_a_pinhole_camera_sees_its_field_of_view_edge_to_edge():
+    # 90° high: half the height is seen at 45°, so that the focal length is half the height.
+    K = cameras.pinhole_matrix(width_px=640, height_px=480, fovy_rad=np.pi / 2)
+    np.testing.assert_allclose(K, [[240, 0, 320], [0, 240, 240], [0, 0, 1]])
+    points = np.array([[0.0, 0.0, 2.0], [0.0, 2.0, 2.0], [-1.0, 0.0, 2.0], [0.0, 0.0, -1.0]])
+    pixels, in_front = cameras.project(K, points)
+    np.testing.assert_allclose(pixels[:3], [[320, 240], [320, 480], [200, 240]])
+    assert in_front.tolist() == [True, True, True, False]
 
 
 def test_nan_and_wrong_shapes_are_refused():

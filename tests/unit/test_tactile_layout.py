@@ -16,6 +16,34 @@ def test_select_inverts_expand(side):
     assert len(set(layout.raw_indices(side=side).tolist())) == 320
 
 
+# Scan row and column of some taxels of the right glove, counted by hand from the wiring in
+# docs/device_packets.md: pad, row and column within the pad, scan row, scan column.
+WIRING = [
+    ("thumb", 0, 0, 0, 0),
+    ("thumb", 0, 3, 0, 3),
+    ("thumb", 3, 0, 3, 0),
+    ("index", 1, 2, 1, 6),
+    ("ring", 2, 0, 2, 12),
+    ("little", 3, 3, 3, 19),
+    ("palm", 0, 0, 4, 0),
+    ("palm", 0, 15, 4, 15),
+    ("palm", 1, 0, 4, 16),
+    ("palm", 1, 4, 5, 0),
+    ("palm", 14, 15, 15, 19),
+]
+
+
+@pytest.mark.parametrize("side", layout.SIDES)
+@pytest.mark.parametrize(("pad", "row", "column", "scan_row", "scan_column"), WIRING)
+def test_each_pad_is_read_from_its_place_in_the_scan(side, pad, row, column, scan_row, scan_column):
+    scan = np.zeros((18, 20))
+    scan[scan_row, scan_column if side == "right" else 19 - scan_column] = 1.0
+    tips, palm = layout.split_pads(layout.select_taxels(scan.ravel(), side=side))
+    pads = {**dict(zip(layout.FINGERS, tips, strict=True)), "palm": palm}
+    assert [name for name in pads if pads[name].any()] == [pad]
+    assert np.argwhere(pads[pad]).tolist() == [[row, column]]
+
+
 def test_left_glove_is_wired_as_the_mirror_image():
     left = layout.raw_indices(side="left").reshape(-1)
     right = layout.raw_indices(side="right").reshape(-1)

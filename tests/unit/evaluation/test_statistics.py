@@ -46,6 +46,18 @@ def test_bootstrap_of_the_mean_covers():
     assert 175 <= hits <= 199
 
 
+@pytest.mark.parametrize(("confidence", "z"), [(0.95, 1.960), (0.8, 1.282)])
+def test_bootstrap_of_many_values_is_the_normal_interval(confidence, z):
+    # z from a table of the normal distribution; a bootstrap's sigma is that of the drawn values.
+    values = np.random.default_rng(5).normal(3.0, 2.0, 400)
+    interval = bootstrap_mean_interval(
+        values, np.random.default_rng(6), num_draws=20_000, confidence=confidence
+    )
+    sigma = values.std() / 20
+    assert interval.low == pytest.approx(values.mean() - z * sigma, abs=0.08 * sigma)
+    assert interval.high == pytest.approx(values.mean() + z * sigma, abs=0.08 * sigma)
+
+
 def test_bootstrap_refuses_nothing_and_tables():
     rng = np.random.default_rng(1)
     for values in (np.array([]), np.zeros((2, 2))):

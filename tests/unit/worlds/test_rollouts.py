@@ -83,6 +83,18 @@ async def test_any_other_number_or_body_is_a_conflict(chunk):
     made.close()
 
 
+async def test_an_older_chunk_is_a_conflict_even_with_the_newest_ones_body():
+    made = service()
+    rollout_id = await begin(made)
+    for chunk in range(3):
+        await made.step(rollout_id, chunk, actions(4), ALL)
+    for chunk in (0, 1):
+        with pytest.raises(ConflictError, match="expected chunk 3"):
+            await made.step(rollout_id, chunk, actions(4), ALL)
+    assert (await made.step(rollout_id, 2, actions(4), ALL)).replayed
+    made.close()
+
+
 @pytest.mark.parametrize(
     ("value", "error"), [(1e6, InvalidInputError), (2e6, RuntimeError), (3e6, NonFiniteError)]
 )
