@@ -36,7 +36,9 @@ class PlantedBug:
         """
         count = source.count(self.old)
         if count != 1:
-            raise ValueError(f"{self.area}, {self.what}: {self.file} holds {count} × {self.old!r}")
+            raise ValueError(
+                f"{self.area}, {self.what}: {self.file} holds {self.old!r} {count} times"
+            )
         return source.replace(self.old, self.new)
 
 
