@@ -16,7 +16,7 @@ from services.dashboard.upstream import Upstream
 from services.dashboard.views import (
     ServiceView,
     StationView,
-    TakeView,
+    TakesView,
     taxel_message,
     unreachable_station,
 )
@@ -76,10 +76,13 @@ class Feeds:
             for name, (ready, reason) in zip(names, answers, strict=True)
         ]
 
-    async def takes(self) -> list[TakeView]:
-        """The newest recordings and episodes, newest first; empty while the store is away."""
+    async def takes(self) -> TakesView:
+        """The newest recordings and episodes, newest first, or why there are none."""
         if "episode_store" not in self._upstreams:
-            return []
+            return TakesView(
+                note="This dashboard was started without DEXTOUCH_DASHBOARD_EPISODE_STORE_URL: "
+                "what is stored is not shown."
+            )
         store = self._upstreams["episode_store"]
         try:
             recordings = await store_api.newest_recordings(store, NUM_TAKES)
@@ -93,13 +96,13 @@ class Feeds:
                 for item in episodes
             }
         except DexTouchError as error:
-            # The services topic tells operators; the log keeps the reason.
             logger.warning("takes_not_listed", error=error.message)
-            return []
-        return [
+            return TakesView(note=f"The store does not list its takes: {error.message}")
+        takes = (
             *(store_api.episode_view(item, self._clocks) for item in episodes),
             *(store_api.recording_view(item) for item in recordings),
-        ]
+        )
+        return TakesView(takes=takes, note="" if takes else "Nothing stored yet.")
 
     async def operate(self, action: str, body: Mapping[str, Any]) -> dict[str, object]:
         """One recorder action; the recorder's new state."""
@@ -120,7 +123,7 @@ class Feeds:
         return [topic_message("services", [view.model_dump() for view in await self.services()])]
 
     async def _take_messages(self) -> list[Message]:
-        return [topic_message("takes", [view.model_dump() for view in await self.takes()])]
+        return [topic_message("takes", (await self.takes()).model_dump())]
 
     async def _camera_messages(self) -> list[Message]:
         try:

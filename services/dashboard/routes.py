@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
 
-from dextouch.errors import AccessDeniedError
+from dextouch.errors import AccessDeniedError, InvalidInputError
 from services.dashboard.feeds import Feeds
 from services.dashboard.sessions import Sessions, check_same_site
 from services.dashboard.settings import DashboardSettings
@@ -22,13 +22,20 @@ WEBSOCKET_REFUSED = 1008
 
 
 class RecorderRequest(BaseModel):
-    """What an operator sends with an action: a prompt with `arm`, an outcome with `save`."""
+    """What an operator sends with an action: a prompt with `arm`, an outcome with `save`.
+
+    `success` is true, false or null (not judged); `save` needs one of them said. `recording_id`
+    names the take that the action is meant for.
+    """
 
     model_config = ConfigDict(extra="forbid")
 
+    recording_id: str | None = Field(default=None, max_length=128)
     task: str | None = Field(default=None, min_length=1, max_length=128)
     instruction: str | None = Field(default=None, min_length=1, max_length=2000)
     domain: Literal["human", "robot"] | None = None
+    operator: str | None = Field(default=None, min_length=1, max_length=128)
+    consent: bool | None = None
     success: bool | None = None
     accept_incomplete: bool | None = None
 
@@ -64,7 +71,8 @@ def api_router(settings: DashboardSettings) -> APIRouter:
                 "name": settings.station,
                 "station": station.model_dump(),
                 "services": [view.model_dump() for view in services],
-                "takes": [view.model_dump() for view in takes],
+                "takes": [view.model_dump() for view in takes.takes],
+                "takes_note": takes.note,
             }
         )
 
@@ -73,8 +81,12 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         action: str, request: Request, wanted: Annotated[RecorderRequest, Body()]
     ) -> JSONResponse:
         """Arm, record, stop, save or discard; answers with the recorder's new state."""
+        if action == "save" and "success" not in wanted.model_fields_set:
+            raise InvalidInputError(
+                "save: got no outcome, expected success: true, false or null (not judged)"
+            )
         feeds: Feeds = request.app.state.feeds
-        return JSONResponse(await feeds.operate(action, wanted.model_dump(exclude_none=True)))
+        return JSONResponse(await feeds.operate(action, wanted.model_dump(exclude_unset=True)))
 
     @router.get("/cameras/{name}.jpg")
     async def camera(name: str, request: Request) -> Response:

@@ -9,6 +9,7 @@ from dextouch.errors import UnavailableError, UnknownNameError
 from services.dashboard.views import (
     CameraView,
     Level,
+    PromptView,
     RecorderView,
     StationView,
     StreamView,
@@ -93,6 +94,7 @@ class RecorderStatus(_Answer):
     state: str
     actions: tuple[str, ...]
     recording_id: str | None = None
+    prompt: PromptView | None = None
     duration_s: float | None = None
     problems: tuple[str, ...] = ()
     check: TakeCheck | None = None
@@ -147,22 +149,31 @@ def station_view(health: object, recorder: object) -> StationView:
 def recorder_view(answer: object) -> RecorderView:
     """The recorder from its own answer."""
     recorder = _read(RecorderStatus, answer)
-    found = recorder.check.problems if recorder.check else ()
-    complete = recorder.check is None or recorder.check.complete
-    # What the check found is also among the problems: say it once.
-    words = list(dict.fromkeys([*recorder.problems, *(problem.message for problem in found)]))
-    if recorder.check is not None and not words:
-        words = ["complete"]
+    check = recorder.check
+    found = sorted(check.problems, key=lambda problem: problem.level) if check else []
+    # What the check found is also among the problems: say it once. ERROR sorts before WARN.
+    checked = [problem.message for problem in found]
+    own = [message for message in recorder.problems if message not in checked]
+    problems = tuple(dict.fromkeys([*own, *checked]))
+    complete = check is None or check.complete
     level: Level = "OK"
-    if words and words != ["complete"]:
+    if problems:
         level = "WARN" if complete else "ERROR"
+    words = [recorder.recording_id] if recorder.recording_id else []
+    if check is not None:
+        words.append("complete" if complete else "incomplete")
+    if problems:
+        words.append("1 finding" if len(problems) == 1 else f"{len(problems)} findings")
     return RecorderView(
         state=recorder.state,
         actions=recorder.actions,
+        recording_id=recorder.recording_id,
+        prompt=recorder.prompt,
         elapsed_s=recorder.duration_s,
         level=level,
         complete=complete,
-        note=" · ".join([recorder.recording_id, *words] if recorder.recording_id else words),
+        note=" · ".join(words),
+        problems=problems,
     )
 
 

@@ -53,7 +53,10 @@ def recording_view(item: RecordingSummary) -> TakeView:
         name=item.recording_id,
         task=item.task,
         domain=item.domain,
-        outcome=f"{num_samples} samples, {len(item.num_samples)} streams",
+        operator=item.operator,
+        consent=item.consent,
+        outcome=OUTCOMES[item.success],
+        size=f"{item.duration_s:.1f} s, {num_samples} samples, {len(item.num_samples)} streams",
     )
 
 
@@ -64,7 +67,10 @@ def episode_view(item: EpisodeSummary, clocks: Mapping[str, str]) -> TakeView:
         name=item.episode_id,
         task=item.task,
         domain=item.domain,
-        outcome=f"{OUTCOMES[item.success]}, {item.num_steps} steps",
+        operator=item.operator,
+        consent=None,
+        outcome=OUTCOMES[item.success],
+        size=f"{item.duration_s:.1f} s, {item.num_steps} steps",
         clocks=clocks.get(item.episode_id, ""),
     )
 

@@ -39,17 +39,35 @@ class StreamView(BaseModel):
     clock_error_ms: float | None = None
 
 
+class PromptView(BaseModel):
+    """What was armed: the page's own fields, filled by whoever armed."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    task: str
+    instruction: str
+    domain: str = "human"
+    operator: str | None = None
+    consent: bool = False
+
+
 class RecorderView(BaseModel):
-    """The recorder's state and which of its actions make sense now."""
+    """The recorder's state and which of its actions make sense now.
+
+    `note` is the verdict on the take in a few words, `problems` what it rests on, worst first.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     state: str
     actions: tuple[str, ...] = ()
+    recording_id: str | None = None
+    prompt: PromptView | None = None
     elapsed_s: float | None = None
     level: Level = "OK"
     complete: bool = True
     note: str = ""
+    problems: tuple[str, ...] = ()
 
 
 class StationView(BaseModel):
@@ -77,7 +95,7 @@ class ServiceView(BaseModel):
 
 
 class TakeView(BaseModel):
-    """One stored recording or episode."""
+    """One stored recording or episode; `consent` is None where the store does not say it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -85,8 +103,20 @@ class TakeView(BaseModel):
     name: str
     task: str
     domain: str
+    operator: str | None
+    consent: bool | None
     outcome: str
+    size: str
     clocks: str = ""
+
+
+class TakesView(BaseModel):
+    """The newest takes; `note` says why there are none."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    takes: tuple[TakeView, ...] = ()
+    note: str = ""
 
 
 class CameraView(BaseModel):

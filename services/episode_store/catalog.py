@@ -165,6 +165,7 @@ class Catalog:
             domain=attributes.domain,
             station=attributes.station,
             operator=attributes.operator,
+            consent=attributes.consent,
             success=attributes.success,
             recovered=attributes.recovered,
             num_samples={name: reader.num_samples(name) for name in reader.streams},

@@ -13,6 +13,9 @@ from contextlib import ExitStack, contextmanager
 import pytest
 from playwright.sync_api import Error, expect, sync_playwright
 
+from services.acquisition.app import create_app as create_station
+from services.acquisition.mocks import pattern
+from services.acquisition.settings import AcquisitionSettings
 from services.cli.servers import bind, serve_all
 
 PATIENCE_S = 30
@@ -139,3 +142,15 @@ def serve():
             return held.enter_context(_served(make_app))
 
         yield start
+
+
+@pytest.fixture
+def serve_station(serve, monkeypatch):
+    """Serve a station with two mock trackers; all ten streams would take a small machine whole."""
+    streams = [s for s in pattern.pattern_streams() if s.descriptor.name in {"head", "wrist_left"}]
+    monkeypatch.setattr(pattern, "pattern_streams", lambda: streams)
+
+    def start(spool, **settings):
+        return serve(create_station(AcquisitionSettings(spool=spool, mock=True, **settings)))
+
+    return start

@@ -20,24 +20,23 @@ function drops(stream) {
   return stream.drop_percent === null ? counted : `${counted} (${number(stream.drop_percent, 2)} %)`;
 }
 
-function trouble(stream) {
-  const lasted = stream.lasted_s === null ? "" : ` · for ${age(stream.lasted_s)}`;
-  return [
-    stream.message ? element("span", { class: "why" }, stream.message + lasted) : null,
-    stream.advice ? element("span", { class: "to_do" }, stream.advice) : null,
-  ];
-}
-
-function row(stream) {
-  return element("tr", { "data-level": stream.level },
+function rows(stream) {
+  const figures = element("tr", { "data-level": stream.level },
     element("td", {}, levelBadge(stream.level)),
-    element("td", { class: "name" }, stream.name, ...trouble(stream)),
+    element("td", { class: "name" }, stream.name),
     rateCell(stream),
     element("td", { class: "number" }, drops(stream)),
     element("td", { class: "number" }, age(stream.age_s)),
     element("td", { class: "number clock_figure" }, number(stream.skew_ppm, 1, "ppm")),
     element("td", { class: "number clock_figure" }, number(stream.clock_error_ms, 2, "ms")),
   );
+  if (!stream.message && !stream.advice) return [figures];
+  const lasted = stream.lasted_s === null ? "" : ` · for ${age(stream.lasted_s)}`;
+  const trouble = element("div", { class: "trouble" },
+    stream.message ? element("span", { class: "why" }, stream.message + lasted) : null,
+    stream.advice ? element("span", { class: "to_do" }, stream.advice) : null);
+  // Below the figures, over the whole width: in the column of names it would be ten lines high.
+  return [figures, element("tr", { "data-level": stream.level, class: "more" }, element("td", { colspan: 7 }, trouble))];
 }
 
 export function showDevices(body, note, station) {
@@ -46,5 +45,5 @@ export function showDevices(body, note, station) {
   note.dataset.level = station.note_level;
   const clocks = station.streams.some((stream) => stream.skew_ppm !== null || stream.clock_error_ms !== null);
   body.closest("table").classList.toggle("no_clocks", !clocks);
-  body.replaceChildren(...station.streams.map(row));
+  body.replaceChildren(...station.streams.flatMap(rows));
 }

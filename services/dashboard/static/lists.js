@@ -9,12 +9,24 @@ export function showServices(list, services) {
     service.level === "OK" ? null : element("span", { class: "quiet" }, service.message))));
 }
 
-export function showTakes(body, takes) {
-  const rows = takes.map((take) => element("tr", {},
-    element("td", { class: "quiet" }, take.kind), element("td", { class: "name" }, take.name),
-    element("td", {}, take.task), element("td", {}, take.domain), element("td", {}, take.outcome, take.clocks ? element("span", { class: "why" }, take.clocks) : null)));
-  const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, "Nothing stored yet."));
-  body.replaceChildren(...(rows.length ? rows : [empty]));
+const CONSENT = new Map([[true, "consent given"], [false, "no consent"]]);
+
+function why(text) {
+  return text ? element("span", { class: "why" }, text) : null;
+}
+
+function takeRow(take) {
+  return element("tr", {},
+    element("td", { class: "quiet" }, take.kind, why(take.domain)),
+    element("td", { class: "name" }, take.name, why(take.size), why(take.clocks)),
+    element("td", {}, take.task),
+    element("td", {}, take.operator ?? "–", why(CONSENT.get(take.consent))),
+    element("td", {}, take.outcome));
+}
+
+export function showTakes(body, { takes, note }) {
+  const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, note));
+  body.replaceChildren(...(takes.length ? takes.map(takeRow) : [empty]));
 }
 
 export function showCameras(section, row, cameras) {

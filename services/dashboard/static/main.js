@@ -45,7 +45,7 @@ const link = new LiveLink({
     setText(find("link"), connected ? "live" : "dashboard not reachable, trying again");
     if (!connected) {
       showStation({ level: "STALE", summary: "", note: "No link to the dashboard: what you see is old.", note_level: "ERROR", reachable: false,
-        streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, note: "", level: "STALE" } });
+        streams: [], recorder: { state: "unknown", actions: [], elapsed_s: null, note: "", problems: [], level: "STALE" } });
       Object.values(hands).forEach((hand) => hand.clear("no link"));
     }
   },

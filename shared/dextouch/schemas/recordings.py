@@ -99,6 +99,7 @@ class RecordingSummary(BaseModel):
     domain: Domain
     station: str
     operator: str | None = None
+    consent: bool = False
     success: bool | None = None
     recovered: bool = False
     num_samples: dict[str, int]

@@ -20,6 +20,7 @@ EPISODE = {
     "origin": "recorded",
     "success": None,
     "num_steps": 81,
+    "duration_s": 5.4,
     "content_sha256": "a" * 64,
 }
 EYE = np.eye(4).tolist()
@@ -67,7 +68,8 @@ class FakeServices:
         self.episodes = [EPISODE]
         self.app.get("/v1/episodes")(self._list_episodes)
         self.app.get("/v1/episodes/{episode_id}")(lambda: DETAIL)
-        self.app.get("/v1/recordings")(lambda: {"recordings": [], "num_matching": 0})
+        self.recordings = []
+        self.app.get("/v1/recordings")(self._list_recordings)
 
     async def _note(self, request, call_next):
         self.asked.append(request.url.path)
@@ -76,6 +78,9 @@ class FakeServices:
     def _list_episodes(self, limit: int, offset: int = 0):
         page = self.episodes[offset : offset + limit]
         return {"episodes": page, "num_matching": len(self.episodes)}
+
+    def _list_recordings(self):
+        return {"recordings": self.recordings, "num_matching": len(self.recordings)}
 
     def _taxels(self):
         arrays = {f"tactile_{side}": values for side, values in PRESSURES.items()}

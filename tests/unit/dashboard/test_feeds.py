@@ -69,7 +69,29 @@ async def test_incomplete_take_is_shown(feeds, services):
     }
     recorder = (await feeds.station()).recorder
     assert (recorder.complete, recorder.level, recorder.elapsed_s) == (False, "ERROR", 5.5)
-    assert recorder.note == "take-7 · head: 0.4 s gap"
+    assert recorder.note == "take-7 · incomplete · 1 finding"
+    assert (recorder.recording_id, recorder.problems) == ("take-7", ("head: 0.4 s gap",))
+
+
+async def test_the_worst_of_a_take_leads(feeds, services):
+    levels = {"b: 2 % lost": "WARN", "head: 0.4 s gap": "ERROR", "a: 1 % lost": "WARN"}
+    problems = [{"level": level, "message": text} for text, level in levels.items()]
+    services.recorder = {
+        "state": "checking",
+        "actions": ["save", "discard"],
+        "recording_id": "take-7",
+        # The check's findings are repeated here, after what the recorder says itself.
+        "problems": ["the disk is full", *levels],
+        "check": {"complete": False, "problems": problems},
+    }
+    recorder = (await feeds.station()).recorder
+    assert recorder.note == "take-7 · incomplete · 4 findings"
+    assert recorder.problems == (
+        "the disk is full",
+        "head: 0.4 s gap",
+        "b: 2 % lost",
+        "a: 1 % lost",
+    )
 
 
 async def test_absent_station_shows_no_numbers():
@@ -99,8 +121,9 @@ async def test_services(upstreams):
 
 
 async def test_takes(feeds):
-    (take,) = await feeds.takes()
-    assert (take.kind, take.name, take.outcome) == ("episode", "take-0001", "not judged, 81 steps")
+    (take,) = (await feeds.takes()).takes
+    assert (take.kind, take.name, take.outcome) == ("episode", "take-0001", "not judged")
+    assert (take.operator, take.consent, take.size) == (None, None, "5.4 s, 81 steps")
     assert take.clocks == "skew to 50 ppm, residual to 0.06 ms, 3 samples lost"
 
 
@@ -113,13 +136,47 @@ async def test_an_episode_is_asked_about_once(feeds, services):
 async def test_the_newest_of_many_are_shown(feeds, services):
     (episode,) = services.episodes
     services.episodes = [episode | {"episode_id": f"take-{n:04d}"} for n in range(20)]
-    takes = await feeds.takes()
+    takes = (await feeds.takes()).takes
     assert [take.name for take in takes] == [f"take-{n:04d}" for n in range(19, 13, -1)]
 
 
 async def test_a_foreign_list_is_no_crash(feeds, services):
     services.episodes = [{"name": "?"}]
-    assert await feeds.takes() == []
+    view = await feeds.takes()
+    assert view.takes == ()
+    assert view.note.startswith("The store does not list its takes: episode_store: an answer of an")
+
+
+async def test_why_no_take_is_shown_is_said(feeds, services):
+    services.episodes = []
+    assert (await feeds.takes()).note == "Nothing stored yet."
+    without = await Feeds({}, DashboardSettings()).takes()
+    assert "DEXTOUCH_DASHBOARD_EPISODE_STORE_URL" in without.note
+
+
+async def test_a_recording_is_shown_with_its_labels(feeds, services):
+    services.recordings = [
+        {
+            "recording_id": "take-2",
+            "task": "stack_bowls",
+            "domain": "human",
+            "station": "desk",
+            "operator": "p7",
+            "consent": True,
+            "success": False,
+            "num_samples": {"head": 300, "wrist_left": 200},
+            "duration_s": 3.0,
+            "content_sha256": "b" * 64,
+        }
+    ]
+    take = (await feeds.takes()).takes[-1]
+    assert (take.name, take.operator, take.consent, take.outcome) == (
+        "take-2",
+        "p7",
+        True,
+        "failure",
+    )
+    assert take.size == "3.0 s, 500 samples, 2 streams"
 
 
 async def test_operate(feeds, services):

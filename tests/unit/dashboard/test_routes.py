@@ -55,6 +55,22 @@ async def test_recorder(client):
     assert "valid: arm" in refused.json()["detail"]
 
 
+async def test_who_is_recorded_reaches_the_station(client, services):
+    prompt = {"task": "stack_bowls", "instruction": "stack", "operator": "p7", "consent": True}
+    await client.post("/v1/recorder/arm", json=prompt)
+    assert services.asked[-1] == prompt
+
+
+async def test_nothing_is_saved_without_an_outcome(client, services):
+    answer = await client.post("/v1/recorder/save", json={"recording_id": "take-7"})
+    assert answer.status_code == 422
+    assert "expected success: true, false or null" in answer.json()["detail"]
+    assert "/v1/recorder/save" not in services.asked
+    for success in (True, False, None):
+        await client.post("/v1/recorder/save", json={"success": success})
+        assert services.asked[-1] == {"success": success}
+
+
 async def test_recorder_conflict_is_passed_on(client):
     answer = await client.post("/v1/recorder/record", json={})
     assert answer.status_code == 409

@@ -1,0 +1,164 @@
+"""Takes recorded through the page, on a station with mock devices: every label is asked for."""
+
+import pytest
+from playwright.sync_api import expect
+
+from dextouch.episodes.log import SpoolReader
+from services.dashboard.app import create_app as create_dashboard
+from services.dashboard.settings import DashboardSettings
+
+
+@pytest.fixture
+def spool(tmp_path):
+    return tmp_path / "spool"
+
+
+@pytest.fixture
+def address(serve, serve_station, spool):
+    """A dashboard over a station with mock devices."""
+    return serve(create_dashboard(DashboardSettings(acquisition_url=serve_station(spool))))
+
+
+def state(page):
+    return page.locator("#recorder_state")
+
+
+def open_recorder(page, address):
+    """The page once it knows the station; its live link."""
+    with page.expect_websocket() as live:
+        page.goto(address)
+    expect(state(page)).to_have_text("idle")
+    return live.value
+
+
+def message(page):
+    return page.locator("#recorder_message")
+
+
+def press_until(page, key, text):
+    """Press a recorder key; twice where it asks whether an incomplete take is meant."""
+    page.keyboard.press(key)
+    asks = message(page).filter(has_text="Once more within three seconds")
+    expect(state(page).filter(has_text=text).or_(asks)).not_to_have_count(0)
+    if state(page).text_content() != text:
+        page.keyboard.press(key)
+    expect(state(page)).to_have_text(text)
+
+
+def record(page):
+    """A take's way from arming to its check, by keys; the id it got."""
+    page.keyboard.press("a")
+    expect(state(page)).to_have_text("armed")
+    page.keyboard.press("r")
+    expect(state(page)).to_have_text("recording")
+    expect(page.locator("#recorder_clock")).not_to_have_text("0:00.0")
+    page.keyboard.press("s")
+    expect(state(page)).to_have_text("checking")
+    return page.locator("#recorder_note").text_content().split(" · ")[0]
+
+
+def fill(page, **fields):
+    for label, text in fields.items():
+        page.get_by_label(label.capitalize()).fill(text)
+
+
+def test_the_outcome_is_asked_at_every_take(page, address, spool):
+    open_recorder(page, address)
+    fill(page, instruction="Stack the bowls", operator="p7")
+    page.get_by_label("Consent given").check()
+    first = record(page)
+    page.locator("#outcome").get_by_text("Success").click()
+    press_until(page, "v", "saved")
+
+    second = record(page)
+    expect(page.locator("input[name=outcome]:checked")).to_have_count(0)
+    expect(page.get_by_role("button", name="Save")).to_be_disabled()
+    page.keyboard.press("v")
+    expect(message(page)).to_contain_text("How did this take end?")
+    page.keyboard.press("v")
+    expect(state(page)).to_have_text("checking")
+    assert not SpoolReader(spool / second).closed
+    page.keyboard.press("n")
+    press_until(page, "v", "saved")
+
+    third = record(page)
+    page.keyboard.press("u")
+    press_until(page, "v", "saved")
+
+    saved = [SpoolReader(spool / name) for name in (first, second, third)]
+    assert all(take.closed for take in saved)
+    labels = [take.attributes for take in saved]
+    assert [label.success for label in labels] == [True, False, None]
+    assert {(label.operator, label.consent) for label in labels} == {("p7", True)}
+
+
+def test_an_outcome_ends_with_its_take(page, address, spool):
+    open_recorder(page, address)
+    fill(page, instruction="Stack the bowls")
+    page.keyboard.press("Enter")
+    thrown_away = record(page)
+    page.keyboard.press("y")
+    press_until(page, "g", "armed")
+    assert not (spool / thrown_away).exists()
+    record(page)
+    expect(page.locator("input[name=outcome]:checked")).to_have_count(0)
+    press_until(page, "d", "discarded")
+
+
+def test_another_operator_is_asked_for_consent(page, address):
+    open_recorder(page, address)
+    fill(page, instruction="Stack the bowls", operator="p7")
+    consent = page.get_by_label("Consent given")
+    consent.check()
+    page.keyboard.press("a")
+    expect(state(page)).to_have_text("armed")
+    expect(consent).to_be_checked()
+    fill(page, operator="p8")
+    expect(consent).not_to_be_checked()
+    # What is armed is still p7: nothing is recorded under the wrong name.
+    expect(page.get_by_role("button", name="Record")).to_be_disabled()
+    page.keyboard.press("Escape")
+    page.keyboard.press("r")
+    expect(message(page)).to_contain_text("arm again")
+    expect(state(page)).to_have_text("armed")
+
+
+def test_keys_work_again_after_typing(page, address):
+    live = open_recorder(page, address)
+    fill(page, instruction="Stack the bowls")
+    page.keyboard.press("Escape")
+    page.keyboard.press("a")
+    expect(state(page)).to_have_text("armed")
+    page.get_by_label("Domain").focus()
+    page.keyboard.press("Escape")
+    page.get_by_label("Instruction").focus()
+    page.keyboard.press("Enter")
+    page.keyboard.press("r")
+    expect(state(page)).to_have_text("recording")
+    expect(page.get_by_label("Instruction")).to_have_value("Stack the bowls")
+    # The question outlives the news that come five times a second.
+    page.keyboard.press("d")
+    expect(message(page)).to_contain_text("Discard this take?")
+    for _ in range(5):
+        live.wait_for_event("framereceived")
+    expect(message(page)).to_contain_text("Discard this take?")
+    press_until(page, "d", "discarded")
+
+
+def test_a_page_that_is_loaded_anew_shows_what_is_armed(page, address):
+    open_recorder(page, address)
+    fill(page, instruction="Stack the bowls", operator="p7")
+    page.keyboard.press("Enter")
+    expect(state(page)).to_have_text("armed")
+    page.reload()
+    expect(state(page)).to_have_text("armed")
+    expect(page.get_by_label("Instruction")).to_have_value("Stack the bowls")
+    expect(page.get_by_label("Operator")).to_have_value("p7")
+    expect(page.get_by_label("Consent given")).not_to_be_checked()
+    expect(page.get_by_role("button", name="Record")).to_be_enabled()
+
+
+def test_no_store_is_said(page, address):
+    page.goto(address)
+    page.locator("#takes").scroll_into_view_if_needed()
+    expect(page.locator("#take_rows")).to_contain_text("without DEXTOUCH_DASHBOARD_EPISODE_STORE")
