@@ -62,21 +62,27 @@ def figures(shipped, episodes):
 
 @pytest.mark.parametrize("kind", ["commanded", "measured"])
 def test_sight_beats_copying(figures, kind):
-    assert figures[kind]["psnr"] > figures[kind]["psnr_copy"] + 1.5
+    assert figures[kind]["psnr"] > figures[kind]["psnr_copy"] + 2.8
     assert figures[kind]["psnr"] < figures[kind]["psnr_codec"]
 
 
 @pytest.mark.parametrize("kind", ["commanded", "measured"])
 def test_touch_beats_copying_and_nothing(figures, kind):
     rivals = figures[kind]["tactile_mse_copy"], figures[kind]["tactile_mse_zero"]
-    assert figures[kind]["tactile_mse"] < 0.5 * min(rivals)
-    assert figures[kind]["contact_f1"] > figures[kind]["contact_f1_copy"] + 0.08
+    # Reached: 0.143 with commanded actions, 0.119 with measured ones.
+    assert figures[kind]["tactile_mse"] < 0.18 * min(rivals)
+    assert figures[kind]["contact_f1"] > figures[kind]["contact_f1_copy"] + 0.15
 
 
-def test_wrong_actions_are_seen_and_felt(figures):
-    given = figures["commanded"]
-    assert given["psnr_wrong_actions"] < given["psnr"] - 1.5
-    assert given["tactile_mse_wrong_actions"] > 3.0 * given["tactile_mse"]
+@pytest.mark.parametrize("kind", ["commanded", "measured"])
+def test_false_actions_for_the_same_moment_are_seen_and_felt(figures, kind):
+    given = figures[kind]
+    # Most of what images gain over standing still is the head's own motion.
+    for rival, psnr_db, touch in (
+        ("other_take", 2.0, 1.25), ("hold", 1.9, 4.0), ("hands_still", 0.4, 4.0)
+    ):  # fmt: skip
+        assert given[f"psnr_{rival}"] < given["psnr"] - psnr_db
+        assert given[f"tactile_mse_{rival}"] > touch * given["tactile_mse"]
 
 
 def test_the_shipped_model_is_small_and_knows_its_history(shipped):
@@ -84,18 +90,9 @@ def test_the_shipped_model_is_small_and_knows_its_history(shipped):
     metadata = shipped.metadata
     assert metadata.command
     assert len(metadata.train_fingerprints) == len(metadata.train_episode_ids) > 0
+    assert np.isfinite(list(metadata.metrics.values())).all()
     assert metadata.metrics["psnr"] > metadata.metrics["psnr_copy"]
     assert not set(metadata.train_episode_ids) & set(metadata.heldout_episode_ids)
-
-
-def test_stored_halves_cost_no_accuracy(shipped, episodes):
-    """Rounding weights to float16 once more must change nothing: they are stored so."""
-    state = shipped.model.state_dict()
-    learned = {name for name, _ in shipped.model.named_parameters()}
-    worst = max(float((state[n] - state[n].half().float()).abs().max()) for n in learned)
-    assert worst == 0.0
-    assert np.isfinite(list(shipped.metadata.metrics.values())).all()
-    assert len(episodes) == 2 * EPISODES_PER_TASK
 
 
 def test_it_looks_before_it_feels(shipped, tmp_path):

@@ -6,6 +6,17 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+# Endings of the figures' names, and what made those predictions.
+PREDICTORS = (
+    ("", "the model"),
+    ("_hands_still", "told that only the head moves"),
+    ("_hold", "told that nothing moves"),
+    ("_other_take", "given another take's actions"),
+    ("_copy", "copy of the first step"),
+    ("_zero", "no touch at all"),
+    ("_codec", "codec alone (limit)"),
+)
+
 
 def show(report: Mapping[str, Any]) -> None:
     """Print stages, errors, predictions and scores."""
@@ -55,23 +66,11 @@ def _errors(errors: Mapping[str, Any]) -> Table:
 
 
 def _world_model(figures: Mapping[str, Any]) -> Table:
-    table = _table("World model on held-out scenes", "", "model", "copy", "other")
-    number = "{:.3g}".format
-    table.add_row(
-        "images, PSNR (dB)",
-        number(figures["psnr"]),
-        number(figures["psnr_copy"]),
-        f"wrong actions {figures['psnr_wrong_actions']:.3g}, codec {figures['psnr_codec']:.3g}",
-    )
-    table.add_row(
-        "touch, MSE (kPa²)",
-        number(figures["tactile_mse"]),
-        number(figures["tactile_mse_copy"]),
-        f"all zero {figures['tactile_mse_zero']:.3g}",
-    )
-    table.add_row(
-        "contact F1", number(figures["contact_f1"]), number(figures["contact_f1_copy"]), ""
-    )
+    table = _table("World model on held-out scenes", "", "images", "touch", "contact")
+    table.add_row("", "PSNR (dB)", "MSE (kPa²)", "F1")
+    for suffix, name in PREDICTORS:
+        keys = (f"{measure}{suffix}" for measure in ("psnr", "tactile_mse", "contact_f1"))
+        table.add_row(name, *(f"{figures[key]:.3g}" if key in figures else "" for key in keys))
     return table
 
 

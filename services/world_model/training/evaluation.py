@@ -9,6 +9,7 @@ from jaxtyping import Float32, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import CAMERA_HEAD
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.worlds.world import ActionKind
@@ -54,11 +55,16 @@ def evaluate_prediction(
         seed: of the noise.
 
     Returns:
-        psnr, psnr_copy, psnr_codec, psnr_wrong_actions (dB, mean over images); tactile_mse and its
-        _copy, _zero, _codec, _wrong_actions (kPa²); contact_f1, contact_f1_copy, contact_f1_codec;
-        num_windows. Copy repeats the first step, zero feels nothing, codec encodes and decodes the
-        truth, wrong actions are those of another held-out episode of the same task, from half a
-        take away (absent where no task has two episodes).
+        psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the rivals
+        that the suffix names, and num_windows.
+
+        - _copy repeats the first step; tactile_mse_zero feels nothing.
+        - _codec encodes and decodes the truth: what the model could reach at best.
+        - _other_take is the model given the actions of another held-out episode of the same task
+          at the same moment (absent where no task has two episodes).
+        - _hold is the model told that nothing moves, _hands_still that only the head does.
+
+        A model whose own figures are no better than these does not use its actions.
 
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.
@@ -88,11 +94,14 @@ def evaluate_prediction(
     figures["tactile_mse_zero"] = tactile_metrics.mse(
         predicted_kpa=np.zeros_like(truth.tactile_kpa), true_kpa=truth.tactile_kpa
     )
-    others = _other_actions(places, requests, action_kind)
+    others = _actions_of_other_takes(places, requests, action_kind)
     if others:
         kept = [index for index, _ in others]
         wrong = predict_all(model, [request for _, request in others], seed=seed)
-        figures |= _figures(wrong, _at(truth, kept), "_wrong_actions")
+        figures |= _figures(wrong, _at(truth, kept), "_other_take")
+    for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
+        still = [_standing_still(request, head_moves=head_moves) for request in requests]
+        figures |= _figures(predict_all(model, still, seed=seed), truth, suffix)
     return {**figures, "num_windows": float(len(windows))}
 
 
@@ -151,16 +160,12 @@ def _through_codec(model: JointWorldModel, windows: Sequence[Window]) -> Futures
     return Futures(np.concatenate(images), np.concatenate(touches))
 
 
-def _other_actions(
+def _actions_of_other_takes(
     places: Sequence[tuple[EpisodeArrays, int]],
     requests: Sequence[PredictionRequest],
     kind: ActionKind,
 ) -> list[tuple[int, PredictionRequest]]:
-    """Each request with actions of the next other episode of its task, from half a take away.
-
-    At the same time of a scripted take the other episode moves nearly the same way, and there
-    would be nothing to notice.
-    """
+    """Each request with the actions of the next other episode of its task at the same moment."""
     by_task: dict[str, list[EpisodeArrays]] = {}
     for episode, _ in places:
         if all(episode is not known for known in by_task.setdefault(episode.task, [])):
@@ -170,14 +175,21 @@ def _other_actions(
         siblings = by_task[episode.task]
         here = next(i for i, known in enumerate(siblings) if known is episode)
         other = siblings[(here + 1) % len(siblings)]
-        num_starts = len(other) - len(request.actions) + 1
-        if other is not episode:
-            begin = (start + num_starts // 2) % num_starts
-            taken = _cut(other, begin, len(request.actions), kind).request
+        num_steps = len(request.actions)
+        if other is not episode and start + num_steps <= len(other):
+            taken = _cut(other, start, num_steps, kind).request
             others.append(
                 (index, replace(request, actions=taken.actions, action_kind=taken.action_kind))
             )
     return others
+
+
+def _standing_still(request: PredictionRequest, *, head_moves: bool) -> PredictionRequest:
+    """The request with every row of its actions like the first, except, if wished, the head's."""
+    actions = np.repeat(request.actions[:1], len(request.actions), axis=0)
+    if head_moves:
+        actions[:, CAMERA_HEAD] = request.actions[:, CAMERA_HEAD]
+    return replace(request, actions=actions)
 
 
 def _figures(predicted: Futures, true: Futures, suffix: str) -> dict[str, float]:

@@ -11,8 +11,9 @@ from safetensors import safe_open
 from dextouch.errors import InvalidInputError
 from services.world_model.checkpoints import METADATA_KEY, read_checkpoint
 from services.world_model.network.inputs import build_inputs
+from services.world_model.training import evaluation
 from services.world_model.training.dataset import cut_window, fingerprint, stack_windows
-from services.world_model.training.evaluation import evaluate_prediction
+from services.world_model.training.evaluation import evaluate_prediction, predict_all
 from services.world_model.training.objective import losses
 from services.world_model.training.trainer import (
     TrainingRun,
@@ -64,7 +65,8 @@ def test_a_report_holds_what_was_measured_on_the_stored_weights(
     )
     assert again == report.metrics
     names = {
-        "psnr", "psnr_copy", "psnr_codec", "psnr_wrong_actions", "tactile_mse",
+        "psnr", "psnr_copy", "psnr_codec", "psnr_other_take", "psnr_hold", "psnr_hands_still",
+        "tactile_mse",
         "tactile_mse_zero", "tactile_mse_copy", "contact_f1", "contact_f1_copy",
     }  # fmt: skip
     assert names <= report.metrics.keys()
@@ -99,6 +101,31 @@ def test_training_episodes_cannot_be_judged_on(tiny_model, toy_episodes):
         evaluate_prediction(tiny_model, toy_episodes, train_fingerprints=prints)
     with pytest.raises(InvalidInputError, match="no window"):
         evaluate_prediction(tiny_model, [], train_fingerprints=prints)
+
+
+def test_false_actions_are_of_the_same_moment(tiny_model, heldout, monkeypatch):
+    asked = []
+
+    def remember(model, requests, *, seed):
+        asked.append(requests)
+        return predict_all(model, requests, seed=seed)
+
+    monkeypatch.setattr(evaluation, "predict_all", remember)
+    evaluate_prediction(tiny_model, heldout, train_fingerprints=(), stride=8)
+    own, other_take, hold, hands_still = asked
+    starts = (0, 8, 0, 8)
+    other = [
+        cut_window(heldout[1 - index // 2], start, 17, action_kind="commanded").request.actions
+        for index, start in enumerate(starts)
+    ]
+    for index, request in enumerate(own):
+        assert (other_take[index].actions == other[index]).all()
+        assert (hold[index].actions == request.actions[0]).all()
+        assert (hands_still[index].actions[:, :58] == request.actions[0, :58]).all()
+        assert (hands_still[index].actions[:, 58:] == request.actions[:, 58:]).all()
+        for false in (other_take, hold, hands_still):
+            assert (false[index].first_image == request.first_image).all()
+            assert false[index].anchor is request.anchor
 
 
 def test_copy_and_zero_are_what_they_say(tiny_model, heldout):
