@@ -30,8 +30,8 @@ def losses(
 ) -> Losses:
     """x_0-prediction errors at random times, every tactile token with weight one.
 
-    The paper weighs only tokens in contact or changing; then idle pads are never trained and
-    report contact that is not there (measured: contact F1 below copying).
+    The paper weighs only tokens in contact or changing, which never trains idle pads. Here they
+    count as much as the others, so that the model learns to predict no contact.
 
     Args:
         model: the network.
