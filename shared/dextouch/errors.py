@@ -17,7 +17,7 @@ DexTouchError
 │   └── StaleDataError         the newest sample is older than the caller allows
 ├── StorageError               bytes on disk are damaged, foreign or cannot be written
 │   ├── CorruptDataError       a checksum or structure does not hold
-│   └── StorageFullError       no space left; what was recorded stays
+│   └── StorageFullError       no space left: free some
 └── AccessDeniedError          no key, or a key without the needed scope
 ```
 """
@@ -101,7 +101,7 @@ class CorruptDataError(StorageError):
 
 
 class StorageFullError(StorageError):
-    """No space left; what was recorded stays."""
+    """No space left: free some."""
 
 
 class AccessDeniedError(DexTouchError):

@@ -174,8 +174,22 @@ def test_nothing_is_seen_before_commit(store, place):
     assert place.keys(".staging") == []
 
 
-def test_an_exception_leaves_nothing(store, place):
-    with pytest.raises(RuntimeError, match="glove fell off"), begin_recording(store)[0]:
+def test_an_exception_keeps_a_take(store, place):
+    writer, values = begin_recording(store, num_samples=37)
+    with pytest.raises(RuntimeError, match="glove fell off"), writer:
+        raise RuntimeError("glove fell off")
+    reader = place.again().recording("take-1")
+    reader.verify()
+    assert reader.attributes.recovered
+    np.testing.assert_array_equal(reader.read("force").values, values)
+    assert store.recover() == ()
+    assert list((store.root / ".staging").iterdir()) == []
+
+
+def test_an_exception_leaves_nothing_of_a_discarded_take(store, place):
+    writer, _ = begin_recording(store)
+    writer.discard()
+    with pytest.raises(RuntimeError, match="glove fell off"), writer:
         raise RuntimeError("glove fell off")
     assert place.keys("recordings") == []
     assert store.recover() == ()

@@ -260,7 +260,9 @@ class BatchLogWriter:
         )
         parts = (header, _CRC.pack(google_crc32c.value(header)), body.data)
         try:
-            with disk_errors(self._what):
+            with disk_errors(
+                self._what, advice="what was recorded stays, free space and try again"
+            ):
                 write_parts(self._file, parts)
         except StorageError:
             # Cutting off needs no space: what was acknowledged before stays readable.

@@ -16,8 +16,10 @@ _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
-def disk_errors(what: str) -> Iterator[None]:
+def disk_errors(what: str, *, advice: str = "free space and try again") -> Iterator[None]:
     """Turn the operating system's errors into ours, naming `what` was being done.
+
+    `advice` ends the message about a full disk.
 
     Raises:
         StorageFullError: no space, quota or file size left.
@@ -27,10 +29,7 @@ def disk_errors(what: str) -> Iterator[None]:
         yield
     except OSError as error:
         if error.errno in _FULL:
-            raise StorageFullError(
-                f"{what}: no space left ({error.strerror}); what was recorded stays, "
-                "free space and try again"
-            ) from error
+            raise StorageFullError(f"{what}: no space left ({error.strerror}); {advice}") from error
         raise StorageError(f"{what}: {error}") from error
 
 
@@ -111,9 +110,14 @@ def _sync_file(path: Path) -> None:
         os.close(descriptor)
 
 
+def partial_name(name: str) -> str:
+    """What a file is called while `replace_file` writes it."""
+    return name + ".partial"
+
+
 def replace_file(path: Path, data: bytes) -> None:
     """Put these bytes in place of a file, whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
+    partial = path.with_name(partial_name(path.name))
     partial.unlink(missing_ok=True)
     write_file(partial, data)
     partial.replace(path)

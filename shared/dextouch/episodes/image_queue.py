@@ -49,9 +49,9 @@ class ImageQueue:
         while self._waiting:
             self._take_oldest()
 
-    def stop(self) -> None:
-        """End the thread; what still waits is left out."""
-        self._thread.shutdown(cancel_futures=True)
+    def stop(self, *, drop: bool) -> None:
+        """End the thread; what still waits is left out, or written before."""
+        self._thread.shutdown(cancel_futures=drop)
 
     def _copy(self, values: np.ndarray) -> np.ndarray:
         if values.dtype == object:

@@ -150,11 +150,12 @@ class JournalWriter:
         crc = google_crc32c.value(payload)
         body = _BODY.pack(self._part_bytes, num_rows, len(payload), crc)
         try:
-            with disk_errors(f"log {self.name}"):
+            with disk_errors(f"log {self.name}", advice="free space on the disk of the store"):
                 write_all(self._part, payload)
                 write_all(self._journal, body + _CRC.pack(google_crc32c.value(body)))
-        except StorageError:
-            # Cutting off needs no space: what was acknowledged before stays readable.
+        except BaseException:
+            # Cutting off needs no space: what was acknowledged before stays readable. An interrupt
+            # between the two writes would otherwise put the next payload in the wrong place.
             self._cut()
             raise
         self.num_rows += 1

@@ -43,7 +43,7 @@ def open_object_storage(
 
 
 class UploadingWriter(EpisodeWriter):
-    """Writes a group in the work folder; its commit uploads it.
+    """Writes a group in the work folder; its commit uploads it, and so does an interrupt.
 
     Args:
         stage: new folder.
@@ -53,11 +53,16 @@ class UploadingWriter(EpisodeWriter):
     """
 
     upload: Callable[[], None]
+    complete: Callable[[Path], RecoveredGroup | None]
 
     def _commit(self) -> None:
         super()._commit()
         # The lock that came along from the stage is still held: `recover` leaves it to us.
         self.upload()
+
+    def _complete(self) -> RecoveredGroup | None:
+        # What was committed waits in the outbox, if anywhere.
+        return self.complete(self._stage) if self._stage.exists() else None
 
 
 class ObjectStorage:
@@ -98,6 +103,7 @@ class ObjectStorage:
         stage = new_stage(self._root, kind, item_id)
         writer = UploadingWriter(stage=stage, target=target, attributes=attributes, options=options)
         writer.upload = lambda: self._upload(kind, target)
+        writer.complete = self._complete
         return writer
 
     def group(self, kind: Kind, item_id: str) -> ObjectGroup:
@@ -177,8 +183,7 @@ class ObjectStorage:
             return []
         self._own_work_folder()
         for stage in abandoned_stages(self._root):
-            self._free_id(stage)
-            recover_stage(stage, self._outbox)
+            self._recover_stage(stage)
         found: builtins.list[RecoveredGroup] = []
         failures: builtins.list[UnavailableError] = []
         for kind in KINDS:
@@ -211,6 +216,16 @@ class ObjectStorage:
             raise type(error)(
                 f"{error.message}; {kind} {folder.name!r} waits in {folder}, `recover` uploads it"
             ) from error
+
+    def _complete(self, stage: Path) -> RecoveredGroup | None:
+        group = self._recover_stage(stage)
+        if group is not None:
+            self._upload(group.kind, self._outbox / f"{group.kind}s" / group.item_id)
+        return group
+
+    def _recover_stage(self, stage: Path) -> RecoveredGroup | None:
+        self._free_id(stage)
+        return recover_stage(stage, self._outbox)
 
     def _free_id(self, stage: Path) -> None:
         """Give a recording another id if its own was taken while its writer was dead."""

@@ -75,9 +75,9 @@ class ShardWriter:
     def _write_rows(self) -> None:
         data = self._chunk.tobytes()
         num_rows = self._num_pending
+        self._log_chunk(compress(data), num_rows)
         self._sha256.update(memoryview(data)[: num_rows * (len(data) // len(self._chunk))])
         self._num_pending = 0
-        self._log_chunk(compress(data), num_rows)
 
     def _log_chunk(self, payload: bytes, num_rows: int) -> None:
         encoded = with_crc(payload)

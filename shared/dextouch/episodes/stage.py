@@ -11,7 +11,14 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from dextouch.episodes.files import disk_errors, replace_file, sync_files, sync_folder, write_file
+from dextouch.episodes.files import (
+    disk_errors,
+    partial_name,
+    replace_file,
+    sync_files,
+    sync_folder,
+    write_file,
+)
 from dextouch.episodes.format import (
     COMMIT_FILE,
     METADATA_FILE,
@@ -104,11 +111,14 @@ def publish_stage(stage: Path, target: Path, record: CommitRecord) -> None:
     Raises:
         ConflictError: something is in that place.
     """
+    if target.exists():
+        raise _taken(target)
     # What a crash is mended from goes only when there is nothing left to mend.
     for name in record.arrays:
         forget_journal(stage, name)
     with disk_errors(f"commit {record.id}"):
-        (stage / STAGE_FILE).unlink(missing_ok=True)
+        for name in (STAGE_FILE, partial_name(STAGE_FILE)):
+            (stage / name).unlink(missing_ok=True)
         sync_folder(stage)
         target.parent.mkdir(parents=True, exist_ok=True)
         _move_into_place(stage, target)
@@ -122,6 +132,10 @@ def _move_into_place(stage: Path, target: Path) -> None:
     except OSError as error:
         if error.errno not in {errno.ENOTEMPTY, errno.EEXIST}:
             raise
-        raise ConflictError(
-            f"{target.parent.name.rstrip('s')} {target.name!r} exists already; choose another id"
-        ) from error
+        raise _taken(target) from error
+
+
+def _taken(target: Path) -> ConflictError:
+    return ConflictError(
+        f"{target.parent.name.rstrip('s')} {target.name!r} exists already; choose another id"
+    )

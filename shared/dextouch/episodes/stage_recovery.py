@@ -29,6 +29,7 @@ from dextouch.episodes.journal import (
 from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows
 from dextouch.episodes.shard_writer import finish_shard
 from dextouch.episodes.stage import (
+    STAGE_FILE,
     Attributes,
     attributes_id,
     commit_stage,
@@ -64,15 +65,18 @@ def recover_stage(stage: Path, root: Path) -> RecoveredGroup | None:
     record = _whole_commit(stage)
     if record is not None:
         target = root / f"{record.kind}s" / record.id
-        if target.exists():
-            # Its writer lost the race for the id and was told so, or never got to migrate it.
-            return None
-        publish_stage(stage, target, record)
-        counts = {name: entry.shape[0] for name, entry in record.arrays.items()}
-        return RecoveredGroup(record.kind, record.id, counts)
+        if not target.exists():
+            publish_stage(stage, target, record)
+            counts = {name: entry.shape[0] for name, entry in record.arrays.items()}
+            return RecoveredGroup(record.kind, record.id, counts)
+    # Another writer was first with the id where there is a whole commit record; what can be made
+    # again was told so, and so was a migration that never got to put its group into place.
     attributes = read_stage(stage)
     if attributes is None:
         return None
+    # Before any shard becomes a log again: a commit record must never vouch for that.
+    for name in (METADATA_FILE, COMMIT_FILE):
+        (stage / name).unlink(missing_ok=True)
     kind = kind_of(attributes)
     num_samples = {
         stream.name: _num_whole_samples(stage, stream_arrays(stream, kind))
@@ -84,8 +88,6 @@ def recover_stage(stage: Path, root: Path) -> RecoveredGroup | None:
     for stream in attributes.streams:
         for name, entry in stream_arrays(stream, kind).items():
             entries[name] = _cut_array(stage, name, entry, num_samples[stream.name])
-    for name in (METADATA_FILE, COMMIT_FILE):
-        (stage / name).unlink(missing_ok=True)
     attributes = _free_id(attributes, root).model_copy(update={"recovered": True})
     target = root / f"{kind}s" / attributes_id(attributes)
     commit_stage(stage, target, attributes, entries)
@@ -99,7 +101,8 @@ def is_recoverable(stage: Path, root: Path) -> bool:
     """
     record = _whole_commit(stage)
     if record is not None:
-        return not (root / f"{record.kind}s" / record.id).exists()
+        in_place = (root / f"{record.kind}s" / record.id).exists()
+        return not in_place or (stage / STAGE_FILE).exists()
     try:
         attributes = read_stage(stage)
         if attributes is None:

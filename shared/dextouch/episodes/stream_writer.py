@@ -41,6 +41,8 @@ class StreamWriter:
         self._least_step_ns = 1 if kind == "episode" else 0
         # Whether values come as numbers or as encoded images; the first block decides.
         self._plain: bool | None = None
+        # Whether a block was broken off half written: what follows would not line up with it.
+        self._is_broken = False
         self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
         self._images = _EncodedImages(descriptor, options.video)
@@ -80,11 +82,10 @@ class StreamWriter:
             self._images.check(values)
         self._check_order(stamps[STAMPS[self._kind][0]])
         self._plain = plain
-        if self._codec == "zstd":
-            self.arrays[name].append(values)
-            self._append_stamps(stamps)
-        elif self._queue is None and (values.dtype == object or not self._options.threads):
-            self._append_images(values, stamps)
+        if self._codec == "zstd" or (
+            self._queue is None and (values.dtype == object or not self._options.threads)
+        ):
+            self._write(values, stamps)
         else:
             self._enqueue(values, stamps)
 
@@ -92,7 +93,7 @@ class StreamWriter:
         # Once there is a queue, everything goes through it: the order must stay.
         if self._queue is None:
             name, when_full = self.descriptor.name, self._options.when_full
-            self._queue = ImageQueue(self._append_images, name=name, when_full=when_full)
+            self._queue = ImageQueue(self._write, name=name, when_full=when_full)
         self._queue.put(values, stamps)
 
     def _check_order(self, stamps_ns: np.ndarray) -> None:
@@ -127,14 +128,26 @@ class StreamWriter:
                 "infinite; leave invalid samples out of an episode"
             )
 
-    def _append_images(self, values: np.ndarray, stamps: Stamps) -> None:
-        for payload, num_images in self._images.chunks(values):
-            self.arrays[self.descriptor.name].append_encoded(payload, num_images)
-        self._append_stamps(stamps)
-
-    def _append_stamps(self, stamps: Stamps) -> None:
+    def _write(self, values: np.ndarray, stamps: Stamps) -> None:
+        """Append a block that was checked to all arrays of the stream."""
+        self._check_unbroken()
+        self._is_broken = True
+        array = self.arrays[self.descriptor.name]
+        if self._codec == "zstd":
+            array.append(values)
+        else:
+            for payload, num_images in self._images.chunks(values):
+                array.append_encoded(payload, num_images)
         for stamp, column in stamps.items():
             self.arrays[f"{self.descriptor.name}_{stamp}"].append(column)
+        self._is_broken = False
+
+    def _check_unbroken(self) -> None:
+        if self._is_broken:
+            raise StorageError(
+                f"{self.descriptor.name}: a block was broken off half written, and nothing can "
+                "follow it; leave the writer's context, which keeps or removes what came before"
+            )
 
     def finish(self) -> dict[str, ArrayEntry]:
         """Complete all arrays; what the commit record says about each.
@@ -144,11 +157,9 @@ class StreamWriter:
         """
         if self._queue is not None:
             self._queue.drain()
+        self._check_unbroken()
+        self._flush()
         name = self.descriptor.name
-        for payload, num_images in self._images.rest():
-            self.arrays[name].append_encoded(payload, num_images)
-        for array in self.arrays.values():
-            array.flush()
         entries = {name: array.finish() for name, array in self.arrays.items()}
         entries[name] = entries[name].model_copy(update={"encoder": self._images.encoder})
         counts = {array: entry.shape[0] for array, entry in entries.items()}
@@ -156,10 +167,31 @@ class StreamWriter:
             raise StorageError(f"{name}: a block was written in part ({counts}); write it anew")
         return entries
 
+    def _flush(self) -> None:
+        """Write what waits in memory for its storage chunk to be full; nothing is appended then."""
+        for payload, num_images in self._images.rest():
+            self.arrays[self.descriptor.name].append_encoded(payload, num_images)
+        for array in self.arrays.values():
+            array.flush()
+
+    def keep(self) -> None:
+        """Write all that waits in memory, unless a block was broken off, and give all back.
+
+        Raises:
+            StorageError: the disk fails; what was written before stays.
+        """
+        try:
+            if self._queue is not None:
+                self._queue.stop(drop=False)
+            if not self._is_broken:
+                self._flush()
+        finally:
+            self.close()
+
     def close(self) -> None:
-        """Give thread and files back."""
+        """Give thread and files back; what waits in memory is left out."""
         if self._queue is not None:
-            self._queue.stop()
+            self._queue.stop(drop=True)
         for array in self.arrays.values():
             array.close()
 

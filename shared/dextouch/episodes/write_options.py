@@ -18,8 +18,10 @@ class WriteOptions(BaseModel):
         threads: whether images are encoded beside the caller, one thread a camera.
         when_full: of the queue before an encoder: "wait" holds the caller up, "drop" leaves the
             image out and counts it, which is what a live take needs.
-        recoverable: whether `EpisodeStore.recover` completes what a killed writer leaves; None:
-            recordings, but not episodes, since these are made again from their recording.
+        recoverable: whether what was written is kept when the writer is broken off: after an
+            exception or Ctrl-C at once, after a kill or on a full disk by `EpisodeStore.recover`.
+            None: recordings, but not episodes, since these are made again from their recording.
+            False suits whoever can repeat the whole of it, such as an import.
         video: quality of `h264` streams.
     """
 

@@ -1,7 +1,8 @@
-"""Blocks of samples → a new episode or recording that appears whole or not at all."""
+"""Writer of a new episode or recording, which appears at once when it is finished."""
 
 import os
 import shutil
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
@@ -16,9 +17,16 @@ from dextouch.episodes.stage import (
     kind_of,
     write_stage,
 )
+from dextouch.episodes.stage_recovery import RecoveredGroup, recover_stage
 from dextouch.episodes.stream_writer import StreamWriter
 from dextouch.episodes.write_options import WriteOptions
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.errors import (
+    ConflictError,
+    DexTouchError,
+    InvalidInputError,
+    StorageError,
+    UnknownNameError,
+)
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.checks import ENCODED_UNITS
@@ -31,8 +39,13 @@ DROPPED_IMAGES = "dropped_before_encoder"
 class EpisodeWriter:
     """Writes one episode or recording beside the store and moves it in when all is well.
 
-    Use it as a context manager (from `EpisodeStore.writer`): leaving normally commits, an
-    exception leaves nothing behind. Streams listed in the attributes are there from the start.
+    Use it as a context manager (from `EpisodeStore.writer`): leaving it normally commits. An
+    exception, Ctrl-C included, keeps what was appended if the writer is `recoverable`, as
+    recordings are unless `WriteOptions` say otherwise: the take is completed as far as it went and
+    has `recovered` set. Where that is impossible, on a full disk, its stage stays and
+    `EpisodeStore.recover` completes it later; a note on the exception says which of the two. Other
+    writers leave nothing behind after an exception. Streams listed in the attributes are there
+    from the start.
 
     Args:
         stage: new folder on the store's file system.
@@ -50,6 +63,7 @@ class EpisodeWriter:
         keep = self._kind == "recording" if options.recoverable is None else options.recoverable
         # Whether `stage.json` must be written before the next sample.
         self._unannounced, self._recoverable = keep, keep
+        self._is_discarded = False
         with disk_errors(f"create {stage}"):
             # Held as long as the writer lives: tells a sweep that this stage is not abandoned.
             self._lock = make_held_folder(stage)
@@ -104,9 +118,15 @@ class EpisodeWriter:
 
         Raises:
             UnknownNameError: no such stream.
-            InvalidInputError: stamps of the other kind, out of order, or values that do not fit.
+            InvalidInputError: stamps of the other kind, out of order, values that do not fit, or
+                a writer that was discarded.
             StorageFullError: the disk is full.
+            StorageError: an earlier block of the stream was broken off.
         """
+        if self._is_discarded:
+            raise InvalidInputError(
+                f"{name}: a sample for {attributes_id(self._attributes)!r}, which was discarded"
+            )
         if name not in self._streams:
             raise UnknownNameError("stream", name, list(self._streams))
         given = {
@@ -157,13 +177,61 @@ class EpisodeWriter:
         trace: TracebackType | None,
     ) -> None:
         try:
-            if kind is None:
+            if kind is None and not self._is_discarded:
                 self._commit()
+        except BaseException as failure:
+            self._leave(broken_off=True, error=failure)
+            raise
+        self._leave(broken_off=kind is not None, error=error)
+
+    def discard(self) -> None:
+        """Give up what was written: the context leaves nothing behind, however it is left."""
+        self._is_discarded = True
+
+    def _leave(self, *, broken_off: bool, error: BaseException | None) -> None:
+        keep = broken_off and self._recoverable and not self._is_discarded
+        try:
+            if keep:
+                keep = self._keep(error)
         finally:
             for stream in self._streams.values():
                 stream.close()
-            shutil.rmtree(self._stage, ignore_errors=True)
+            # Also after another interrupt: what is worth keeping stays until it is complete.
+            if not keep:
+                shutil.rmtree(self._stage, ignore_errors=True)
             os.close(self._lock)
+
+    def _keep(self, error: BaseException | None) -> bool:
+        """Complete the take as far as it went; whether its stage must stay for `recover`."""
+        what = f"{self._kind} {attributes_id(self._attributes)!r}"
+        for stream in self._streams.values():
+            # On a full disk the storage chunks that are there already are what is kept.
+            with suppress(StorageError):
+                stream.keep()
+        try:
+            with suppress(StorageError):
+                write_stage(self._stage, self._with_losses())
+            group = self._complete()
+        except DexTouchError as failure:
+            told = (
+                f"{what}: what was appended is kept in {self._stage}, but could not be completed "
+                f"({failure.message}); EpisodeStore.recover completes it"
+            )
+        else:
+            if group is None:
+                return False
+            counts = ", ".join(f"{name}: {count}" for name, count in group.num_samples.items())
+            told = (
+                f"{what}: what was appended is kept as {group.item_id!r}, marked as recovered "
+                f"(samples of {counts})"
+            )
+        if error is not None:
+            error.add_note(told)
+        return self._stage.exists()
+
+    def _complete(self) -> RecoveredGroup | None:
+        """Commit what is in the stage; None where that is not worth it."""
+        return recover_stage(self._stage, self._target.parent.parent)
 
     def _commit(self) -> None:
         if not self._streams:

@@ -86,7 +86,8 @@ def leave_stage(store, recording_id, operator):
     writer.append("force", values=batch().values, t_host_ns=batch().t_host_ns)
     folder = next((store.root / ".staging").glob(f"*{recording_id}*"))
     folder.rename(store.root / "kept")
-    writer.__exit__(KeyboardInterrupt, None, None)
+    writer.discard()
+    writer.__exit__(None, None, None)
     (store.root / "kept").rename(folder)
 
 

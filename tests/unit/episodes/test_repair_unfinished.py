@@ -140,7 +140,8 @@ def stage(store):
     )
     (stage,) = (store.root / ".staging").iterdir()
     shutil.copytree(stage, store.root / "kept")
-    writer.__exit__(KeyboardInterrupt, None, None)
+    writer.discard()
+    writer.__exit__(None, None, None)
     (store.root / "kept").rename(stage)
     return stage
 

@@ -1,0 +1,346 @@
+"""Takes that an exception, a Ctrl-C or a full disk breaks off: what was appended is kept."""
+
+import json
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore, WriteOptions
+from dextouch.episodes.journal import JournalWriter
+from dextouch.episodes.shard_writer import ShardWriter
+from dextouch.errors import (
+    ConflictError,
+    InvalidInputError,
+    StorageError,
+    StorageFullError,
+)
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+
+FORCE = StreamDescriptor(
+    name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
+)
+CAMERA = StreamDescriptor(
+    name="camera", kind="image", shape=(48, 64, 3), dtype="uint8", unit="h264", nominal_rate_hz=30
+)
+# 3600 bytes a sample and 30 samples a storage chunk: noise fills a small disk quickly.
+NOISE = StreamDescriptor(
+    name="noise", kind="tactile", shape=(900,), dtype="float32", unit="kPa", nominal_rate_hz=60
+)
+
+
+def take(*streams, **changes):
+    fields = {"recording_id": "take-1", "task": "t", "instruction": "", "domain": "human"}
+    return RecordingAttributes.model_validate(
+        fields | {"station": "bench", "streams": streams} | changes
+    )
+
+
+def record(writer, first, count=1):
+    """Samples whose value and stamp are their number."""
+    numbers = np.arange(first, first + count)
+    values = np.repeat(numbers[:, None], 2, axis=1).astype("f4")
+    writer.append("force", values=values, t_host_ns=numbers)
+
+
+def kept_numbers(store, recording_id="take-1"):
+    """The numbers of the samples of `force`; stamps and values agree, and nothing is damaged."""
+    reader = store.recording(recording_id)
+    reader.verify()
+    assert reader.attributes.recovered
+    batch = reader.read("force")
+    assert batch.values[:, 0].tolist() == batch.t_host_ns.tolist()
+    return batch.t_host_ns.tolist()
+
+
+def stages(store):
+    return list((store.root / ".staging").iterdir())
+
+
+def break_off(store, fill, *streams, error=RuntimeError, options=None):
+    """A take of some samples that an exception ends; what its user is told about it."""
+    with (
+        pytest.raises(error) as caught,
+        store.writer(kind="recording", attributes=take(*streams), options=options) as writer,
+    ):
+        _fill_and_fail(writer, fill, error)
+    return " ".join(getattr(caught.value, "__notes__", []))
+
+
+def _fill_and_fail(writer, fill, error):
+    fill(writer)
+    raise error("the glove came off")
+
+
+def record_17(writer):
+    """Three storage chunks of five samples, and two samples that wait in memory."""
+    for number in range(17):
+        record(writer, number)
+
+
+@pytest.mark.parametrize("error", [RuntimeError, KeyboardInterrupt])
+def test_every_appended_sample_is_kept(store, error):
+    told = break_off(store, record_17, FORCE, error=error)
+    assert kept_numbers(store) == list(range(17))
+    assert stages(store) == []
+    assert "kept as 'take-1', marked as recovered" in told
+
+
+CHILD = """
+import sys
+import numpy as np
+from dextouch.episodes import EpisodeStore
+from dextouch.schemas.recordings import RecordingAttributes
+
+attributes = RecordingAttributes.model_validate_json(sys.argv[2])
+with EpisodeStore(sys.argv[1]).writer(kind="recording", attributes=attributes) as writer:
+    number = 0
+    while True:
+        values = np.full((1, 2), number, "f4")
+        writer.append("force", values=values, t_host_ns=np.array([number]))
+        number += 1
+        if number == 20_000:
+            print("recording", flush=True)
+            if sys.argv[3] == "waits":
+                sys.stdin.read(1)
+"""
+
+
+@pytest.mark.parametrize("state", ["waits", "appends"])
+def test_ctrl_c_keeps_the_take(store, state):
+    child = subprocess.Popen(
+        [sys.executable, "-c", CHILD, str(store.root), take(FORCE).model_dump_json(), state],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout.readline() == "recording\n"
+    child.send_signal(signal.SIGINT)
+    _, said = child.communicate()
+    assert child.returncode != 0
+    assert "KeyboardInterrupt" in said
+    assert "kept as 'take-1', marked as recovered" in said
+    numbers = kept_numbers(store)
+    assert numbers == list(range(len(numbers)))
+    # An append that was cut short costs the storage chunk it belongs to, which are five samples.
+    assert len(numbers) == 20_000 if state == "waits" else len(numbers) > 19_995
+    assert stages(store) == []
+
+
+def test_images_that_wait_for_their_encoder_are_kept(store):
+    def fill(writer):
+        record(writer, 0, 3)
+        for number in range(20):
+            image = np.full((1, 48, 64, 3), 90, np.uint8)
+            writer.append("camera", values=image, t_host_ns=np.array([number]))
+
+    break_off(store, fill, FORCE, CAMERA)
+    assert kept_numbers(store) == [0, 1, 2]
+    assert len(store.recording("take-1").images("camera")) == 20
+
+
+real_append = ShardWriter.append
+
+
+@pytest.mark.parametrize("place", range(1, 9))
+def test_an_interrupt_inside_an_append_loses_no_earlier_storage_chunk(store, monkeypatch, place):
+    """Ctrl-C between any two writes of a log: stamps and values stay beside each other."""
+    real, calls = JournalWriter.append, []
+
+    def interrupted(self, payload, num_rows):
+        calls.append(self.name)
+        if len(calls) == 4 + place:
+            raise KeyboardInterrupt
+        real(self, payload, num_rows)
+
+    def fill(writer):
+        for number in range(40):
+            record(writer, number)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(JournalWriter, "append", interrupted)
+        break_off(store, fill, FORCE, error=KeyboardInterrupt)
+    # Four arrays, so the first four writes are the first storage chunk of each.
+    assert kept_numbers(store) == list(range(5 if place <= 4 else 10))
+
+
+def test_what_follows_a_block_that_was_broken_off_is_refused(store, monkeypatch):
+    """Else values and stamps of what follows would not belong together."""
+    real = JournalWriter.append
+
+    def full_once(self, payload, num_rows):
+        if self.name == "force" and self.num_rows == 1 and not failed:
+            failed.append(self.name)
+            raise StorageFullError("no space left")
+        real(self, payload, num_rows)
+
+    def fill(writer):
+        record(writer, 0, 9)
+        with pytest.raises(StorageFullError):
+            record(writer, 9)
+        with pytest.raises(StorageError, match=r"force: .*broken off.*leave the writer"):
+            record(writer, 10)
+
+    failed = []
+    monkeypatch.setattr(JournalWriter, "append", full_once)
+    break_off(store, fill, FORCE)
+    assert kept_numbers(store) == list(range(5))
+
+
+def test_a_take_with_a_block_broken_off_is_not_committed_as_if_whole(store, monkeypatch):
+    monkeypatch.setattr(ShardWriter, "append", _fail_at_the_stamps)
+    writer = store.writer(kind="recording", attributes=take(FORCE))
+    with pytest.raises(RuntimeError, match="stamps"):
+        record(writer, 0, 9)
+    with pytest.raises(StorageError, match="broken off"):
+        writer.__exit__(None, None, None)
+    # Of the values a storage chunk is there, of the stamps none.
+    assert store.list(kind="recording") == []
+
+
+def _fail_at_the_stamps(self, rows):
+    if rows.dtype == np.int64:
+        raise RuntimeError("stamps")
+    real_append(self, rows)
+
+
+def fill_disk(writer):
+    rng = np.random.default_rng(1)
+    for number in range(10_000):
+        values = rng.normal(size=(1, 900)).astype("f4")
+        writer.append("noise", values=values, t_host_ns=np.array([number]))
+
+
+def test_a_full_disk_keeps_the_take(store, file_size_limit):
+    writer = store.writer(kind="recording", attributes=take(NOISE))
+    with file_size_limit(1_000_000), pytest.raises(StorageFullError) as caught, writer:
+        fill_disk(writer)
+    assert "no space left" in caught.value.message
+    # Nothing can follow a block that was broken off.
+    assert "try again" not in caught.value.message
+    # Cutting off the storage chunk that did not fit left room for the index.
+    assert "marked as recovered" in " ".join(caught.value.__notes__)
+    reader = store.recording("take-1")
+    reader.verify()
+    assert reader.num_samples("noise") >= 240
+    expected = np.random.default_rng(1).normal(size=(reader.num_samples("noise"), 900))
+    np.testing.assert_array_equal(reader.read("noise").values, expected.astype("f4"))
+
+
+FULL_DISK = """
+import json
+import sys
+from pathlib import Path
+import numpy as np
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import StorageFullError
+from dextouch.schemas.recordings import RecordingAttributes
+
+disk = Path(sys.argv[1])
+ballast = disk / "ballast"
+ballast.write_bytes(bytes(1 << 20))
+store = EpisodeStore(disk / "store")
+rng, num_appended, notes = np.random.default_rng(1), 0, []
+try:
+    attributes = RecordingAttributes.model_validate_json(sys.argv[2])
+    with store.writer(kind="recording", attributes=attributes) as writer:
+        while True:
+            values = rng.normal(size=(1, 900)).astype("f4")
+            writer.append("noise", values=values, t_host_ns=np.array([num_appended]))
+            num_appended += 1
+except StorageFullError as error:
+    notes = getattr(error, "__notes__", [])
+before = store.list(kind="recording")
+ballast.unlink()
+(group,) = store.recover()
+store.recording("take-1").verify()
+answer = {"appended": num_appended, "notes": notes, "before": before, "kept": group.num_samples}
+print(json.dumps(answer))
+"""
+
+
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="no unshare to mount a small disk with")
+def test_a_disk_that_is_really_full(tmp_path):
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    mounted = 'mount -t tmpfs -o size=4m none "$1" || exit 77; shift; exec "$@"'
+    small_disk = ["unshare", "-rm", "sh", "-c", mounted, "sh", str(disk)]
+    script = [sys.executable, "-c", FULL_DISK, str(disk), take(NOISE).model_dump_json()]
+    child = subprocess.run(
+        [*small_disk, *script],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if child.returncode == 77 or child.stderr.startswith("unshare"):
+        pytest.skip(f"no small disk can be mounted here: {child.stderr.strip()}")
+    assert child.returncode == 0, child.stderr
+    got = json.loads(child.stdout)
+    assert got["before"] == []
+    assert "EpisodeStore.recover completes it" in " ".join(got["notes"])
+    assert got["appended"] > 600
+    assert got["appended"] - got["kept"]["noise"] <= 30
+
+
+def test_a_take_whose_id_was_taken_meanwhile_is_kept_under_another(store):
+    late = store.writer(kind="recording", attributes=take(FORCE))
+    record(late, 0, 17)
+    with store.writer(kind="recording", attributes=take(FORCE)) as first:
+        record(first, 0, 4)
+    with pytest.raises(ConflictError, match="exists already") as caught:
+        late.__exit__(None, None, None)
+    assert "'take-1-recovered-1'" in " ".join(caught.value.__notes__)
+    assert kept_numbers(store, "take-1-recovered-1") == list(range(17))
+    assert store.recording("take-1").num_samples("force") == 4
+
+
+def test_what_is_known_at_the_end_is_kept_too(store):
+    def fill(writer):
+        record(writer, 0, 7)
+        writer.set_attributes(take(FORCE, success=False))
+
+    break_off(store, fill, FORCE)
+    assert store.recording("take-1").attributes.success is False
+
+
+def test_a_take_without_a_sample_leaves_nothing(store):
+    told = break_off(store, lambda _: None, FORCE)
+    assert told == ""
+    assert store.list(kind="recording") == []
+    assert stages(store) == []
+
+
+@pytest.mark.parametrize("error", [None, RuntimeError("the glove came off")])
+def test_a_discarded_take_leaves_nothing(store, error):
+    writer = store.writer(kind="recording", attributes=take(FORCE))
+    record(writer, 0, 17)
+    writer.discard()
+    with pytest.raises(InvalidInputError, match="discarded"):
+        record(writer, 17)
+    writer.__exit__(type(error) if error else None, error, None)
+    assert store.list(kind="recording") == []
+    assert stages(store) == []
+
+
+def test_what_its_caller_can_repeat_leaves_nothing(store):
+    told = break_off(store, record_17, FORCE, options=WriteOptions(recoverable=False))
+    assert told == ""
+    assert store.list(kind="recording") == []
+    assert stages(store) == []
+
+
+def test_a_second_interrupt_leaves_the_rest_to_recover(store, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("dextouch.episodes.writer.recover_stage", interrupted)
+        break_off(store, record_17, FORCE, error=KeyboardInterrupt)
+    assert store.sweep() == 0
+    EpisodeStore(store.root).recover()
+    assert kept_numbers(store) == list(range(17))
