@@ -158,12 +158,13 @@ def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> b
 
 def _stamp_findings(contents: Group) -> list[Finding]:
     """Stamps that are out of order, by which every search in them would go wrong."""
-    first, least = STAMPS[contents.kind][0], 1 if contents.kind == "episode" else 0
+    first, strictly = STAMPS[contents.kind][0], contents.kind == "episode"
     findings = []
     for stream in contents.attributes.streams:
         name = f"{stream.name}_{first}"
-        steps = np.diff(contents.shard(name).read())
-        if len(bad := np.flatnonzero(steps < least)):
+        stamps = contents.shard(name).read()
+        earlier, later = stamps[:-1], stamps[1:]
+        if len(bad := np.flatnonzero(later <= earlier if strictly else later < earlier)):
             message = f"{contents.what}: array {name!r}: goes back after row {int(bad[0])}"
             findings.append(Finding(message, name))
     return findings

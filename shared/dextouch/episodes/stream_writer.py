@@ -100,11 +100,12 @@ class StreamWriter:
         least, first_ns, last_ns = self._least_step_ns, int(stamps_ns[0]), self._last_stamp_ns
         if last_ns is not None and first_ns - last_ns < least:
             raise self._disorder(first_ns - last_ns, 0)
-        # By hand: np.diff of a few stamps costs as much as all else that is done with them.
-        steps = stamps_ns[1:] - stamps_ns[:-1]
-        if len(steps) and steps.min() < least:
-            bad = int(np.flatnonzero(steps < least)[0])
-            raise self._disorder(int(steps[bad]), bad + 1)
+        # Compared, not subtracted: the difference of two extreme stamps can come round.
+        earlier, later = stamps_ns[:-1], stamps_ns[1:]
+        wrong = later <= earlier if least else later < earlier
+        if wrong.any():
+            bad = int(wrong.argmax())
+            raise self._disorder(int(later[bad]) - int(earlier[bad]), bad + 1)
         self._last_stamp_ns = int(stamps_ns[-1])
 
     def _disorder(self, step_ns: int, place: int) -> InvalidInputError:

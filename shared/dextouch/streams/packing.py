@@ -1,8 +1,8 @@
-"""Named numpy arrays and plain fields ↔ msgpack bytes: what chunks and observations ride on."""
+"""Named numpy arrays and plain fields as msgpack bytes: what chunks and observations travel in."""
 
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sized
+from typing import Any, TypeVar
 
 import msgpack
 import numpy as np
@@ -11,7 +11,17 @@ from dextouch.errors import InvalidInputError, LimitExceededError
 
 MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
+# Of one list or map, and of all lists and maps of a message together: fields are small, and what
+# is large travels as an array. A list takes 56 bytes of memory and one byte of a message.
+MAX_ITEMS_A_CONTAINER = 1024
+MAX_ITEMS = 16_384
+# Numbers of one array, an axis of length zero counted as one: numpy cannot hold every shape even
+# of an array without numbers.
+MAX_NUMBERS = 1 << 31
 DTYPES = ("uint8", "uint16", "int32", "int64", "float32", "float64", "bool")
+
+
+C = TypeVar("C", bound=Sized)
 
 
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
@@ -41,13 +51,29 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
         max_bytes: the most that is accepted.
 
     Raises:
-        LimitExceededError: more bytes, arrays or axes than allowed.
+        LimitExceededError: more bytes, arrays, or items of lists and maps than allowed.
         InvalidInputError: no msgpack, or not of this layout.
     """
     if len(data) > max_bytes:
         raise LimitExceededError(f"body: got {len(data)} bytes, expected at most {max_bytes}")
+    num_items = 0
+
+    def counted(container: C) -> C:
+        nonlocal num_items
+        num_items += 1 + len(container)
+        if num_items > MAX_ITEMS:
+            raise LimitExceededError(f"body: lists and maps hold more than {MAX_ITEMS} items")
+        return container
+
     try:
-        message = msgpack.unpackb(data, strict_map_key=True)
+        message = msgpack.unpackb(
+            data,
+            strict_map_key=True,
+            object_hook=counted,
+            list_hook=counted,
+            max_array_len=MAX_ITEMS_A_CONTAINER,
+            max_map_len=MAX_ITEMS_A_CONTAINER,
+        )
     except (ValueError, msgpack.UnpackException) as error:
         raise InvalidInputError(f"body: not msgpack ({type(error).__name__}: {error})") from error
     if (
@@ -56,12 +82,14 @@ def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np
         or not isinstance(message.get("arrays"), dict)
     ):
         raise InvalidInputError("body: expected a map with the maps 'fields' and 'arrays'")
+    if not all(isinstance(name, str) for part in ("fields", "arrays") for name in message[part]):
+        raise InvalidInputError("body: names of fields and arrays are text")
     if len(message["arrays"]) > MAX_ARRAYS:
         raise LimitExceededError(
             f"body: got {len(message['arrays'])} arrays, expected at most {MAX_ARRAYS}"
         )
     return message["fields"], {
-        str(name): _array(str(name), entry) for name, entry in message["arrays"].items()
+        name: _array(name, entry) for name, entry in message["arrays"].items()
     }
 
 
@@ -75,8 +103,12 @@ def _array(name: str, entry: object) -> np.ndarray:
         not isinstance(shape, list)
         or len(shape) > MAX_DIMENSIONS
         or not all(isinstance(n, int) and not isinstance(n, bool) and n >= 0 for n in shape)
+        or math.prod(max(n, 1) for n in shape) > MAX_NUMBERS
     ):
-        raise InvalidInputError(f"array {name!r}: shape {shape!r}, expected a list of counts")
+        raise InvalidInputError(
+            f"array {name!r}: shape {shape!r}, expected at most {MAX_DIMENSIONS} counts whose "
+            f"product is at most {MAX_NUMBERS}"
+        )
     expected = math.prod(shape) * np.dtype(dtype).itemsize
     if not isinstance(data, bytes) or len(data) != expected:
         got = len(data) if isinstance(data, bytes) else type(data).__name__

@@ -91,11 +91,14 @@ def test_every_appended_sample_is_kept(store, error):
 
 
 CHILD = """
+import signal
 import sys
 import numpy as np
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas.recordings import RecordingAttributes
 
+# A shell that starts the tests in the background has them ignore it.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 attributes = RecordingAttributes.model_validate_json(sys.argv[2])
 with EpisodeStore(sys.argv[1]).writer(kind="recording", attributes=attributes) as writer:
     number = 0
@@ -119,9 +122,12 @@ def test_ctrl_c_keeps_the_take(store, state):
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert child.stdout.readline() == "recording\n"
-    child.send_signal(signal.SIGINT)
-    _, said = child.communicate()
+    try:
+        assert child.stdout.readline() == "recording\n"
+        child.send_signal(signal.SIGINT)
+        _, said = child.communicate(timeout=60)
+    finally:
+        child.kill()
     assert child.returncode != 0
     assert "KeyboardInterrupt" in said
     assert "kept as 'take-1', marked as recovered" in said

@@ -181,6 +181,8 @@ def test_file_urls(tmp_path):
         ({"values": np.zeros((2, 2), "f8")}, ShapeError, "expected float32"),
         ({"values": np.full((2, 2), np.nan, "f4")}, NonFiniteError, "4 values"),
         ({"t_ref_ns": np.array([5, 5])}, InvalidInputError, "at least 1 ns"),
+        # Their difference as an int64 is 1.
+        ({"t_ref_ns": np.array([2**63 - 1, -(2**63)])}, InvalidInputError, "at least 1 ns"),
         ({"t_ref_ns": np.array([5])}, ShapeError, "like the values"),
         ({"t_ref_ns": np.array([5.0, 6.0])}, ShapeError, "int64"),
         ({"t_host_ns": np.array([5, 6])}, InvalidInputError, "got stamps"),

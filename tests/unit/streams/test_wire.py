@@ -105,6 +105,8 @@ VALUES = np.zeros((2, 7))
         (IDENTITY, STAMPS | {"values": VALUES.astype("f4")}),
         (IDENTITY, STAMPS | {"values": VALUES, "sequence": np.zeros(2)}),
         (IDENTITY, STAMPS | {"values": VALUES, "t_host_ns": np.array([2, 1])}),
+        # Their difference as an int64 is 1.
+        (IDENTITY, STAMPS | {"values": VALUES, "t_host_ns": np.array([2**63 - 1, -(2**63)])}),
         (IDENTITY, {name: np.arange(0) for name in STAMPS} | {"values": VALUES[:0]}),
     ],
 )
@@ -128,6 +130,25 @@ def test_image_ends_must_fit(ends):
         wire.decode_batch(
             framed(pack({"stream": "camera_head", "number": 0}, arrays)), CAMERA, number=0
         )
+
+
+def test_image_ends_whose_steps_overflow_are_refused():
+    """Each step is positive as an int64; cut up by them, the images are 4000 times the batch."""
+    ends = np.array([2**63 - 1, -(2**63), -1, 4] * 4000)
+    arrays = {name: np.arange(len(ends)) for name in STAMPS}
+    arrays |= {"image_bytes": np.zeros(4, "u1"), "image_end": ends}
+    body = framed(pack({"stream": "camera_head", "number": 0}, arrays))
+    with pytest.raises(InvalidInputError, match="image_end must rise"):
+        wire.decode_batch(body, CAMERA, number=0)
+
+
+def test_too_many_images_are_refused_before_they_are_cut_up():
+    ends = np.arange(1, 70_001)
+    arrays = {name: np.arange(len(ends)) for name in STAMPS}
+    arrays |= {"image_bytes": np.zeros(len(ends), "u1"), "image_end": ends}
+    body = framed(pack({"stream": "camera_head", "number": 0}, arrays))
+    with pytest.raises(LimitExceededError, match="65536"):
+        wire.decode_batch(body, CAMERA, number=0)
 
 
 def test_limits():

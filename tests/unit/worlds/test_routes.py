@@ -251,6 +251,18 @@ async def test_no_chunk_body_makes_a_500(client, body, headers):
     assert 400 <= problem_of(response).status < 500
 
 
+async def test_a_start_with_an_absurd_shape_is_refused(client):
+    """An empty array whose other axes numpy cannot hold."""
+    start = RolloutStart("stand_bottle", 1, "x", "commanded", observation(), anchor(), K_HEAD)
+    request = StartRequest(world="copy-first", task="stand_bottle", seed=1, instruction="x")
+    message = msgpack.unpackb(encode_start(request, start))
+    message["arrays"]["tactile_kpa"] |= {"shape": [0, 2**62, 320], "data": b""}
+    response = await client.post("/v1/rollouts", content=msgpack.packb(message), headers=MSGPACK)
+    problem = problem_of(response)
+    assert problem.status == 422
+    assert "'tactile_kpa': shape [0, 4611686018427387904, 320]" in problem.detail
+
+
 def damaged_start(data: st.DataObject) -> bytes:
     """A good start of which one value was replaced by another."""
     start = RolloutStart("stand_bottle", 1, "x", "commanded", observation(), anchor(), K_HEAD)
@@ -274,7 +286,9 @@ def damaged_start(data: st.DataObject) -> bytes:
     else:
         array = arrays[data.draw(st.sampled_from(sorted(arrays)))]
         array[data.draw(st.sampled_from(["dtype", "shape", "data"]))] = data.draw(
-            anything | st.lists(st.integers(-1, 70), max_size=5)
+            anything
+            | st.lists(st.integers(-1, 70), max_size=5)
+            | st.lists(st.sampled_from([0, 1, 320, 2**31, 2**62, 2**64 - 1]), max_size=5)
         )
     return msgpack.packb(message)
 
