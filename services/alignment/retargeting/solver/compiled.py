@@ -1,4 +1,4 @@
-"""A plain function in, one that numba compiles and keeps on disk out.
+"""Compilation of the solver by numba, and the folder that keeps compiled code between starts.
 
 numba notices changes of the file that holds a function, not of the files whose functions it calls.
 Compiled code is therefore kept in a folder that is named after the content of this whole package.
@@ -7,50 +7,107 @@ Compiled code is therefore kept in a folder that is named after the content of t
 import hashlib
 import os
 import shutil
+import stat
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 
+import structlog
 from numba import config, njit
 
 PACKAGE = Path(__file__).parent
+ROOT_UID = 0
 
 
-def folder_of_code(wanted: Path, spare: Path) -> Path | None:
-    """Where compiled code is kept: the wanted folder, or the spare one where that is read-only.
+def folder_of_code(*bases: Path) -> Path | None:
+    """Where compiled code is kept: in the first of these folders that this user may write.
 
-    What a read-only folder brings along (of an image) is copied.
+    Code of this version that an earlier, read-only one holds (of an image that another user built)
+    is copied. Code is run: it is taken only from folders that nobody but this user and root
+    may write.
 
     Args:
-        wanted: for the code of all versions.
-        spare: of this user alone, since code in it is run.
+        bases: for the code of all versions, best first; other users may read what is kept there.
 
     Returns:
-        None where neither may be written.
+        None where none may be written.
     """
     digest = hashlib.sha256()
     for path in sorted(PACKAGE.glob("*.py")):
         digest.update(path.read_bytes())
     name = digest.hexdigest()[:16]
-    for base in (wanted, spare):
+    for index, base in enumerate(bases):
         folder = base / name
         try:
-            folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+            is_new = not folder.is_dir()
+            folder.mkdir(parents=True, exist_ok=True, mode=0o755)
+            if not (_is_safe(base) and _is_own(folder)):
+                continue
         except OSError:
             continue
-        if not os.access(folder, os.W_OK) or folder.stat().st_uid != os.getuid():
-            continue
-        if base == spare and (wanted / name).is_dir():
-            shutil.copytree(wanted / name, folder, dirs_exist_ok=True)
+        if is_new:
+            _copy_first([earlier / name for earlier in bases[:index]], folder)
         return folder
     return None
 
 
-# numba reads NUMBA_CACHE_DIR.
-_FOLDER = folder_of_code(
-    Path(config.CACHE_DIR or "~/.cache/dextouch").expanduser(),
-    Path(tempfile.gettempdir()) / f"dextouch-{os.getuid()}",
-)
-if _FOLDER is not None:
+def _is_own(folder: Path) -> bool:
+    return os.access(folder, os.W_OK) and folder.stat().st_uid == os.getuid()
+
+
+def _is_safe(folder: Path) -> bool:
+    """Whether nobody but this user and root may change what lies in it."""
+    found = folder.stat()
+    return found.st_uid in (ROOT_UID, os.getuid()) and not found.st_mode & (
+        stat.S_IWGRP | stat.S_IWOTH
+    )
+
+
+def _copy_first(sources: list[Path], folder: Path) -> None:
+    """Copy the first of these folders that may be read; without any, code is compiled anew."""
+    for source in sources:
+        try:
+            if not (source.is_dir() and _is_safe(source)):
+                continue
+            # `rglob` passes over what may not be read without a word.
+            next(source.iterdir(), None)
+            for path in sorted(source.rglob("*")):
+                if path.is_file():
+                    target = folder / path.relative_to(source)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    # Another process may read it already: whole or not at all.
+                    part = target.with_name(f"{target.name}.{os.getpid()}")
+                    shutil.copyfile(path, part)
+                    part.replace(target)
+        except OSError as error:
+            structlog.get_logger().warning(
+                "compiled_code_not_copied", source=str(source), error=str(error)
+            )
+            continue
+        return
+
+
+def _usual_bases() -> list[Path]:
+    """`NUMBA_CACHE_DIR` or the user's own cache, then a folder for temporary files."""
+    bases = []
+    # Without a home.
+    with suppress(RuntimeError):
+        bases.append(Path(config.CACHE_DIR or "~/.cache/dextouch").expanduser())
+    # With nothing writable.
+    with suppress(FileNotFoundError):
+        bases.append(Path(tempfile.gettempdir()) / f"dextouch-{os.getuid()}")
+    return bases
+
+
+_FOLDER = folder_of_code(*_usual_bases())
+if _FOLDER is None:
+    structlog.get_logger().warning(
+        "compiled_code_not_kept",
+        tried=[str(base) for base in _usual_bases()],
+        advice="every start compiles for about half a minute; set NUMBA_CACHE_DIR to a folder that "
+        "this user may write",
+    )
+else:
     config.CACHE_DIR = str(_FOLDER)
 
 # Sums in any order and fused products, but NaN and infinity as they are.

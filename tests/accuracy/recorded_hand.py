@@ -1,0 +1,42 @@
+"""A real tracked hand of `../shared/data`, in wrist axes, and how far a robot's bones point off."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from dextouch.hands.node_order import FINGER_METACARPALS, node_order
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, THUMB_JOINTS, WRIST, solver_indices
+from services.alignment.retargeting.keypoint_axes import to_wrist_axes
+from services.alignment.retargeting.wrist_frame import wrist_frame
+
+RECORDING = Path(__file__).parents[3] / "shared/data/hands/right_hand_mediapipe_first_half.npy"
+RATE_HZ = 30.0
+needs_recording = pytest.mark.skipif(
+    not RECORDING.is_file(), reason="no recordings in ../shared/data"
+)
+
+
+def recorded_keypoints_m():
+    """[310, 25, 3] of one right hand, wrist axes; the palm's metacarpals are not tracked."""
+    nodes = [(WRIST, WRIST)]
+    for chain in CHAINS:
+        joints = THUMB_JOINTS if chain == "thumb" else FINGER_JOINTS[1:]
+        nodes.extend((chain, joint) for joint in joints)
+    order = node_order(nodes, may_lack=FINGER_METACARPALS)
+    keypoints = order.keypoints(np.load(RECORDING, allow_pickle=False))
+    return to_wrist_axes(keypoints, wrist_frame(keypoints, "right").T_tracker_wrist)
+
+
+def bone_angles_deg(keypoints_m, joints_rad):
+    """[T, 5, 3]: angle between each tracked bone and the robot's, by forward kinematics."""
+    tracked = np.stack([keypoints_m[:, solver_indices(chain)] for chain in CHAINS], axis=1)
+    ours, theirs = (
+        bones / np.linalg.norm(bones, axis=-1, keepdims=True)
+        for bones in (
+            np.diff(RobotHand("right").chain_points_m(joints_rad), axis=2),
+            np.diff(tracked, axis=2),
+        )
+    )
+    return np.rad2deg(np.arccos(np.clip((ours * theirs).sum(axis=-1), -1.0, 1.0)))
