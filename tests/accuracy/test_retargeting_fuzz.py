@@ -38,10 +38,14 @@ def test_faults_are_told_and_forgotten(whose, num_samples, capsys):
             f"{figures['good_again']} samples later tips within {figures['back_tip_mm']:.2f} mm of "
             f"the clean run, bound 1; joints {figures['back_joint_p999_deg']:.2f} deg (p99.9), "
             f"worst {figures['back_joint_deg']:.1f} | fingers hit {sum(hits.values())}, not told "
-            f"{untold}\n"
+            f"{untold} | up to {figures['way_back']} samples on the way back at the rate limit\n"
         )
     assert figures["finite"]
     assert figures["outside"] == 0
+    # 9.6 rad/s at 60 Hz, whatever was lost.
+    assert figures["max_step_rad"] <= 0.16 + 1e-9
+    # Joints that go 2 rad need 13 steps.
+    assert figures["way_back"] <= 13
     assert figures["clean_unsolved"] == 0
     assert figures["num_wronged"] == 0
     assert figures["num_unconverged"] <= num_samples * 5 * 1e-4

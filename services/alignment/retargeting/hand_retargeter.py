@@ -36,10 +36,11 @@ IMPLAUSIBLE = arrays.IMPLAUSIBLE
 class RetargetStatus(IntEnum):
     """How much of a finger's answer is the solver's own; of a sample, the worst that applies.
 
-    PARTIAL: some of its points were missing. REACQUIRED: it was lost, searched again and may have
-    jumped. UNCONVERGED: the search did not come to rest. IMPLAUSIBLE: bones or knuckle are not this
-    hand's. MISSING: fewer than two points. The last two hold what was before; a sample is
-    IMPLAUSIBLE or MISSING if all fingers are, PARTIAL if some are.
+    PARTIAL: some of its points were missing. REACQUIRED: it was lost and searched again; live, it
+    is on its way to where it is tracked, at the rate limit. UNCONVERGED: the search did not come to
+    rest. IMPLAUSIBLE: bones or knuckle are not this hand's. MISSING: fewer than two points. The
+    last two hold what was before; a sample is IMPLAUSIBLE or MISSING if all fingers are, PARTIAL if
+    some are.
     """
 
     SOLVED = arrays.SOLVED
@@ -98,15 +99,39 @@ class HandRetargeter:
         self._arrays = hand_arrays(self.hand)
         self._is_joint = joint_places(self.hand)
         self._tuning = self.options.tuning()
+        self._live = self._tuning.copy()
+        self._live["is_live"] = True
         self._person = self._person_of(profile)
         self._memory = self._blank()
+        self._was_sent = False
         # Of `step`, which is called often: what need not be made anew.
         self._scratch = np.zeros(1, dtype=SCRATCH)
         self._elapsed_s = np.zeros(1)
 
-    def reset(self) -> None:
-        """Forget all samples: the next `step` searches from several starts."""
+    def reset(self, joints_rad: np.ndarray | None = None) -> None:
+        """Forget all samples: the next `step` searches from several starts.
+
+        Args:
+            joints_rad: [J], where the robot's joints are; the next outputs lead from there at the
+                rate limit. None knows of no joints: the next output is wherever the hand is.
+
+        Raises:
+            ShapeError: not one angle a joint.
+            InvalidInputError: angles that are not finite.
+        """
         self._memory = self._blank()
+        self._was_sent = joints_rad is not None
+        if joints_rad is None:
+            return
+        angles = np.asarray(joints_rad, dtype=np.float64)
+        num = len(self.hand.joint_names)
+        if angles.shape != (num,):
+            raise ShapeError(f"joints_rad: got shape {angles.shape}, expected [{num}]")
+        if not np.isfinite(angles).all():
+            raise InvalidInputError(f"joints_rad: got {angles.tolist()}, expected finite angles")
+        self._memory.joints_rad[self._is_joint] = np.clip(
+            angles, self.hand.lower_rad, self.hand.upper_rad
+        )
 
     def step(
         self,
@@ -115,6 +140,11 @@ class HandRetargeter:
         elapsed_s: float = NOMINAL_PERIOD_S,
     ) -> RetargetResult:
         """Joint angles of one more sample, live; what is not tracked holds its last angles.
+
+        No joint goes further from one output to the next than `velocity_limit_rad_s` allows in the
+        time elapsed, nor than `max_step_rad`, whatever was lost before: a finger that is found
+        again is REACQUIRED until it has caught up. Only the first output after the start or
+        `reset` is where the hand is; give `reset` the robot's angles to begin there.
 
         Args:
             keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
@@ -137,7 +167,9 @@ class HandRetargeter:
         if valid is not None:
             trusted = _trusted(keypoints[None], np.asarray(valid)[None])
         self._elapsed_s[0] = elapsed_s
-        tables = (self._arrays, self._person, self._tuning, self._scratch)
+        tuning = self._live if self._was_sent else self._tuning
+        self._was_sent = True
+        tables = (self._arrays, self._person, tuning, self._scratch)
         return self._follow(tables, (keypoints[None], trusted, self._elapsed_s), self._memory)
 
     def retarget(
@@ -181,7 +213,7 @@ class HandRetargeter:
                 "or knuckles are not those of the profile, or nodes are missing); expected every "
                 "finger at least once"
             )
-        return replace(result, joints_rad=self._fill(result.joints_rad, result.solved))
+        return replace(result, joints_rad=self._fill(result, np.cumsum(elapsed_s)))
 
     def measure(self, keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> HandProfile:
         """The profile of a person from calibration samples.
@@ -204,7 +236,9 @@ class HandRetargeter:
     def _blank(self) -> Memory:
         rest = np.clip(0.0, self._arrays["lower_rad"][0], self._arrays["upper_rad"][0])
         num = len(self.hand.fingers)
-        return Memory(rest[:num], rest[:num].copy(), np.full(num, np.inf))
+        return Memory(
+            rest[:num], rest[:num].copy(), np.full(num, np.inf), np.zeros(num, dtype=np.uint8)
+        )
 
     def _follow(
         self,
@@ -228,18 +262,18 @@ class HandRetargeter:
             solved=output.finger_status < IMPLAUSIBLE,
         )
 
-    def _fill(
-        self, joints_rad: np.ndarray, solved: np.ndarray
-    ) -> Float64[np.ndarray, "time joints"]:
-        """Untracked stretches of fingers, linearly between the samples around; held at ends."""
-        filled = joints_rad.copy()
-        rows = np.arange(len(filled))
+    def _fill(self, result: RetargetResult, t_s: np.ndarray) -> Float64[np.ndarray, "time joints"]:
+        """Untracked stretches of fingers, linearly between the samples around; held at ends.
+
+        In time, so that the rate limit, which the samples around keep, holds within as well.
+        """
+        filled = result.joints_rad.copy()
         finger_of = np.nonzero(self._is_joint)[0]
         for joint, finger in enumerate(finger_of):
-            known = solved[:, finger]
+            known = result.solved[:, finger]
             if not known.all():
                 filled[~known, joint] = np.interp(
-                    rows[~known], rows[known], joints_rad[known, joint]
+                    t_s[~known], t_s[known], result.joints_rad[known, joint]
                 )
         return filled
 

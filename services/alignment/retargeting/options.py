@@ -17,6 +17,10 @@ class RetargetOptions:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
             weight; at other rates in proportion to the rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
+        max_step_rad: live (`HandRetargeter.step`), no joint goes further from one output to the
+            next, however much time lies between or was lost; the default is 9.6 rad/s at 60 Hz.
+            Motors that are led to their targets smoothly may be given the velocity limit times the
+            period of a slower tracker.
         pinch_near_m: below this distance of thumb and fingertip the vector between them has its
             full weight.
         pinch_far_m: from here on it has none, and thumb and finger are solved apart.
@@ -30,6 +34,7 @@ class RetargetOptions:
 
     temporal_weight_m2: float = 1e-4
     velocity_limit_rad_s: float = 9.6
+    max_step_rad: float = 0.16
     pinch_near_m: float = 0.005
     pinch_far_m: float = 0.060
     pinch_weight: float = 100.0
@@ -42,6 +47,7 @@ class RetargetOptions:
         ranges = {
             "temporal_weight_m2": (0.0, MAX_WEIGHT),
             "velocity_limit_rad_s": (LEAST, np.inf),
+            "max_step_rad": (LEAST, np.inf),
             "pinch_near_m": (LEAST, 1.0),
             "pinch_far_m": (self.pinch_near_m + LEAST, 1.0),
             "pinch_weight": (PINCH_WEIGHT_FAR, MAX_WEIGHT),
@@ -62,6 +68,7 @@ class RetargetOptions:
         record = np.zeros(1, dtype=TUNING)
         record["temporal_weight_m2"] = self.temporal_weight_m2
         record["velocity_limit_rad_s"] = self.velocity_limit_rad_s
+        record["max_step_rad"] = self.max_step_rad
         record["pinch_near_m"] = self.pinch_near_m
         record["pinch_far_m"] = self.pinch_far_m
         record["pinch_weight_near"] = self.pinch_weight

@@ -164,6 +164,7 @@ def _knuckle_motion(
             np.zeros((len(rows), MAX_JOINTS)),
             np.zeros((len(rows), MAX_JOINTS)),
             np.full(len(rows), np.inf),
+            np.zeros(len(rows), dtype=np.uint8),
         ),
         output,
     )

@@ -72,6 +72,9 @@ TUNING: Final = np.dtype(
     [
         ("temporal_weight_m2", np.float64),
         ("velocity_limit_rad_s", np.float64),
+        # Live, every output is sent to motors: a joint goes no further from one to the next.
+        ("is_live", np.bool_),
+        ("max_step_rad", np.float64),
         ("pinch_near_m", np.float64),
         ("pinch_far_m", np.float64),
         ("pinch_weight_near", np.float64),
@@ -108,6 +111,9 @@ SCRATCH: Final = np.dtype(
         ("reduced", np.float64, (_J, _J)),
         ("step", np.float64, (_F, _J)),
         ("trial", np.float64, (_F, _J)),
+        # Since the sample before, and what came out then.
+        ("elapsed_s", np.float64),
+        ("sent", np.float64, (_F, _J)),
         # The box, the sample before, and how strongly it pulls.
         ("lower", np.float64, (_F, _J)),
         ("upper", np.float64, (_F, _J)),
@@ -141,11 +147,13 @@ class Memory(NamedTuple):
         joints_rad: [F, 6], what came out.
         alone_rad: [F, 6], what fingers would do if there were no pinch.
         unsolved_s: [F] since a finger was solved; infinite if it never was.
+        is_behind: [F] whether a finger that was lost is still on its way to where it is tracked.
     """
 
     joints_rad: np.ndarray
     alone_rad: np.ndarray
     unsolved_s: np.ndarray
+    is_behind: np.ndarray
 
 
 class Output(NamedTuple):

@@ -26,6 +26,7 @@ from services.alignment.retargeting.solver.minimize import (
     minimize,
     solve_cold,
 )
+from services.alignment.retargeting.solver.points import linearize
 from services.alignment.retargeting.solver.seen import find_pinches, read_sample, see_finger
 
 # How often fingers are pushed apart in one sample.
@@ -34,9 +35,8 @@ MAX_PUSHES = 4
 
 @compiled
 @no_type_check
-def set_box(hand, tuning, work, finger, before_rad, unsolved_s):
+def set_box(hand, work, finger, before_rad, reach):
     """Where the joints of a finger may go in this sample: limits, and what time allows."""
-    reach = tuning.velocity_limit_rad_s * unsolved_s
     for joint in range(hand.num_joints[finger]):
         before = before_rad[finger, joint]
         lower, upper = hand.lower_rad[finger, joint], hand.upper_rad[finger, joint]
@@ -91,7 +91,8 @@ def solve_alone(hand, person, tuning, work, memory, output):
             errors_m[finger] = 0.0
             continue
         unsolved_s = memory.unsolved_s[finger]
-        set_box(hand, tuning, work, finger, memory.alone_rad, unsolved_s)
+        reach = tuning.velocity_limit_rad_s * unsolved_s
+        set_box(hand, work, finger, memory.alone_rad, reach)
         work.posture_weight_m2[finger] = 0.0
         work.pull_m2[finger] = 0.0
         if unsolved_s >= tuning.reacquire_after_s:
@@ -113,14 +114,21 @@ def solve_alone(hand, person, tuning, work, memory, output):
 def solve_pinches(hand, person, tuning, work, memory, num_near, output):
     """The thumb and the fingers near it together, close to what each does alone.
 
-    The others as they are; no joint leaves the box around what came out before.
+    The others as they are; no joint leaves the box around what came out before. That box grows with
+    the time a finger was lost, but live, where the time of one output is all that motors have.
     """
     status, errors_m = output
     joints, alone = memory.joints_rad, memory.alone_rad
     for finger in range(hand.num_fingers):
         if status[finger] >= IMPLAUSIBLE:
             continue
-        set_box(hand, tuning, work, finger, joints, memory.unsolved_s[finger])
+        reach = tuning.velocity_limit_rad_s * memory.unsolved_s[finger]
+        if tuning.is_live:
+            allowed = min(tuning.velocity_limit_rad_s * work.elapsed_s, tuning.max_step_rad)
+            if reach > allowed * (1.0 + 1e-9):
+                memory.is_behind[finger] = 1
+            reach = allowed
+        set_box(hand, work, finger, work.sent, reach)
         work.posture_weight_m2[finger] = tuning.posture_weight_m2
         for joint in range(hand.num_joints[finger]):
             work.posture[finger, joint] = alone[finger, joint]
@@ -128,7 +136,8 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
     for finger in range(hand.num_fingers):
         if status[finger] >= IMPLAUSIBLE:
             continue
-        if work.is_near[finger] and memory.unsolved_s[finger] < tuning.reacquire_after_s:
+        is_lost = memory.unsolved_s[finger] >= tuning.reacquire_after_s
+        if work.is_near[finger] and not (is_lost or memory.is_behind[finger]):
             continue
         for joint in range(hand.num_joints[finger]):
             lower, upper = work.lower[finger, joint], work.upper[finger, joint]
@@ -139,6 +148,34 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
             errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
             if not at_rest:
                 status[finger] = UNCONVERGED
+
+
+@compiled
+@no_type_check
+def tell_behind(hand, person, work, memory, output):
+    """Fingers that the box keeps from where they are tracked are REACQUIRED until they are there.
+
+    Their tip error is that of the angles that come out.
+    """
+    status, errors_m = output
+    for finger in range(hand.num_fingers):
+        if status[finger] >= IMPLAUSIBLE or not memory.is_behind[finger]:
+            continue
+        is_held = False
+        for joint in range(hand.num_joints[finger]):
+            angle = memory.joints_rad[finger, joint]
+            lower, upper = work.lower[finger, joint], work.upper[finger, joint]
+            if angle <= lower and lower > hand.lower_rad[finger, joint]:
+                is_held = True
+            if angle >= upper and upper < hand.upper_rad[finger, joint]:
+                is_held = True
+        if not is_held:
+            memory.is_behind[finger] = 0
+            continue
+        status[finger] = max(status[finger], REACQUIRED)
+        linearize(hand, person, work, finger, memory.joints_rad[finger])
+        work.step[finger, :] = 0.0
+        errors_m[finger] = tip_error(work, finger, hand.num_joints[finger])
 
 
 @compiled_once
@@ -161,7 +198,10 @@ def retarget_samples(tables, samples, memory, output):
         status = output.finger_status[t]
         found = (status, output.tip_error_m[t])
         read_sample(hand, work, keypoints[t], valid[t])
+        work.elapsed_s = elapsed_s[t]
         for finger in range(num_fingers):
+            for joint in range(hand.num_joints[finger]):
+                work.sent[finger, joint] = joints[finger, joint]
             memory.unsolved_s[finger] += elapsed_s[t]
             status[finger] = see_finger(hand, person, tuning, work, finger, memory)
         num_near = find_pinches(hand, tuning, work, status)
@@ -173,6 +213,7 @@ def retarget_samples(tables, samples, memory, output):
                     break
                 solve_alone(hand, person, tuning, work, memory, found)
                 solve_pinches(hand, person, tuning, work, memory, num_near, found)
+        tell_behind(hand, person, work, memory, found)
         for finger in range(num_fingers):
             if status[finger] < IMPLAUSIBLE:
                 memory.unsolved_s[finger] = 0.0

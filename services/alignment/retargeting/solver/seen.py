@@ -95,7 +95,7 @@ def knuckle_error_m(hand, person, tuning, work, finger, memory):
     base = hand.point_joints[finger, 0]
     origin = work.origin[finger]
     if travel > 0.0:
-        place_joints(hand, finger, memory.joints_rad[finger], origin, work.axis[finger], work.turn)
+        place_joints(hand, finger, memory.alone_rad[finger], origin, work.axis[finger], work.turn)
     squared, arm = 0.0, 0.0
     for k in range(3):
         expected = person.knuckle_m[finger, k]
