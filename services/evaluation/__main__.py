@@ -1,23 +1,28 @@
-"""`train-policy`, `train-probe` or `run` and flags in; a checkpoint or a scored evaluation out."""
+"""The commands of the evaluation service: train a policy or the probe, or score policies."""
 
 import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
+from dextouch.clients.policy import Policy
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.episodes import EpisodeStore
-from dextouch.schemas.rollouts import ReturnSelector
+from dextouch.errors import InvalidInputError, UnknownNameError
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
-from services.evaluation.demonstrations import CAMERA, read_demonstrations
+from services.evaluation.demonstrations import read_demonstrations
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.hold import HoldPolicy
+from services.evaluation.policies.outside import PolicySource
 from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
-from services.evaluation.reporting.sections import figure
+from services.evaluation.reporting.sections import failure_rows, figure
+from services.evaluation.results import ResultLog
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
@@ -36,6 +41,7 @@ USAGE = """usage: evaluation train-policy|train-probe|run [flags]
   run            roll policies out in a real and in imagined worlds, and score both
 
 Flags: evaluation COMMAND --help"""
+EXIT_FAILED = 1
 EXIT_USAGE = 2
 
 
@@ -87,44 +93,91 @@ def _keep(checkpoint: Checkpoint, output: Path, json_path: Path | None) -> int:
 
 
 def run_evaluation(arguments: list[str]) -> int:
-    """Score every policy in every world; the figures go to the terminal and the asked files."""
+    """Score every policy in every world; the figures go to the terminal and the asked files.
+
+    Returns:
+        0, or 1 when a rollout failed.
+    """
     settings = parse(RunSettings, arguments)
     probe = SuccessProbe.load(settings.probe)
-    cloned = BehaviourCloningPolicy.load(settings.policy)
-    instructions = probe.metadata.settings["instructions"]
+    policies, trained_on = gather_policies(settings)
     plan = EvaluationPlan(
-        {task: instructions[task] for task in settings.tasks or probe.metadata.tasks},
+        instructions_for(settings.tasks, probe.metadata.settings["instructions"]),
         settings.seed_range(),
-        settings.num_chunks,
-        trained_on={"the cloned policy": cloned.metadata.training_starts},
+        settings.num_steps,
+        trained_on=trained_on,
     )
-    scripts = {
-        name: ReplayPolicy.of(read_demonstrations(EpisodeStore(url), tasks=settings.tasks))
-        for name, url in settings.scripts.items()
-    }
-    report = evaluate(
-        real=_address(settings.real),
-        imagined={name: _address(world) for name, world in settings.imagined.items()},
-        policies={**scripts, "behaviour-cloning": cloned, "hold": HoldPolicy()},
-        plan=plan,
-        probe=probe,
-    ).to_report()
-    _print_scores(report)
-    _write_json(settings.json_path, report)
+    log = ResultLog(settings.results_path())
+    with ExitStack() as connections:
+        report = evaluate(
+            real=_address(settings.real, connections),
+            imagined={n: _address(world, connections) for n, world in settings.imagined.items()},
+            policies=policies,
+            plan=plan,
+            probe=probe,
+            keep=log.keep,
+        )
+    figures = report.to_report()
+    _print_scores(figures)
+    _write_json(settings.json_path, figures)
     if settings.html is not None:
-        write_report(report, ReportPictures(), settings.html)
-    return 0
+        write_report(figures, ReportPictures(), settings.html)
+    _print_failures(figures, log.path)
+    return EXIT_FAILED if report.failures else 0
 
 
-def _address(world: ServedWorld) -> WorldAddress:
-    selector = ReturnSelector(cameras=(CAMERA,))
-    return WorldAddress(RolloutClient(world.url, world.api_key, selector=selector), world.world)
+def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str, Sequence[str]]]:
+    """Every asked policy by its name, and the starts that ours were trained on.
+
+    Raises:
+        InvalidInputError: two policies of one name, or one of yours that does not load.
+        UnknownNameError: arguments for a policy that is not there.
+    """
+    sources = [PolicySource.parse(text) for text in settings.policy]
+    names = [source.name for source in sources]
+    if unknown := sorted(set(settings.policy_arguments) - set(names)):
+        raise UnknownNameError("policy of --policy_arguments", unknown[0], names)
+    names += [*settings.scripts, *settings.builtin]
+    if repeated := sorted({name for name in names if names.count(name) > 1}):
+        raise InvalidInputError(
+            f"policies: {repeated[0]!r} is there twice; name yours, --policy NAME=MODULE:FACTORY"
+        )
+    policies = {s.name: s.load(settings.policy_arguments.get(s.name, {})) for s in sources}
+    for name, url in settings.scripts.items():
+        episodes = read_demonstrations(EpisodeStore(url), tasks=settings.tasks)
+        policies[name] = ReplayPolicy.of(episodes)
+    trained_on: dict[str, Sequence[str]] = {}
+    if "behaviour-cloning" in settings.builtin:
+        cloned = BehaviourCloningPolicy.load(settings.cloned_policy)
+        policies["behaviour-cloning"] = cloned
+        trained_on["the cloned policy"] = cloned.metadata.training_starts
+    if "hold" in settings.builtin:
+        policies["hold"] = HoldPolicy()
+    return policies, trained_on
+
+
+def instructions_for(tasks: Sequence[str], known: Mapping[str, str]) -> dict[str, str]:
+    """The sentences of tasks; of all that are known when none is named.
+
+    Raises:
+        UnknownNameError: a task that the success probe does not know.
+    """
+    for task in tasks:
+        if task not in known:
+            raise UnknownNameError("task of the success probe", task, list(known))
+    return {task: known[task] for task in tasks or known}
+
+
+def _address(world: ServedWorld, connections: ExitStack) -> WorldAddress:
+    client = connections.enter_context(RolloutClient(world.url, world.api_key))
+    return WorldAddress(client, world.world)
 
 
 def _print_scores(report: Mapping[str, Any]) -> None:
-    print(f"{'task':<16}{'policy':<22}{'real':>6}{'imagined':>10}")
+    print(f"{'task':<16}{'policy':<22}{'real':>10}{'imagined':>10}")
     for row in report["policies"]:
-        print(f"{row['task']:<16}{row['policy']:<22}{row['real']:>6.2f}{row['imagined']:>10.2f}")
+        rates = "".join(f"{figure(row[world]):>10}" for world in ("real", "imagined"))
+        print(f"{row['task']:<16}{row['policy']:<22}{rates}")
     for task, figures in report["agreement"].items():
         print(
             f"\n{task}: Pearson {figure(figures['pearson'])}, MMRV {figure(figures['mmrv'])} "
@@ -132,6 +185,21 @@ def _print_scores(report: Mapping[str, Any]) -> None:
         )
         for comment in report["comments"][task]:
             print(f"  {comment}")
+
+
+def _print_failures(report: Mapping[str, Any], results: Path) -> None:
+    """What failed, to standard error, with one example of each kind."""
+    rows = failure_rows(report)
+    if rows:
+        print(
+            f"\n{len(report['failures'])} of {report['num_rollouts']} rollouts failed and are "
+            f"missing from the figures; all are in {results}",
+            file=sys.stderr,
+        )
+    for row in rows:
+        print(f"  {row.policy} in {row.world}, {row.count} x: {row.message}", file=sys.stderr)
+        if row.traceback:
+            print(indent(row.traceback, "    "), file=sys.stderr)
 
 
 def _write_json(path: Path | None, content: Mapping[str, Any]) -> None:

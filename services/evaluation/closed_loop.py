@@ -1,25 +1,28 @@
-"""Worlds, policies and matched starts in; success in every world and their agreement out.
+"""Closed-loop evaluation: policies rolled out in worlds from matched starts, and scored.
 
 The real world begins each (task, seed) once for every policy; every imagined world begins from
 exactly that first observation, anchor and camera. Real success is what the real world says,
-imagined success what the probe says about the last three steps.
+imagined success what the probe says about the last three steps. A rollout that fails is kept as a
+failure, and the others go on.
 """
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 
-import numpy as np
 from jaxtyping import Float64
+from numpy import ndarray
 
 from dextouch.clients.policy import Policy, PolicyStart
-from dextouch.clients.rollouts import Rollout, RolloutClient
-from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.clients.rollouts import Rollout
+from dextouch.errors import ConflictError, DexTouchError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas.rollouts import Observation, ReturnSelector
 from services.evaluation.demonstrations import CAMERA
+from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.progress import Progress
-from services.evaluation.scores import REAL, ClosedLoopReport, RolloutScore
+from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.starts import refuse_training_starts, start_digest
+from services.evaluation.study_worlds import StudyWorlds, WorldAddress
 from services.evaluation.success_probe import (
     DECISION_THRESHOLD,
     NUM_SEEN_STEPS,
@@ -27,26 +30,24 @@ from services.evaluation.success_probe import (
     SuccessProbe,
 )
 
+__all__ = ["EvaluationPlan", "MatchedStart", "WorldAddress", "evaluate", "matched_start"]
 
-@dataclass(frozen=True)
-class WorldAddress:
-    """Where a world is served, and what it is called there."""
-
-    client: RolloutClient
-    world: str
+# What becomes of one rollout.
+Outcome = RolloutScore | RolloutFailure
 
 
 @dataclass(frozen=True)
 class EvaluationPlan:
     """What is rolled out.
 
-    `instructions` maps every task to its sentence; `trained_on` maps what was trained (world
-    model, policy, probe) to digests of its training starts, none of which may be judged on.
+    `instructions` maps every task to its sentence; every rollout lasts `num_steps` steps of the
+    model grid, however many steps a policy sends at once; `trained_on` maps what was trained
+    (world model, policy, probe) to digests of its training starts, none of which may be judged on.
     """
 
     instructions: Mapping[str, str]
     seeds: Sequence[int]
-    num_chunks: int = 5
+    num_steps: int = 80
     trained_on: Mapping[str, Iterable[str]] = field(default_factory=dict)
 
 
@@ -59,16 +60,21 @@ class MatchedStart:
     instruction: str
     observation: Observation
     anchor: AnchorPoses
-    K_head: Float64[np.ndarray, "3 3"]
+    K_head: Float64[ndarray, "3 3"]
 
     @property
     def digest(self) -> str:
         """Digest of image and touch."""
-        return start_digest(self.observation.images[CAMERA][0], self.observation.tactile_kpa[0])
+        return first_digest(self.observation)
 
     def for_policy(self) -> PolicyStart:
         """What a policy is told before it acts."""
         return PolicyStart(self.task, self.instruction, self.seed, self.anchor, self.K_head)
+
+
+def first_digest(observation: Observation) -> str:
+    """Digest of the head camera's image and the touch of a first observation."""
+    return start_digest(observation.images[CAMERA][0], observation.tactile_kpa[0])
 
 
 def evaluate(
@@ -78,6 +84,7 @@ def evaluate(
     policies: Mapping[str, Policy],
     plan: EvaluationPlan,
     probe: SuccessProbe,
+    keep: Callable[[Outcome], None] | None = None,
 ) -> ClosedLoopReport:
     """Roll every policy out from every start in every world.
 
@@ -87,117 +94,166 @@ def evaluate(
         policies: by the name they have in the report.
         plan: tasks, seeds and length.
         probe: judge of imagined success.
+        keep: called with every outcome as soon as it is known.
+
+    Returns:
+        The scores, and beside them the rollouts that failed with their errors.
 
     Raises:
-        ConflictError: a start that something was trained on, or a real world that does not begin
-            a task and seed the same way twice.
-        InvalidInputError: nothing to evaluate, or a real world that does not judge success.
+        ConflictError: a start that something was trained on.
+        UnknownNameError: a world or task that is not there.
+        InvalidInputError: nothing to evaluate, or worlds that do not fit each other or the plan.
+        UnavailableError: a world is not there at the beginning.
     """
     if not imagined or not policies or not plan.instructions or not plan.seeds:
         raise InvalidInputError(
             f"evaluation: got {len(imagined)} imagined worlds, {len(policies)} policies, "
             f"{len(plan.instructions)} tasks and {len(plan.seeds)} seeds; expected one of each"
         )
+    worlds = StudyWorlds.ask(real, imagined)
+    worlds.check(list(plan.instructions), plan.num_steps, probe.shape.image_size_px)
     starts = [
-        matched_start(real, task, seed, instruction)
+        _start(real, task, seed, instruction)
         for task, instruction in plan.instructions.items()
         for seed in plan.seeds
     ]
+    digests = [start.digest for start in starts if isinstance(start, MatchedStart)]
     trained_on = {**plan.trained_on, "the success probe": probe.metadata.training_starts}
-    for what, digests in trained_on.items():
-        refuse_training_starts((s.digest for s in starts), trained_on=digests, what=what)
+    for what, trained in trained_on.items():
+        refuse_training_starts(digests, trained_on=trained, what=what)
     scores: list[RolloutScore] = []
-    with Progress("rollouts", len(starts) * len(policies) * (1 + len(imagined))) as progress:
-        for start in starts:
-            for name, policy in policies.items():
-                ending, success = _real_ending(real, start, policy, plan)
-                probability = probe.probability(ending)
-                scores.append(_score(REAL, name, start, probability, success=success))
-                progress.advance()
-                for world, address in imagined.items():
-                    ending = _imagined_ending(address, start, policy, plan)
-                    probability = probe.probability(ending)
-                    scores.append(_score(world, name, start, probability))
-                    progress.advance()
-    return ClosedLoopReport(tuple(scores), tuple(imagined), tuple(policies))
+    failures: list[RolloutFailure] = []
+    study = _Study(worlds, policies, plan, probe)
+    with Progress("rollouts", len(starts) * len(policies) * len(worlds.addresses)) as progress:
+        for outcome in study.outcomes(starts):
+            if keep is not None:
+                keep(outcome)
+            if isinstance(outcome, RolloutScore):
+                scores.append(outcome)
+            else:
+                failures.append(outcome)
+            progress.advance(failed=float(len(failures)))
+    return ClosedLoopReport(tuple(scores), tuple(imagined), tuple(policies), tuple(failures))
 
 
-def _score(
-    world: str,
-    policy: str,
-    start: MatchedStart,
-    probability: float,
-    *,
-    success: bool | None = None,
-) -> RolloutScore:
-    """A score; where the world does not tell, the probe decides."""
-    decided = probability >= DECISION_THRESHOLD if success is None else success
-    return RolloutScore(world, policy, start.task, start.seed, start.digest, decided, probability)
+@dataclass(frozen=True)
+class _FailedStart:
+    """A task and seed that the real world did not begin."""
+
+    task: str
+    seed: int
+    error: DexTouchError
+
+
+def _start(
+    real: WorldAddress, task: str, seed: int, instruction: str
+) -> MatchedStart | _FailedStart:
+    try:
+        return matched_start(real, task, seed, instruction)
+    except DexTouchError as error:
+        return _FailedStart(task, seed, error)
+
+
+def _failure(
+    error: DexTouchError, start: MatchedStart | _FailedStart, policy: str, world: str
+) -> RolloutFailure:
+    trace = error.details.get("traceback")
+    return RolloutFailure(
+        world=world,
+        policy=policy,
+        task=start.task,
+        seed=start.seed,
+        error=type(error).__name__,
+        message=error.message,
+        traceback=trace if isinstance(trace, str) else None,
+    )
 
 
 def matched_start(real: WorldAddress, task: str, seed: int, instruction: str) -> MatchedStart:
-    """How the real world begins a task and seed, as far as the head camera and the hands see."""
+    """How the real world begins a task and seed, with the images of all its cameras."""
     with real.client.start(
         world=real.world, task=task, seed=seed, instruction=instruction
     ) as rollout:
-        first = rollout.observation
-        if CAMERA not in first.images:
-            raise UnknownNameError("camera", CAMERA, list(first.images))
-        seen = replace(first, images={CAMERA: first.images[CAMERA]})
-        return MatchedStart(task, seed, instruction, seen, rollout.anchor, rollout.K_head)
+        return MatchedStart(
+            task, seed, instruction, rollout.observation, rollout.anchor, rollout.K_head
+        )
 
 
-def _real_ending(
-    real: WorldAddress, start: MatchedStart, policy: Policy, plan: EvaluationPlan
-) -> tuple[Ending, bool]:
-    with real.client.start(
-        world=real.world, task=start.task, seed=start.seed, instruction=start.instruction
-    ) as rollout:
+@dataclass(frozen=True)
+class _Study:
+    """Everything that the rollouts of one evaluation have in common."""
+
+    worlds: StudyWorlds
+    policies: Mapping[str, Policy]
+    plan: EvaluationPlan
+    probe: SuccessProbe
+
+    def outcomes(self, starts: Iterable[MatchedStart | _FailedStart]) -> Iterator[Outcome]:
+        """What becomes of every rollout, one after the other."""
+        for start in starts:
+            for policy in self.policies:
+                for world in self.worlds.addresses:
+                    yield self._outcome(start, policy, world)
+
+    def _outcome(self, start: MatchedStart | _FailedStart, policy: str, world: str) -> Outcome:
+        if isinstance(start, _FailedStart):
+            return _failure(start.error, start, policy, world)
+        try:
+            return self._score(start, policy, world)
+        except DexTouchError as error:
+            return _failure(error, start, policy, world)
+
+    def _score(self, start: MatchedStart, policy: str, world: str) -> RolloutScore:
+        """A score; where the world does not tell, the probe decides."""
+        with self._begin(start, world) as rollout:
+            ending = self._play(rollout, start, policy, world)
+            success = rollout.observation.success if world == REAL else None
+        probability = self.probe.probability(ending)
+        decided = probability >= DECISION_THRESHOLD if success is None else success
+        return RolloutScore(
+            world, policy, start.task, start.seed, start.digest, decided, probability
+        )
+
+    def _begin(self, start: MatchedStart, world: str) -> Rollout:
+        """A rollout from a matched start: by task and seed in the real world.
+
+        Raises:
+            ConflictError: the real world began differently than before.
+        """
+        address = self.worlds.addresses[world]
+        client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras))
+        init = None if world == REAL else (start.observation, start.anchor, start.K_head)
+        rollout = client.start(
+            world=address.world,
+            task=start.task,
+            seed=start.seed,
+            instruction=start.instruction,
+            init=init,
+        )
         first = rollout.observation
-        if start_digest(first.images[CAMERA][0], first.tactile_kpa[0]) != start.digest:
+        if init is None and first_digest(first) != start.digest:
+            rollout.close()
             raise ConflictError(
-                f"world {real.world!r}: task {start.task!r} with seed {start.seed} began "
+                f"world {address.world!r}: task {start.task!r} with seed {start.seed} began "
                 "differently than before; matched starts need a world that repeats itself"
             )
-        ending = play(rollout, policy, start, num_chunks=plan.num_chunks)
-        success = rollout.observation.success
-    if success is None:
-        raise InvalidInputError(
-            f"world {real.world!r} does not judge success; expected one that does, such as the twin"
+        return rollout
+
+    def _play(self, rollout: Rollout, start: MatchedStart, policy: str, world: str) -> Ending:
+        """Let a policy act in a rollout; what is seen in its last three steps."""
+        actor, description = self.policies[policy], self.worlds.descriptions[world]
+        where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
+        ask(actor.reset, start.for_policy(), where=f"{where}: reset")
+        while (left := self.plan.num_steps - rollout.info.last_step) > 0:
+            acting = f"{where}, chunk {rollout.info.next_chunk}: act"
+            answer = ask(actor.act, rollout.observation, where=acting)
+            rollout.step(action_chunk(answer, description, where=acting)[:left])
+        last = rollout.observation
+        if len(last) < NUM_SEEN_STEPS:
+            raise InvalidInputError(
+                f"{where}: the last chunk shows {len(last)} steps, expected at least "
+                f"{NUM_SEEN_STEPS}; send longer chunks"
+            )
+        return Ending(
+            last.images[CAMERA][-NUM_SEEN_STEPS:], last.tactile_kpa[-NUM_SEEN_STEPS:], start.task
         )
-    return ending, success
-
-
-def _imagined_ending(
-    imagined: WorldAddress, start: MatchedStart, policy: Policy, plan: EvaluationPlan
-) -> Ending:
-    with imagined.client.start(
-        world=imagined.world,
-        task=start.task,
-        seed=start.seed,
-        instruction=start.instruction,
-        init=(start.observation, start.anchor, start.K_head),
-    ) as rollout:
-        return play(rollout, policy, start, num_chunks=plan.num_chunks)
-
-
-def play(rollout: Rollout, policy: Policy, start: MatchedStart, *, num_chunks: int) -> Ending:
-    """Let a policy act in a rollout; what is seen in its last three steps.
-
-    Raises:
-        InvalidInputError: chunks too short to show three steps.
-    """
-    policy.reset(start.for_policy())
-    observation = rollout.observation
-    for _ in range(num_chunks):
-        observation = rollout.step(policy.act(observation))
-    if len(observation) < NUM_SEEN_STEPS:
-        raise InvalidInputError(
-            f"rollout in {start.task!r}: the last chunk shows {len(observation)} steps, "
-            f"expected at least {NUM_SEEN_STEPS}"
-        )
-    return Ending(
-        observation.images[CAMERA][-NUM_SEEN_STEPS:],
-        observation.tactile_kpa[-NUM_SEEN_STEPS:],
-        start.task,
-    )

@@ -19,6 +19,9 @@ def task_comments(
         world: name of the imagined world.
     """
     num_starts = agreement["num_starts"]
+    if num_starts == 0:
+        return [f"No rollout ended both in the real world and in {world}: nothing to compare."]
+    rows = [row for row in rows if UNDEFINED not in {row["real"], row["imagined"]}]
     size = (
         f"{agreement['num_policies']} policies, N = {num_starts} starts each: a single rollout "
         f"moves a success rate by {1 / num_starts:.2f}."

@@ -14,6 +14,7 @@ from services.evaluation.statistics import bootstrap_agreement, wilson_interval
 
 REAL = "real"
 _BOOTSTRAP_SEED = 0
+_AGREEMENT_FIGURES = ("pearson", "mmrv", "spearman", "kendall", "bias", "mean_absolute_error")
 
 
 @dataclass(frozen=True)
@@ -34,37 +35,67 @@ class RolloutScore:
 
 
 @dataclass(frozen=True)
+class RolloutFailure:
+    """A rollout that did not come to its end: it says nothing about the policy's success.
+
+    `error` is the class of the error, `traceback` that of the policy's own code, if it raised.
+    """
+
+    world: str
+    policy: str
+    task: str
+    seed: int
+    error: str
+    message: str
+    traceback: str | None = None
+
+
+@dataclass(frozen=True)
 class ClosedLoopReport:
-    """Every rollout of an evaluation; the first imagined world is the one that is reported."""
+    """Every rollout of an evaluation; the first imagined world is the one that is reported.
+
+    Rollouts that failed are missing from every figure, and counted beside it.
+    """
 
     scores: tuple[RolloutScore, ...]
     imagined_worlds: tuple[str, ...]
     policies: tuple[str, ...]
+    failures: tuple[RolloutFailure, ...] = ()
+
+    @property
+    def rollouts(self) -> tuple[RolloutScore | RolloutFailure, ...]:
+        """Those that ended and those that failed."""
+        return self.scores + self.failures
 
     @property
     def tasks(self) -> tuple[str, ...]:
         """In the order of the rollouts."""
-        return tuple(dict.fromkeys(score.task for score in self.scores))
+        return tuple(dict.fromkeys(rollout.task for rollout in self.rollouts))
 
     def outcomes(self, world: str, task: str) -> Float64[np.ndarray, "policies starts"]:
-        """Success (1 or 0) of every policy from every start.
+        """Success (1 or 0) of every policy from every start; NaN where the rollout failed.
 
         Raises:
             InvalidInputError: a policy that was not rolled out from the same starts as the others.
         """
-        rows, digests = [], set()
-        for policy in self.policies:
-            mine = [s for s in self._of(world, task) if s.policy == policy]
-            rows.append([float(s.success) for s in mine])
-            digests.add(tuple(s.start_digest for s in mine))
-        if len(digests) != 1 or not rows[0]:
+        scores = {(s.policy, s.seed): s for s in self._of(world, task)}
+        failed = {(f.policy, f.seed) for f in self._failed(world, task)}
+        seeds = list(dict.fromkeys(r.seed for r in self.rollouts if r.task == task))
+        asked = {(policy, seed) for policy in self.policies for seed in seeds}
+        digests = {(s.seed, s.start_digest) for s in scores.values()}
+        if set(scores) | failed != asked or len(digests) != len(dict(digests)):
             raise InvalidInputError(
                 f"scores of {world!r} in {task!r}: the policies began from different starts"
             )
+        success = {key: float(score.success) for key, score in scores.items()}
+        rows = [[success.get((p, seed), math.nan) for seed in seeds] for p in self.policies]
         return np.array(rows)
 
     def _of(self, world: str, task: str) -> list[RolloutScore]:
         return [s for s in self.scores if s.world == world and s.task == task]
+
+    def _failed(self, world: str, task: str) -> list[RolloutFailure]:
+        return [f for f in self.failures if f.world == world and f.task == task]
 
     def policy_rows(self) -> list[dict[str, Any]]:
         """One row a policy and task: real and imagined success rate with Wilson intervals."""
@@ -83,13 +114,17 @@ class ClosedLoopReport:
 
     def _cell(self, name: str, world: str, task: str, policy: str) -> dict[str, Any]:
         mine = [s for s in self._of(world, task) if s.policy == policy]
+        num_failed = sum(f.policy == policy for f in self._failed(world, task))
+        counts = {f"{name}_rollouts": len(mine), f"{name}_failed": num_failed}
+        if not mine:
+            return {name: UNDEFINED, f"{name}_probability": UNDEFINED, **counts}
         successes = sum(s.success for s in mine)
         interval = wilson_interval(successes, len(mine))
         return {
             name: successes / len(mine),
             f"{name}_interval": [interval.low, interval.high],
             f"{name}_probability": float(np.mean([s.probability for s in mine])),
-            f"{name}_rollouts": len(mine),
+            **counts,
         }
 
     def agreement(self, world: str) -> dict[str, dict[str, Any]]:
@@ -101,7 +136,12 @@ class ClosedLoopReport:
         return {task: self._agreement(world, task) for task in self.tasks}
 
     def _agreement(self, world: str, task: str) -> dict[str, Any]:
-        real, imagined = self.outcomes(REAL, task), self.outcomes(world, task)
+        real, imagined = matched(self.outcomes(REAL, task), self.outcomes(world, task))
+        if real.size == 0:
+            return dict.fromkeys(_AGREEMENT_FIGURES, UNDEFINED) | {
+                "num_policies": 0,
+                "num_starts": 0,
+            }
         pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
         found: dict[str, Any] = {
             "pearson": defined(pearson(**pair)),
@@ -126,9 +166,11 @@ class ClosedLoopReport:
             found[f"{measure}_undefined_share"] = drawn.undefined_share
         return found
 
-    def probe_accuracy(self) -> float:
+    def probe_accuracy(self) -> float | str:
         """Share of real rollouts whose outcome the probe's probability tells rightly."""
         real = [s for s in self.scores if s.world == REAL]
+        if not real:
+            return UNDEFINED
         return float(np.mean([(s.probability >= 0.5) == s.success for s in real]))
 
     def to_report(self) -> dict[str, Any]:
@@ -145,8 +187,24 @@ class ClosedLoopReport:
             "agreement_of_other_worlds": {world: self.agreement(world) for world in others},
             "imagined_world": first,
             "probe_accuracy_on_real": self.probe_accuracy(),
+            "num_rollouts": len(self.rollouts),
             "rollouts": [asdict(score) for score in self.scores],
+            "failures": [asdict(failure) for failure in self.failures],
         }
+
+
+def matched(
+    real: np.ndarray, imagined: np.ndarray
+) -> tuple[Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]]:
+    """Outcomes [policies, starts] without those that have no counterpart.
+
+    Policies without a single start that ended in both worlds are left out, then starts that did
+    not end in both worlds for every policy that is left.
+    """
+    known = np.isfinite(real) & np.isfinite(imagined)
+    rows = known.any(axis=1)
+    columns = known[rows].all(axis=0)
+    return real[rows][:, columns], imagined[rows][:, columns]
 
 
 def defined(value: float) -> float | str:

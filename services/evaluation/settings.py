@@ -1,9 +1,9 @@
-"""Flags in; frozen settings of training and of an evaluation run out."""
+"""Settings of training and of an evaluation, from flags and environment."""
 
 import re
 import shlex
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, CliApp
@@ -56,22 +56,41 @@ class ServedWorld(BaseModel):
 
 
 class RunSettings(BaseSettings):
-    """Roll policies out in a real and in imagined worlds.
+    """Roll policies out in a real and in imagined worlds, and score both.
 
-    `scripts` maps a policy name to a store whose robot episodes it replays; the cloned policy and
-    the policy that holds still are always there.
+    A policy of your own is a Python object with act(observation): see docs/rollout_api.md,
+    "Write a policy and score it". The exit status is 1 when a rollout failed; the others count.
     """
 
     model_config = service_config("evaluation_run")
 
-    real: ServedWorld
-    imagined: dict[str, ServedWorld] = Field(min_length=1)
+    real: ServedWorld = Field(description="the world that judges success itself, such as the twin")
+    imagined: dict[str, ServedWorld] = Field(
+        min_length=1, description="worlds to compare with it, by their names in the report"
+    )
     seeds: str = Field(description="FIRST:LAST+1, such as 10000:10010")
-    tasks: tuple[str, ...] = ()
-    scripts: dict[str, str] = {}
-    policy: Path = DEFAULT_POLICY
-    probe: Path = DEFAULT_PROBE
-    num_chunks: int = Field(default=5, ge=1)
+    tasks: tuple[str, ...] = Field(default=(), description="default: all the success probe knows")
+    policy: tuple[str, ...] = Field(
+        default=(), description="policy of your own, [NAME=]MODULE:FACTORY; may be repeated"
+    )
+    policy_arguments: dict[str, dict[str, Any]] = Field(
+        default={}, description="keyword arguments of factories, by the policy's name"
+    )
+    scripts: dict[str, str] = Field(
+        default={}, description="stores whose robot episodes are replayed, by the policy's name"
+    )
+    builtin: tuple[Literal["behaviour-cloning", "hold"], ...] = Field(
+        default=("behaviour-cloning", "hold"),
+        description="policies of ours beside them; [] for none",
+    )
+    cloned_policy: Path = Field(default=DEFAULT_POLICY, description="checkpoint of train-policy")
+    probe: Path = Field(default=DEFAULT_PROBE, description="checkpoint of train-probe")
+    num_steps: int = Field(default=80, ge=4, description="length of a rollout; 15 steps a second")
+    results: Path | None = Field(
+        default=None,
+        description="every rollout is added here as a line of JSON when it ends; default: beside "
+        "the report, as .jsonl",
+    )
     json_path: Path | None = Field(default=None, alias="json", description="write figures here")
     html: Path | None = Field(default=None, description="write a page here")
 
@@ -82,6 +101,11 @@ class RunSettings(BaseSettings):
         if not match or int(match[1]) >= int(match[2]):
             raise ValueError(f"got {text!r}, expected FIRST:LAST+1 such as 10000:10010")
         return text
+
+    def results_path(self) -> Path:
+        """Where rollouts are kept: as asked, beside the report, or in the working folder."""
+        report = self.json_path or self.html or Path("evaluation")
+        return self.results or report.with_suffix(".jsonl")
 
     def seed_range(self) -> range:
         """The seeds."""

@@ -6,6 +6,7 @@ from typing import Any
 from dextouch.clients.policy import Policy
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.episodes import EpisodeStore
+from dextouch.errors import DexTouchError
 from services.cli.demo.models import Models
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
@@ -40,6 +41,9 @@ def judge(
 
     Returns:
         `policies`, `agreement` and the rest, as `report.json` holds them.
+
+    Raises:
+        DexTouchError: a rollout failed.
     """
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
@@ -57,4 +61,10 @@ def judge(
         plan=tasks,
         probe=models.probe,
     )
+    if report.failures:
+        first = report.failures[0]
+        raise DexTouchError(
+            f"{len(report.failures)} of {len(report.rollouts)} rollouts failed, first "
+            f"{first.policy!r} in {first.world!r}: {first.message}"
+        )
     return report.to_report()

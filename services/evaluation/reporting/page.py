@@ -1,8 +1,8 @@
 """A report (what report.json holds) and its pictures in; one HTML file that stands alone out.
 
 Every section is optional: what a run did not do is not on the page. The report may hold
-`about`, `stages`, `errors`, `world_model`, `policies` and `agreement`; unknown keys only appear in
-the raw figures at the end.
+`about`, `stages`, `errors`, `world_model`, `policies`, `agreement` and `failures`; unknown keys
+only appear in the raw figures at the end.
 """
 
 import json
@@ -22,6 +22,7 @@ from services.evaluation.reporting.pictures import ReportPictures
 from services.evaluation.reporting.sections import (
     comparison_bars,
     error_rows,
+    failure_rows,
     figure,
     stage_bars,
     tiles,
@@ -61,6 +62,8 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         action_charts=action_charts(pictures.actions),
         comparisons=comparison_bars(report.get("world_model", {})),
         policies=policy_panels(report),
+        failures=failure_rows(report),
+        num_rollouts=report.get("num_rollouts", 0),
         strips=strips(pictures),
         raw=json.dumps(report, indent=1, default=str, ensure_ascii=False),
     )

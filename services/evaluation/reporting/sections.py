@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 UNDEFINED = "undefined"
@@ -24,6 +24,7 @@ AGREEMENT: tuple[tuple[str, str], ...] = (
     ("bias", "mean of imagined less real"),
     ("mean_absolute_error", "mean absolute error"),
 )
+_FAILURE_FIELDS = ("policy", "world", "error", "message", "traceback")
 # Title, unit, what is better, and the bars: figure and name.
 COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
     (
@@ -114,6 +115,18 @@ class Tile:
     note: str
 
 
+@dataclass(frozen=True)
+class FailureRow:
+    """Rollouts of one policy in one world that failed alike; the message is the first one's."""
+
+    policy: str
+    world: str
+    error: str
+    message: str
+    traceback: str | None
+    count: int = 1
+
+
 def is_number(value: object) -> bool:
     """Whether a figure is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
@@ -176,6 +189,16 @@ def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
             known = (interval[0], interval[1]) if isinstance(interval, list) else None
             found.append(AgreementFigure(name, agreement[key], known))
     return found
+
+
+def failure_rows(report: Mapping[str, Any]) -> list[FailureRow]:
+    """Rollouts that failed, counted by policy, world and class of error."""
+    rows: dict[tuple[str, ...], FailureRow] = {}
+    for entry in report.get("failures", []):
+        row = FailureRow(**{name: entry[name] for name in _FAILURE_FIELDS})
+        key = (row.policy, row.world, row.error)
+        rows[key] = replace(rows[key], count=rows[key].count + 1) if key in rows else row
+    return list(rows.values())
 
 
 def tiles(report: Mapping[str, Any]) -> list[Tile]:

@@ -6,6 +6,8 @@ with RolloutClient("http://127.0.0.1:8100") as client:
             rollout.step(policy.act(rollout.observation))
 """
 
+from contextlib import suppress
+from copy import copy
 from types import TracebackType
 from typing import TypeVar
 from urllib.parse import urlencode
@@ -15,7 +17,7 @@ from jaxtyping import Float64
 from pydantic import BaseModel, ValidationError
 
 from dextouch.clients.http_link import HttpLink, Reply
-from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError
+from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError, UnavailableError
 from dextouch.hands.actions import AnchorPoses, check_actions
 from dextouch.schemas.problems import first_problems
 from dextouch.schemas.rollout_codec import (
@@ -64,10 +66,14 @@ class RolloutClient:
         timeout_s: float = 60.0,
         selector: ReturnSelector = ALL,
     ) -> None:
-        if not selector.tactile:
-            raise InvalidInputError("selector: an Observation holds touch; expected tactile=True")
         self._link = HttpLink(url, api_key=api_key, timeout_s=timeout_s)
-        self._query = _query(selector)
+        self.selector = selector
+
+    def selecting(self, selector: ReturnSelector) -> "RolloutClient":
+        """This client, on the same connection, with another selector for what it starts."""
+        other = copy(self)
+        other.selector = selector
+        return other
 
     def worlds(self) -> list[WorldDescription]:
         """What can be rolled out there."""
@@ -100,9 +106,10 @@ class RolloutClient:
         )
         observation, anchor, K_head = (None, None, None) if init is None else init
         start = RolloutStart(task, seed, instruction, action_kind, observation, anchor, K_head)
+        query = _query(self.selector)
         reply = self._link.request(
             "POST",
-            f"/v1/rollouts?{self._query}",
+            f"/v1/rollouts?{query}",
             body=encode_start(request, start),
             content_type=MSGPACK,
             accept=MSGPACK,
@@ -110,7 +117,7 @@ class RolloutClient:
         answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
         if answer.origin is None:
             raise UnavailableError("start: the answer holds no anchor; is the service too old?")
-        return Rollout(self._link, self._query, answer, answer.origin)
+        return Rollout(self._link, query, answer, answer.origin)
 
     def close(self) -> None:
         """Close the connection; rollouts stay at the service until closed or expired."""
@@ -203,7 +210,12 @@ class Rollout:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self.close()
+        if error is None:
+            self.close()
+            return
+        # What went wrong inside matters more than that this cannot be ended either.
+        with suppress(DexTouchError):
+            self.close()
 
 
 def _start_request(**fields: object) -> StartRequest:
@@ -214,6 +226,8 @@ def _start_request(**fields: object) -> StartRequest:
 
 
 def _query(selector: ReturnSelector) -> str:
+    if not selector.tactile:
+        raise InvalidInputError("selector: an Observation holds touch; expected tactile=True")
     cameras = [] if selector.cameras is None else [("cameras", name) for name in selector.cameras]
     return urlencode([("steps", selector.steps), *cameras])
 

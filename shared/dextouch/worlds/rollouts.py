@@ -92,8 +92,11 @@ class RolloutService:
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def worlds(self) -> list[WorldDescription]:
-        """What can be asked for."""
-        return [worker.world.description for worker in self._workers.values()]
+        """What can be asked for, by the names that starts take."""
+        return [
+            worker.world.description.model_copy(update={"name": name})
+            for name, worker in self._workers.items()
+        ]
 
     async def ping(self) -> None:
         """Raise UnavailableError when the store cannot be reached."""

@@ -90,6 +90,34 @@ def test_the_selector_sends_less(url):
     assert set(seen.images) == {CAMERAS[0]}
 
 
+def test_another_selector_on_the_same_connection(client):
+    narrow = client.selecting(ReturnSelector(cameras=(CAMERAS[1],), steps="last"))
+    with narrow.start(world="sum", **ASKED) as rollout:
+        assert set(rollout.step(actions(8)).images) == {CAMERAS[1]}
+    with client.start(world="sum", **ASKED) as rollout:
+        assert set(rollout.step(actions(8)).images) == set(CAMERAS)
+    with pytest.raises(InvalidInputError, match="tactile=True"):
+        client.selecting(ReturnSelector(tactile=False)).start(world="sum", **ASKED)
+
+
+def test_worlds_are_listed_by_the_names_that_starts_take():
+    app = create_world_app({"world_model": SumWorld(name="tiny")}, WorldServiceSettings())
+    with served(app) as address, RolloutClient(address) as client:
+        (world,) = client.worlds()
+        client.start(world=world.name, **ASKED).close()
+
+
+def test_an_error_inside_is_not_hidden_by_one_of_closing(client, monkeypatch):
+    rollout = client.start(world="sum", **ASKED)
+    monkeypatch.setattr(rollout, "close", lambda: (_ for _ in ()).throw(UnavailableError("gone")))
+    with pytest.raises(ZeroDivisionError), rollout:
+        raise ZeroDivisionError
+    with pytest.raises(UnavailableError), rollout:
+        pass
+    monkeypatch.undo()
+    rollout.close()
+
+
 def test_a_branch_shares_the_past_and_goes_its_own_way(client):
     with client.start(world="sum", **ASKED) as rollout:
         rollout.step(actions(4))

@@ -29,12 +29,16 @@ class Forgetful(toy.ToyWorld):
 @pytest.fixture(scope="module")
 def client():
     judge = toy.ToyWorld("judge", judge=True)
+    wide_judge = toy.ToyWorld("wide judge", judge=True, cameras=toy.TWO_CAMERAS)
     worlds = {
         "judge": judge,
         "dream": toy.ToyWorld("dream", judge=False),
         "nightmare": toy.ToyWorld("nightmare", judge=False, drift_m=0.05),
         "forgetful": Forgetful("forgetful", judge=True),
         "copy-first": CopyFirstWorld.beside(judge.description),
+        "wide": toy.ToyWorld("wide", judge=False, cameras=toy.TWO_CAMERAS),
+        "wide judge": wide_judge,
+        "wide copy-first": CopyFirstWorld.beside(wide_judge.description),
     }
     with served(create_world_app(worlds, WorldServiceSettings())) as url, RolloutClient(url) as it:
         yield it
@@ -124,13 +128,112 @@ def test_training_starts_are_refused(client, probe, policies, demonstrations):
         evaluate(plan=plan, **asked)
 
 
-def test_a_real_world_must_repeat_itself_and_judge(client, probe):
-    asked = {"imagined": addresses(client, "dream"), "policies": {"h": HoldPolicy()}}
-    plan = EvaluationPlan(toy.INSTRUCTIONS, [2000], num_chunks=1)
-    with pytest.raises(ConflictError, match="began differently"):
-        evaluate(real=WorldAddress(client, "forgetful"), plan=plan, probe=probe, **asked)
-    with pytest.raises(InvalidInputError):
-        evaluate(real=WorldAddress(client, "dream"), plan=plan, probe=probe, **asked)
+def test_a_real_world_that_does_not_repeat_itself_has_no_scores(client, probe):
+    found = evaluate(
+        real=WorldAddress(client, "forgetful"),
+        imagined=addresses(client, "dream"),
+        policies={"h": HoldPolicy()},
+        plan=EvaluationPlan({"reach": ""}, [2000], num_steps=16),
+        probe=probe,
+    )
+    assert [failure.world for failure in found.failures] == ["real"]
+    assert "began differently" in found.failures[0].message
+    assert found.to_report()["policies"][0]["real"] == "undefined"
+
+
+@pytest.mark.parametrize(
+    ("real", "imagined", "num_steps", "message"),
+    [
+        ("dream", "dream", 16, "does not judge success"),
+        ("judge", "judge", 16, "begins from task_seed"),
+        ("judge", "wide", 16, "camera_wrist_left"),
+        ("judge", "dream", 18, "multiple of 4"),
+    ],
+)
+def test_worlds_that_do_not_fit_are_refused_before_the_first_rollout(
+    client, probe, real, imagined, num_steps, message
+):
+    kept = []
+    with pytest.raises(InvalidInputError, match=message):
+        evaluate(
+            real=WorldAddress(client, real),
+            imagined=addresses(client, imagined),
+            policies={"h": HoldPolicy()},
+            plan=EvaluationPlan(toy.INSTRUCTIONS, [2000], num_steps=num_steps),
+            probe=probe,
+            keep=kept.append,
+        )
+    assert kept == []
+
+
+class Watching(HoldPolicy):
+    """Notes what it is shown."""
+
+    def reset(self, start):
+        super().reset(start)
+        self.seen = getattr(self, "seen", [])
+
+    def act(self, observation):
+        self.seen.append((len(observation), set(observation.images)))
+        return super().act(observation)
+
+
+def test_cameras_are_those_that_every_world_has(client, probe):
+    """The real world shows more than the model knows; the baseline beside it wants all of it."""
+    policy = Watching(chunk_steps=12)
+    found = evaluate(
+        real=WorldAddress(client, "wide judge"),
+        imagined=addresses(client, "dream", "wide copy-first"),
+        policies={"hold": policy},
+        plan=EvaluationPlan({"reach": ""}, [2000], num_steps=32),
+        probe=probe,
+    )
+    assert found.failures == ()
+    assert len(found.scores) == 3
+    # 12 + 12 + 8 steps: the last chunk is cut, so that all policies act equally long.
+    assert policy.seen == [(1, {"camera_head"}), (12, {"camera_head"}), (12, {"camera_head"})] * 3
+
+
+class Fragile(HoldPolicy):
+    """Falls over in one task and seed, in its second chunk."""
+
+    def reset(self, start):
+        super().reset(start)
+        self.fragile = (start.task, start.seed) == ("reach", 2001)
+
+    def act(self, observation):
+        if self.fragile and observation.first_step:
+            raise ZeroDivisionError("no idea")
+        return super().act(observation)
+
+
+def test_a_failing_rollout_is_a_row_and_the_rest_goes_on(client, probe):
+    kept = []
+    report = evaluate(
+        real=WorldAddress(client, "judge"),
+        imagined=addresses(client, "dream"),
+        policies={"fragile": Fragile(), "hold": HoldPolicy()},
+        plan=EvaluationPlan(toy.INSTRUCTIONS, SEEDS, num_steps=32),
+        probe=probe,
+        keep=kept.append,
+    )
+    assert len(kept) == 2 * 2 * 2 * len(SEEDS)
+    assert [(f.policy, f.task, f.seed, f.world) for f in report.failures] == [
+        ("fragile", "reach", 2001, "real"),
+        ("fragile", "reach", 2001, "dream"),
+    ]
+    failure = report.failures[0]
+    assert failure.message == (
+        "policy 'fragile', task 'reach', seed 2001, chunk 1: act raised ZeroDivisionError: no idea"
+    )
+    assert 'raise ZeroDivisionError("no idea")' in failure.traceback
+    assert "asking.py" not in failure.traceback
+    whole = report.to_report()
+    row = next(r for r in whole["policies"] if (r["policy"], r["task"]) == ("fragile", "reach"))
+    assert (row["real_rollouts"], row["real_failed"]) == (len(SEEDS) - 1, 1)
+    # Agreement is of starts that every policy ended in both worlds.
+    assert whole["agreement"]["reach"]["num_starts"] == len(SEEDS) - 1
+    assert whole["agreement"]["reach far"]["num_starts"] == len(SEEDS)
 
 
 def test_nothing_to_evaluate_and_unknown_worlds_are_refused(client, probe):
@@ -143,6 +246,6 @@ def test_nothing_to_evaluate_and_unknown_worlds_are_refused(client, probe):
             real=real,
             imagined=addresses(client, "atlantis"),
             policies={"hold": HoldPolicy()},
-            plan=EvaluationPlan({"reach": ""}, [2000], num_chunks=1),
+            plan=EvaluationPlan({"reach": ""}, [2000], num_steps=16),
             probe=probe,
         )

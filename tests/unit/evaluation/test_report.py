@@ -136,6 +136,17 @@ def test_agreement_counts_ties_and_says_what_it_means(tmp_path):
     assert "pearson_interval" not in words
 
 
+def test_failed_rollouts_are_counted_by_kind(tmp_path):
+    failure = {"policy": "mine", "world": "real", "task": "t", "error": "InvalidInputError",
+               "message": "act raised <ValueError>", "traceback": None}  # fmt: skip
+    failures = [{**failure, "seed": seed} for seed in range(3)]
+    text, _ = page(tmp_path, {"failures": failures, "num_rollouts": 12})
+    shown = text.split("<details")[0]
+    assert "3 of 12 rollouts" in shown
+    assert "act raised &lt;ValueError&gt;" in shown
+    assert shown.count("<td>mine</td>") == 1
+
+
 def test_raw_figures_come_along(tmp_path):
     report = {k: v for k, v in REPORT.items() if k in {"stages", "world_model"}}
     text, _ = page(tmp_path, report)

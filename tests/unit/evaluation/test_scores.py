@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.evaluation.scores import ClosedLoopReport, RolloutScore
+from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 
 
 def report(outcomes: dict[str, dict[str, str]]) -> ClosedLoopReport:
@@ -109,3 +109,43 @@ def test_different_starts_are_not_compared():
     moved = [replace(s, start_digest="another") if s.policy == "c" else s for s in whole.scores]
     with pytest.raises(InvalidInputError, match="different starts"):
         ClosedLoopReport(tuple(moved), whole.imagined_worlds, whole.policies).agreement("model")
+
+
+def test_failed_rollouts_are_missing_not_failures_of_the_policy():
+    whole = report(GOOD)
+
+    def gone(score):  # Policy b fails from start 1 in the model, policy c from every start there.
+        return score.world == "model" and (
+            (score.policy, score.seed) == ("b", 1) or score.policy == "c"
+        )
+
+    failures = tuple(
+        RolloutFailure(s.world, s.policy, s.task, s.seed, "UnavailableError", "gone")
+        for s in whole.scores
+        if gone(s)
+    )
+    kept = tuple(s for s in whole.scores if not gone(s))
+    found = ClosedLoopReport(kept, whole.imagined_worlds, whole.policies, failures).to_report()
+    a, b, c = found["policies"]
+    assert (a["imagined"], a["imagined_rollouts"], a["imagined_failed"]) == (0.75, 4, 0)
+    assert (b["imagined"], b["imagined_rollouts"], b["imagined_failed"]) == (2 / 3, 3, 1)
+    assert (c["imagined"], c["imagined_rollouts"], c["imagined_failed"]) == ("undefined", 0, 4)
+    # Left are policies a and b from starts 0, 2 and 3: real 1 and 1/3, imagined 2/3 and 2/3.
+    agreement = found["agreement"]["stand"]
+    assert (agreement["num_policies"], agreement["num_starts"]) == (2, 3)
+    assert agreement["bias"] == pytest.approx((2 / 3 + 2 / 3 - 1 - 1 / 3) / 2)
+    assert found["num_rollouts"] == 36
+    assert len(found["failures"]) == 5
+    json.dumps(found, allow_nan=False)
+
+
+def test_without_a_common_start_there_is_no_agreement():
+    whole = report(GOOD)
+    failures = tuple(
+        RolloutFailure(s.world, s.policy, s.task, s.seed, "UnavailableError", "gone")
+        for s in whole.scores
+    )
+    found = ClosedLoopReport((), whole.imagined_worlds, whole.policies, failures).to_report()
+    assert found["agreement"]["stand"]["pearson"] == "undefined"
+    assert found["agreement"]["stand"]["num_starts"] == 0
+    assert found["probe_accuracy_on_real"] == "undefined"

@@ -21,6 +21,7 @@ STEPS = 81
 TASKS = ("reach", "reach far")
 INSTRUCTIONS = {"reach": "Touch the red spot.", "reach far": "Touch the far red spot."}
 REACHED_M = 0.02
+TWO_CAMERAS = ("camera_head", "camera_wrist_left")
 K_HEAD = np.array([[40.0, 0, 16], [0, 40.0, 16], [0, 0, 1]])
 ANCHOR = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 
@@ -90,7 +91,14 @@ class ToyWorld:
     `drift_m` moves the hand away from where it was sent: an imperfect imagination.
     """
 
-    def __init__(self, name: str, *, judge: bool, drift_m: float = 0.0) -> None:
+    def __init__(
+        self,
+        name: str,
+        *,
+        judge: bool,
+        drift_m: float = 0.0,
+        cameras: tuple[str, ...] = ("camera_head",),
+    ) -> None:
         self.judge = judge
         self.drift_m = drift_m
         self.description = WorldDescription(
@@ -98,7 +106,7 @@ class ToyWorld:
             kind="twin" if judge else "model",
             digest=f"{name}-digest",
             tasks=TASKS,
-            cameras=("camera_head",),
+            cameras=cameras,
             image_height_px=SIZE,
             image_width_px=SIZE,
             model_rate_hz=15.0,
@@ -127,7 +135,9 @@ class ToyWorld:
         success = bool(np.linalg.norm(hands[-1] - target) < REACHED_M)
         return Observation(
             first_step=first_step,
-            images={"camera_head": np.stack([image(hand, target) for hand in hands])},
+            images=dict.fromkeys(
+                self.description.cameras, np.stack([image(hand, target) for hand in hands])
+            ),
             tactile_kpa=np.stack([touch(hand, target) for hand in hands]),
             action_reached=np.stack([action(hand) for hand in hands]),
             reached_is_measured=self.judge,

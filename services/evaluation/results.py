@@ -1,0 +1,39 @@
+"""Append-only file of results: one JSON object a line for every rollout, as soon as it ended."""
+
+import json
+from dataclasses import asdict
+from datetime import UTC, datetime
+from pathlib import Path
+
+from dextouch.errors import StorageError
+from services.evaluation.scores import RolloutFailure, RolloutScore
+
+
+class ResultLog:
+    """Keeps rollouts one by one, so that a study that is broken off keeps what it has.
+
+    Rows of an earlier study stay; `study`, the time this one began, tells them apart.
+
+    Args:
+        path: of the file; it and its folder are created with the first row.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._study = datetime.now(UTC).isoformat(timespec="milliseconds")
+
+    def keep(self, outcome: RolloutScore | RolloutFailure) -> None:
+        """Write one row.
+
+        Raises:
+            StorageError: the file cannot be written.
+        """
+        row = {"study": self._study, **asdict(outcome)}
+        try:
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            with self.path.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row, allow_nan=False) + "\n")
+        except OSError as error:
+            raise StorageError(
+                f"results {self.path}: cannot be written ({error}); choose another --results"
+            ) from error

@@ -1,0 +1,114 @@
+"""The worlds of one evaluation: where they are served, and whether they fit each other."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from dextouch.clients.rollouts import RolloutClient
+from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.schemas.rollouts import WorldDescription
+from services.evaluation.demonstrations import CAMERA
+from services.evaluation.scores import REAL
+
+
+@dataclass(frozen=True)
+class WorldAddress:
+    """Where a world is served, and what it is called there."""
+
+    client: RolloutClient
+    world: str
+
+
+@dataclass(frozen=True)
+class StudyWorlds:
+    """The real world, as `real`, and the imagined ones, by their names in the report."""
+
+    addresses: Mapping[str, WorldAddress]
+    descriptions: Mapping[str, WorldDescription]
+
+    @classmethod
+    def ask(cls, real: WorldAddress, imagined: Mapping[str, WorldAddress]) -> "StudyWorlds":
+        """Ask every service what its world is.
+
+        Raises:
+            UnavailableError: a service does not answer.
+            UnknownNameError: a service without a world of this name.
+            InvalidInputError: an imagined world with the name of the real one.
+        """
+        if REAL in imagined:
+            raise InvalidInputError(f"imagined world {REAL!r}: that is the real one; rename it")
+        addresses = {REAL: real, **imagined}
+        described = {name: _description(address) for name, address in addresses.items()}
+        return cls(addresses, described)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Cameras that every world has: what policies see."""
+        others = [set(one.cameras) for one in self.descriptions.values()]
+        return tuple(
+            camera
+            for camera in self.descriptions[REAL].cameras
+            if all(camera in cameras for cameras in others)
+        )
+
+    def check(self, tasks: Sequence[str], num_steps: int, image_size_px: int) -> None:
+        """Refuse worlds that cannot take part, before the first rollout.
+
+        Raises:
+            UnknownNameError: a task that a world does not have.
+            InvalidInputError: a real world that does not know success or does not begin from task
+                and seed, an imagined one that does not begin from its observations, images of
+                another size than the success probe's, or a length that is no multiple of a
+                world's chunk.
+        """
+        real = self.descriptions[REAL]
+        if not real.knows_success or "task_seed" not in real.starts_from:
+            raise InvalidInputError(
+                f"real world {real.name!r}: it does not judge success or does not begin from a "
+                "task and seed; expected a world that does both, such as the twin"
+            )
+        if CAMERA not in real.cameras:
+            raise UnknownNameError("camera of the real world", CAMERA, list(real.cameras))
+        for name, world in self.descriptions.items():
+            for task in tasks:
+                if task not in world.tasks:
+                    raise UnknownNameError(f"task of world {name!r}", task, list(world.tasks))
+            if num_steps < 1 or num_steps % world.chunk_multiple:
+                raise InvalidInputError(
+                    f"num_steps: got {num_steps}, expected a multiple of {world.chunk_multiple}, "
+                    f"the chunk of world {name!r}"
+                )
+            size = (world.image_height_px, world.image_width_px)
+            if size != (image_size_px, image_size_px):
+                raise InvalidInputError(
+                    f"world {name!r}: got images of {size[0]}x{size[1]} px, expected "
+                    f"{image_size_px}x{image_size_px} px as the success probe was trained on"
+                )
+            if name != REAL:
+                _check_imagined(name, world, real)
+
+
+def _check_imagined(name: str, world: WorldDescription, real: WorldDescription) -> None:
+    if "observation" not in world.starts_from:
+        raise InvalidInputError(
+            f"imagined world {name!r}: it begins from {', '.join(world.starts_from)}; expected one "
+            "that begins from an observation of the real world"
+        )
+    missing = [camera for camera in world.cameras if camera not in real.cameras]
+    if missing or CAMERA not in world.cameras:
+        raise InvalidInputError(
+            f"imagined world {name!r}: got cameras {', '.join(world.cameras)}, expected "
+            f"{CAMERA} and only cameras of the real world ({', '.join(real.cameras)}), which its "
+            "first images come from"
+        )
+    if world.model_rate_hz != real.model_rate_hz:
+        raise InvalidInputError(
+            f"imagined world {name!r}: got steps at {world.model_rate_hz:g} Hz, expected "
+            f"{real.model_rate_hz:g} Hz as in the real world"
+        )
+
+
+def _description(address: WorldAddress) -> WorldDescription:
+    described = {world.name: world for world in address.client.worlds()}
+    if address.world not in described:
+        raise UnknownNameError("world", address.world, list(described))
+    return described[address.world]
