@@ -18,8 +18,9 @@ from queue import SimpleQueue
 from tests.mutants.bugs import ROOT, PlantedBug, planted_bugs
 
 MIN_KILLED = 0.9
-# CPU seconds; a bug that makes its tests run longer counts as noticed.
+# A bug that makes its tests run for longer, or wait for ever, counts as noticed.
 MAX_CPU_S = 600
+MAX_WALL_S = 1800
 
 
 def copy_of_repository(folder: Path) -> Path:
@@ -49,9 +50,13 @@ def run_tests(copy: Path, tests: Iterable[str]) -> tuple[bool, str]:
     }
     command = [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", *tests]
     limited = ["sh", "-c", f'ulimit -t {MAX_CPU_S}; exec "$@"', "sh", *command]
-    done = subprocess.run(
-        limited, cwd=copy, env=environment, capture_output=True, text=True, check=False
-    )
+    try:
+        done = subprocess.run(
+            limited, cwd=copy, env=environment, capture_output=True, text=True, check=False,
+            timeout=MAX_WALL_S,
+        )  # fmt: skip
+    except subprocess.TimeoutExpired:
+        return False, f"no end after {MAX_WALL_S} s"
     return done.returncode == 0, "\n".join(done.stdout.splitlines()[-12:])
 
 
