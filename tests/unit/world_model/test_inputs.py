@@ -181,6 +181,8 @@ def _with(request, **changes):
         ({(2, 5): np.inf}, NonFiniteError),
         ({(3, 1): 5.0}, InvalidInputError),
         ({(3, 1): 1e300}, InvalidInputError),
+        ({(3, 11): -5.0}, InvalidInputError),
+        ({(4, 40): -50.0}, InvalidInputError),
         ({(4, 20): 50.0}, InvalidInputError),
         ({(4, c): 0.0 for c in range(3, 9)}, DegenerateRotationError),
         ({(4, 6): 1.0, (4, 7): 0.0, (4, 3): 1.0, (4, 4): 0.0, (4, 5): 0.0, (4, 8): 0.0},
