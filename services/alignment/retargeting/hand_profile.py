@@ -21,6 +21,8 @@ INDEX_PROXIMAL_RANGE_M = (0.025, 0.060)
 BONE_RANGE_M = (0.003, 0.150)
 _INDEX_FINGER = CHAINS.index("index")
 NUM_COLUMNS = 9
+# A person's knuckles turn in place (0), the robot's travel with its flexion axes (1).
+RIGID_TRAVEL = 0.5
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,15 @@ class HandProfile:
                 f"hand profile: bones {np.round(self.bone_m, 4).tolist()}, "
                 f"expected {low} … {high} m"
             )
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether this is the robot's own hand (or a copy), whose bones and knuckles hold exactly.
+
+        People's tracked bones and knuckles shift by millimetres with the posture; to hold them
+        fixed would bend fingers that are straight.
+        """
+        return bool(np.median(self.travel) >= RIGID_TRAVEL)
 
     def to_rows(self) -> Float64[np.ndarray, "5 9"]:
         """As a matrix for a recording's calibration.

@@ -76,9 +76,6 @@ class RetargetOptions:
         record["posture_weight_m2"] = self.posture_weight_m2
         record["reacquire_after_s"] = self.reacquire_after_s
         record["num_starts"] = self.num_starts
-        record["bone_tolerance"] = BONE_TOLERANCE
-        record["bone_tolerance_m"] = BONE_TOLERANCE_M
-        record["knuckle_tolerance_m"] = KNUCKLE_TOLERANCE_M
         record["max_bend_cosine"] = MAX_BEND_COSINE
         record["keeps_fingers_apart"] = self.keeps_fingers_apart
         return record
@@ -88,11 +85,5 @@ PINCH_WEIGHT_FAR = 1e-3
 # Beyond, products of weights and distances drown what the points say.
 MAX_WEIGHT = 1e6
 LEAST = 1e-6
-# A bone that differs from the person's by more than both is an error of the tracker.
-BONE_TOLERANCE = 0.3
-BONE_TOLERANCE_M = 0.008
-# So is a knuckle that lies further than this from its place in the wrist frame; neighbours are
-# 16 mm or more apart.
-KNUCKLE_TOLERANCE_M = 0.012
-# And two bones in a row bent by more than 140°; hands and robot stop at 120°.
+# Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
 MAX_BEND_COSINE = -0.766

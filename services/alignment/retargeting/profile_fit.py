@@ -33,11 +33,26 @@ from services.alignment.retargeting.solver.samples import retarget_samples
 NUM_SAMPLES = 240
 # Below this a tracker's noise makes no difference, and ratios of zeros would come up (metres).
 LEAST_SIGMA_M = 1e-4
+# A knuckle's spread is the difference of two variances, each known to some 8 % from 240 samples:
+# less than this share of the tracker's noise cannot be told from none.
+LEAST_SIGMA_SHARE = 0.3
+# Standard deviations within which 95 of 100 points of a normal distribution in space lie.
+CHI_95 = 2.7955
+LEAST_KNUCKLE_SIGMA_M = 1e-5
 # A robot's knuckle that moved less than this (RMS, metres) tells nothing about its travel.
 LEAST_TRAVEL_M = 1e-3
 UNKNOWN_FREEDOM = 1e6
 # Of a robot's finger; shorter is none.
 LEAST_BONE_M = 1e-6
+# A bone that differs from the person's by more than all of these is an error of the tracker: a part
+# of its length, a distance, and so many standard deviations of the tracker's noise.
+BONE_TOLERANCE = 0.3
+BONE_TOLERANCE_M = 0.008
+BONE_SIGMAS = 5.0
+# So is a knuckle that lies so many standard deviations from its place in the wrist frame, but no
+# nearer and no further than this; neighbours are 16 mm or more apart.
+KNUCKLE_SIGMAS = 3.5
+KNUCKLE_TOLERANCE_M = (0.012, 0.015)
 # Samples that lie seconds apart: no pinches, no pull.
 EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
 
@@ -60,6 +75,7 @@ def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
     record = np.zeros(1, dtype=PERSON)
     rows, num = chains_of(hand), len(hand.fingers)
     record["is_known"] = True
+    record["is_rigid"] = profile.is_rigid
     own_m, bone_m = robot_bone_m(hand), profile.bone_m[rows].copy()
     for finger, bone in zip(*np.nonzero(own_m[:, :2] < LEAST_BONE_M), strict=True):
         # Two bones of the person in a row are one of the robot's.
@@ -69,7 +85,15 @@ def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
     record["bone_scale"][0, :num] = bone_m / np.maximum(own_m, LEAST_BONE_M)
     record["knuckle_m"][0, :num] = profile.knuckle_m[rows]
     record["travel"][0, :num] = profile.travel[rows]
-    record["freedom"][0, :num] = (profile.knuckle_sigma_m[rows] / sigma_m) ** 2
+    record["freedom"][0, :num] = (
+        (profile.knuckle_sigma_m[rows] / sigma_m) ** 2 if profile.is_rigid else UNKNOWN_FREEDOM
+    )
+    noise_m = BONE_SIGMAS * np.sqrt(2) * profile.point_sigma_m
+    record["bone_tolerance_m"][0, :num] = np.maximum(
+        BONE_TOLERANCE * bone_m, max(BONE_TOLERANCE_M, noise_m)
+    )
+    spread_m = KNUCKLE_SIGMAS * np.hypot(profile.knuckle_sigma_m[rows], profile.point_sigma_m)
+    record["knuckle_tolerance_m"][0, :num] = np.clip(spread_m, *KNUCKLE_TOLERANCE_M)
     return record
 
 
@@ -117,7 +141,8 @@ def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
         knuckle_m[finger], travel[finger], left_m = _fit_knuckle(
             points.points_m[rows][kept, finger, 0], moved_m[kept, finger]
         )
-        sigma_m[finger] = np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0))
+        least_m = max(LEAST_KNUCKLE_SIGMA_M, LEAST_SIGMA_SHARE * point_sigma_m)
+        sigma_m[finger] = max(np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0)), least_m)
     return HandProfile(bone_m, knuckle_m, travel, sigma_m, point_sigma_m)
 
 
@@ -191,5 +216,7 @@ def _fit_knuckle(
         travel = min(max(travel, 0.0), 1.0)
     places = seen_m - travel * moved_m
     place = np.median(places, axis=0)
-    left_m = float(1.4826 * np.median(np.abs(places - place)))
+    # By the worst twentieth, not the middle: people's knuckles are off most in a fist.
+    off_m = np.linalg.norm(places - place, axis=1)
+    left_m = float(np.percentile(off_m, 95)) / CHI_95
     return place, travel, left_m

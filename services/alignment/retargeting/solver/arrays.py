@@ -54,8 +54,10 @@ HAND: Final = np.dtype(
 # The tracked hand; see `HandProfile`.
 PERSON: Final = np.dtype(
     [
-        # False: bones are those of each sample, and nothing is known of knuckles.
+        # False: no bones or knuckles to compare a sample with.
         ("is_known", np.bool_),
+        # False: bones are those of each sample as far as they are seen, and knuckles are free.
+        ("is_rigid", np.bool_),
         # PIP, DIP and tip from the point before; and that by the robot's.
         ("bone_m", np.float64, (_F, 3)),
         ("bone_scale", np.float64, (_F, 3)),
@@ -64,6 +66,9 @@ PERSON: Final = np.dtype(
         ("travel", np.float64, (_F,)),
         # Variance of the knuckle by variance of a measured point.
         ("freedom", np.float64, (_F,)),
+        # Further off, bones and knuckles are not this person's.
+        ("bone_tolerance_m", np.float64, (_F, 3)),
+        ("knuckle_tolerance_m", np.float64, (_F,)),
     ]
 )
 
@@ -82,9 +87,6 @@ TUNING: Final = np.dtype(
         ("posture_weight_m2", np.float64),
         ("reacquire_after_s", np.float64),
         ("num_starts", np.int64),
-        ("bone_tolerance", np.float64),
-        ("bone_tolerance_m", np.float64),
-        ("knuckle_tolerance_m", np.float64),
         ("max_bend_cosine", np.float64),
         ("keeps_fingers_apart", np.bool_),
     ]

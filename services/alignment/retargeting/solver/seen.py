@@ -64,12 +64,11 @@ def see_finger(hand, person, tuning, work, finger, memory):
         length = np.sqrt(squared)
         known = person.bone_m[finger, bone]
         if person.is_known:
-            allowed = max(tuning.bone_tolerance * known, tuning.bone_tolerance_m)
-            if abs(length - known) > allowed:
+            if abs(length - known) > person.bone_tolerance_m[finger, bone]:
                 return IMPLAUSIBLE
         elif not 0.003 <= length <= 0.150:
             return IMPLAUSIBLE
-        else:
+        if not person.is_rigid:
             work.scale[finger, bone] *= length / known
         if length > 0.0:
             for k in range(3):
@@ -82,7 +81,7 @@ def see_finger(hand, person, tuning, work, finger, memory):
             return IMPLAUSIBLE
     if person.is_known and usable[0]:
         error_m = knuckle_error_m(hand, person, tuning, work, finger, memory)
-        if error_m > tuning.knuckle_tolerance_m:
+        if error_m > person.knuckle_tolerance_m[finger]:
             return IMPLAUSIBLE
     return SOLVED if is_whole else PARTIAL
 
