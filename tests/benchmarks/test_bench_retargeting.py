@@ -19,9 +19,17 @@ from dextouch.errors import (
 from dextouch.hands.robot_hand import RobotHand
 from services.cli.bench.command import stage_parser
 from services.cli.bench.figures import Figure
-from services.cli.bench.retargeting import rival_process, rivals, stage
+from services.cli.bench.retargeting import compare, rival_process, rivals, stage
 from services.cli.bench.retargeting.acceptance import requirements, velocity_limit_deg, worst_ratio
-from services.cli.bench.retargeting.compare import PINCH_INPUT, ROBOT_INPUT, Speed, scale_of
+from services.cli.bench.retargeting.compare import (
+    PINCH_INPUT,
+    ROBOT_INPUT,
+    Effort,
+    Speed,
+    compare_robot,
+    compare_speed,
+    scale_of,
+)
 from services.cli.bench.retargeting.hand_urdf import hand_urdf, roll_pitch_yaw
 from services.cli.bench.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
 from services.cli.bench.retargeting.pinches import people, pinch_motion
@@ -30,6 +38,7 @@ from services.cli.bench.retargeting.rivals import RIVALS
 from services.cli.bench.retargeting.robustness import faulty_motions, try_faults
 from services.cli.bench.retargeting.scores import PinchScore, RobotScore, score_robot
 from services.cli.bench.retargeting.sequences import cold_postures, robot_motion
+from services.cli.bench.retargeting.tables import tables
 
 SIDES = ("left", "right")
 DEX = RIVALS["dex vector15"]
@@ -143,16 +152,24 @@ def test_a_rivals_joints_are_put_in_order_by_name(monkeypatch, tmp_path):
     assert [sorted(names)[int(value)] for value in joints[2]] == names
 
 
-def test_no_alarm_is_left_by_a_refusal():
+def test_the_alarm_counts_processor_time_and_is_not_left_behind():
+    found = []
+
     def solve(_):
+        found.append(
+            (signal.getitimer(signal.ITIMER_PROF)[0], signal.getitimer(signal.ITIMER_REAL))
+        )
         raise ValueError("not this one")
 
     try:
         with pytest.raises(ValueError, match="not this one"):
             rival_process.follow(rivals.Setup([np.zeros(45)], solve, []))
-        assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+        assert signal.getitimer(signal.ITIMER_PROF) == (0.0, 0.0)
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
+    # A busy machine takes any time on the wall.
+    assert found[0][0] == pytest.approx(rival_process.CALL_LIMIT_S, abs=1.0)
+    assert found[0][1] == (0.0, 0.0)
 
 
 CHILD = """
@@ -199,6 +216,32 @@ def test_a_rival_that_refuses_hangs_or_dies_does_not_end_the_run(monkeypatch):
         assert (process.run(motion, 1.0).joints_rad == 0.5).all()
         with pytest.raises(UnavailableError, match="status 5"):
             process.run(faulty[3.0], 1.0)
+
+
+def test_a_rival_that_does_not_finish_is_a_row(monkeypatch):
+    begin = subprocess.Popen
+    # It takes its time at the first sample of all.
+    child_text = CHILD.replace("while reference[0, 0] == 2.0:", "while True:").replace(
+        "1.0\n", "0.2\n"
+    )
+
+    def child(command, **pipes):
+        return begin([sys.executable, "-c", child_text, command[-1]], **pipes)
+
+    monkeypatch.setattr(rival_process.subprocess, "Popen", child)
+    motion = robot_motion("right", 30, 0, natural=True)
+    sets = {"natural range": [motion]}
+    monkeypatch.setattr(compare, "_timed_motions", lambda name, effort: [motion])
+    with RivalProcess(DEX) as process:
+        processes = {DEX.name: process}
+        scores = compare_robot(sets, processes, no_bar)
+        timed = compare_speed(Effort(1, 30, 1, 1, 1, 0), processes, no_bar)
+    assert list(scores["natural range"]) == [OURS, OURS_EXACT]
+    assert {one.method for one in timed} == {OURS, OURS_LIVE}
+    shown = tables(timed, scores, {}, ColdStart(1, 1, 1), [], [DEX.name])
+    assert [table.rows[-1][:2] for table in shown[:4]] == [(DEX.name, "did not finish")] * 4
+    assert all(len(row) == len(table.columns) for table in shown for row in table.rows)
+    assert worst_ratio(timed, OURS, DEX.name) is None
 
 
 @pytest.mark.parametrize("name", RIVALS)

@@ -1,13 +1,18 @@
-"""Motions and methods in; errors of each on the same motions, and times taken in turns, out."""
+"""Errors of every method on the same motions, and times taken in turns.
+
+A rival that does not finish has no score or speed; what the others measured stays.
+"""
 
 import gc
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
 
+from dextouch.errors import LimitExceededError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_retargeter import warm_up
@@ -103,8 +108,9 @@ def compare_robot(sets: Mapping[str, Sequence[Motion]], rivals: Rivals, bar: Bar
         for set_name, motions in sets.items():
             for name in names:
                 step(f"{set_name}, {name}")
-                answers = [_answer(name, motion, rivals) for motion in motions]
-                scores[set_name][name] = score_robot(motions, answers)
+                with suppress(LimitExceededError):
+                    answers = [_answer(name, motion, rivals) for motion in motions]
+                    scores[set_name][name] = score_robot(motions, answers)
     return scores
 
 
@@ -117,8 +123,9 @@ def compare_pinches(
     with bar("pinches", len(names)) as step:
         for name in names:
             step(name)
-            answers = [_answer(name, motion, rivals) for motion in motions]
-            scores[name] = score_pinches(motions, answers)
+            with suppress(LimitExceededError):
+                answers = [_answer(name, motion, rivals) for motion in motions]
+                scores[name] = score_pinches(motions, answers)
     return scores
 
 
@@ -139,7 +146,9 @@ def compare_speed(effort: Effort, rivals: Rivals, bar: Bar) -> list[Speed]:
                 subject(0)
             gc.collect()
             for name, timed in interleaved(subjects, effort.num_rounds, on_step=step).items():
-                found.append(_speed(name, input_name, timed))
+                finished = [one for one in timed if one is not None]
+                if len(finished) == len(timed):
+                    found.append(_speed(name, input_name, finished))
     return found
 
 
@@ -178,7 +187,10 @@ def _timed_motions(input_name: str, effort: Effort) -> list[Motion]:
     return [with_noise(motion, NOISE_M, rng) for motion in motions]
 
 
-def _subjects(motions: Sequence[Motion], rivals: Rivals) -> dict[str, Callable[[int], Timed]]:
+def _subjects(
+    motions: Sequence[Motion], rivals: Rivals
+) -> dict[str, Callable[[int], Timed | None]]:
+    """What times a method on one of the motions; None once a rival did not finish."""
     profiles = [ours.profile_of(motion) for motion in motions]
     scales = [scale_of(motion) for motion in motions]
 
@@ -188,8 +200,15 @@ def _subjects(motions: Sequence[Motion], rivals: Rivals) -> dict[str, Callable[[
     def live(index: int) -> Timed:
         return ours.time_live(motions[index], profiles[index])
 
-    def rival(process: RivalProcess, index: int) -> Timed:
-        return process.run(motions[index], scales[index])
+    given_up = set()
+
+    def rival(process: RivalProcess, index: int) -> Timed | None:
+        name = process.rival.name
+        if name not in given_up:
+            with suppress(LimitExceededError):
+                return process.run(motions[index], scales[index])
+            given_up.add(name)
+        return None
 
     theirs = {name: partial(rival, process) for name, process in rivals.items()}
     return {OURS: batch, OURS_LIVE: live, **theirs}

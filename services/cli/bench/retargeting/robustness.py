@@ -67,7 +67,7 @@ def _try(name: str, motion: Motion, whole: Motion, rivals: Rivals) -> str:
     try:
         joints = rivals[name].run(motion, scale_of(whole)).joints_rad
     except LimitExceededError as error:
-        return f"never returned within {error.details['limit_s']:g} s"
+        return f"never returned within {error.details['limit_s']:g} s of processor time"
     except InvalidInputError:
         return "refuses the sample"
     return _describe(motion, joints)

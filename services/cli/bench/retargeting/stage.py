@@ -74,7 +74,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         stage="retargeting",
         machine=describe_machine(PACKAGES),
         options={**asdict(effort), "rivals": list(rivals)},
-        tables=tables(speeds, robot, pinches, cold, outcomes),
+        tables=tables(speeds, robot, pinches, cold, outcomes, list(rivals)),
         panels=panels(speeds, robot, pinches),
         requirements=requirements(speeds, robot, pinches, cold),
         data={

@@ -1,6 +1,6 @@
 """What the retargeting stage measured in; its tables and its chart out."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 from services.cli.bench.chart import Panel, Point
 from services.cli.bench.report import ResultTable
@@ -24,12 +24,13 @@ def tables(
     pinches: Mapping[str, PinchScore],
     cold: ColdStart,
     outcomes: Sequence[Outcome],
+    rivals: Sequence[str] = (),
 ) -> list[ResultTable]:
-    """All tables of the stage."""
+    """All tables of the stage; a rival without a result says that it did not finish."""
     return [
-        *[_speed_table(speeds, motion) for motion in (ROBOT_INPUT, PINCH_INPUT)],
-        *[_robot_table(robot, name) for name in robot],
-        _pinch_table(pinches),
+        *[_speed_table(speeds, motion, rivals) for motion in (ROBOT_INPUT, PINCH_INPUT)],
+        *[_robot_table(robot, name, rivals) for name in robot],
+        _pinch_table(pinches, rivals),
         ResultTable(
             "Cold start: fingers of postures anywhere, found to 0.1 mm",
             ("fingers", "with one start", "with retries"),
@@ -74,7 +75,17 @@ def _points(speeds: Sequence[Speed], motion: str, errors: Mapping[str, float]) -
     ]
 
 
-def _speed_table(speeds: Sequence[Speed], motion: str) -> ResultTable:
+def _unfinished(
+    rivals: Sequence[str], finished: Iterable[str], num_columns: int
+) -> list[tuple[str, ...]]:
+    """A row of that many columns for each rival without a result."""
+    missing = set(rivals).difference(finished)
+    return [
+        (name, "did not finish", *[""] * (num_columns - 2)) for name in rivals if name in missing
+    ]
+
+
+def _speed_table(speeds: Sequence[Speed], motion: str, rivals: Sequence[str]) -> ResultTable:
     mine = {speed.method: speed for speed in speeds if speed.motion == motion}
     rows = []
     for method, speed in mine.items():
@@ -83,10 +94,11 @@ def _speed_table(speeds: Sequence[Speed], motion: str) -> ResultTable:
         rows.append((method, speed.cpu_us.text(), *ratios, *calls))
     columns = ("/ ours", "/ ours, live", "call (µs)", "p99 (µs)")
     title = f"Time a sample and hand ({motion}, 1 mm noise): processor, ratios, wall time of a call"
+    rows += _unfinished(rivals, mine, 2 + len(columns))
     return ResultTable(title, ("method", "cpu (µs)", *columns), rows)
 
 
-def _robot_table(robot: RobotScores, name: str) -> ResultTable:
+def _robot_table(robot: RobotScores, name: str, rivals: Sequence[str]) -> ResultTable:
     return ResultTable(
         f"The robot's own hands, {name}: means, joints beyond limits, largest turn a sample",
         ("method", "tip (mm)", "p95", "max", "joint (deg)", "max", "outside", "turn (deg)"),
@@ -102,11 +114,12 @@ def _robot_table(robot: RobotScores, name: str) -> ResultTable:
                 f"{score.max_step_deg:.3g}",
             )
             for method, score in robot[name].items()
-        ],
+        ]
+        + _unfinished(rivals, robot[name], 8),
     )
 
 
-def _pinch_table(pinches: Mapping[str, PinchScore]) -> ResultTable:
+def _pinch_table(pinches: Mapping[str, PinchScore], rivals: Sequence[str]) -> ResultTable:
     return ResultTable(
         "Pinches of people: the robot's gap where the human one is below 3 mm; a joint may turn "
         f"{velocity_limit_deg():.3g} deg a sample",
@@ -121,5 +134,6 @@ def _pinch_table(pinches: Mapping[str, PinchScore]) -> ResultTable:
                 str(score.num_outside),
             )
             for method, score in pinches.items()
-        ],
+        ]
+        + _unfinished(rivals, pinches, 6),
     )
