@@ -9,6 +9,7 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.checks import ENCODED_UNITS
 
 COPY_SAMPLES = 256
+COPY_BYTES = 4 << 20
 # Images are some fifty thousand bytes each.
 COPY_IMAGES = 32
 
@@ -32,7 +33,8 @@ def commit_spool(
     options = WriteOptions(recoverable=False)
     with store.writer(kind="recording", attributes=attributes, options=options) as writer:
         for name, descriptor in reader.streams.items():
-            num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else COPY_SAMPLES
+            fitting = max(1, min(COPY_SAMPLES, COPY_BYTES // descriptor.sample_bytes()))
+            num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else fitting
             for batch in reader.batches(name, num_samples=num_samples):
                 writer.append(
                     name,

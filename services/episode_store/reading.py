@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from math import prod
 from typing import Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader
@@ -161,7 +160,7 @@ class StoreReader:
     ) -> None:
         count = reader.count(stream, span.start_ns, span.stop_ns)
         descriptor = reader.streams[stream]
-        sample_bytes = prod(descriptor.shape) * np.dtype(descriptor.dtype).itemsize + 24
+        sample_bytes = descriptor.sample_bytes() + 24
         if count * sample_bytes > self._max_bytes:
             allowed = self._max_bytes // sample_bytes
             raise LimitExceededError(

@@ -134,7 +134,7 @@ class DatedStream:
 
 def piece_rows(descriptor: StreamDescriptor) -> int:
     """How many samples of a stream are read at once."""
-    row_bytes = int(np.prod(descriptor.shape)) * descriptor.numpy_dtype().itemsize
+    row_bytes = descriptor.sample_bytes()
     return max(1, PIECE_BYTES // max(row_bytes, 1))
 
 

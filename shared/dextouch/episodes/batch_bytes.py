@@ -51,14 +51,13 @@ def batch_of_bytes(
     columns: list[list[bytes]] = [[], [], []]
     values: list[bytes] = []
     encoded = descriptor.unit in ENCODED_UNITS
-    sample_bytes = int(np.prod(descriptor.shape)) * descriptor.numpy_dtype().itemsize
     for body, count in zip(bodies, counts, strict=True):
         size = count * _STAMP_BYTES
         for number, column in enumerate(columns):
             column.append(body[number * size : (number + 1) * size])
         rest = body[3 * size :]
         got = _images(rest, count) if encoded else [rest]
-        if got is None or (not encoded and len(rest) != count * sample_bytes):
+        if got is None or (not encoded and len(rest) != count * descriptor.sample_bytes()):
             raise CorruptDataError(
                 f"{what}: a record of {len(body)} bytes is not that of {count} samples of "
                 f"{descriptor.name!r}; it was written for another stream"

@@ -20,7 +20,9 @@ FORMAT_VERSION: Final = 2
 COMMIT_FILE = "commit.json"
 METADATA_FILE = "zarr.json"
 ATTRIBUTES_KEY = "dextouch"
+# Numbers a storage chunk: half a second of them, or as many samples as fit into this.
 CHUNK_SECONDS = 0.5
+CHUNK_BYTES = 1 << 20
 ZSTD_LEVEL = 1
 # Images a closed group of pictures, which is a storage chunk.
 GOP_IMAGES = 8
@@ -93,9 +95,10 @@ def codec_of(descriptor: StreamDescriptor) -> Codec:
 def stream_arrays(descriptor: StreamDescriptor, kind: Kind) -> dict[str, ArrayEntry]:
     """Every array that a stream occupies in a group, without rows yet; its values come first."""
     name, codec = descriptor.name, codec_of(descriptor)
-    rows = max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
-    # The stamps of images go to disk as often as the images, so that a kill parts neither.
-    stamp_rows = rows if codec == "zstd" else GOP_IMAGES
+    half_second = max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
+    rows = min(half_second, max(1, CHUNK_BYTES // descriptor.sample_bytes()))
+    # Stamps end where values do, so that a kill parts neither: of encoded images after as many.
+    stamp_rows = half_second // rows * rows if codec == "zstd" else GOP_IMAGES
     time, no_hash = f"{name}_time", "0" * 64
     axes = (f"{name}_axis{axis}" for axis in range(1, 1 + len(descriptor.shape)))
     values = ArrayEntry(

@@ -3,6 +3,7 @@
 import hashlib
 import shutil
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 
 import numpy as np
@@ -130,10 +131,13 @@ def _whole_commit(stage: Path) -> CommitRecord | None:
 
 
 def _num_whole_samples(stage: Path, arrays: dict[str, ArrayEntry]) -> int:
-    """Samples of a stream whose values and stamps are all on the disk."""
-    return min(
-        int(_trusted_rows(stage, name, entry)["num_rows"].sum()) for name, entry in arrays.items()
-    )
+    """Samples of a stream up to the last place where a storage chunk of each array ends."""
+    ends = [
+        np.cumsum(_trusted_rows(stage, name, entry)["num_rows"], dtype=np.int64)
+        for name, entry in arrays.items()
+    ]
+    common = reduce(np.intersect1d, ends)
+    return int(common[-1]) if len(common) else 0
 
 
 def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:

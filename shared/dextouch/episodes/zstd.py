@@ -10,6 +10,9 @@ import zstandard
 from dextouch.episodes.format import ZSTD_LEVEL
 from dextouch.errors import CorruptDataError
 
+# Far above what is written today (1 MiB, or one sample), and above the half second of raw images
+# that releases before wrote.
+MAX_CHUNK_BYTES = 1 << 29
 _MAGIC = bytes.fromhex("28b52ffd")
 _REPEATED = 1
 
@@ -32,8 +35,10 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
     """The bytes of one frame that must hold `size` of them and be followed by nothing.
 
     Raises:
-        CorruptDataError: anything else; `what` names it.
+        CorruptDataError: anything else, or more than MAX_CHUNK_BYTES; `what` names it.
     """
+    if size > MAX_CHUNK_BYTES:
+        raise CorruptDataError(f"{what}: is of {size} bytes, expected at most {MAX_CHUNK_BYTES}")
     try:
         # Asked before anything is unpacked: a bomb says a size that we never allocate.
         said = zstandard.get_frame_parameters(frame).content_size

@@ -11,7 +11,7 @@ from dextouch.schemas.episodes import (
     Matrix,
     StoreId,
 )
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.descriptors import MAX_STREAMS, StreamDescriptor
 
 
 class LedgerEntry(BaseModel):
@@ -51,7 +51,7 @@ class RecordingAttributes(BaseModel):
     lineage: tuple[LineageEntry, ...] = ()
     ledger: tuple[LedgerEntry, ...] = ()
     quality: dict[str, FiniteFloat] = {}
-    streams: tuple[StreamDescriptor, ...] = ()
+    streams: tuple[StreamDescriptor, ...] = Field(default=(), max_length=MAX_STREAMS)
 
 
 class RecordingStatus(BaseModel):

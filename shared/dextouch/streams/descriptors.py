@@ -1,10 +1,18 @@
 """What a stream is: its rate, shape, unit, clock and what its device can prove about itself."""
 
-from typing import Literal
+import math
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+# Batches and windows add an axis to those of a sample, and a packed array has eight at most.
+MAX_SAMPLE_AXES = 7
+# More than the largest picture of H.264 (level 6.2), three bytes a pixel.
+MAX_SAMPLE_BYTES = 1 << 27
+MIN_RATE_HZ = 1e-6
+# Of one recording or episode; each keeps up to eight files open while it is written.
+MAX_STREAMS = 100
 StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
 
 
@@ -24,22 +32,36 @@ class ClockCapabilities(BaseModel):
 class StreamDescriptor(BaseModel):
     """One stream of a recording or an episode.
 
-    `shape` is that of one sample's payload; `unit` of its numbers (`counts`, `kPa`, `m`, `rad`,
-    `pose_m_wxyz`, `rgb8`, …); `frame` the coordinate system of the numbers, if any.
+    `shape` is that of one sample's payload, of at most MAX_SAMPLE_BYTES; `unit` of its numbers
+    (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` the coordinate system of the
+    numbers, if any.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
     kind: StreamKind
-    shape: tuple[int, ...]
+    shape: tuple[Annotated[int, Field(ge=1)], ...] = Field(max_length=MAX_SAMPLE_AXES)
     dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
     unit: str
-    nominal_rate_hz: float = Field(gt=0, le=10_000)
+    nominal_rate_hz: float = Field(ge=MIN_RATE_HZ, le=10_000)
     frame: str | None = None
     side: Literal["left", "right"] | None = None
     device: str | None = None
     capabilities: ClockCapabilities = ClockCapabilities()
+
+    @model_validator(mode="after")
+    def _fits_in_memory(self) -> "StreamDescriptor":
+        if self.sample_bytes() > MAX_SAMPLE_BYTES:
+            raise ValueError(
+                f"{self.name}: a sample of shape {self.shape} takes {self.sample_bytes()} bytes, "
+                f"expected at most {MAX_SAMPLE_BYTES}"
+            )
+        return self
+
+    def sample_bytes(self) -> int:
+        """Size of one sample's numbers in memory."""
+        return math.prod(self.shape) * self.numpy_dtype().itemsize
 
     def numpy_dtype(self) -> np.dtype[np.generic]:
         """The payload's dtype, little endian."""

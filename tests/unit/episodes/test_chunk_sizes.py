@@ -1,0 +1,155 @@
+"""How large storage chunks are, and what a stream must not be: memory stays bounded."""
+
+import json
+import os
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from dextouch.episodes import WriteOptions
+from dextouch.episodes.format import array_metadata, canonical_json, decode_commit, stream_arrays
+from dextouch.episodes.shard_reader import with_crc
+from dextouch.errors import CorruptDataError
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+from tests.unit.episodes.hostile_group import forge_record, memory_bound, shard_of, write_shard
+
+MEBIBYTE = 2**20
+
+
+def stream(shape, dtype="float64", rate_hz=30.0, **changes):
+    fields = {"name": "raw", "kind": "scalar", "shape": shape, "dtype": dtype, "unit": "counts"}
+    return StreamDescriptor.model_validate(fields | {"nominal_rate_hz": rate_hz} | changes)
+
+
+def take(*streams):
+    return RecordingAttributes(
+        recording_id="take-1",
+        task="t",
+        instruction="",
+        domain="human",
+        station="bench",
+        streams=streams,
+    )
+
+
+# Rows from the sentences of docs/episode_format.md, by hand.
+@pytest.mark.parametrize(
+    ("descriptor", "rows", "stamp_rows"),
+    [
+        # Half a second.
+        (stream((360,), "uint16", 60), 30, 30),
+        (stream((7,), "float64", 100), 50, 50),
+        (stream((64, 64, 3), "uint8"), 15, 15),
+        (stream((), "float32", 10_000), 5000, 5000),
+        (stream((3,), "float32", 0.1), 1, 1),
+        # 1 048 576 bytes: one image of 921 600, four of 230 400, two rows of 400 000.
+        (stream((480, 640, 3), "uint8"), 1, 15),
+        (stream((240, 320, 3), "uint8"), 4, 12),
+        (stream((50_000,), "float64", 10_000), 2, 5000),
+        # One row is larger than that.
+        (stream((1080, 1920, 3), "uint8"), 1, 15),
+    ],
+)
+@pytest.mark.parametrize("kind", ["episode", "recording"])
+def test_rows_of_a_storage_chunk(descriptor, rows, stamp_rows, kind):
+    values, *stamps = stream_arrays(descriptor, kind).values()
+    assert values.chunk_rows == rows
+    assert {stamp.chunk_rows for stamp in stamps} == {stamp_rows}
+
+
+@pytest.mark.parametrize(
+    ("changed", "says"),
+    [
+        ({"shape": (2**40,)}, "8796093022208 bytes"),
+        ({"shape": (2**13, 2**13, 2**13)}, "bytes"),
+        ({"shape": (2**62, 2**62)}, "bytes"),
+        ({"shape": (0,)}, "greater than or equal to 1"),
+        ({"shape": (-3, -4)}, "greater than or equal to 1"),
+        ({"shape": (1,) * 8}, "at most 7"),
+        ({"nominal_rate_hz": 1e-300}, "greater than or equal to 0.000001"),
+    ],
+)
+def test_absurd_streams_are_refused_by_name(changed, says):
+    good = {"shape": (3,), "dtype": "float64"}
+    with pytest.raises(ValidationError, match=says):
+        stream(**(good | {k.replace("nominal_", ""): v for k, v in changed.items()}))
+
+
+def test_the_largest_image_of_h264_is_a_stream():
+    """Level 6.2 of H.264: 139,264 macroblocks of 16 x 16 pixels."""
+    assert stream((4352, 8192, 3), "uint8", unit="h264").shape == (4352, 8192, 3)
+
+
+def raw_images(first, count):
+    numbers = np.arange(first, first + count)
+    values = np.broadcast_to(numbers[:, None, None, None], (count, 240, 320, 3)).astype("u1")
+    return {"values": values, "t_host_ns": numbers}
+
+
+@pytest.mark.parametrize("how", ["killed", "interrupted", "finished"])
+def test_storage_chunks_of_values_and_stamps_that_differ_go_together(store, how):
+    """Four images a storage chunk, twelve stamps: what is kept ends where both do."""
+    images = stream((240, 320, 3), "uint8", kind="image", unit="rgb8")
+    writer = store.writer(kind="recording", attributes=take(images))
+    for number in range(31):
+        writer.append("raw", **raw_images(number, 1))
+    if how == "killed":
+        for part in writer._streams.values():
+            part.close()
+        os.close(writer._lock)
+        store.recover()
+    else:
+        error = RuntimeError if how == "interrupted" else None
+        writer.__exit__(error, None, None)
+    reader = store.recording("take-1")
+    reader.verify()
+    batch = reader.read("raw")
+    assert batch.t_host_ns.tolist() == list(range(24 if how == "killed" else 31))
+    np.testing.assert_array_equal(batch.values[:, 5, 7, 1], batch.t_host_ns)
+    np.testing.assert_array_equal(reader.images("raw", 9, 10), raw_images(9, 1)["values"])
+
+
+def test_an_episode_with_half_a_second_of_large_images_still_opens(store, monkeypatch):
+    """As releases before wrote them: 15 images a storage chunk."""
+    monkeypatch.setattr("dextouch.episodes.format.CHUNK_BYTES", 2**40)
+    images = stream((240, 320, 3), "uint8", kind="image", unit="rgb8")
+    with store.writer(kind="recording", attributes=take(images)) as writer:
+        writer.append("raw", **raw_images(0, 31))
+    monkeypatch.undo()
+    folder = store.root / "recordings" / "take-1"
+    record, _ = decode_commit((folder / "commit.json").read_bytes(), what="take-1")
+    assert record.arrays["raw"].chunk_rows == 15
+    reader = store.recording("take-1")
+    reader.verify()
+    np.testing.assert_array_equal(reader.images("raw"), raw_images(0, 31)["values"])
+
+
+def repeated_zeros(num_bytes):
+    """A zstd frame of that many zeros: blocks of 128 KiB in four bytes each (RFC 8878)."""
+    header = bytes.fromhex("28b52ffd") + b"\xa0" + num_bytes.to_bytes(4, "little")
+    blocks, left = [], num_bytes
+    while left:
+        size = min(left, 1 << 17)
+        left -= size
+        blocks.append((size << 3 | 1 << 1 | (not left)).to_bytes(3, "little") + b"\x00")
+    return header + b"".join(blocks)
+
+
+def test_a_stored_chunk_of_gigabytes_is_refused_before_it_is_unpacked(store):
+    """61 kB on the disk, each checksum right, 2 GB in memory."""
+    heavy = stream((50_000,), "float64", 10_000)
+    options = WriteOptions(recoverable=False)
+    with store.writer(kind="recording", attributes=take(heavy), options=options) as writer:
+        writer.append("raw", values=np.zeros((1, 50_000)), t_host_ns=np.array([7]))
+    folder = store.root / "recordings" / "take-1"
+    forge_record(folder, lambda record: record["arrays"]["raw"].update(chunk_rows=5000))
+    record, _ = decode_commit((folder / "commit.json").read_bytes(), what="take-1")
+    (folder / "raw" / "zarr.json").write_bytes(array_metadata(record.arrays["raw"]))
+    write_shard(shard_of(folder, "raw"), [with_crc(repeated_zeros(5000 * 400_000))])
+    reader = store.recording("take-1")
+    for read in (lambda: reader.read("raw"), reader.verify):
+        with memory_bound(), pytest.raises(CorruptDataError, match=r"'raw'.*2000000000 bytes"):
+            read()
+    assert canonical_json(json.loads((folder / "commit.json").read_bytes()))
