@@ -10,7 +10,9 @@ class EpisodeStoreSettings(ServiceSettings):
     """Where episodes lie, and the bounds of one request, of all at once, and of a station.
 
     `store_url` is a local folder or file:///…; uploads that are not finished lie below it too.
-    `max_body_bytes` must hold one batch of the wire format. Batches beyond `max_batches_in_flight`
+    `max_body_bytes` must hold one batch of the wire format. `max_open_uploads` unfinished uploads
+    keep their files open, two each: choose at least the number of stations that upload at once,
+    for opening one again costs a reading of its whole log. Batches beyond `max_batches_in_flight`
     or `max_bytes_in_flight` are refused with 429; those that leave less than `min_free_bytes` on
     the disk, or bring a station above its quota (unfinished and finished), with 507.
     `commit_in_process` writes finished recordings in a process of its own.
@@ -20,7 +22,7 @@ class EpisodeStoreSettings(ServiceSettings):
 
     store_url: str = Field(default_factory=default_store, min_length=1)
     sync_uploads: bool = True
-    max_open_uploads: int = Field(default=16, ge=1, le=1024)
+    max_open_uploads: int = Field(default=128, ge=1, le=1024)
     max_batches_in_flight: int = Field(default=32, ge=1, le=1024)
     max_bytes_in_flight: int = Field(default=128 * 2**20, ge=1024)
     min_free_bytes: int = Field(default=512 * 2**20, ge=0)

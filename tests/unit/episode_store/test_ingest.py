@@ -300,3 +300,20 @@ class Breaking:
 
     def close(self):
         self.inner.close()
+
+
+def test_forty_stations_at_once_read_no_log_again(start, attributes, batch_of, monkeypatch):
+    """With its files closed in between, each batch would cost a reading of all before it."""
+    read_again = []
+    real = SpoolWriter.resume
+    monkeypatch.setattr(
+        SpoolWriter, "resume", lambda path, **how: read_again.append(path) or real(path, **how)
+    )
+    client = start()
+    names = [f"take-{n}" for n in range(40)]
+    for name in names:
+        client.create(attributes.model_copy(update={"recording_id": name}))
+    for number in range(2):
+        for name in names:
+            client.send_batch(name, attributes.streams[0], batch_of(number, 1), number=number)
+    assert read_again == []

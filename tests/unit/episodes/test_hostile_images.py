@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.shard_reader import with_crc
-from dextouch.errors import CorruptDataError
+from dextouch.errors import CorruptDataError, StorageError
 from dextouch.images.jpeg import encode_jpeg
 from tests.unit.episodes.hostile_group import (
     ID,
@@ -166,14 +166,20 @@ def test_a_jpeg_that_announces_much_and_holds_little(store, folder):
             store.open(ID).images(STILLS)
 
 
-def test_images_larger_than_any_are_refused_before_they_are_made(store, folder):
+# Of the pictures that a stream may have, the first is larger than H.264 knows.
+@pytest.mark.parametrize(
+    ("size", "says"),
+    [(6144, "pixels, expected at most"), (8388608, "bytes, expected at most")],
+)
+def test_images_larger_than_any_are_refused_before_they_are_made(store, folder, size, says):
     data = (folder / "zarr.json").read_bytes()
-    forge_attributes(folder, data.replace(b'"shape":[64,64,3]', b'"shape":[8388608,8388608,3]'))
+    shape = f'"shape":[{size},{size},3]'.encode()
+    forge_attributes(folder, data.replace(b'"shape":[64,64,3]', shape))
 
     def edit(record):
         for name in (VIDEO, STILLS):
-            record["arrays"][name]["shape"][1:3] = [8388608, 8388608]
+            record["arrays"][name]["shape"][1:3] = [size, size]
 
     forge_record(folder, edit)
-    with pytest.raises(CorruptDataError, match="pixels, expected at most"):
+    with pytest.raises(StorageError, match=says):
         store.open(ID)
