@@ -64,7 +64,8 @@ def test_commands_of_the_readme_run_in_order_and_twice(tmp_path):
             out, _ = running.communicate(timeout=900)
             assert running.returncode == 0, words
             if words == ["store", "list"]:
-                listed = [line.split()[0] for line in out.splitlines()]
+                rows = [line.split() for line in out.splitlines()]
+                listed = [row[0] for row in rows if row[1] == "episode"]
         names = [re.fullmatch(r"demo-(human|robot)-[0-9a-f]{12}", name)[1] for name in listed]
         assert names == ["human", "robot"]
     report = json.loads((tmp_path / "demo" / "report.json").read_text())

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,12 +20,21 @@ from dextouch.episodes.inspection import (
     inspect_group,
     inspect_stage,
     inspect_upload,
+    is_held,
     open_contents,
     unfinished,
 )
 from dextouch.episodes.sources import GroupFiles, LocalGroup
+from dextouch.episodes.stage import (
+    STAGE_FILE,
+    Attributes,
+    attributes_id,
+    kind_of,
+    read_stage,
+)
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
-from dextouch.schemas.episodes import json_ready
+from dextouch.schemas.episodes import EpisodeSummary, json_ready
+from dextouch.schemas.recordings import RecordingSummary
 from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
 from services.episode_store.words.context import (
     EXIT_DAMAGED,
@@ -38,33 +48,84 @@ _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 
 
 def list_items(context: Context) -> Outcome:
-    """What is in the store, or in its trash."""
-    options, say = context.options, context.say
+    """What is in the store and matches, or what is in its trash."""
+    options = context.options
     if options.trash:
         return _list_trash(context)
     root = context.local_root()
     if root is not None and not root.is_dir():
         raise NotFoundError(f"store {root}: no such folder; name another with --store")
+    if options.kind == "recording" and options.origin is not None:
+        raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
     catalog = Catalog(context.store)
-    if options.kind == "recording":
-        if options.origin is not None:
-            raise InvalidInputError(
-                "list --kind recording: takes no --origin, recordings have none"
-            )
-        taken = RecordingFilter(task=options.task, domain=options.domain)
-        recordings = catalog.recordings(taken, limit=sys.maxsize)
-        for take in recordings.recordings:
-            num_samples = sum(take.num_samples.values())
-            say(f"{take.recording_id}  {take.task}  {take.domain}  {num_samples} samples")
-        return json_ready(recordings), 0
+    # Recordings have no origin that could match.
+    kind: Kind | None = "episode" if options.origin is not None else options.kind
+    result: dict[str, Any] = {"num_matching": 0, "next_after": None}
+    totals = []
+    for each in KINDS if kind is None else (kind,):
+        list_one = _list_episodes if each == "episode" else _list_recordings
+        found, num_in_all = list_one(context, catalog)
+        result |= found | {"num_matching": result["num_matching"] + found["num_matching"]}
+        totals.append(f"{num_in_all} {each}" + "s" * (num_in_all != 1))
+    if kind != "episode" and root is not None:
+        result["unfinished"] = _list_broken_off(context, root)
+    if not result["num_matching"] and not result.get("unfinished"):
+        context.say(f"nothing matches, of {' and '.join(totals)}")
+    return result, 0
+
+
+def _list_episodes(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
+    """The matching episodes, and how many there are in all."""
+    options = context.options
     wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
-    episodes = catalog.episodes(wanted, limit=sys.maxsize)
-    for episode in episodes.episodes:
-        say(
-            f"{episode.episode_id}  {episode.task}  {episode.domain}  {episode.origin}  "
-            f"{episode.num_steps} steps  {_OUTCOMES[episode.success]}"
+    found = catalog.episodes(wanted, limit=sys.maxsize)
+    for row in found.episodes:
+        context.say(
+            f"{row.episode_id}  episode  {row.task}  {row.domain}  {row.origin}  "
+            f"{row.num_steps} steps  {_outcome(row)}"
         )
-    return json_ready(episodes), 0
+    return json_ready(found), catalog.episodes(EpisodeFilter(), limit=1).num_matching
+
+
+def _list_recordings(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
+    """The matching recordings, and how many there are in all."""
+    options = context.options
+    wanted = RecordingFilter(task=options.task, domain=options.domain)
+    found = catalog.recordings(wanted, limit=sys.maxsize)
+    for row in found.recordings:
+        context.say(
+            f"{row.recording_id}  recording  {row.task}  {row.domain}  "
+            f"{sum(row.num_samples.values())} samples  {_outcome(row)}"
+        )
+    return json_ready(found), catalog.recordings(RecordingFilter(), limit=1).num_matching
+
+
+def _outcome(row: EpisodeSummary | RecordingSummary | Attributes) -> str:
+    return _OUTCOMES[row.success] + "  recovered" * row.recovered
+
+
+def _list_broken_off(context: Context, root: Path) -> list[str]:
+    """Takes whose writer is gone and whose stage waits for `recover`; their names come back."""
+    names = []
+    for place, folder in unfinished(root):
+        if place == "stage" and (folder / STAGE_FILE).is_file() and not is_held(folder):
+            kind, name = _stage_name(folder)
+            names.append(name)
+            context.say(f"{name}  {kind}  broken off; `dextouch store repair` completes it")
+    return names
+
+
+def _stage_name(folder: Path) -> tuple[str, str]:
+    try:
+        attributes = read_stage(folder)
+    except StorageError:
+        attributes = None
+    # A damaged one goes by the name of its folder.
+    return (
+        ("stage", folder.name)
+        if attributes is None
+        else (kind_of(attributes), attributes_id(attributes))
+    )
 
 
 def _list_trash(context: Context) -> Outcome:
@@ -121,7 +182,7 @@ def show(context: Context) -> Outcome:
     }
     attributes = reader.attributes
     context.say(f"{kind} {item_id}  {attributes.task}  {attributes.domain}")
-    context.say(f"{_OUTCOMES[attributes.success]}{'  recovered' * attributes.recovered}")
+    context.say(_outcome(attributes))
     for source in attributes.lineage:
         context.say(f"made from {source.kind} {source.id}")
     for line in table(rows):

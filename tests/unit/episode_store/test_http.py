@@ -201,7 +201,9 @@ def test_command_line(store, capsys, tmp_path):
     write_episode(store, "e-2", task="stack_bowls")
     report = tmp_path / "report.json"
     assert run(store, "list", "--task", "stack_bowls", "--json", str(report)) == 0
-    assert capsys.readouterr().out.startswith("e-2  stack_bowls  robot  twin  9 steps  success")
+    assert capsys.readouterr().out.startswith(
+        "e-2  episode  stack_bowls  robot  twin  9 steps  success"
+    )
     assert json.loads(report.read_text())["num_matching"] == 1
     assert run(store, "show", "e-1", "--json", "-") == 0
     assert json.loads(capsys.readouterr().out)["num_samples"]["camera_head"] == 9

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import shutil
 
 import numpy as np
@@ -120,11 +121,59 @@ def test_show_is_a_table(store, word):
     assert result["streams"]["force"]["num_bytes"] == size
 
 
+EPISODE_ROW = "e-1  episode  stand_bottle  robot  twin  0 steps  not judged\n"
+RECORDING_ROW = "r-1  recording  stand_bottle  human  20 samples  not judged\n"
+
+
+def test_list_shows_episodes_and_recordings(word, tmp_path):
+    assert word("list") == (0, EPISODE_ROW + RECORDING_ROW, "")
+    assert word("list", "--kind", "episode")[1] == EPISODE_ROW
+    assert word("list", "--kind", "recording")[1] == RECORDING_ROW
+    assert word("list", "--domain", "human")[1] == RECORDING_ROW
+    # Recordings have no origin.
+    assert word("list", "--origin", "twin")[1] == EPISODE_ROW
+    assert word("list", "--task", "stand_bottle")[1] == EPISODE_ROW + RECORDING_ROW
+    told = "nothing matches, of 1 episode and 1 recording\n"
+    assert word("list", "--task", "stack_bowls")[1] == told
+    told = "nothing matches, of 1 recording\n"
+    assert word("list", "--task", "stack_bowls", "--kind", "recording")[1] == told
+    result = json.loads(word("list", "--json", "-")[1])
+    assert [row["episode_id"] for row in result["episodes"]] == ["e-1"]
+    assert [row["recording_id"] for row in result["recordings"]] == ["r-1"]
+    assert result["num_matching"] == 2
+    assert "recordings" not in json.loads(word("list", "--kind", "episode", "--json", "-")[1])
+
+
+def test_a_store_of_recordings_alone_is_not_empty(store, word):
+    store.delete("e-1", for_good=True)
+    assert word("list") == (0, RECORDING_ROW, "")
+
+
+def test_what_was_broken_off_is_seen(store, word):
+    """A take that was kept, one whose completion waits for space, and one that is being written."""
+    for name in ("r-2", "r-3"):
+        writer = store.writer(kind="recording", attributes=recording_attributes(name, None))
+        writer.append("force", values=np.ones((7, 2), "f4"), t_host_ns=np.arange(7))
+        if name == "r-2":
+            writer.__exit__(KeyboardInterrupt, None, None)
+    out = word("list", "--kind", "recording")[1]
+    row = "r-2  recording  stand_bottle  human  7 samples  not judged  recovered\n"
+    assert out == RECORDING_ROW + row
+    assert word("show", "r-2")[1].splitlines()[1] == "not judged  recovered"
+    for stream in writer._streams.values():
+        stream.close()
+    os.close(writer._lock)
+    *_, last = word("list")[1].splitlines()
+    assert last == "r-3  recording  broken off; `dextouch store repair` completes it"
+    assert json.loads(word("list", "--json", "-")[1])["unfinished"] == ["r-3"]
+    assert word("repair")[0] == 0
+    *_, last = word("list")[1].splitlines()
+    assert last == "r-3  recording  stand_bottle  human  5 samples  not judged  recovered"
+
+
 def test_delete_list_restore_purge(store, word, tmp_path):
     assert word("delete", "e-1") == (0, "e-1  in the trash\n", "")
-    assert word("list")[1] == ""
-    assert word("list", "--kind", "recording")[1].startswith("r-1  stand_bottle  ")
-    assert word("list", "--kind", "recording", "--task", "stack_bowls")[1] == ""
+    assert word("list", "--kind", "episode")[1] == "nothing matches, of 0 episodes\n"
     status, out, _ = word("list", "--trash", "--json", str(tmp_path / "trash.json"))
     assert out.startswith("e-1  episode  deleted 20")
     (entry,) = json.loads((tmp_path / "trash.json").read_text())["trash"]
