@@ -174,9 +174,10 @@ def _address(world: ServedWorld, connections: ExitStack) -> WorldAddress:
 
 
 def _print_scores(report: Mapping[str, Any]) -> None:
-    print(f"{'task':<16}{'policy':<22}{'real':>10}{'imagined':>10}")
+    worlds = ["real"] if report["imagined_world"] is None else ["real", "imagined"]
+    print(f"{'task':<16}{'policy':<22}" + "".join(f"{world:>10}" for world in worlds))
     for row in report["policies"]:
-        rates = "".join(f"{figure(row[world]):>10}" for world in ("real", "imagined"))
+        rates = "".join(f"{figure(row[world]):>10}" for world in worlds)
         print(f"{row['task']:<16}{row['policy']:<22}{rates}")
     for task, figures in report["agreement"].items():
         print(

@@ -90,7 +90,7 @@ def evaluate(
 
     Args:
         real: the world that judges success itself.
-        imagined: worlds to compare with it, by the name they have in the report.
+        imagined: worlds to compare with it, by the name they have in the report; may be none.
         policies: by the name they have in the report.
         plan: tasks, seeds and length.
         probe: judge of imagined success.
@@ -105,10 +105,10 @@ def evaluate(
         InvalidInputError: nothing to evaluate, or worlds that do not fit each other or the plan.
         UnavailableError: a world is not there at the beginning.
     """
-    if not imagined or not policies or not plan.instructions or not plan.seeds:
+    if not policies or not plan.instructions or not plan.seeds:
         raise InvalidInputError(
-            f"evaluation: got {len(imagined)} imagined worlds, {len(policies)} policies, "
-            f"{len(plan.instructions)} tasks and {len(plan.seeds)} seeds; expected one of each"
+            f"evaluation: got {len(policies)} policies, {len(plan.instructions)} tasks and "
+            f"{len(plan.seeds)} seeds; expected at least one of each"
         )
     worlds = StudyWorlds.ask(real, imagined)
     worlds.check(list(plan.instructions), plan.num_steps, probe.shape.image_size_px)

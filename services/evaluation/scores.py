@@ -52,7 +52,7 @@ class RolloutFailure:
 
 @dataclass(frozen=True)
 class ClosedLoopReport:
-    """Every rollout of an evaluation; the first imagined world is the one that is reported.
+    """Every rollout of an evaluation; the first imagined world, if any, is the one reported.
 
     Rollouts that failed are missing from every figure, and counted beside it.
     """
@@ -103,7 +103,9 @@ class ClosedLoopReport:
         for task in self.tasks:
             for policy in self.policies:
                 row: dict[str, Any] = {"policy": policy, "task": task}
-                for name, world in ((REAL, REAL), ("imagined", self.imagined_worlds[0])):
+                for name, world in zip(
+                    (REAL, "imagined"), (REAL, *self.imagined_worlds), strict=False
+                ):
                     row |= self._cell(name, world, task, policy)
                 row["other_worlds"] = {
                     world: self._cell("success", world, task, policy)
@@ -175,13 +177,13 @@ class ClosedLoopReport:
 
     def to_report(self) -> dict[str, Any]:
         """What a report holds of it: `policies`, `agreement` and the rest, as plain JSON."""
-        first, *others = self.imagined_worlds
-        rows, agreement = self.policy_rows(), self.agreement(first)
+        first, *others = self.imagined_worlds or (None,)
+        rows, agreement = self.policy_rows(), {} if first is None else self.agreement(first)
         return {
             "policies": rows,
             "agreement": agreement,
             "comments": {
-                task: task_comments([r for r in rows if r["task"] == task], found, first)
+                task: task_comments([r for r in rows if r["task"] == task], found, str(first))
                 for task, found in agreement.items()
             },
             "agreement_of_other_worlds": {world: self.agreement(world) for world in others},

@@ -58,15 +58,16 @@ class ServedWorld(BaseModel):
 class RunSettings(BaseSettings):
     """Roll policies out in a real and in imagined worlds, and score both.
 
-    A policy of your own is a Python object with act(observation): see docs/rollout_api.md,
-    "Write a policy and score it". The exit status is 1 when a rollout failed; the others count.
+    How to write a policy of your own and score it: docs/policies.md. The exit status is 1 when a
+    rollout failed; the others count.
     """
 
     model_config = service_config("evaluation_run")
 
     real: ServedWorld = Field(description="the world that judges success itself, such as the twin")
     imagined: dict[str, ServedWorld] = Field(
-        min_length=1, description="worlds to compare with it, by their names in the report"
+        default={},
+        description="worlds to compare with it, by their names in the report; may be left out",
     )
     seeds: str = Field(description="FIRST:LAST+1, such as 10000:10010")
     tasks: tuple[str, ...] = Field(default=(), description="default: all the success probe knows")

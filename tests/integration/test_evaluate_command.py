@@ -60,6 +60,11 @@ class Crashing(NoReset):
         return super().act(observation)
 
 
+class Gone:
+    def __array__(self, dtype=None, copy=None):
+        raise RuntimeError("buffer was donated")
+
+
 class Returning:
     def __init__(self, what):
         self.what = what
@@ -73,6 +78,7 @@ class Returning:
             "six": rows[:6],
             "none": None,
             "ragged": [[1.0], [1.0, 2.0]],
+            "gone": Gone(),
             "long": np.tile(rows, (5, 1)),
             "narrow": rows[:, :7],
         }[self.what]
@@ -154,7 +160,7 @@ def test_policies_of_ones_own_are_scored(folder, url):
 
 
 def test_what_a_policy_does_wrong_is_named_and_the_others_are_scored(folder, url):
-    wrong = ("nan", "six", "none", "ragged", "long", "narrow")
+    wrong = ("nan", "six", "none", "ragged", "gone", "long", "narrow")
     policies = [("--policy", f"{what}=mypolicy:Returning") for what in wrong]
     done = evaluate(
         *(folder, url, "--policy", "crash=mypolicy:Crashing", "--policy", "good=mypolicy:NoReset"),
@@ -163,7 +169,7 @@ def test_what_a_policy_does_wrong_is_named_and_the_others_are_scored(folder, url
         *("--num_steps", "32"),
     )
     assert done.returncode == 1
-    assert "14 of 16 rollouts failed" in done.stderr
+    assert "16 of 18 rollouts failed" in done.stderr
     assert 'raise RuntimeError("gripper not homed")' in done.stderr
     assert "asking.py" not in done.stderr
     messages = {row["policy"]: row["message"] for row in rows(folder) if row.get("error")}
@@ -175,6 +181,7 @@ def test_what_a_policy_does_wrong_is_named_and_the_others_are_scored(folder, url
         "six": f"policy 'six', {where}, chunk 0: act returned 6 rows, expected a multiple of 4",
         "none": "act returned NoneType, expected an array [K, 67]",
         "ragged": "act returned list that is no array",
+        "gone": "act returned Gone that is no array (buffer was donated)",
         "long": "act returned 80 rows, expected a multiple of 4, at least 4 and at most 64",
         "narrow": "act returned ndarray of shape [16, 7] and float64, expected an array [K, 67]",
     }
@@ -208,7 +215,7 @@ def in_process(folder, monkeypatch, capsys, free_port):
     ("policy", "expected"),
     [
         ("mypolcy:Reach", ["no module 'mypolcy'", "run from the folder that holds it"]),
-        ("mypolicy:Raech", ["unknown factory", "'Raech'; valid: Crashing, NoReset, Reach,"]),
+        ("mypolicy:Raech", ["unknown factory", "'Raech'; valid: Crashing, Gone, NoReset, Reach,"]),
         ("mypolicy:np", ["mypolicy:np is module, expected a function or class"]),
         ("mypolicy:empty_factory", ["returned dict without a method act"]),
         ("mypolicy:broken_factory", ["KeyError: 'weights.pt'", 'mypolicy.py", line', "in broken"]),

@@ -73,7 +73,7 @@ def _array(answer: object, where: str) -> np.ndarray:
     detach = getattr(answer, "detach", None)
     try:
         return np.asarray(answer if detach is None else detach().cpu().double())
-    except (ValueError, TypeError) as error:
+    except Exception as error:  # arrays of other libraries convert themselves, or fail to
         raise ShapeError(
             f"{where} returned {type(answer).__name__} that is no array ({error}), expected "
             f"[K, {ACTION_DIM}]"

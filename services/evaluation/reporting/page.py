@@ -62,6 +62,7 @@ def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
         action_charts=action_charts(pictures.actions),
         comparisons=comparison_bars(report.get("world_model", {})),
         policies=policy_panels(report),
+        agreement=report.get("agreement", {}),
         failures=failure_rows(report),
         num_rollouts=report.get("num_rollouts", 0),
         strips=strips(pictures),

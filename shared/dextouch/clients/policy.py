@@ -27,7 +27,7 @@ class PolicyStart:
 
 @runtime_checkable
 class Policy(Protocol):
-    """Acts in any world: it sees observations and cannot tell worlds apart."""
+    """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md)."""
 
     def reset(self, start: PolicyStart) -> None:
         """Forget the last rollout and begin another."""

@@ -107,6 +107,18 @@ def test_probe_is_judged_by_the_real_outcomes(report):
     assert report.to_report()["probe_accuracy_on_real"] >= 0.85
 
 
+def test_the_real_world_alone_is_enough(client, probe):
+    found = evaluate(
+        real=WorldAddress(client, "judge"),
+        imagined={},
+        policies={"hold": HoldPolicy()},
+        plan=EvaluationPlan({"reach": ""}, [2000], num_steps=16),
+        probe=probe,
+    )
+    assert [score.world for score in found.scores] == ["real"]
+    assert found.to_report()["agreement"] == {}
+
+
 def test_training_starts_are_refused(client, probe, policies, demonstrations):
     seen = next(
         d.seed

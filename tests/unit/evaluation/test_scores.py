@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
+from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.scores import ClosedLoopReport, RolloutFailure, RolloutScore
 
 
@@ -149,3 +150,15 @@ def test_without_a_common_start_there_is_no_agreement():
     assert found["agreement"]["stand"]["pearson"] == "undefined"
     assert found["agreement"]["stand"]["num_starts"] == 0
     assert found["probe_accuracy_on_real"] == "undefined"
+
+
+def test_without_an_imagined_world_there_are_real_rates_only(tmp_path):
+    found = report({"real": GOOD["real"]}).to_report()
+    assert [row["real"] for row in found["policies"]] == [1.0, 0.5, 0.0]
+    assert "imagined" not in found["policies"][0]
+    assert found["agreement"] == found["comments"] == {}
+    assert found["imagined_world"] is None
+    write_report(found, ReportPictures(), tmp_path / "report.html")
+    shown = (tmp_path / "report.html").read_text().split("<details")[0]
+    assert "0.50" in shown
+    assert '<th class="number">imagined' not in shown
