@@ -1,7 +1,7 @@
 """Counters and blocks of the readers come in; levels, findings and events by stream go out."""
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -19,7 +19,7 @@ from services.acquisition.health_levels import Board, Verdict, worst
 from services.acquisition.health_link import LinkJudge
 from services.acquisition.health_path import PathJudge
 from services.acquisition.health_report import device_health, stale_code, stream_health
-from services.acquisition.health_station import CalibrationJudge, DiskJudge
+from services.acquisition.health_station import CalibrationJudge, DiskJudge, UploadJudge
 from services.acquisition.health_taxels import TaxelJudge
 from services.acquisition.health_tracking import (
     FiniteJudge,
@@ -94,6 +94,7 @@ class HealthMonitor:
         self._figures: dict[str, float] = {}
         self._station_evaluated_ns = 0
         self._disk: DiskJudge | None = None
+        self._uploads: UploadJudge | None = None
         self._calibration = CalibrationJudge(
             [watched.descriptor for watched in self._streams], live.calibration
         )
@@ -111,6 +112,10 @@ class HealthMonitor:
         self._disk = DiskJudge(spool_root, self._supervisors)
         # The first look begins the measurement of what arrives.
         self._disk.judge(self._clock.now_ns())
+
+    def watch_uploads(self, refused: Callable[[], Mapping[str, str]]) -> None:
+        """Tell from now on which takes the store refused, and why."""
+        self._uploads = UploadJudge(refused)
 
     def watch_paths(self, paths: PathWatch) -> None:
         """Compare measured path delays with the calibration from now on."""
@@ -208,8 +213,7 @@ class HealthMonitor:
 
     def _evaluate_station(self, now_ns: int, *, confirming: bool) -> None:
         verdicts = [self._calibration.judge(now_ns)]
-        if self._disk is not None:
-            verdicts.append(self._disk.judge(now_ns))
+        verdicts += [judge.judge(now_ns) for judge in (self._disk, self._uploads) if judge]
         findings = [finding for verdict in verdicts for finding in verdict.findings]
         with self._lock:
             changes = self._board.update(findings, now_ns, confirming=confirming)

@@ -1,4 +1,4 @@
-"""Disk and calibration of a station come in; time left and what is missing or old go out."""
+"""Judges of the station itself: its disk, its calibration and what the store refused."""
 
 import shutil
 import time
@@ -121,6 +121,28 @@ class CalibrationJudge:
                 text = f"the oldest calibration is {age_s / 86_400:.0f} days old; calibrate again"
                 findings.append(HealthFinding(code="calibration_age", level="WARN", message=text))
         return Verdict(tuple(findings), figures)
+
+
+class UploadJudge:
+    """Whether the store refused takes for good.
+
+    Args:
+        refused: the store's words by take.
+    """
+
+    def __init__(self, refused: Callable[[], Mapping[str, str]]) -> None:
+        self._refused = refused
+
+    def judge(self, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del now_ns
+        refused = self._refused()
+        if not refused:
+            return Verdict()
+        first, reason = next(iter(refused.items()))
+        others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
+        text = f"the store refuses take {first}{others}: {reason}"
+        return Verdict((HealthFinding(code="upload_refused", level="WARN", message=text),))
 
 
 def needed_matrices(descriptors: Sequence[StreamDescriptor]) -> list[str]:

@@ -7,6 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, FastAPI, Response
 from starlette.concurrency import run_in_threadpool
 
+from dextouch.schemas.episodes import StoreId
 from dextouch.serving.access import RequireScope
 from dextouch.streams.packing import pack
 from services.acquisition.health_metrics import HealthCollector
@@ -75,6 +76,7 @@ def recorder_router(station: Station) -> APIRouter:
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
     """Health, live views and uploads."""
     station.health.watch_disk(station.recorder.spool_root)
+    station.health.watch_uploads(lambda: uploader.refused)
     router = APIRouter(
         prefix="/v1",
         tags=["station"],
@@ -113,6 +115,11 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
     async def uploads() -> list[UploadStatus]:
         """Saved takes and whether the store has them."""
         return await run_in_threadpool(uploader.status)
+
+    @router.post("/uploads/{recording_id}/retry")
+    async def retry(recording_id: StoreId) -> UploadStatus:
+        """Send a take again that the store refused."""
+        return await run_in_threadpool(uploader.retry, recording_id)
 
     return router
 

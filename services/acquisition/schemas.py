@@ -49,6 +49,7 @@ Code = Literal[
     "disk",
     "calibration_missing",
     "calibration_age",
+    "upload_refused",
 ]
 State = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 Action = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
@@ -215,7 +216,7 @@ class DeviceHealth(BaseModel):
 class StationHealth(BaseModel):
     """All streams and devices; `level` is the worst of the streams and of `findings`.
 
-    `findings` and `figures` are those of the station itself: disk and calibration.
+    `findings` and `figures` are those of the station itself: disk, calibration and uploads.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -269,10 +270,16 @@ class CameraList(BaseModel):
 
 
 class UploadStatus(BaseModel):
-    """One saved take and whether the store has it."""
+    """One saved take and whether the store has it.
+
+    `stored_as` is its id in the store, which differs where another recording had that id already.
+    A `refused` take stays in the spool and is not sent again before somebody asks for it.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: str
     uploaded: bool
+    stored_as: str | None = None
+    refused: bool = False
     error: str | None = None

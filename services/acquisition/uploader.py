@@ -1,5 +1,6 @@
-"""Saved takes of the spool come in, recordings of the episode store go out, each exactly once."""
+"""Upload of saved takes from a station's spool to the episode store, each exactly once."""
 
+import hashlib
 import shutil
 import threading
 from collections.abc import Iterator, Mapping
@@ -7,11 +8,20 @@ from pathlib import Path
 from typing import Protocol, runtime_checkable
 
 import structlog
+from pydantic import ValidationError
 
 from dextouch.episodes.files import disk_errors, replace_file
 from dextouch.episodes.log import SpoolReader, SpoolWriter
-from dextouch.errors import ConflictError, DexTouchError, StorageError
+from dextouch.errors import (
+    ConflictError,
+    DexTouchError,
+    InvalidInputError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+)
 from dextouch.schemas.recordings import (
+    ID_TAKEN,
     BatchReceipt,
     LedgerEntry,
     RecordingAttributes,
@@ -26,6 +36,12 @@ logger = structlog.get_logger(__name__)
 
 RECORDING_FILE = "recording.json"
 UPLOADED_FILE = "uploaded.json"
+# Holds the store's words about a take that it refused for good.
+REFUSED_FILE = "refused.txt"
+# A refusal may be a passing one (an upload that expired in between), but not so often in a row.
+MAX_REFUSALS = 3
+REFUSALS = (ConflictError, InvalidInputError, LimitExceededError)
+MAX_ID_CHARACTERS = 128
 NO_STORE = "no episode_store_url is set: takes stay in the spool"
 MAX_BATCH_SAMPLES = 120
 # Of pixels: half of what may travel, since a JPEG image of noise can be larger than its pixels.
@@ -64,6 +80,9 @@ class Uploader:
     What the store acknowledged is not sent again, also not by the next process: batch n of a
     stream is always the same samples, and the store says which batch it expects next.
 
+    A take whose id another recording of the store has is stored under a second one, `second_id`.
+    A take that the store refuses for good is set aside: it stays in the spool until `retry`.
+
     Args:
         spool_root: folder of the takes.
         store: where they go; None keeps them in the spool.
@@ -84,6 +103,8 @@ class Uploader:
         self._period_s = period_s
         self._keep_uploaded = keep_uploaded
         self._errors: dict[str, str] = {}
+        self._num_refusals: dict[str, int] = {}
+        self.refused: Mapping[str, str] = {}
         # How long the store asked to be left alone.
         self._retry_after_s = 0.0
         self._stopping = threading.Event()
@@ -104,42 +125,100 @@ class Uploader:
         """Every saved take, and every damaged one."""
         found = []
         for path in _spools(self._spool_root):
-            error = self._errors.get(path.name)
+            damage = None
             try:
                 if not SpoolReader(path).closed:
                     continue
-            except StorageError as damage:
-                error = damage.message
-            uploaded = (path / UPLOADED_FILE).exists()
-            if self._store is None and not uploaded and error is None:
-                error = NO_STORE
-            found.append(UploadStatus(recording_id=path.name, uploaded=uploaded, error=error))
+            except StorageError as error:
+                damage = error.message
+            found.append(self._status(path, damage))
         return found
+
+    def retry(self, recording_id: str) -> UploadStatus:
+        """Send a take again that was set aside.
+
+        Raises:
+            NotFoundError: no such take was set aside.
+        """
+        path = self._spool_root / recording_id
+        if not (path / REFUSED_FILE).is_file():
+            raise NotFoundError(
+                f"take {recording_id!r}: got no such take among those that the store refused; "
+                "see GET /v1/uploads"
+            )
+        # Forgotten first: the upload may begin as soon as the file is gone.
+        self._num_refusals.pop(recording_id, None)
+        self._errors.pop(recording_id, None)
+        with disk_errors(f"send {recording_id!r} again"):
+            (path / REFUSED_FILE).unlink(missing_ok=True)
+        return self._status(path, None)
 
     def upload_all(self) -> list[str]:
         """Send every closed take that the store lacks; ids of those that it has now.
 
-        A take that cannot be sent is reported by `status` and tried again at the next call. A
-        store that is busy or full says when to come again, and is asked for nothing else before.
+        A take that cannot be sent is reported by `status` and tried again at the next call, unless
+        the store refused it for good. A store that is busy or full says when to come again, and is
+        asked for nothing else before.
         """
         done = []
+        refused = {}
         self._retry_after_s = 0.0
         for path in _spools(self._spool_root):
             if (path / UPLOADED_FILE).exists() or self._stopping.is_set():
+                continue
+            if (reason := _refusal(path)) is not None:
+                refused[path.name] = reason
                 continue
             try:
                 if self._upload(path):
                     done.append(path.name)
                     self._errors.pop(path.name, None)
+                    self._num_refusals.pop(path.name, None)
                     give_back_free_memory()
             except DexTouchError as error:
-                if self._errors.get(path.name) != error.message:
-                    logger.warning("fail_upload", recording_id=path.name, error=error.message)
-                self._errors[path.name] = error.message
+                self._note_failure(path, error)
                 if "retry_after_s" in error.details:
                     self._retry_after_s = float(str(error.details["retry_after_s"]))
                     break
+        self.refused = refused
         return done
+
+    def _status(self, path: Path, damage: str | None) -> UploadStatus:
+        name, error = path.name, damage or self._errors.get(path.name)
+        uploaded, stored_as, reason = (path / UPLOADED_FILE).exists(), None, _refusal(path)
+        if uploaded:
+            stored_as = _stored_as(path)
+        elif reason is not None:
+            error = f"{reason}; it is kept here and sent again by POST /v1/uploads/{name}/retry"
+        elif self._store is None and error is None:
+            error = NO_STORE
+        return UploadStatus(
+            recording_id=name,
+            uploaded=uploaded,
+            stored_as=stored_as,
+            refused=reason is not None,
+            error=error,
+        )
+
+    def _note_failure(self, path: Path, error: DexTouchError) -> None:
+        """Remember why a take was not sent, and set it aside once it is clear that it never is."""
+        name = path.name
+        if self._errors.get(name) != error.message:
+            logger.warning("fail_upload", recording_id=name, error=error.message)
+        self._errors[name] = error.message
+        if not isinstance(error, REFUSALS) or "retry_after_s" in error.details:
+            self._num_refusals.pop(name, None)
+            return
+        self._num_refusals[name] = self._num_refusals.get(name, 0) + 1
+        if self._num_refusals[name] < MAX_REFUSALS:
+            return
+        try:
+            with disk_errors(f"set take {name!r} aside"):
+                replace_file(path / REFUSED_FILE, error.message.encode())
+        except StorageError as full:
+            logger.warning("fail_set_aside", recording_id=name, error=full.message)
+            return
+        logger.error("set_take_aside", recording_id=name, error=error.message)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
@@ -150,7 +229,8 @@ class Uploader:
         spool = SpoolReader(path)
         if not spool.closed or self._store is None:
             return False
-        status = self._store.create(spool.attributes)
+        status = self._begin(self._store, spool.attributes)
+        recording_id = status.recording_id
         num_batches = {}
         for name, descriptor in spool.streams.items():
             num_samples = batch_samples(descriptor)
@@ -162,12 +242,12 @@ class Uploader:
             for number, batch in enumerate(batches, start=first):
                 if self._stopping.is_set():
                     return False
-                self._store.send_batch(path.name, descriptor, batch, number=number)
+                self._store.send_batch(recording_id, descriptor, batch, number=number)
         known = spool.attributes
         status = self._store.finish(
-            path.name, num_batches, success=known.success, ledger=known.ledger
+            recording_id, num_batches, success=known.success, ledger=known.ledger
         )
-        logger.info("upload_take", recording_id=path.name)
+        logger.info("upload_take", recording_id=path.name, stored_as=recording_id)
         # Where this fails the take is sent again: the store then answers that it has everything.
         with disk_errors(f"note the upload of {path.name!r}"):
             if self._keep_uploaded:
@@ -175,6 +255,23 @@ class Uploader:
             else:
                 shutil.rmtree(path)
         return True
+
+    def _begin(self, store: RecordingStore, attributes: RecordingAttributes) -> RecordingStatus:
+        """Begin an upload, under its second id where another recording has the first."""
+        try:
+            return store.create(attributes)
+        except ConflictError as error:
+            if error.details.get("reason") != ID_TAKEN:
+                raise
+        return store.create(attributes.model_copy(update={"recording_id": second_id(attributes)}))
+
+
+def second_id(attributes: RecordingAttributes) -> str:
+    """The id of a take whose first one is taken: always the same for one take, else another."""
+    started = (attributes.station, attributes.started_at, attributes.started_t_host_ns)
+    digest = hashlib.sha256(repr((attributes.recording_id, *map(str, started))).encode())
+    suffix = f"-{digest.hexdigest()[:12]}"
+    return attributes.recording_id[: MAX_ID_CHARACTERS - len(suffix)] + suffix
 
 
 def batch_samples(descriptor: StreamDescriptor) -> int:
@@ -218,6 +315,23 @@ def _recover(path: Path) -> bool:
     spool.close()
     logger.warning("recover_take", recording_id=path.name)
     return True
+
+
+def _refusal(path: Path) -> str | None:
+    """Why the store refused a take for good; None where it did not."""
+    try:
+        return (path / REFUSED_FILE).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return None
+
+
+def _stored_as(path: Path) -> str | None:
+    """The id that a take has in the store; None where the note of its upload is damaged."""
+    try:
+        note = (path / UPLOADED_FILE).read_bytes()
+        return RecordingStatus.model_validate_json(note).recording_id
+    except ValidationError:
+        return None
 
 
 def _spools(spool_root: Path) -> Iterator[Path]:

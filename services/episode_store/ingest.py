@@ -15,6 +15,7 @@ from dextouch.episodes.format import check_id
 from dextouch.episodes.log import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas.recordings import (
+    ID_TAKEN,
     BatchReceipt,
     FinishRecording,
     RecordingAttributes,
@@ -205,7 +206,8 @@ def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
     late = {"success": ours.success, "ledger": ours.ledger}
     if got.model_copy(update=late) != ours:
         raise ConflictError(
-            f"recording {ours.recording_id!r} exists with other attributes; choose another id"
+            f"recording {ours.recording_id!r} exists with other attributes; choose another id",
+            reason=ID_TAKEN,
         )
 
 

@@ -28,7 +28,7 @@ QUICK = (
     "disk full in 20 min",
 )
 # Told to whoever asks while a sample is overdue; and what needs minutes of asking the device.
-TESTED_ELSEWHERE = {"late", "latency_calibration"}
+TESTED_ELSEWHERE = {"late", "latency_calibration", "upload_refused"}
 
 
 def judged(name, outcome):

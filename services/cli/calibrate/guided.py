@@ -102,13 +102,14 @@ class StationTakes:
         self._act("save", {"recording_id": name, "accept_incomplete": True})
         if found is not None:
             return str(folder.resolve()), found
-        self._await_upload(name)
-        return name, check(name)
+        stored_as = self._await_upload(name)
+        return stored_as, check(stored_as)
 
     def _act(self, action: str, body: dict[str, object]) -> None:
         self._link.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
 
-    def _await_upload(self, name: str) -> None:
+    def _await_upload(self, name: str) -> str:
+        """The take's id in the store."""
         if not self._has_store:
             raise NotFoundError(
                 f"take {name!r}: not in {self._spool.resolve()}; name the station's spool with "
@@ -116,8 +117,9 @@ class StationTakes:
             )
         for _ in progress(list(range(round(UPLOAD_S))), "waiting for the upload"):
             uploads = json.loads(self._link.request("GET", "/v1/uploads").body)
-            if any(take["recording_id"] == name and take["uploaded"] for take in uploads):
-                return
+            for take in uploads:
+                if take["recording_id"] == name and take["uploaded"]:
+                    return str(take.get("stored_as") or name)
             self._wait(1.0)
         raise NotFoundError(
             f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "

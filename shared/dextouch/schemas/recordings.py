@@ -13,6 +13,9 @@ from dextouch.schemas.episodes import (
 )
 from dextouch.streams.descriptors import MAX_STREAMS, StreamDescriptor
 
+# Reason of the store's ConflictError where another recording has the id.
+ID_TAKEN = "id_taken"
+
 
 class LedgerEntry(BaseModel):
     """One kind of fault that a station noticed in one stream, and how often."""
