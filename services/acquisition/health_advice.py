@@ -45,5 +45,5 @@ ADVICE: Final[Mapping[Code, str]] = {
     "disk": "Upload and delete takes, or spool to a larger disk.",
     "calibration_missing": "Calibrate with `dextouch station calibrate` before recording.",
     "calibration_age": "Calibrate again with `dextouch station calibrate`.",
-    "upload_refused": "Put right what the store names, then POST /v1/uploads/ID/retry.",
+    "upload_refused": "Put right what the store names, then send the take again from the page.",
 }

@@ -4,7 +4,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Depends, FastAPI, Response
+from fastapi import APIRouter, Body, Depends, FastAPI, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.schemas.episodes import StoreId
@@ -112,9 +112,9 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         return Response(image, media_type="image/jpeg")
 
     @router.get("/uploads")
-    async def uploads() -> list[UploadStatus]:
-        """Saved takes and whether the store has them."""
-        return await run_in_threadpool(uploader.status)
+    async def uploads(refused: Annotated[bool, Query()] = False) -> list[UploadStatus]:  # noqa: FBT002 - a query's flag
+        """Saved takes and whether the store has them; with `refused`, those alone it refused."""
+        return await run_in_threadpool(uploader.status, only_refused=refused)
 
     @router.post("/uploads/{recording_id}/retry")
     async def retry(recording_id: StoreId) -> UploadStatus:

@@ -121,10 +121,11 @@ class Uploader:
         if self._thread.ident is not None:
             self._thread.join()
 
-    def status(self) -> list[UploadStatus]:
-        """Every saved take, and every damaged one."""
+    def status(self, *, only_refused: bool = False) -> list[UploadStatus]:
+        """Every saved take, and every damaged one; or those alone that the store refused."""
         found = []
-        for path in _spools(self._spool_root):
+        refused = [self._spool_root / name for name in self.refused]
+        for path in refused if only_refused else _spools(self._spool_root):
             damage = None
             try:
                 if not SpoolReader(path).closed:

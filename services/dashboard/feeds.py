@@ -14,6 +14,7 @@ from services.dashboard.settings import DashboardSettings
 from services.dashboard.topics import Message, Topic, topic_message
 from services.dashboard.upstream import Upstream
 from services.dashboard.views import (
+    RefusedView,
     ServiceView,
     StationView,
     TakesView,
@@ -77,7 +78,19 @@ class Feeds:
         ]
 
     async def takes(self) -> TakesView:
-        """The newest recordings and episodes, newest first, or why there are none."""
+        """The newest recordings and episodes, and takes of the station that are refused."""
+        stored, refused = await asyncio.gather(self._stored(), self._refused())
+        return stored.model_copy(update={"refused": refused})
+
+    async def _refused(self) -> tuple[RefusedView, ...]:
+        try:
+            answer = await self.upstream("acquisition").json("GET", station_api.REFUSED_PATH)
+            return station_api.refused_views(answer)
+        except DexTouchError:
+            return ()  # the station topic tells why
+
+    async def _stored(self) -> TakesView:
+        """The newest first, or why there are none."""
         if "episode_store" not in self._upstreams:
             return TakesView(
                 note="This dashboard was started without DEXTOUCH_DASHBOARD_EPISODE_STORE_URL: "
@@ -109,6 +122,11 @@ class Feeds:
         path = station_api.action_path(action)
         answer = await self.upstream("acquisition").json("POST", path, body=body)
         return station_api.recorder_view(answer).model_dump()
+
+    async def retry(self, recording_id: str) -> None:
+        """Let the station send a take again that the store refused."""
+        path = station_api.retry_path(recording_id)
+        await self.upstream("acquisition").json("POST", path)
 
     async def camera_image(self, name: str) -> tuple[bytes, str]:
         """The newest image of a camera and its media type."""

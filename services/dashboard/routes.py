@@ -73,6 +73,7 @@ def api_router(settings: DashboardSettings) -> APIRouter:
                 "services": [view.model_dump() for view in services],
                 "takes": [view.model_dump() for view in takes.takes],
                 "takes_note": takes.note,
+                "refused": [view.model_dump() for view in takes.refused],
             }
         )
 
@@ -87,6 +88,12 @@ def api_router(settings: DashboardSettings) -> APIRouter:
             )
         feeds: Feeds = request.app.state.feeds
         return JSONResponse(await feeds.operate(action, wanted.model_dump(exclude_unset=True)))
+
+    @router.post("/uploads/{recording_id}/retry", status_code=204)
+    async def retry(recording_id: str, request: Request) -> None:
+        """Send a take again that the store refused."""
+        feeds: Feeds = request.app.state.feeds
+        await feeds.retry(recording_id)
 
     @router.get("/cameras/{name}.jpg")
     async def camera(name: str, request: Request) -> Response:

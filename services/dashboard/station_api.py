@@ -2,8 +2,9 @@
 
 from collections.abc import Sequence
 from typing import TypeVar
+from urllib.parse import quote
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, RootModel, ValidationError
 
 from dextouch.errors import UnavailableError, UnknownNameError
 from services.dashboard.views import (
@@ -11,6 +12,7 @@ from services.dashboard.views import (
     Level,
     PromptView,
     RecorderView,
+    RefusedView,
     StationView,
     StreamView,
     worst,
@@ -18,6 +20,7 @@ from services.dashboard.views import (
 
 HEALTH_PATH = "/v1/health"
 RECORDER_PATH = "/v1/recorder"
+REFUSED_PATH = "/v1/uploads?refused=true"
 TAXELS_PATH = "/v1/live/taxels"
 CAMERAS_PATH = "/v1/live/cameras"
 
@@ -100,6 +103,10 @@ class RecorderStatus(_Answer):
     check: TakeCheck | None = None
 
 
+class RefusedList(RootModel[tuple[RefusedView, ...]]):
+    """Takes that the store refused."""
+
+
 class CameraList(_Answer):
     """Cameras that have sent an image."""
 
@@ -175,6 +182,16 @@ def recorder_view(answer: object) -> RecorderView:
         note=" · ".join(words),
         problems=problems,
     )
+
+
+def retry_path(recording_id: str) -> str:
+    """Where a take is sent again."""
+    return f"/v1/uploads/{quote(recording_id, safe='')}/retry"
+
+
+def refused_views(answer: object) -> tuple[RefusedView, ...]:
+    """The takes that the store refused from the answer at REFUSED_PATH."""
+    return _read(RefusedList, answer).root
 
 
 def camera_views(answer: object) -> list[CameraView]:

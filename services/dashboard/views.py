@@ -110,11 +110,21 @@ class TakeView(BaseModel):
     clocks: str = ""
 
 
+class RefusedView(BaseModel):
+    """One take of the station that the store refused, and why."""
+
+    model_config = ConfigDict(frozen=True, extra="ignore")
+
+    recording_id: str
+    error: str
+
+
 class TakesView(BaseModel):
-    """The newest takes; `note` says why there are none."""
+    """The newest takes; `note` says why there are none. `refused` ones wait at the station."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    refused: tuple[RefusedView, ...] = ()
     takes: tuple[TakeView, ...] = ()
     note: str = ""
 

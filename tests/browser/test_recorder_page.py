@@ -1,6 +1,8 @@
 """Takes recorded through the page, on a station with mock devices: every label is asked for."""
 
 import pytest
+from fastapi import FastAPI
+from fastapi.responses import JSONResponse
 from playwright.sync_api import expect
 
 from dextouch.episodes.log import SpoolReader
@@ -156,6 +158,34 @@ def test_a_page_that_is_loaded_anew_shows_what_is_armed(page, address):
     expect(page.get_by_label("Operator")).to_have_value("p7")
     expect(page.get_by_label("Consent given")).not_to_be_checked()
     expect(page.get_by_role("button", name="Record")).to_be_enabled()
+
+
+def test_a_refused_take_is_shown_and_sent_again(page, serve, serve_station, spool):
+    """Three times when it was saved, and three times more when the operator asks for it."""
+    problem = {"type": "urn:dextouch:error:InvalidInputError", "title": "InvalidInput"}
+    asked = []
+    store = FastAPI()
+
+    @store.post("/v1/recordings")
+    def create():
+        asked.append(1)
+        facts = {"status": 422, "detail": f"unknown task, said {len(asked)} times"}
+        return JSONResponse(problem | facts, 422, media_type="application/problem+json")
+
+    station = serve_station(spool, episode_store_url=serve(store), upload_period_s=0.01)
+    open_recorder(page, serve(create_dashboard(DashboardSettings(acquisition_url=station))))
+    fill(page, instruction="Stack the bowls")
+    page.keyboard.press("Escape")
+    take = record(page)
+    page.keyboard.press("u")
+    press_until(page, "v", "saved")
+    waiting = page.get_by_role("list", name="takes that the store refused")
+    page.locator("#takes").scroll_into_view_if_needed()
+    expect(waiting).to_contain_text(take)
+    expect(waiting).to_contain_text("unknown task, said 3 times")
+    waiting.get_by_role("button", name="Send again").click()
+    expect(waiting).to_contain_text("unknown task, said 6 times")
+    assert (spool / take / "recording.json").exists()
 
 
 def test_no_store_is_said(page, address):

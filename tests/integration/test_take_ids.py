@@ -174,7 +174,9 @@ async def test_a_take_that_is_refused_for_good_is_set_aside(tmp_path, monkeypatc
         assert found["level"] == "WARN"
         assert "same-1" in found["message"]
         assert "not in this store's list" in found["message"]
-        assert "retry" in found["advice"]
+        assert "send the take again" in found["advice"]
+        listed = (await client.get("/v1/uploads?refused=true")).json()
+        assert [take["recording_id"] for take in listed] == ["same-1"]
 
         missing = await client.post("/v1/uploads/another/retry")
         assert missing.status_code == 404

@@ -24,6 +24,33 @@ function takeRow(take) {
     element("td", {}, take.outcome));
 }
 
+// A take that the store refused waits at the station until somebody has it sent again.
+function refusedItem(take, say) {
+  const button = element("button", { type: "button" }, "Send again");
+  button.addEventListener("click", async () => {
+    button.disabled = true;
+    try {
+      const answer = await fetch(`/v1/uploads/${encodeURIComponent(take.recording_id)}/retry`, { method: "POST" });
+      if (!answer.ok) say((await answer.json()).detail ?? `refused (${answer.status})`);
+    } catch (error) {
+      say(`The dashboard did not answer: ${error.message}`);
+    } finally {
+      button.disabled = false;
+    }
+  });
+  return element("li", {}, element("span", {}, element("strong", {}, take.recording_id), why(take.error)), button);
+}
+
+export function showRefused(list, refused) {
+  // Rebuilt only when it changes, so that a click does not fall between two buttons.
+  const now = JSON.stringify(refused);
+  if (list.dataset.shown === now) return;
+  list.dataset.shown = now;
+  const note = element("li", { class: "note", "data-level": "ERROR", role: "alert" });
+  const items = refused.map((take) => refusedItem(take, (text) => { note.textContent = text; }));
+  list.replaceChildren(...(items.length ? [...items, note] : []));
+}
+
 export function showTakes(body, { takes, note }) {
   const empty = element("tr", {}, element("td", { colspan: 5, class: "free" }, note));
   body.replaceChildren(...(takes.length ? takes.map(takeRow) : [empty]));

@@ -3,7 +3,7 @@
 import { showDevices } from "./devices.js";
 import { setText } from "./dom.js";
 import { drawScale, HandCanvas, readTaxels } from "./hands.js";
-import { showCameras, showServices, showTakes } from "./lists.js";
+import { showCameras, showRefused, showServices, showTakes } from "./lists.js";
 import { LiveLink } from "./live.js";
 import { RecorderPanel } from "./recorder.js";
 import { startTheme } from "./theme.js";
@@ -30,7 +30,10 @@ function showStation(station) {
 const topics = {
   station: showStation,
   services: (services) => showServices(find("service_list"), services),
-  takes: (takes) => showTakes(find("take_rows"), takes),
+  takes: (takes) => {
+    showTakes(find("take_rows"), takes);
+    showRefused(find("refused_list"), takes.refused);
+  },
   cameras: (cameras) => showCameras(find("cameras"), find("camera_row"), cameras),
   taxels_lost: (reason) => Object.values(hands).forEach((hand) => hand.clear(reason)),
 };
