@@ -190,7 +190,7 @@ class Uploader:
         if uploaded:
             stored_as = _stored_as(path)
         elif reason is not None:
-            error = f"{reason}; it is kept here and sent again by POST /v1/uploads/{name}/retry"
+            error = f"the store refuses it: {reason}; it stays here until it is sent again"
         elif self._store is None and error is None:
             error = NO_STORE
         return UploadStatus(
