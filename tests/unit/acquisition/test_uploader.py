@@ -9,7 +9,13 @@ from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
-from services.acquisition.uploader import UPLOADED_FILE, Uploader, batch_samples, recover_spool
+from services.acquisition.uploader import (
+    UPLOADED_FILE,
+    Uploader,
+    batch_samples,
+    recover_spool,
+    second_id,
+)
 
 STREAMS = tuple(
     StreamDescriptor(
@@ -198,6 +204,23 @@ def test_one_refused_take_does_not_hold_up_the_next(tmp_path):
         "a: exists with other attributes",
         None,
     ]
+
+
+def test_a_second_id_is_valid_and_of_one_take_alone():
+    takes = [
+        RecordingAttributes(
+            recording_id=name, task="t", instruction="i", domain="human", station=station
+        )
+        for name in ("take", "take-1", "t" * 128)
+        for station in ("Desk 1", "Desk 2")
+    ]
+    ids = [second_id(take) for take in takes]
+    assert ids == [second_id(take) for take in takes]
+    assert len(set(ids)) == len(takes)
+    for take, other in zip(takes, ids, strict=True):
+        # As an id, it is checked against the pattern of the store.
+        renamed = RecordingAttributes.model_validate(take.model_dump() | {"recording_id": other})
+        assert renamed.recording_id.startswith(take.recording_id[:100])
 
 
 def test_thread_uploads_and_stops(tmp_path):
