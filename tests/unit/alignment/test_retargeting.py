@@ -30,6 +30,7 @@ def bending(num_steps):
 
 
 EXACT = RetargetOptions(temporal_weight_m2=0.0)
+MIDDLE_NODES = ("proximal", "intermediate", "distal", "tip")
 
 
 def test_slopes_are_the_derivative():
@@ -145,6 +146,42 @@ def test_no_joint_is_faster_than_the_limit():
     assert steps_rad.max() == pytest.approx(1 / 60)
     slow = HandRetargeter("right", options=options).retarget(there, t_s=np.arange(25.0))
     np.testing.assert_allclose(slow.joints_rad[-1], bending(2)[1], atol=1e-6)
+
+
+@pytest.mark.parametrize("elapsed_s", [1 / 120, 1 / 60, 1 / 30])
+def test_the_sample_before_pulls_by_the_time_since(elapsed_s):
+    """One small step against the normal equations: (J'J + pull) dq = J'J dq of the hand."""
+    options, little = RetargetOptions(), slice(16, 20)
+    before = np.full(20, 0.3)
+    wanted = before.copy()
+    wanted[little] += [0.004, -0.003, 0.006, 0.005]
+    live = HandRetargeter("right", options=options)
+    found = [live.step(keypoints_of(before[None])[0]) for _ in range(3)][-1].joints_rad[0]
+    moved = live.step(keypoints_of(wanted[None])[0], elapsed_s=elapsed_s).joints_rad[0] - found
+    # Slopes of the points by central differences; without a profile the knuckle is free.
+    ahead, behind = (
+        HAND.chain_points_m(before + sign * 1e-5 * np.eye(20)[little])[:, 4] for sign in (1, -1)
+    )
+    slopes = (ahead - behind) / 2e-5
+    J = (slopes - slopes.mean(axis=1, keepdims=True)).reshape(4, -1).T
+    # m²/rad² at 60 Hz; at twice the rate twice as much.
+    pull = options.temporal_weight_m2 / 60 / elapsed_s
+    expected = np.linalg.solve(J.T @ J + pull * np.eye(4), J.T @ J @ (wanted - before)[little])
+    np.testing.assert_allclose(moved[little], expected, atol=4e-5)
+
+
+@pytest.mark.parametrize(("share", "is_believed"), [(0.9, True), (0.5, False), (1.5, False)])
+def test_bones_of_another_length_are_not_this_hands(share, is_believed):
+    keypoints = keypoints_of(bending(30))
+    live = HandRetargeter("right", HandRetargeter("right").measure(keypoints))
+    live.step(keypoints[0])
+    sample, middle = keypoints[1].copy(), CHAINS.index("middle")
+    knuckle, *further = (NODE_INDEX["middle", name] for name in MIDDLE_NODES)
+    # The first bone is shorter or longer, all others are as before: 45 mm by 10 or 50 %.
+    sample[further] += (share - 1) * (sample[further[0]] - sample[knuckle])
+    expected = np.zeros(5)
+    expected[middle] = RetargetStatus.SOLVED if is_believed else RetargetStatus.IMPLAUSIBLE
+    np.testing.assert_array_equal(live.step(sample).finger_status[0], expected)
 
 
 def test_hands_of_other_fingers_and_joints_are_followed():

@@ -1,0 +1,76 @@
+"""Values on a common grid: hand-made lines, their ends and gaps; joints that stay in limits."""
+
+import numpy as np
+import pytest
+
+from dextouch.streams.descriptors import StreamDescriptor
+from services.alignment.synchronization.hand_joints import retarget_hands
+from services.alignment.synchronization.recorded_streams import LoadedStream
+from services.alignment.synchronization.resampling import place_on_grid, vectors_on_grid
+from services.cli.bench.retargeting.sequences import motion_of
+from services.twin.hands import twin_hand
+
+MS = 1_000_000
+
+
+def placed(t_ms, grid_ms, max_gap_ms=30):
+    return place_on_grid(
+        np.array(t_ms) * MS,
+        np.array(grid_ms) * MS,
+        period_ns=10 * MS,
+        max_gap_ns=max_gap_ms * MS,
+    )
+
+
+def test_a_stream_goes_on_for_one_and_a_half_periods_at_its_ends():
+    grid_ms = [-100, -16, -15, -1, 0, 4, 10, 20, 35, 36, 10_000]
+    at = placed([0, 10, 20], grid_ms)
+    assert at.valid.tolist() == [False, False, *[True] * 7, False, False]
+    # A value that rises by 2 a millisecond.
+    values = vectors_on_grid(np.array([[0.0], [20.0], [40.0]]), at)[:, 0]
+    np.testing.assert_allclose(values[at.valid], [-30, -2, 0, 8, 20, 40, 70], atol=1e-9)
+
+
+def test_no_line_is_drawn_through_a_gap():
+    # 100 ms without a sample behind the first and before the last.
+    at = placed([0, 100, 110, 210], [-5, 0, 5, 50, 99, 100, 105, 110, 115, 205, 215])
+    assert np.flatnonzero(at.valid).tolist() == [1, 5, 6, 7]
+
+
+@pytest.mark.parametrize("end", ["first", "last"])
+def test_joints_beyond_the_last_sample_stay_in_their_limits(end):
+    """The line through the last two samples would leave the limits that the last one lies at."""
+    streams, at, upper_rad = {}, {}, {}
+    # At 60 Hz; grid steps one period beyond either end.
+    t_ns = np.rint(np.arange(40) * (1e9 / 60)).astype(np.int64)
+    grid_ns = np.array([t_ns[0] - 16 * MS, t_ns[20], t_ns[-1] + 16 * MS])
+    for side in ("left", "right"):
+        hand = twin_hand(side, "robot")
+        upper_rad[side] = hand.kinematics.upper_rad
+        joints = np.full((40, 20), 0.3)
+        # PIPs of the four fingers close by 0.12 rad a sample, at last to 0.06 rad beyond the limit.
+        closing = upper_rad[side][6] + 0.06 - 0.12 * np.arange(40)[::-1]
+        joints[:, 6::4] = np.maximum(closing, 0.3)[:, None]
+        samples = joints if end == "last" else joints[::-1]
+        name = f"keypoints_{side}"
+        streams[name] = LoadedStream(
+            StreamDescriptor(
+                name=name,
+                kind="keypoints",
+                shape=(25, 3),
+                dtype="float64",
+                unit="m",
+                nominal_rate_hz=60.0,
+                side=side,
+            ),
+            t_ns,
+            motion_of(hand, samples).keypoints_m,
+        )
+        at[name] = place_on_grid(t_ns, grid_ns, period_ns=16_666_667, max_gap_ns=50 * MS)
+        assert at[name].valid.all()
+    found = retarget_hands(streams, at, {}).joints_rad.reshape(3, 2, 20)
+    row = 2 if end == "last" else 0
+    for side_index, side in enumerate(("left", "right")):
+        assert (found[:, side_index] <= upper_rad[side]).all()
+        np.testing.assert_array_equal(found[row, side_index, 6::4], upper_rad[side][6::4])
+        assert (found[1, side_index, 6::4] < 0.6).all()
