@@ -108,21 +108,90 @@ def test_nearest_is_nearest(stamps, t):
         assert abs(stamps[index] - time) == abs(stamps - time).min()
 
 
-@given(
-    stamps=st.lists(st.integers(-50, 900), max_size=40, unique=True).map(sorted),
-    start=st.integers(0, 8),
-    count=st.integers(1, 5),
-)
+def test_of_two_equally_near_stamps_the_earlier_counts():
+    got = nearest_indices(np.array([10, 20, 30]), np.array([15, 25, 14, 26, 0, 99]))
+    assert got.tolist() == [0, 1, 0, 2, 0, 2]
+
+
+# Samples near any step, a few microseconds to either side, and anywhere between.
+STEP_NS = 66_666_667
+SOME_STAMPS = st.lists(
+    st.integers(-50_000_000, 900_000_000)
+    | st.builds(
+        lambda step, off_ns: step * STEP_NS + off_ns, st.integers(0, 13), st.integers(-2000, 2000)
+    ),
+    max_size=40,
+    unique=True,
+).map(sorted)
+
+
+def steps_of(stamp_ns, grid_ns):
+    """The step whose (t-1, t] holds a stamp: one within 1 µs of a step counts as that step."""
+    for step, t_ns in enumerate(grid_ns.tolist()):
+        if abs(stamp_ns - t_ns) <= 1_000:
+            return step
+        if stamp_ns < t_ns:
+            return step
+    return len(grid_ns)
+
+
+@given(stamps=SOME_STAMPS, start=st.integers(0, 8), count=st.integers(1, 5))
 def test_ranges_tile_the_time_and_windows_agree(stamps, start, count):
-    stamps_ns = np.array(stamps, dtype=np.int64) * 1_000_000
-    grid_ns = np.arange(14, dtype=np.int64) * 66_666_667
+    stamps_ns = np.array(stamps, dtype=np.int64)
+    grid_ns = np.arange(14, dtype=np.int64) * STEP_NS
     whole = step_ranges(stamps_ns, grid_ns, 0, 14)
     part = step_ranges(stamps_ns, grid_ns, start, start + count)
     np.testing.assert_array_equal(part, whole[start : start + count])
+    steps = [steps_of(stamp, grid_ns) for stamp in stamps]
     for step in range(1, 14):
         low, high = whole[step]
-        inside = (stamps_ns > grid_ns[step - 1] + 1000) & (stamps_ns <= grid_ns[step] + 1000)
-        assert np.flatnonzero(inside).tolist() == list(range(low, high))
+        assert [i for i, at in enumerate(steps) if at == step] == list(range(low, high))
+
+
+def test_samples_within_a_microsecond_after_a_step_belong_to_it():
+    """Worked out by hand from docs/episode_format.md, for steps of 100 ms."""
+    stamps_ns = np.array(
+        [0, 50_000_000, 100_001_000, 100_001_001, 199_999_000, 200_000_999, 200_001_001]
+    )
+    ranges = step_ranges(stamps_ns, np.arange(3) * 100_000_000, 0, 3)
+    assert ranges.tolist() == [[0, 1], [1, 3], [3, 6]]
+
+
+@pytest.mark.parametrize(
+    ("first_ns", "is_taken"),
+    [
+        (0, True),
+        (50_000_000, True),
+        (50_000_001, False),
+        (-50_000_000, True),
+        (-50_000_001, False),
+        (99_000_000, False),
+    ],
+)
+def test_step_0_takes_a_first_sample_within_half_a_step(first_ns, is_taken):
+    ranges = step_ranges(np.array([first_ns, 250_000_000]), np.arange(3) * 100_000_000, 0, 3)
+    assert ranges[0].tolist() == [0, int(is_taken)]
+    assert step_ranges(np.array([], dtype=np.int64), np.arange(2), 0, 1).tolist() == [[0, 0]]
+
+
+@pytest.mark.parametrize("off_ns", [-900, 900])
+def test_stamps_off_by_less_than_a_microsecond_change_nothing(made, store, off_ns):
+    expected = made.write(store).window(0)
+    for side in ("left", "right"):
+        made.stamps_ns[f"tactile_{side}"] = made.stamps_ns[f"tactile_{side}"] + off_ns
+    window = made.write(store, episode_id="shifted").window(0)
+    np.testing.assert_array_equal(window.tactile_kpa, expected.tactile_kpa)
+    np.testing.assert_array_equal(window.tactile_valid, expected.tactile_valid)
+
+
+def test_a_glove_that_begins_late_gives_nothing_at_step_0(made, store):
+    """The first sample is 50 ms after step 0, more than half of its 66.7 ms."""
+    stamps = made.stamps_ns["tactile_left"]
+    made.stamps_ns["tactile_left"] = stamps[3:]
+    made.values["tactile_left"] = made.values["tactile_left"][3:]
+    window = made.write(store).window(0)
+    assert window.tactile_valid[:2].tolist() == [[False, True], [True, True]]
+    assert (window.tactile_kpa[0, 0] == 0).all()
 
 
 @given(

@@ -115,6 +115,13 @@ def test_whole_bytes_with_wrong_content_are_refused(fields, arrays):
         wire.decode_batch(framed(pack(fields, arrays)), POSE, number=0)
 
 
+def test_samples_that_arrive_at_one_time_are_taken():
+    stamps = np.array([7, 7, 8])
+    batch = SampleBatch(stamps, stamps, stamps, np.zeros((3, 7)))
+    data = wire.encode_batch(POSE, batch, number=0)
+    assert_same(wire.decode_batch(data, POSE, number=0), batch)
+
+
 def test_bytes_that_are_no_image_are_refused():
     arrays = STAMPS | {"image_bytes": np.zeros(8, "u1"), "image_end": np.array([4, 8])}
     with pytest.raises(InvalidInputError, match="image 0 of the batch: 4 bytes are no JPEG"):

@@ -1,0 +1,93 @@
+"""Journals of a stage, written byte by byte as docs/episode_format.md describes them."""
+
+import struct
+
+import google_crc32c
+import numpy as np
+import pytest
+
+from dextouch.episodes.journal import read_payloads, read_rows
+from dextouch.errors import CorruptDataError
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+
+PAYLOADS = [b"a" * 10, b"bc" * 6, b"defg" * 5]
+OFFSETS = [0, 10, 22]
+
+
+def row(offset, payload, num_rows=5):
+    """Offset u64, rows, payload length, payload crc32c, crc32c of the row: u32 each."""
+    body = struct.pack("<QIII", offset, num_rows, len(payload), google_crc32c.value(payload))
+    return body + struct.pack("<I", google_crc32c.value(body))
+
+
+def write_log(folder, rows, part):
+    (folder / "force.journal").write_bytes(b"DXTJRNL\x02" + b"".join(rows))
+    (folder / "force.part").write_bytes(part)
+
+
+@pytest.fixture
+def rows():
+    return [row(*each) for each in zip(OFFSETS, PAYLOADS, strict=True)]
+
+
+def test_whole_rows_are_read(tmp_path, rows):
+    write_log(tmp_path, rows, b"".join(PAYLOADS))
+    found = read_rows(tmp_path, "force")
+    assert found["offset"].tolist() == OFFSETS
+    assert read_payloads(tmp_path, "force", found) == PAYLOADS
+
+
+@pytest.mark.parametrize(
+    ("num_bytes", "num_rows"),
+    [(42, 3), (41, 2), (22, 2), (21, 1), (10, 1), (9, 0), (0, 0)],
+)
+def test_a_row_whose_payload_is_not_wholly_there_does_not_count(
+    tmp_path, rows, num_bytes, num_rows
+):
+    """After a power loss the rows may be on the disk and their payloads not."""
+    write_log(tmp_path, rows, b"".join(PAYLOADS)[:num_bytes])
+    assert read_rows(tmp_path, "force")["offset"].tolist() == OFFSETS[:num_rows]
+
+
+@pytest.mark.parametrize("offset", [0, 9, 11, 22, 2**63])
+def test_a_last_row_that_does_not_follow_does_not_count(tmp_path, rows, offset):
+    write_log(tmp_path, [rows[0], row(offset, PAYLOADS[1])], b"".join(PAYLOADS))
+    assert read_rows(tmp_path, "force")["offset"].tolist() == [0]
+
+
+def test_rows_around_a_hole_are_refused(tmp_path, rows):
+    """Payloads lie end to end: what no row vouches for must not end up between them."""
+    second, third = row(12, PAYLOADS[1]), row(24, PAYLOADS[2])
+    part = PAYLOADS[0] + b"??" + PAYLOADS[1] + PAYLOADS[2]
+    write_log(tmp_path, [rows[0], second, third], part)
+    with pytest.raises(CorruptDataError, match="row 1 of 3 does not hold"):
+        read_rows(tmp_path, "force")
+
+
+def test_a_first_row_begins_at_the_first_byte(tmp_path, rows):
+    write_log(tmp_path, [row(2, PAYLOADS[0])], b"??" + PAYLOADS[0])
+    assert len(read_rows(tmp_path, "force")) == 0
+
+
+def test_the_live_view_ends_before_a_payload_that_is_not_there_yet(store):
+    force = StreamDescriptor(
+        name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
+    )
+    attributes = RecordingAttributes(
+        recording_id="take-1",
+        task="t",
+        instruction="",
+        domain="human",
+        station="bench",
+        streams=(force,),
+    )
+    writer = store.writer(kind="recording", attributes=attributes)
+    writer.append("force", values=np.ones((15, 2), "f4"), t_host_ns=np.arange(15))
+    (part,) = (store.root / ".staging").glob("*/force.part")
+    part.write_bytes(part.read_bytes()[:-1])
+    batch = store.live("take-1").read("force")
+    assert batch.t_host_ns.tolist() == list(range(10))
+    assert (batch.values == 1).all()
+    writer.discard()
+    writer.__exit__(None, None, None)
