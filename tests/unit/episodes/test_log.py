@@ -2,7 +2,9 @@
 
 import errno
 import os
+import struct
 
+import google_crc32c
 import numpy as np
 import pytest
 
@@ -52,6 +54,37 @@ def test_batches_come_back_and_are_the_same_whoever_cuts_them(path):
     assert [len(b) for b in reader.batches("glove_left", num_samples=4)] == [4, 4, 2]
     (later,) = reader.batches("glove_left", num_samples=4, first=2)
     assert_same(later, glove_batch(8, 2))
+
+
+def record(place, batch, *, first_sample, stream=0):
+    """A record of a log as docs/episode_format.md describes it, of a stream of numbers."""
+    body = b"".join(
+        np.asarray(column).astype(dtype).tobytes()
+        for column, dtype in [
+            (batch.t_host_ns, "<i8"),
+            (batch.t_device_ns, "<i8"),
+            (batch.sequence, "<i8"),
+            (batch.values, "<u2"),
+        ]
+    )
+    counts = (stream, len(batch), len(body), google_crc32c.value(body))
+    header = struct.pack("<4sQQIIII", b"DXTR", place, first_sample, *counts)
+    return header + struct.pack("<I", google_crc32c.value(header)) + body
+
+
+@pytest.mark.parametrize("first_sample", [0, 1, 2, 3, 2**63])
+def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(path, first_sample):
+    log.SpoolWriter(path, ATTRIBUTES).close()
+    data = b"DXTBLOG\x01"
+    data += record(len(data), glove_batch(0, 2), first_sample=0)
+    data += record(len(data), glove_batch(2, 3), first_sample=first_sample)
+    (path / LOG_FILE).write_bytes(data)
+    if first_sample == 2:
+        assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
+        return
+    for read in (lambda: log.SpoolReader(path).read("glove_left"), lambda: log.recover(path)):
+        with pytest.raises(CorruptDataError, match="stream number 0 do not follow each other"):
+            read()
 
 
 def test_a_living_spool_shows_full_batches_only(path):
