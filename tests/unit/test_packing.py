@@ -1,11 +1,14 @@
 """Packed fields and arrays come back as they went; foreign bytes are refused."""
 
+import contextlib
 import struct
 import tracemalloc
 
 import msgpack
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.streams.packing import pack, unpack
@@ -122,3 +125,41 @@ def test_what_messages_hold_is_within_the_bounds():
     got, arrays = unpack(pack(fields, {"a": np.zeros((0, 1080, 1920, 3))}), max_bytes=10**6)
     assert got == fields
     assert arrays["a"].shape == (0, 1080, 1920, 3)
+
+
+ANYTHING = st.recursive(
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.binary()
+    # Also times, which travel as an extension of msgpack, and other extensions.
+    | st.text()
+    | st.builds(msgpack.ExtType, st.integers(0, 127), st.binary(max_size=20)),
+    lambda inner: (
+        st.lists(inner, max_size=4)
+        | st.dictionaries(st.sampled_from(["fields", "arrays", "dtype", "shape", "data"]), inner)
+    ),
+    max_leaves=6,
+)
+EMPTY = st.fixed_dictionaries(
+    {
+        "dtype": st.sampled_from(["float32", "bool"]),
+        "shape": st.lists(st.sampled_from([0, 1, 7, 2**31, 2**62, 2**64 - 1]), max_size=9),
+        "data": st.just(b""),
+    }
+)
+ENTRY = EMPTY | st.fixed_dictionaries({"dtype": ANYTHING, "shape": ANYTHING, "data": ANYTHING})
+MESSAGE = st.fixed_dictionaries(
+    {"fields": st.dictionaries(st.text(), ANYTHING) | ANYTHING}
+    | {"arrays": st.dictionaries(st.text(), ENTRY, max_size=3) | ANYTHING}
+)
+
+
+@given(data=st.binary() | (MESSAGE | ANYTHING).map(msgpack.packb), cut=st.integers(0, 5))
+def test_whatever_comes_is_read_or_refused_by_name(data, cut):
+    for body in (data, data[: len(data) - cut], data[cut:]):
+        with contextlib.suppress(InvalidInputError, LimitExceededError):
+            fields, arrays = unpack(body, max_bytes=100_000)
+            assert all(isinstance(array, np.ndarray) for array in arrays.values())
+            assert isinstance(fields, dict)
