@@ -25,7 +25,7 @@ def commands_of_the_readme():
     lines = "\n".join(re.findall(r"```\n(.*?)```", section, re.DOTALL)).splitlines()
     typed = [shlex.split(line, comments=True) for line in lines]
     quick = {("make", "demo"): ["dextouch", "demo", "--seeds", "1"], ("make", "test"): []}
-    return [quick.get(tuple(words), [Path(words[0]).name, *words[1:]]) for words in typed]
+    return [quick.get(tuple(words), [Path(words[0]).name, *words[1:]]) for words in typed if words]
 
 
 def in_folder(folder, words, **more):
