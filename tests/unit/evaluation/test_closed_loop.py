@@ -1,8 +1,11 @@
 """The closed loop over HTTP: matched starts, disjoint seeds, and scores that tell worlds apart."""
 
+from contextlib import ExitStack
+
 import numpy as np
 import pytest
 
+from dextouch.clients import http_link
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from dextouch.worlds.baseline import CopyFirstWorld
@@ -34,6 +37,7 @@ def client():
         "judge": judge,
         "dream": toy.ToyWorld("dream", judge=False),
         "nightmare": toy.ToyWorld("nightmare", judge=False, drift_m=0.05),
+        "choosy": Choosy("choosy", judge=True),
         "forgetful": Forgetful("forgetful", judge=True),
         "copy-first": CopyFirstWorld.beside(judge.description),
         "wide": toy.ToyWorld("wide", judge=False, cameras=toy.TWO_CAMERAS),
@@ -117,6 +121,56 @@ def test_the_real_world_alone_is_enough(client, probe):
     )
     assert [score.world for score in found.scores] == ["real"]
     assert found.to_report()["agreement"] == {}
+
+
+class Choosy(toy.ToyWorld):
+    """A judge that does not begin from one seed."""
+
+    def reset(self, start):
+        if start.seed == 2001:
+            raise InvalidInputError("toy: nothing to reach here")
+        return super().reset(start)
+
+
+def test_a_start_that_fails_costs_its_own_rollouts_only(client, probe):
+    found = evaluate(
+        real=WorldAddress(client, "choosy"),
+        imagined=addresses(client, "dream"),
+        policies={"hold": HoldPolicy()},
+        plan=EvaluationPlan({"reach": ""}, SEEDS, num_steps=16),
+        probe=probe,
+    )
+    assert {(f.world, f.seed) for f in found.failures} == {("real", 2001), ("dream", 2001)}
+    assert "nothing to reach here" in found.failures[0].message
+    assert len(found.scores) == 4
+
+
+def test_a_world_that_goes_away_midway_is_missing_from_then_on(client, probe, monkeypatch):
+    monkeypatch.setattr(http_link, "RETRY_PAUSES_S", ())
+    kept = []
+    with ExitStack() as away:
+        app = create_world_app({"far": toy.ToyWorld("far", judge=False)}, WorldServiceSettings())
+        far = away.enter_context(RolloutClient(away.enter_context(served(app))))
+
+        def keep(outcome):
+            kept.append(outcome)
+            if len(kept) == 2:
+                away.close()
+
+        found = evaluate(
+            real=WorldAddress(client, "judge"),
+            imagined={"far": WorldAddress(far, "far")},
+            policies={"hold": HoldPolicy()},
+            plan=EvaluationPlan({"reach": ""}, SEEDS, num_steps=16),
+            probe=probe,
+            keep=keep,
+        )
+    assert [(f.world, f.seed, f.error) for f in found.failures] == [
+        ("far", 2001, "UnavailableError"),
+        ("far", 2002, "UnavailableError"),
+    ]
+    assert len(found.scores) == 4
+    assert found.agreement("far")["reach"]["num_starts"] == 1
 
 
 def test_training_starts_are_refused(client, probe, policies, demonstrations):
