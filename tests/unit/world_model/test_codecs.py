@@ -117,3 +117,11 @@ def test_a_glove_that_never_felt_anything_can_be_fitted():
     tokenizer = TactileTokenizer(NetworkConfig())
     tokenizer.fit(torch.zeros(8, 2, 320))
     assert torch.isfinite(tokenizer.encode(torch.ones(2, 320))).all()
+
+
+def test_latents_below_zero_are_no_pressure(tiny_config):
+    tokenizer = TactileTokenizer(tiny_config)
+    latents = torch.zeros(2, tokenizer.channels)
+    latents[0, :80] = -3.0
+    latents[1, 80:] = -3.0
+    assert tokenizer.decode(latents).abs().max() == 0.0

@@ -112,3 +112,22 @@ def test_a_store_is_loaded_whole(toy_store, toy_episodes):
     assert [e.episode_id for e in loaded] == [e.episode_id for e in toy_episodes]
     assert fingerprint(loaded[2]) == fingerprint(toy_episodes[2])
     assert isinstance(toy_store, EpisodeStore)
+
+
+def test_every_start_is_drawn_the_last_one_too(toy_episode):
+    sampler = WindowSampler([toy_episode(0, 19)], np.random.default_rng(0), max_steps=17)
+    assert {place.start for place in sampler.places(60, 17)} == {0, 1, 2}
+
+
+def test_a_window_carries_the_flags_of_its_own_steps(toy_episode):
+    episode = toy_episode(0)
+    episode.tactile_valid[7, 1] = False
+    flags = cut_window(episode, 5, 9).tactile_valid
+    assert np.argwhere(~flags).tolist() == [[2, 1]]
+
+
+def test_other_actions_are_another_fingerprint(toy_episode):
+    episode = toy_episode(0)
+    before = fingerprint(episode)
+    episode.actions["measured"][3, 20] += 0.01
+    assert fingerprint(episode) != before

@@ -73,6 +73,15 @@ def test_noise_never_reaches_clean_tokens(model, inputs, noisy):
     assert (a.video[:, 1:] - b.video[:, 1:]).abs().max() > 1e-3
 
 
+def test_clean_tokens_do_not_depend_on_the_time_of_the_noisy_ones(model, inputs, noisy):
+    first = model.first_latents(inputs)
+    early = model(inputs, first, noisy, torch.full((3,), 0.1))
+    late = model(inputs, first, noisy, torch.full((3,), 0.9))
+    torch.testing.assert_close(early.video[:, 0], late.video[:, 0], rtol=0, atol=1e-6)
+    torch.testing.assert_close(early.tactile[:, 0], late.tactile[:, 0], rtol=0, atol=1e-6)
+    assert (early.video[:, 1:] - late.video[:, 1:]).abs().max() > 1e-3
+
+
 def test_each_stream_hears_the_other(model, inputs, noisy):
     first = model.first_latents(inputs)
     t = torch.full((3,), 0.7)
