@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dextouch.clocks.lower_hull import Line, LowerHull
-from dextouch.clocks.steps import find_steps
+from dextouch.clocks.steps import find_steps, find_wrong_stamps
 from dextouch.errors import ClockFitError, InvalidInputError
 
 MIN_SAMPLES = 10
@@ -15,6 +15,8 @@ WINDOW_S = 60.0
 # Below this many samples or seconds a segment's own slope is mostly noise.
 MIN_SLOPE_SAMPLES = 50
 MIN_SLOPE_SPAN_S = 1.0
+# No crystal's rate changes by more within a take; such a line hangs on two late samples.
+MAX_DRIFT_NS_PER_S = 1e6
 PATH_DELAY_NOTE = (
     "host times include the stream's smallest path delay, which stamps of one direction cannot "
     "show; subtract the calibrated latency_ns"
@@ -29,7 +31,6 @@ class ClockSegment:
     are in seconds of device time after `start_device_ns`; beyond the ends the end lines go on.
     """
 
-    start_index: int
     start_device_ns: int
     stop_device_ns: int
     start_host_ns: int
@@ -87,7 +88,8 @@ class ClockModel:
         Args:
             t_device_ns: unwrapped device stamps, int64.
             t_host_ns: arrival of each, needed only where the device's clock went back: it tells
-                which stretch a stamp belongs to.
+                which stretch a stamp belongs to. No sample is dated after its arrival, whatever
+                its stamp says.
 
         Raises:
             InvalidInputError: the device's clock went back and no arrivals are given.
@@ -109,7 +111,7 @@ class ClockModel:
         for index, segment in enumerate(self.segments):
             mine = chosen == index
             host_ns[mine] = segment.to_host_ns(t_device_ns[mine])
-        return host_ns
+        return host_ns if t_host_ns is None else np.minimum(host_ns, keys)
 
 
 def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
@@ -126,17 +128,20 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
             than a clock is stepped) or "length" (unequal lengths).
     """
     device, host = _checked(t_device_ns, t_host_ns)
-    cuts = find_steps(device, host)
+    right = np.delete(np.arange(len(device)), find_wrong_stamps(device))
+    device, host = device[right], host[right]
+    cuts, waiting = find_steps(device, host)
     bounds = list(zip([0, *cuts], [*cuts, len(device)], strict=True))
-    slopes = [_slope(device[a:b], host[a:b]) for a, b in bounds]
+    fitted_to = [a + np.flatnonzero(~waiting[a:b]) for a, b in bounds]
+    slopes = [_slope(device[points], host[points]) for points in fitted_to]
     lengths = np.array(
         [b - a if slope is not None else 0 for (a, b), slope in zip(bounds, slopes, strict=True)]
     )
     known = np.array([0.0 if slope is None else slope for slope in slopes])
     mean_slope = float((known * lengths).sum() / max(lengths.sum(), 1))
     segments = tuple(
-        _fit_segment(device, host, bound, None if slope is not None else mean_slope)
-        for bound, slope in zip(bounds, slopes, strict=True)
+        _fit_segment(device, host, points, None if slope is not None else mean_slope)
+        for points, slope in zip(fitted_to, slopes, strict=True)
     )
     fitted = np.concatenate(
         [segment.to_host_ns(device[a:b]) for segment, (a, b) in zip(segments, bounds, strict=True)]
@@ -201,16 +206,15 @@ def _slope(device: np.ndarray, host: np.ndarray) -> float | None:
 
 
 def _fit_segment(
-    device: np.ndarray, host: np.ndarray, bound: tuple[int, int], slope: float | None
+    device: np.ndarray, host: np.ndarray, points: np.ndarray, slope: float | None
 ) -> ClockSegment:
-    start, stop = bound
-    x, y, reference_ns = _offsets(device[start:stop], host[start:stop])
+    """The first and the last of `points` are those of the segment; it may have more between."""
+    x, y, reference_ns = _offsets(device[points], host[points])
     knots = _knots(x, y) if slope is None else _straight(x, _hull(x, y).line_of_slope(slope))
     return ClockSegment(
-        start_index=start,
-        start_device_ns=int(device[start]),
-        stop_device_ns=int(device[stop - 1]),
-        start_host_ns=int(host[start]),
+        start_device_ns=int(device[points[0]]),
+        stop_device_ns=int(device[points[-1]]),
+        start_host_ns=int(host[points[0]]),
         reference_offset_ns=reference_ns,
         knots_s=np.array([knot[0] for knot in knots]),
         knot_offsets_ns=np.array([knot[1] for knot in knots]),
@@ -225,16 +229,23 @@ def _straight(x: list[float], line: Line) -> list[tuple[float, float]]:
 def _knots(x: list[float], y: list[float]) -> list[tuple[float, float]]:
     """Centres of half-overlapping windows, each with its supporting line's value, and the ends."""
     span_s = x[-1]
-    if span_s <= WINDOW_S:
+    num_windows = max(1, int(np.ceil((span_s - WINDOW_S) / (WINDOW_S / 2))) + 1)
+    if num_windows == 1:
         return _straight(x, _hull(x, y).supporting_line(span_s / 2))
-    num_windows = int(np.ceil((span_s - WINDOW_S) / (WINDOW_S / 2))) + 1
-    centres = np.linspace(WINDOW_S / 2, span_s - WINDOW_S / 2, num_windows)
-    lines = []
-    for centre in centres:
-        a, b = np.searchsorted(x, [centre - WINDOW_S / 2, centre + WINDOW_S / 2])
+    fits = []
+    for start_s in np.linspace(0, span_s - WINDOW_S, num_windows):
+        a, b = np.searchsorted(x, [start_s, start_s + WINDOW_S])
         if b - a >= MIN_SAMPLES:
-            lines.append((float(centre), _hull(x[a:b], y[a:b]).supporting_line(float(centre))))
-    if not lines:
+            # Where samples are missing, the window's own middle may lie beside its last one.
+            middle_s, hull = (x[a] + x[b - 1]) / 2, _hull(x[a:b], y[a:b])
+            fits.append((middle_s, hull, hull.supporting_line(middle_s)))
+    if not fits:
         return _straight(x, _hull(x, y).supporting_line(span_s / 2))
-    knots = [(centre, line.at(centre)) for centre, line in lines]
+    slope = float(np.median([line.slope_ns_per_s for _, _, line in fits]))
+    lines = [
+        (middle_s, line if abs(line.slope_ns_per_s - slope) <= MAX_DRIFT_NS_PER_S else level)
+        for middle_s, hull, line in fits
+        for level in [hull.line_of_slope(slope)]
+    ]
+    knots = [(middle_s, line.at(middle_s)) for middle_s, line in lines]
     return [(0.0, lines[0][1].at(0.0)), *knots, (span_s, lines[-1][1].at(span_s))]

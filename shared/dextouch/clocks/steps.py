@@ -1,7 +1,12 @@
-"""Device stamps and arrivals of a take in, the samples at which the device's clock jumped out."""
+"""Finds where a device's clock jumped or stood still, and stamps that are wrong by themselves.
+
+`fit_clock` needs it before it can fit anything: one line through a step is wrong on both sides.
+"""
+
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy.lib.stride_tricks import sliding_window_view
 
 CONFIRM_S = 1.0
@@ -17,41 +22,142 @@ IRREGULAR_REACH = 3
 MATCH_SHARE = 0.2
 MATCH_CHANGE_SHARE = 0.5
 REGULAR_QUANTILE = 0.9
+# A clock that stood still shows in no distance of stamps, only in the arrivals: they are late from
+# then on. A rise of this size must last for a second, a smaller one for ten, by both clocks.
+STOP_NS = 30_000_000.0
+STOP_LASTS_NS = 1_000_000_000
+SMALL_STOP_NS = 5_000_000.0
+SMALL_STOP_LASTS_NS = 10_000_000_000
+# It was a delay if arrivals come back within this time: so many of them, as single stamps lie.
+RETURN_NS = 120_000_000_000
+MIN_RETURNED = 3
 
 
-def find_steps(device: np.ndarray, host: np.ndarray) -> list[int]:
-    """Indices of the first samples after a step of the device's clock, in increasing order.
+class Steps(NamedTuple):
+    """What a take's arrivals tell of its device's clock.
+
+    Attributes:
+        cuts: first samples after a step or a stop, in order.
+        waiting: samples [n] that all waited longer than those around them, for a second or more.
+    """
+
+    cuts: list[int]
+    waiting: Bool[np.ndarray, " n"]
+
+
+def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
+    """Find where a device's clock jumped or stood still.
 
     A step lasts, a delay does not: the smallest apparent offset of the second before is compared
     with that of the second after. Where a device samples regularly, a step shows in the distance
-    of its stamps too, and what does not show there was a delay, however long. Where device time
-    runs back there is a step in any case.
+    of its stamps too. What does not show there was a delay if it ended within two minutes;
+    otherwise the clock stood still, or the path became longer for good, which looks the same.
+    Where device time runs back there is a step in any case.
     """
-    backward = (np.flatnonzero(np.diff(device) < 0) + 1).tolist()
+    waiting = np.zeros(len(device), dtype=bool)
+    cuts: list[int] = (np.flatnonzero(np.diff(device) < 0) + 1).tolist()
     period_ns = float(np.median(np.diff(host)))
     count = int(np.clip(CONFIRM_S * 1e9 / max(period_ns, 1.0), 5, 500))
-    cuts: list[int] = list(backward)
     if len(device) > 2 * count:
-        offset_ns = (host - device - (host[0] - device[0])).astype(np.float64)
+        levels = _Levels(device, host, count)
         stamps = _Stamps(device)
-        for cut, change_ns in _level_changes(offset_ns, count):
+        for cut, change_ns in levels.changes():
             exact = stamps.place(cut, change_ns)
             if exact is not None and all(abs(exact - known) > count for known in cuts):
                 cuts.append(exact)
-    return sorted(set(cuts))
+        for first, last in levels.rises(sorted(cuts)):
+            if last is None:
+                cuts.append(first)
+            else:
+                waiting[first:last] = True
+    return Steps(sorted(set(cuts)), waiting)
 
 
-def _level_changes(offset_ns: np.ndarray, count: int) -> list[tuple[int, float]]:
-    """Where the one-second minimum changes for good, and by how much."""
-    minima = sliding_window_view(offset_ns, count).min(axis=1)
-    # At sample i (count … n - count): the least of the `count` samples before, and from it on.
-    change = minima[count:] - minima[: len(minima) - count]
-    spread = float(np.median(np.abs(change - np.median(change))))
-    threshold = STEP_NS + SPREAD_FACTOR * spread
-    # A fall shows until the first fallen sample, a rise from the first risen one on.
-    falls = [(last, change[first : last + 1].min()) for first, last in _runs(-change, threshold)]
-    rises = [(first, change[first : last + 1].max()) for first, last in _runs(change, threshold)]
-    return sorted((count + index, float(height)) for index, height in falls + rises)
+def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
+    """Indices of single stamps off the middle of two neighbours that are two periods apart.
+
+    Only a device that samples regularly shows them; of others none are found.
+    """
+    if len(device) < 3:
+        return np.empty(0, dtype=np.int64)
+    stamps = _Stamps(device)
+    if not stamps.is_regular:
+        return np.empty(0, dtype=np.int64)
+    two_ns = (device[2:] - device[:-2]).astype(np.float64)
+    off_ns = np.abs((device[1:-1] - device[:-2]).astype(np.float64) - two_ns / 2)
+    wrong = (np.abs(two_ns - 2 * stamps.period_ns) < STEP_NS) & (off_ns > STEP_NS)
+    return np.flatnonzero(wrong).astype(np.int64) + 1
+
+
+class _Levels:
+    """The smallest apparent offsets of a second before and after each sample."""
+
+    def __init__(self, device: np.ndarray, host: np.ndarray, count: int) -> None:
+        self._device, self._host, self._count = device, host, count
+        offset_ns = (host - device - (host[0] - device[0])).astype(np.float64)
+        minima = sliding_window_view(offset_ns, count).min(axis=1)
+        # At sample i (count … n - count): the least of the `count` samples before, and from it on.
+        change_ns = minima[count:] - minima[: len(minima) - count]
+        middle_ns = float(np.median(change_ns))
+        spread_ns = float(np.median(np.abs(change_ns - middle_ns)))
+        self._threshold_ns = STEP_NS + SPREAD_FACTOR * spread_ns
+        # The median is a whole number of ticks where arrivals are; the mean is not.
+        drift_ns = float(change_ns[np.abs(change_ns - middle_ns) <= self._threshold_ns].mean())
+        self._change_ns = change_ns - drift_ns
+        # The same from sample 1 on: before the first second is over, the least since the start.
+        least_ns = np.minimum.accumulate(offset_ns[: count - 1])
+        self._rise_ns = np.concatenate([minima[1:count] - least_ns, self._change_ns])
+        # Without drift, levels that are minutes apart can be compared.
+        elapsed = (host - host[0]) / float(np.median(host[count:] - host[:-count]))
+        self._straight_ns = offset_ns - drift_ns * elapsed
+
+    def changes(self) -> list[tuple[int, float]]:
+        """Where the one-second minimum changes for good, and by how much."""
+        change_ns, threshold_ns = self._change_ns, self._threshold_ns
+        # A fall shows until the first fallen sample, a rise from the first risen one on.
+        falls = [(b, change_ns[a : b + 1].min()) for a, b in _runs(-change_ns, threshold_ns)]
+        rises = [(a, change_ns[a : b + 1].max()) for a, b in _runs(change_ns, threshold_ns)]
+        return sorted((self._count + index, float(height)) for index, height in falls + rises)
+
+    def rises(self, cuts: list[int]) -> list[tuple[int, int | None]]:
+        """Where the offset rose between known cuts and stayed, and where it came back, if ever."""
+        bounds = [0, *cuts, len(self._device)]
+        found: list[tuple[int, int | None]] = []
+        known = 0
+        for index in (np.flatnonzero(self._rise_ns > self._threshold_ns) + 1).tolist():
+            after = int(np.searchsorted(bounds, index, side="right"))
+            first = max(bounds[after - 1], known, index - self._count)
+            if first < index and (rise := self._rise(first, index, bounds[after])) is not None:
+                found.append(rise)
+                known = rise[0] if rise[1] is None else rise[1]
+        return found
+
+    def _rise(self, first: int, index: int, last: int) -> tuple[int, int | None] | None:
+        """First sample of a rise that shows at `index`, first one after it; None if none lasts.
+
+        Args:
+            first: of the samples before it that tell the level.
+            last: where the next step of the clock is.
+        """
+        y, host, device = self._straight_ns, self._host[index:last], self._device[index:last]
+        before_ns = y[first:index].min()
+        for least_ns, lasts_ns in (
+            (STOP_NS, STOP_LASTS_NS),
+            (max(self._threshold_ns, SMALL_STOP_NS), SMALL_STOP_LASTS_NS),
+        ):
+            ends = [int(np.searchsorted(t, t[0] + lasts_ns)) for t in (host, device)]
+            num = max(*ends, self._count)
+            if num < last - index and y[index : index + num].min() - before_ns > least_ns:
+                break
+        else:
+            return None
+        level_ns = y[index + num // 2 : index + num].min()
+        # What lies below the new level had waited at the old one.
+        early = np.flatnonzero(y[index : index + num] < level_ns - STEP_NS)
+        start = index + int(early[-1]) + 1 if len(early) else index
+        within = int(np.searchsorted(host, host[0] + RETURN_NS))
+        back = np.flatnonzero(y[index : index + within] < (before_ns + level_ns) / 2)
+        return start, index + int(back[0]) if len(back) >= MIN_RETURNED else None
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:
@@ -66,11 +172,11 @@ class _Stamps:
 
     def __init__(self, device: np.ndarray) -> None:
         steps: Float64[np.ndarray, " m"] = np.diff(device).astype(np.float64)
-        self._period_ns = float(np.median(steps))
-        self._departures_ns = steps - self._period_ns
-        self._tolerance_ns = MATCH_SHARE * self._period_ns
+        self.period_ns = float(np.median(steps))
+        self._departures_ns = steps - self.period_ns
+        self._tolerance_ns = MATCH_SHARE * self.period_ns
         scatter_ns = np.quantile(self._beside_period(self._departures_ns), REGULAR_QUANTILE)
-        self._is_regular = bool(scatter_ns < self._tolerance_ns / 2)
+        self.is_regular = bool(scatter_ns < self._tolerance_ns / 2)
 
     def place(self, cut: int, change_ns: float) -> int | None:
         """The first sample after the step near `cut`; None where there was none, only a delay.
@@ -79,18 +185,18 @@ class _Stamps:
             cut: first sample after a change of level, give or take a few.
             change_ns: of the apparent offset: a clock that goes back makes it rise.
         """
-        reach = REACH if self._is_regular else IRREGULAR_REACH
+        reach = REACH if self.is_regular else IRREGULAR_REACH
         first, last = max(cut - reach, 1), min(cut + reach, len(self._departures_ns))
         departures_ns = self._departures_ns[first - 1 : last]
-        if not self._is_regular:
+        if not self.is_regular:
             exact = int(np.argmax(np.abs(departures_ns)))
             return cut if np.abs(departures_ns[exact]) < STEP_NS / 2 else first + exact
         rest_ns = departures_ns + change_ns
         # Lost samples add whole periods to a distance, a delay adds none; what is left over of a
         # change by whole periods without any such jump is a delay.
-        num_lost = np.maximum(np.rint(rest_ns / max(self._period_ns, 1.0)), 0)
+        num_lost = np.maximum(np.rint(rest_ns / max(self.period_ns, 1.0)), 0)
         jumped = (num_lost == 0) | (self._beside_period(departures_ns) > self._tolerance_ns)
-        misses_ns = np.abs(rest_ns - num_lost * self._period_ns)
+        misses_ns = np.abs(rest_ns - num_lost * self.period_ns)
         nearest = int(np.argmin(np.where(jumped, misses_ns, np.inf)))
         if jumped[nearest] and misses_ns[nearest] <= min(
             self._tolerance_ns, abs(change_ns) * MATCH_CHANGE_SHARE
@@ -102,5 +208,5 @@ class _Stamps:
 
     def _beside_period(self, departures_ns: np.ndarray) -> Float64[np.ndarray, " m"]:
         """How far each lies from a whole number of sample periods."""
-        period_ns = max(self._period_ns, 1.0)
+        period_ns = max(self.period_ns, 1.0)
         return np.abs(departures_ns - period_ns * np.rint(departures_ns / period_ns))
