@@ -29,10 +29,26 @@ def report_line(report: AlignmentReport) -> str:
         f"; {stream}: taxels not measured and zero: {_by_reason(reasons)}"
         for stream, reasons in report.refused_taxels.items()
     )
+    doubts = "".join(f"; {doubt}" for doubt in _doubts(report))
     return (
         f"{report.recording_id} {verb}: {report.episode_id}, {report.num_steps} steps, "
-        f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}"
+        f"{len(report.streams)} streams, {lost} samples lost{absent}{refused}{doubts}"
     )
+
+
+def _doubts(report: AlignmentReport) -> list[str]:
+    """Streams whose times may be wrong, and why."""
+    found = []
+    for clock in report.clocks:
+        whys = {
+            "skew": f"its clock is off by {_number(clock.skew_ppm, 0)} ppm",
+            "residual": f"samples come {_number(clock.residual_rms_ms, 1)} ms later than they "
+            "should, more than a sample period",
+        }
+        if clock.warnings:
+            reasons = " and ".join(whys[warning] for warning in clock.warnings)
+            found.append(f"{clock.stream}: times in doubt: {reasons}")
+    return found
 
 
 def report_page(report: AlignmentReport) -> Group:
@@ -44,6 +60,7 @@ def report_page(report: AlignmentReport) -> Group:
             f"{', '.join(report.absent) or 'nothing'}"
         ),
         _clocks(report),
+        *map(Text, _doubts(report)),
     ]
     if report.retargeting:
         parts.append(_retargeting(report.retargeting))
@@ -66,6 +83,7 @@ def _clocks(report: AlignmentReport) -> Table:
         "residual ms",
         "latency ms",
         "drift ppm",
+        "steps",
     ):
         table.add_column(name, justify="right")
     table.add_column("dated by")
@@ -80,6 +98,7 @@ def _clocks(report: AlignmentReport) -> Table:
             _number(clock.residual_rms_ms, 3),
             f"{_number(clock.latency_ms, 2)}{sigma}",
             _number(clock.skew_ppm, 1),
+            str(clock.num_steps),
             clock.method or "-",
         )
     return table

@@ -1,4 +1,4 @@
-"""One stream's stamps in, the times of its samples on the host's clock and a clock report out."""
+"""Dates every sample of a recorded stream on the host's clock, and reports how well."""
 
 from dataclasses import dataclass, replace
 
@@ -8,12 +8,15 @@ from jaxtyping import Int64
 from dextouch.clocks import date_by_counting, find_lost_samples, fit_clock, unwrap_counter
 from dextouch.clocks.counters import prefers_sequence
 from dextouch.errors import ClockFitError
-from dextouch.schemas.episodes import ClockMethod, ClockReport
+from dextouch.schemas.episodes import ClockMethod, ClockReport, ClockWarning
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
 
 NS_PER_MS = 1e6
 MIN_COUNTED_SAMPLES = 60
+# Crystals are good to 100 ppm. A nominal rate that stands for a clock may be off by percents.
+MAX_SKEW_PPM = 1000.0
+MAX_RATE_ERROR_PPM = 20_000.0
 
 
 @dataclass(frozen=True)
@@ -89,8 +92,20 @@ def time_stream(
         residual_rms_ms=None if rms_ns is None else rms_ns / NS_PER_MS,
         num_samples=len(kept),
         num_dropped=dated.num_lost + len(batch) - len(kept),
+        num_steps=dated.num_steps,
+        warnings=_warnings(dated, descriptor.period_ns()),
     )
     return TimedStream(kept, t_host_ns[kept], report, dated.num_steps, dated.method)
+
+
+def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
+    """Why the times are in doubt, if they are."""
+    skew_limit_ppm = MAX_SKEW_PPM if dated.method == "device" else MAX_RATE_ERROR_PPM
+    doubts: dict[ClockWarning, bool] = {
+        "skew": abs(dated.skew_ppm or 0.0) > skew_limit_ppm,
+        "residual": (dated.residual_rms_ns or 0.0) > period_ns,
+    }
+    return tuple(name for name, is_so in doubts.items() if is_so)
 
 
 def _dated(batch: SampleBatch, descriptor: StreamDescriptor) -> _Dated:

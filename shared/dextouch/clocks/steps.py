@@ -74,7 +74,7 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
 
 
 def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
-    """Indices of single stamps off the middle of two neighbours that are two periods apart.
+    """Indices of single stamps that lie at no whole period between their two neighbours.
 
     Only a device that samples regularly shows them; of others none are found.
     """
@@ -83,10 +83,14 @@ def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
     stamps = _Stamps(device)
     if not stamps.is_regular:
         return np.empty(0, dtype=np.int64)
-    two_ns = (device[2:] - device[:-2]).astype(np.float64)
-    off_ns = np.abs((device[1:-1] - device[:-2]).astype(np.float64) - two_ns / 2)
-    wrong = (np.abs(two_ns - 2 * stamps.period_ns) < STEP_NS) & (off_ns > STEP_NS)
-    return np.flatnonzero(wrong).astype(np.int64) + 1
+    period_ns = max(stamps.period_ns, 1.0)
+    both_ns = (device[2:] - device[:-2]).astype(np.float64)
+    first_ns = (device[1:-1] - device[:-2]).astype(np.float64)
+    num_both = np.rint(both_ns / period_ns)
+    num_first = np.clip(np.rint(first_ns / period_ns), 1, np.maximum(num_both - 1, 1))
+    neighbours_agree = (num_both >= 2) & (np.abs(both_ns - num_both * period_ns) < STEP_NS)
+    is_off = np.abs(first_ns - num_first * period_ns) > STEP_NS
+    return np.flatnonzero(neighbours_agree & is_off).astype(np.int64) + 1
 
 
 class _Levels:

@@ -15,6 +15,9 @@ ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
 # What dates a stream's samples: the device's stamps, its sequence numbers, the count of those that
 # it must have sent, or the arrivals as they are.
 ClockMethod = Literal["device", "sequence", "counting", "arrival"]
+# Why the times of a stream are in doubt: its clock is far off its nominal rate, or samples arrive
+# later than the fit says by more than a sample period (root mean square).
+ClockWarning = Literal["skew", "residual"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 Domain = Literal["human", "robot"]
 Origin = Literal["recorded", "twin", "imagined"]
@@ -84,7 +87,8 @@ class ClockReport(BaseModel):
 
     `method` is what dates the samples, None where the episode does not say. `latency_ms` is the
     constant path delay that was taken away; `latency_sigma_ms` says how well it is known, None
-    where nobody measured it.
+    where nobody measured it. `num_steps` counts where the device's clock jumped or stood still and
+    the fit was cut; `warnings` say why the times are in doubt.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -97,6 +101,8 @@ class ClockReport(BaseModel):
     residual_rms_ms: FiniteFloat | None = None
     num_samples: int = Field(ge=0)
     num_dropped: int = Field(default=0, ge=0)
+    num_steps: int = Field(default=0, ge=0)
+    warnings: tuple[ClockWarning, ...] = ()
 
 
 class EpisodeAttributes(BaseModel):
