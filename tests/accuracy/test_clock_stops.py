@@ -43,7 +43,6 @@ def simulate(path, events, *, seed, seconds):
     count_s = count_s[rng.random(len(count_s)) >= 0.002]
     true_s, device_s = count_s * (1 + SKEW) + rng.random() * 0.01, count_s + 987.654
     stretch = np.zeros(len(count_s), dtype=int)
-    late_s, stalls = np.zeros(len(count_s)), []
     for kind, at_s, size_s in events:
         after = count_s >= at_s
         if kind in {"stop", "restart"}:
@@ -52,26 +51,36 @@ def simulate(path, events, *, seed, seconds):
             device_s = device_s + after * size_s
         if kind == "restart":
             device_s = np.where(after, count_s - at_s, device_s)
-        if kind == "burst":
-            stalls.append((true_s[np.argmax(after)], size_s))
-        if kind == "late":
-            late_s = late_s + (after & (count_s < at_s + 15)) * size_s
         stretch += after * (kind in {"stop", "restart", "step"})
     if path == "late stamps":
         device_s = device_s + np.abs(rng.normal(0, 0.5e-3, len(device_s)))
-    arrival_s = true_s + BASE_S + late_s
+    arrival_s = arrivals(path, events, (count_s, true_s), rng)
+    to_ns = [np.rint(t_s * 1e9).astype(np.int64) for t_s in (device_s, arrival_s, true_s)]
+    return Simulated(to_ns[0], to_ns[1] + 10**18, to_ns[2] + 10**18, stretch)
+
+
+def arrivals(path, events, times, rng):
+    """What path and host do to samples, taken at `times` by the device's count and in truth."""
+    count_s, true_s = times
+    arrival_s = true_s + BASE_S
     if path != "usb beat":
-        arrival_s = arrival_s + rng.exponential(0.8e-3, len(arrival_s))
-        arrival_s = arrival_s + (rng.random(len(true_s)) < 0.01) * rng.exponential(0.02, len(true_s))
+        arrival_s = arrival_s + rng.exponential(0.8e-3, len(true_s))
+        arrival_s = arrival_s + (rng.random(len(true_s)) < 0.01) * rng.exponential(
+            0.02, len(true_s)
+        )
+    stalls = []
+    for kind, at_s, size_s in events:
+        if kind == "late":
+            arrival_s = arrival_s + ((count_s >= at_s) & (count_s < at_s + 15)) * size_s
+        if kind == "burst":
+            stalls.append((true_s[np.argmax(count_s >= at_s)], size_s))
     if path == "wifi clumps":
-        stalls += [(at, 0.2) for at in np.cumsum(rng.exponential(1.0, int(seconds)) + 0.2)]
+        stalls += [(at, 0.2) for at in np.cumsum(rng.exponential(1.0, int(true_s[-1])) + 0.2)]
     for at_s, size_s in stalls:
         held = (arrival_s >= at_s) & (arrival_s < at_s + size_s)
         arrival_s[held] = at_s + size_s
     # A bus is polled every millisecond; nothing overtakes.
-    arrival_s = np.maximum.accumulate(np.ceil(arrival_s * 1e3) * 1e-3)
-    to_ns = [np.rint(t_s * 1e9).astype(np.int64) for t_s in (device_s, arrival_s, true_s)]
-    return Simulated(to_ns[0], to_ns[1] + 10**18, to_ns[2] + 10**18, stretch)
+    return np.maximum.accumulate(np.ceil(arrival_s * 1e3) * 1e-3)
 
 
 def offline(take):
@@ -108,10 +117,10 @@ def rms_ms(estimate_ns, take, counts=slice(None)):
 def test_a_clock_that_stood_still_is_cut(path, stop_s, capsys):
     ours, rival = [], []
     for seed in range(3):
-        take = simulate(path, [("stop", 40.0, stop_s)], seed=seed, seconds=90)
+        take = simulate(path, [("stop", 27.0, stop_s)], seed=seed, seconds=60)
         times_ns, model = offline(take)
         assert model.num_steps == 1
-        assert abs(model.skew_ppm - 50) < 10
+        assert abs(model.skew_ppm - 50) < 20
         ours.append(rms_ms(times_ns, take))
         rival.append(rms_ms(oracle(take), take))
     with capsys.disabled():
@@ -175,7 +184,7 @@ def happenings(draw):
 
 
 @settings(
-    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
+    max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow], derandomize=True
 )
 @given(events=happenings(), path=st.sampled_from(sorted(BOUNDS_MS)), seed=st.integers(0, 9))
 def test_no_combination_is_silently_wrong(events, path, seed):

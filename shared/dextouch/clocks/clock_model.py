@@ -29,11 +29,13 @@ class ClockSegment:
 
     host = device + reference_offset_ns + (broken line through knots of the offset), where knots
     are in seconds of device time after `start_device_ns`; beyond the ends the end lines go on.
+    Arrivals from `start_host_ns` on belong to it, but for the first `num_tied` at that very moment.
     """
 
     start_device_ns: int
     stop_device_ns: int
     start_host_ns: int
+    num_tied: int
     reference_offset_ns: int
     knots_s: Float64[np.ndarray, " k"]
     knot_offsets_ns: Float64[np.ndarray, " k"]
@@ -107,6 +109,10 @@ class ClockModel:
             starts = [segment.start_host_ns for segment in self.segments]
             keys = np.asarray(t_host_ns, dtype=np.int64)
         chosen = np.clip(np.searchsorted(starts, keys, side="right") - 1, 0, len(starts) - 1)
+        if t_host_ns is not None:
+            for index, segment in enumerate(self.segments[1:]):
+                tied = np.flatnonzero(keys == segment.start_host_ns)[: segment.num_tied]
+                chosen[tied] = index
         host_ns = np.empty_like(t_device_ns)
         for index, segment in enumerate(self.segments):
             mine = chosen == index
@@ -209,12 +215,14 @@ def _fit_segment(
     device: np.ndarray, host: np.ndarray, points: np.ndarray, slope: float | None
 ) -> ClockSegment:
     """The first and the last of `points` are those of the segment; it may have more between."""
+    first = points[0]
     x, y, reference_ns = _offsets(device[points], host[points])
     knots = _knots(x, y) if slope is None else _straight(x, _hull(x, y).line_of_slope(slope))
     return ClockSegment(
-        start_device_ns=int(device[points[0]]),
+        start_device_ns=int(device[first]),
         stop_device_ns=int(device[points[-1]]),
-        start_host_ns=int(host[points[0]]),
+        start_host_ns=int(host[first] - (host[first] - host[max(first - 1, 0)]) // 2),
+        num_tied=int(np.count_nonzero(host[:first] == host[first])),
         reference_offset_ns=reference_ns,
         knots_s=np.array([knot[0] for knot in knots]),
         knot_offsets_ns=np.array([knot[1] for knot in knots]),

@@ -13,6 +13,8 @@ CONFIRM_S = 1.0
 STEP_NS = 1_000_000.0
 # A step must also stand out this far above the usual scatter of the one-second minima.
 SPREAD_FACTOR = 8.0
+# A single stamp is wrong where it is off by so many times what stamps usually are.
+WRONG_SCATTERS = 3.0
 # How near to a change of level a jump of the stamps lies, in samples: a few late ones before a
 # rise look risen too. Without regular stamps to tell, only next to it.
 REACH = 30
@@ -22,12 +24,12 @@ IRREGULAR_REACH = 3
 MATCH_SHARE = 0.2
 MATCH_CHANGE_SHARE = 0.5
 REGULAR_QUANTILE = 0.9
-# A clock that stood still shows in no distance of stamps, only in the arrivals: they are late from
-# then on. A rise of this size must last for a second, a smaller one for ten, by both clocks.
-STOP_NS = 30_000_000.0
-STOP_LASTS_NS = 1_000_000_000
-SMALL_STOP_NS = 5_000_000.0
-SMALL_STOP_LASTS_NS = 10_000_000_000
+# A clock that stood still shows in no distance of stamps, only in the arrivals: within a fifth of a
+# second they become late, and stay so. A rise of so much must last for so long, by both clocks.
+SUDDEN_RISES = ((25e6, 1_000_000_000), (5e6, 10_000_000_000))
+# The path may have become longer little by little; the fit follows it after a minute anyway.
+GRADUAL_RISE = (5e6, 60_000_000_000)
+SUDDEN_S = 0.2
 # It was a delay if arrivals come back within this time: so many of them, as single stamps lie.
 RETURN_NS = 120_000_000_000
 MIN_RETURNED = 3
@@ -88,8 +90,9 @@ def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
     first_ns = (device[1:-1] - device[:-2]).astype(np.float64)
     num_both = np.rint(both_ns / period_ns)
     num_first = np.clip(np.rint(first_ns / period_ns), 1, np.maximum(num_both - 1, 1))
-    neighbours_agree = (num_both >= 2) & (np.abs(both_ns - num_both * period_ns) < STEP_NS)
-    is_off = np.abs(first_ns - num_first * period_ns) > STEP_NS
+    limit_ns = max(STEP_NS, WRONG_SCATTERS * stamps.scatter_ns)
+    neighbours_agree = (num_both >= 2) & (np.abs(both_ns - num_both * period_ns) < limit_ns)
+    is_off = np.abs(first_ns - num_first * period_ns) > limit_ns
     return np.flatnonzero(neighbours_agree & is_off).astype(np.int64) + 1
 
 
@@ -141,27 +144,31 @@ class _Levels:
 
         Args:
             first: of the samples before it that tell the level.
+            index: of a sample from which on all of a second are above that level.
             last: where the next step of the clock is.
         """
         y, host, device = self._straight_ns, self._host[index:last], self._device[index:last]
         before_ns = y[first:index].min()
-        for least_ns, lasts_ns in (
-            (STOP_NS, STOP_LASTS_NS),
-            (max(self._threshold_ns, SMALL_STOP_NS), SMALL_STOP_LASTS_NS),
-        ):
+        num_sudden = max(2, round(SUDDEN_S / CONFIRM_S * self._count))
+        for least_ns, lasts_ns in (*SUDDEN_RISES, GRADUAL_RISE):
             ends = [int(np.searchsorted(t, t[0] + lasts_ns)) for t in (host, device)]
             num = max(*ends, self._count)
-            if num < last - index and y[index : index + num].min() - before_ns > least_ns:
-                break
-        else:
-            return None
-        level_ns = y[index + num // 2 : index + num].min()
-        # What lies below the new level had waited at the old one.
-        early = np.flatnonzero(y[index : index + num] < level_ns - STEP_NS)
-        start = index + int(early[-1]) + 1 if len(early) else index
-        within = int(np.searchsorted(host, host[0] + RETURN_NS))
-        back = np.flatnonzero(y[index : index + within] < (before_ns + level_ns) / 2)
-        return start, index + int(back[0]) if len(back) >= MIN_RETURNED else None
+            if num >= last - index:
+                return None
+            risen = y[index : index + num]
+            if risen.min() - before_ns <= max(least_ns, self._threshold_ns):
+                continue
+            level_ns = risen[num // 2 :].min()
+            # What lies below the new level had waited at the old one.
+            early = np.flatnonzero(risen < level_ns - STEP_NS)
+            start = index + int(early[-1]) + 1 if len(early) else index
+            middle_ns = (before_ns + level_ns) / 2
+            is_sudden = y[max(start - num_sudden, first) : start].min() < middle_ns
+            if is_sudden or (least_ns, lasts_ns) == GRADUAL_RISE:
+                within = int(np.searchsorted(host, host[0] + RETURN_NS))
+                back = np.flatnonzero(y[index : index + within] < middle_ns)
+                return start, index + int(back[0]) if len(back) >= MIN_RETURNED else None
+        return None
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:
@@ -179,8 +186,9 @@ class _Stamps:
         self.period_ns = float(np.median(steps))
         self._departures_ns = steps - self.period_ns
         self._tolerance_ns = MATCH_SHARE * self.period_ns
-        scatter_ns = np.quantile(self._beside_period(self._departures_ns), REGULAR_QUANTILE)
-        self.is_regular = bool(scatter_ns < self._tolerance_ns / 2)
+        beside_ns = self._beside_period(self._departures_ns)
+        self.scatter_ns = float(np.quantile(beside_ns, REGULAR_QUANTILE))
+        self.is_regular = self.scatter_ns < self._tolerance_ns / 2
 
     def place(self, cut: int, change_ns: float) -> int | None:
         """The first sample after the step near `cut`; None where there was none, only a delay.

@@ -1,11 +1,17 @@
 """What dates a stream, and what its clock report says of it."""
 
+import dataclasses
+import io
+
 import numpy as np
 import pytest
+from rich.console import Console
 
 from dextouch.schemas.episodes import ClockReport
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import SampleBatch
+from services.alignment.report import AlignmentReport
+from services.alignment.report_page import report_line, report_page
 from services.alignment.synchronization.stream_clock import time_stream
 
 PERIOD_NS = 10_000_000
@@ -51,6 +57,78 @@ def test_the_report_names_the_method_and_the_latency(given, method):
     assert time_stream(batch, descriptor).report.latency_sigma_ms is None
 
 
+@pytest.mark.parametrize("stamps", [True, False])
+@pytest.mark.parametrize("stop_s", [0.05, 0.5, 3.0])
+def test_a_device_that_stood_still_is_dated_right_on_both_sides(stamps, stop_s):
+    """A minute at 100 Hz; its timer stops for a while in the middle, and nothing says so."""
+    index = np.arange(6000, dtype=np.int64)
+    true_ns = 10**12 + index * PERIOD_NS + (index >= 3000) * round(stop_s * 1e9)
+    _, descriptor = take(stamps=stamps, numbers=True)
+    batch = SampleBatch(
+        t_host_ns=true_ns + index * 7919 % 97 * 5000,
+        t_device_ns=index * PERIOD_NS if stamps else np.full(6000, -1),
+        sequence=index,
+        values=np.zeros((6000, 1), dtype=np.float32),
+    )
+    timed = time_stream(batch, descriptor)
+    np.testing.assert_allclose(timed.t_host_ns - true_ns, 0, atol=100_000)
+    assert (timed.num_steps, timed.report.num_steps, timed.report.warnings) == (1, 1, ())
+
+
+@pytest.mark.parametrize(
+    ("stamps", "skew_ppm", "warnings"),
+    [(True, 900, ()), (True, 1100, ("skew",)), (False, 1100, ()), (False, 30_000, ("skew",))],
+)
+def test_a_clock_far_off_its_rate_is_a_warning(stamps, skew_ppm, warnings):
+    """Numbers count by a nominal rate, which may be off by percents; stamps may not."""
+    batch, descriptor = take(stamps=stamps, numbers=True)
+    since_ns = np.arange(COUNT, dtype=np.int64) * (PERIOD_NS + PERIOD_NS * skew_ppm // 1_000_000)
+    timed = time_stream(dataclasses.replace(batch, t_host_ns=10**12 + since_ns), descriptor)
+    assert timed.report.skew_ppm == pytest.approx(skew_ppm, abs=1)
+    assert timed.report.warnings == warnings
+
+
+def test_arrivals_later_than_a_period_are_a_warning():
+    batch, descriptor = take(stamps=True, numbers=True)
+    # Five at a time: they wait for 40, 30, 20, 10 and 0 ms.
+    clumps_ns = np.repeat(batch.t_host_ns[4::5] // PERIOD_NS * PERIOD_NS, 5)
+    report = time_stream(dataclasses.replace(batch, t_host_ns=clumps_ns), descriptor).report
+    assert report.residual_rms_ms == pytest.approx(np.sqrt(600), abs=0.01)
+    assert report.warnings == ("residual",)
+
+
+def test_doubts_are_on_the_line_and_the_page_of_a_report():
+    clocks = (
+        ClockReport(stream="glove_left", num_samples=9),
+        ClockReport(
+            stream="glove_right",
+            num_samples=9,
+            skew_ppm=-4200.0,
+            residual_rms_ms=71.25,
+            num_steps=3,
+            warnings=("skew", "residual"),
+        ),
+    )
+    report = AlignmentReport(
+        recording_id="take",
+        episode_id="take-1",
+        created=True,
+        domain="human",
+        num_steps=4,
+        streams={},
+        absent=(),
+        clocks=clocks,
+        quality={},
+        content_sha256="0" * 64,
+    )
+    console = Console(width=200, record=True, file=io.StringIO())
+    console.print(report_page(report))
+    for text in (report_line(report), console.export_text()):
+        assert "glove_right: times in doubt: its clock is off by -4200 ppm and samples" in text
+        assert "glove_left: times" not in text
+
+
 def test_reports_of_older_episodes_load():
     report = ClockReport.model_validate({"stream": "x", "skew_ppm": 1.0, "num_samples": 3})
     assert (report.method, report.latency_sigma_ms) == (None, None)
+    assert (report.num_steps, report.warnings) == (0, ())
