@@ -66,6 +66,30 @@ def test_offset_of_a_few_seeds(num_axes, bound_ms, capsys):
     assert max(sigmas) <= 3
 
 
+def test_sigma_covers_the_spread_of_stamps_that_jitter(capsys):
+    """Noise alone would allow half the sigma; stamps of real streams jitter by milliseconds."""
+    ratios = {"noise": [], "jitter": []}
+    for seed in range(24):
+        for name, noise, jitter_s in (("noise", 0.2, 0.0), ("jitter", 0.02, 0.002)):
+            (t_a, a, t_b, b), offset_s = streams(seed, noise=noise)
+            rng = np.random.default_rng(1000 + seed)
+            late_ns = [
+                np.rint(rng.normal(0, jitter_s, len(t)) * 1e9).astype(int) for t in (t_a, t_b)
+            ]
+            found = estimate_time_offset(np.sort(t_a + late_ns[0]), a, np.sort(t_b + late_ns[1]), b)
+            ratios[name].append((found.offset_ns - offset_s * 1e9) / found.sigma_ns)
+    spread = {name: float(np.sqrt(np.mean(np.square(found)))) for name, found in ratios.items()}
+    within = float(np.mean(np.abs(ratios["jitter"]) <= 2))
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\ntime offset, errors in sigmas: {spread['noise']:.2f} of noise, bounds 0.25, 0.75 | "
+            f"{spread['jitter']:.2f} of jitter, bound 1.5, {100 * within:.0f} % within two"
+        )
+    assert 0.25 <= spread["noise"] <= 0.75
+    assert spread["jitter"] <= 1.5
+    assert within >= 0.85
+
+
 def test_motion_lost_in_noise_is_refused():
     for seed in range(3):
         taken, _ = streams(seed, noise=4.0)

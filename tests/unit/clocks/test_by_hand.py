@@ -1,0 +1,162 @@
+"""Counters, ticks, lines and steps against values worked out by hand or by another library."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
+
+from dextouch.clocks import OnlineClock, fit_clock
+from dextouch.clocks.counters import DeviceCounter
+from dextouch.clocks.lower_hull import LowerHull
+from dextouch.clocks.steps import find_steps, find_wrong_stamps
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import SampleBatch
+from services.alignment.synchronization.stream_clock import time_stream
+
+PERIOD_NS = 10_000_000
+MS = 1_000_000
+# 16 bits of milliseconds come round every 65.536 s.
+MILLIS = ClockCapabilities(device_time=True, device_time_bits=16, tick_ns=MS)
+
+
+def descriptor(capabilities):
+    return StreamDescriptor(
+        name="glove",
+        kind="scalar",
+        shape=(1,),
+        dtype="float32",
+        unit="1",
+        nominal_rate_hz=100,
+        capabilities=capabilities,
+    )
+
+
+@pytest.mark.parametrize("pause_s", [10, 40, 60, 100, 300])
+def test_a_counter_goes_on_after_a_pause_of_any_length(pause_s):
+    """Between two equal counts lie 0, 65.536 s, …; only the host's clock tells which."""
+    counter = DeviceCounter(descriptor(MILLIS))
+    before_ms, after_ms = 65_000, 65_000 + pause_s * 1000
+    assert counter.straighten(10**15, before_ms * MS, None) == before_ms * MS
+    # The second sample waits 3 ms longer than the first.
+    t_host_ns = 10**15 + (pause_s * 1000 + 3) * MS
+    assert counter.straighten(t_host_ns, after_ms % 65_536 * MS, None) == after_ms * MS
+
+
+def test_a_pause_of_more_than_half_a_wrap_is_no_step():
+    clock = OnlineClock(descriptor(MILLIS))
+    sent_ms = np.concatenate([np.arange(0, 6000, 10), np.arange(46_000, 52_000, 10)])
+    for t_ms in sent_ms.tolist():
+        clock.update(t_host_ns=10**15 + t_ms * MS, t_device_ns=t_ms % 65_536 * MS)
+    assert clock.num_steps == 0
+
+
+def ticking_take():
+    """Samples at all phases of a tick of 1 ms; every one arrives 2 ms after it was taken."""
+    true_ns = 10**15 + np.arange(3000, dtype=np.int64) * 10_037_000
+    return true_ns, true_ns // MS * MS, true_ns + 2 * MS
+
+
+def test_times_of_ticking_stamps_have_no_bias_online():
+    """A tick cuts off 0 … 1 ms, half a millisecond in the mean."""
+    true_ns, device_ns, host_ns = ticking_take()
+    clock = OnlineClock(descriptor(ClockCapabilities(device_time=True, tick_ns=MS)))
+    pairs = zip(host_ns.tolist(), device_ns.tolist(), strict=True)
+    got = [clock.update(t_host_ns=host, t_device_ns=device) for host, device in pairs]
+    error_ns = np.array(got[600:]) - true_ns[600:] - 2 * MS
+    assert abs(error_ns.mean()) < 50_000
+    assert np.abs(error_ns).max() < 600_000
+
+
+def test_times_of_ticking_stamps_have_no_bias_offline():
+    true_ns, device_ns, host_ns = ticking_take()
+    batch = SampleBatch(
+        t_host_ns=host_ns,
+        t_device_ns=device_ns,
+        sequence=np.full(3000, -1),
+        values=np.zeros((3000, 1), dtype=np.float32),
+    )
+    stream = descriptor(ClockCapabilities(device_time=True, tick_ns=MS))
+    error_ns = time_stream(batch, stream).t_host_ns - true_ns - 2 * MS
+    assert abs(error_ns.mean()) < 50_000
+
+
+@pytest.mark.parametrize("seconds", [30, 300])
+def test_a_model_goes_on_beyond_its_ends(seconds):
+    """By 50 ppm: 3 ms a minute."""
+    device_ns = np.arange(seconds * 100, dtype=np.int64) * PERIOD_NS
+    to_host_ns = lambda t_ns: 10**15 + t_ns + t_ns * 50 // 1_000_000  # noqa: E731
+    model = fit_clock(device_ns, to_host_ns(device_ns))
+    beyond_ns = np.array([-60, -1, seconds, seconds + 60], dtype=np.int64) * 10**9
+    np.testing.assert_allclose(model.to_host_ns(beyond_ns) - to_host_ns(beyond_ns), 0, atol=1000)
+
+
+@settings(max_examples=60)
+@given(
+    st.lists(
+        st.tuples(st.integers(0, 12), st.integers(-1000, 1000)), min_size=4, max_size=40
+    ).filter(lambda points: len({x for x, _ in points}) > 2)
+)
+def test_the_lower_hull_is_that_of_qhull(points):
+    """Several points may share an x: the lowest of them counts, in whatever order they come."""
+    points = sorted(points, key=lambda point: point[0])
+    hull = LowerHull()
+    for x, y in points:
+        hull.add(float(x), float(y))
+    # A roof far above makes every vertex below it one of the lower hull.
+    first, last = points[0][0], points[-1][0]
+    roofed = np.array([*points, (first, 10**6), (last, 10**6)], dtype=np.float64)
+    vertices = roofed[ConvexHull(roofed).vertices]
+    wanted = sorted(map(tuple, vertices[vertices[:, 1] < 10**6].tolist()))
+    assert list(hull) == wanted
+
+
+def test_a_step_is_found_where_samples_were_lost_beside_another_odd_distance():
+    """The timer hesitates once, ten samples later the clock jumps back and five samples are lost.
+
+    By hand: 2.7 periods back and five lost make a distance of 1 + 5 - 2.7 = 3.3 periods, 0.3 beside
+    a whole number; the hesitation alone is 0.45 beside one.
+    """
+    taken_ns = np.arange(1000, dtype=np.int64) * PERIOD_NS
+    taken_ns[490:] += 4_500_000
+    device_ns = taken_ns - (np.arange(1000) >= 500) * 27_000_000
+    arrived = np.r_[0:500, 505:1000]
+    waits_ns = np.arange(1000) * 7919 % 97 * 5000
+    host_ns = (10**15 + taken_ns + waits_ns)[arrived]
+    assert find_steps(device_ns[arrived], host_ns).cuts == [500]
+
+
+def test_wrong_stamps_are_single_ones_between_two_that_agree():
+    stamps_ns = np.delete(np.arange(200, dtype=np.int64), [21, 60, 61]) * PERIOD_NS
+    assert find_wrong_stamps(stamps_ns).tolist() == []
+    for wrong, by_ns in ((20, 3_000_000), (100, 43_000_000), (150, -2_000_000)):
+        stamps_ns[wrong] += by_ns
+    assert find_wrong_stamps(stamps_ns).tolist() == [20, 100, 150]
+    # Two in a row, a step, and the ends are something else; so is a device without a rhythm.
+    stepped_ns = np.arange(200, dtype=np.int64) * PERIOD_NS
+    stepped_ns[[50, 51]] += 4_000_000
+    stepped_ns[120:] += 7_000_000
+    stepped_ns[[0, -1]] += 2_000_000
+    assert find_wrong_stamps(stepped_ns).tolist() == []
+    irregular_ns = np.random.default_rng(0).uniform(0, 2e9, 200).astype(np.int64)
+    assert find_wrong_stamps(np.sort(irregular_ns)).tolist() == []
+
+
+def test_no_sample_is_dated_after_its_arrival():
+    device_ns = np.arange(600, dtype=np.int64) * PERIOD_NS
+    host_ns = 10**15 + device_ns + 2 * MS
+    model = fit_clock(device_ns, host_ns)
+    ahead_ns = device_ns[300:301] + 7 * MS
+    assert model.to_host_ns(ahead_ns, host_ns[300:301]).tolist() == host_ns[300:301].tolist()
+    assert model.to_host_ns(ahead_ns).tolist() == (host_ns[300:301] + 7 * MS).tolist()
+
+
+def test_samples_of_one_clump_lie_on_their_own_side_of_a_step():
+    """Four samples before the step and six after it arrive at the same moment."""
+    taken_ns = np.arange(800, dtype=np.int64) * PERIOD_NS
+    device_ns = taken_ns - (np.arange(800) >= 400) * 3_000_000_000
+    host_ns = 10**15 + taken_ns + 2 * MS
+    host_ns[396:406] = host_ns[405]
+    model = fit_clock(device_ns, host_ns)
+    error_ns = model.to_host_ns(device_ns, host_ns) - 10**15 - taken_ns - 2 * MS
+    np.testing.assert_allclose(error_ns, 0, atol=10)
