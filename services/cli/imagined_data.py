@@ -1,7 +1,8 @@
-"""A store of robot episodes and a checkpoint in; the same episodes as the model imagines them, out.
+"""Robot episodes of a store as the world model imagines them: `dextouch train imagined`.
 
-The probe that judges imagined endings must have seen imagined endings: they are softer than true
-ones. Their outcome is that of the same actions in the twin.
+Their outcome is that of the same actions in the twin. Measure the success probe on them to see
+how far imagined endings can be trusted. It should not be trained on them: where the model
+imagined another outcome, it would learn not to believe what it sees.
 """
 
 import argparse

@@ -17,12 +17,12 @@ USAGE = """usage: dextouch train data|world-model|imagined|policy|probe [options
 
   data         record the mixed twin episodes that everything is trained on
   world-model  the joint visuo-tactile flow-matching model
-  imagined     those episodes as the world model imagines them, for the probe
+  imagined     those episodes as the world model imagines them
   policy       a closed-loop policy that imitates the demonstrations
-  probe        the judge of imagined success
+  probe        the judge of imagined success; give it data made with --ladder
 
-Each explains itself with --help and writes its figures with --json PATH.
-The committed checkpoints were made in this order."""
+Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`
+makes data and checkpoints as the committed ones were made; docs/evaluation.md has the commands."""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -78,8 +78,13 @@ def run_train_probe(arguments: list[str]) -> int:
     settings = parse(TrainProbeSettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
     demonstrations = read_demonstrations(*stores, tasks=settings.tasks)
-    command = command_line("train-probe", arguments)
-    checkpoint = train_success_probe(demonstrations, settings.training, command=command)
+    kept = [EpisodeStore(url) for url in settings.held_out]
+    checkpoint = train_success_probe(
+        demonstrations,
+        settings.training,
+        command=command_line("train-probe", arguments),
+        held_out=read_demonstrations(*kept, tasks=settings.tasks) if kept else (),
+    )
     return _keep(checkpoint, settings.output, settings.json_path)
 
 

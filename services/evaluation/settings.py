@@ -39,6 +39,9 @@ class TrainProbeSettings(BaseSettings):
     model_config = service_config("evaluation_train_probe")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    held_out: tuple[str, ...] = Field(
+        default=(), description="stores to measure on (a fifth of the seeds of `episodes`)"
+    )
     output: Path = Path("runs/evaluation/success_probe.safetensors")
     tasks: tuple[str, ...] = ()
     training: ProbeSettings = ProbeSettings()

@@ -41,6 +41,40 @@ def _check_confidence(confidence: float) -> None:
         raise InvalidInputError(f"confidence: got {confidence}, expected between 0 and 1")
 
 
+def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
+    """Probability that a success scores above a failure; ties count half.
+
+    Args:
+        scores: [n], higher for a surer success.
+        success: [n], what came true.
+
+    Raises:
+        InvalidInputError: only successes, or only failures.
+    """
+    positive, negative = _by_outcome(scores, success)
+    return float((np.sign(positive[:, None] - negative[None, :]).mean() + 1) / 2)
+
+
+def balanced_accuracy(decisions: np.ndarray, success: np.ndarray) -> float:
+    """Mean of the shares of successes and of failures that were decided rightly.
+
+    Raises:
+        InvalidInputError: only successes, or only failures.
+    """
+    positive, negative = _by_outcome(np.asarray(decisions, dtype=bool), success)
+    return float((positive.mean() + (~negative).mean()) / 2)
+
+
+def _by_outcome(values: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    values, positive = np.asarray(values), np.asarray(success, dtype=bool)
+    if values.shape != positive.shape or values.ndim != 1 or positive.all() or not positive.any():
+        raise InvalidInputError(
+            f"judging: got {values.shape} scores, {positive.sum()} of {positive.shape} outcomes "
+            "are successes; expected one each and both outcomes"
+        )
+    return values[positive], values[~positive]
+
+
 def wilson_interval(successes: int, trials: int, *, confidence: float = 0.95) -> Interval:
     """Wilson score interval of a success rate, inside 0 … 1 (Wilson 1927).
 

@@ -1,4 +1,4 @@
-"""The last images and taxels of a rollout in; the probability that the task succeeded out."""
+"""Success probe: a small network that tells from the end of a rollout whether it succeeded."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, UInt8
+from jaxtyping import Float32, Float64, Int64, UInt8
 from pydantic import BaseModel, ConfigDict
 from torch import nn
 
@@ -14,10 +14,11 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
 from services.evaluation.features import NUM_PAD_FEATURES, pad_features
 
-KIND = "success-probe"
+# Version 2 of the network; checkpoints of the first are refused by this name.
+KIND = "success-probe-2"
 NUM_SEEN_STEPS = 3
 DECISION_THRESHOLD = 0.5
-_CHANNELS = (16, 32, 32)
+_CHANNELS = (24, 32, 48, 48)
 _TASK_FEATURES = 8
 
 
@@ -42,36 +43,56 @@ class Ending:
 
 @dataclass(frozen=True)
 class ProbeBatch:
-    """Inputs of the network: images [n, 9, h, w] in −0.5 … 0.5, touch [n, 72], task index [n]."""
+    """Inputs of the network: last images as bytes, mean touch of the three steps, task index."""
 
-    images: torch.Tensor
-    touch: torch.Tensor
-    task: torch.Tensor
+    images: UInt8[torch.Tensor, "n 3 h w"]
+    touch: Float32[torch.Tensor, "n 24"]
+    task: Int64[torch.Tensor, " n"]
+
+    def __getitem__(self, index: torch.Tensor) -> "ProbeBatch":
+        """Some of the endings."""
+        return ProbeBatch(self.images[index], self.touch[index], self.task[index])
 
 
 class ProbeNetwork(nn.Module):
-    """Three strided convolutions and two linear layers."""
+    """Four strided convolutions on the last image, touch and task beside them, two linear layers.
+
+    The image is all that shows how well an object stands. Few features reach the linear layers,
+    so that they learn where things lie and not one training episode from another.
+    """
 
     def __init__(self, shape: ProbeShape) -> None:
         super().__init__()
         layers: list[nn.Module] = []
-        channels = 3 * NUM_SEEN_STEPS
+        channels = 3
         for width in _CHANNELS:
-            layers += [nn.Conv2d(channels, width, 3, stride=2, padding=1), nn.ReLU()]
+            layers.append(nn.Conv2d(channels, width, 3, stride=2, padding=1))
+            layers += [nn.BatchNorm2d(width), nn.GELU()]
             channels = width
         side = -(-shape.image_size_px // 2 ** len(_CHANNELS))
-        num_features = channels * side * side + NUM_SEEN_STEPS * NUM_PAD_FEATURES + _TASK_FEATURES
+        num_features = channels * side * side + NUM_PAD_FEATURES + _TASK_FEATURES
         self.eye = nn.Sequential(*layers, nn.Flatten())
         self.task = nn.Embedding(len(shape.tasks), _TASK_FEATURES)
         self.head = nn.Sequential(
-            nn.Dropout(0.2), nn.Linear(num_features, shape.hidden), nn.ReLU(),
+            nn.Dropout(0.3), nn.Linear(num_features, shape.hidden), nn.GELU(),
             nn.Linear(shape.hidden, 1),
         )  # fmt: skip
 
     def forward(self, batch: ProbeBatch) -> torch.Tensor:
         """Log odds [n] of success."""
-        parts = [self.eye(batch.images), batch.touch, self.task(batch.task)]
+        return self.judge(unit_images(batch.images), batch.touch, batch.task)
+
+    def judge(
+        self, images: torch.Tensor, touch: torch.Tensor, task: torch.Tensor
+    ) -> Float32[torch.Tensor, " n"]:
+        """Log odds of images [n, 3, h, w] in −0.5 … 0.5 with their touch and task."""
+        parts = [self.eye(images), touch, self.task(task)]
         return torch.as_tensor(self.head(torch.cat(parts, dim=1)))[:, 0]
+
+
+def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor, "n 3 h w"]:
+    """Bytes as −0.5 … 0.5."""
+    return images.float() / 255 - 0.5
 
 
 def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
@@ -89,11 +110,11 @@ def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
             raise InvalidInputError(
                 f"success probe: got images {ending.images.shape}, expected {size}"
             )
-    images = torch.from_numpy(np.stack([e.images for e in endings])).float() / 255 - 0.5
-    touch = pad_features(np.stack([e.tactile_kpa for e in endings]))
+    images = torch.from_numpy(np.stack([e.images[-1] for e in endings]))
+    touch = pad_features(np.stack([e.tactile_kpa for e in endings])).mean(axis=1)
     return ProbeBatch(
-        images.permute(0, 1, 4, 2, 3).flatten(1, 2),
-        torch.from_numpy(touch).flatten(1),
+        images.permute(0, 3, 1, 2).contiguous(),
+        torch.from_numpy(touch),
         torch.tensor([shape.tasks.index(e.task) for e in endings]),
     )
 

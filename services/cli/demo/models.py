@@ -13,6 +13,12 @@ from services.world_model.checkpoints import Checkpoint, default_checkpoint, rea
 
 # Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
 EXACT_DATA = ("--first", "1000", "--count", "120", "--miss-fraction", "0", "--exact")
+# Endings near the border of success for the probe, and others to measure it on.
+ENDINGS = (
+    "--ladder", "--first", "2000", "--count", "315",
+    "--miss-fraction", "0.1", "--still-fraction", "0.1",
+)  # fmt: skip
+UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180", "--miss-fraction", "0")
 
 
 @dataclass(frozen=True)
@@ -39,17 +45,18 @@ def train_models(folder: Path) -> Models:
     Args:
         folder: where episodes and checkpoints go; episodes that are there are used again.
     """
-    episodes, exact, imagined = (str(folder / name) for name in ("episodes", "exact", "imagined"))
+    episodes, exact, endings, unseen = (
+        str(folder / name) for name in ("episodes", "exact", "endings", "unseen")
+    )
     world_model = folder / "world_model.safetensors"
     policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
     train.main(["data", "--store", episodes])
     train.main(["data", "--store", exact, *EXACT_DATA])
     train.main(["world-model", "--episodes", episodes, "--output", str(world_model)])
     train.main(["policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)])
-    train.main(
-        ["imagined", "--episodes", episodes, "--store", imagined, "--checkpoint", str(world_model)]
-    )
-    train.main(["probe", "--episodes", episodes, "--episodes", imagined, "--output", str(probe)])
+    train.main(["data", "--store", endings, *ENDINGS])
+    train.main(["data", "--store", unseen, *UNSEEN_ENDINGS])
+    train.main(["probe", "--episodes", endings, "--held_out", unseen, "--output", str(probe)])
     return _load(world_model, policy, probe)
 
 

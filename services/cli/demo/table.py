@@ -26,8 +26,12 @@ def show(report: Mapping[str, Any]) -> None:
     console.print(_world_model(report["world_model"]))
     console.print(_policies(report["policies"]))
     accuracy = report["success_probe"]["held_out_accuracy"]
-    console.print(f"Imagined success is told by a learned probe, right on {accuracy:.0%} of the")
-    console.print("held-out true and imagined endings.\n")
+    console.print(
+        f"Imagined success is told by a learned probe, right on {accuracy:.0%} of the true"
+    )
+    console.print(
+        "endings it was measured on; endings that the model imagines wrongly mislead it.\n"
+    )
     console.print(_agreement(report["agreement"]))
     for task, comments in report["comments"].items():
         console.print(f"\n{task}", style="bold")

@@ -2,9 +2,12 @@
 
 import numpy as np
 import pytest
+from scipy.stats import mannwhitneyu
 
 from dextouch.errors import InvalidInputError, ShapeError
 from services.evaluation.statistics import (
+    area_under_roc,
+    balanced_accuracy,
     bootstrap_agreement,
     bootstrap_mean_interval,
     wilson_interval,
@@ -65,6 +68,24 @@ def test_bootstrap_refuses_nothing_and_tables():
             bootstrap_mean_interval(values, rng)
     with pytest.raises(InvalidInputError, match="confidence"):
         bootstrap_mean_interval(np.ones(3), rng, confidence=1.0)
+
+
+def test_area_under_roc_against_scipy():
+    rng = np.random.default_rng(5)
+    for _ in range(20):
+        scores, success = rng.integers(0, 6, 30) / 5, rng.random(30) < 0.4
+        wins, losses = scores[success], scores[~success]
+        area = mannwhitneyu(wins, losses).statistic / (len(wins) * len(losses))
+        assert area_under_roc(scores, success) == pytest.approx(area)
+
+
+def test_balanced_accuracy_by_hand():
+    success = np.array([True] * 8 + [False] * 2)
+    assert balanced_accuracy(np.ones(10), success) == 0.5
+    assert balanced_accuracy(np.array([1] * 6 + [0] * 3 + [1]), success) == 0.625
+    for measure in (balanced_accuracy, area_under_roc):
+        with pytest.raises(InvalidInputError, match="both outcomes"):
+            measure(np.ones(3), np.ones(3))
 
 
 def test_agreement_of_identical_worlds_is_sure():

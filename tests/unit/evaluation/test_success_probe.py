@@ -2,8 +2,10 @@
 
 import numpy as np
 import pytest
+import torch
+from scipy.stats import mannwhitneyu
 
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from services.evaluation.demonstrations import data_hash, split_by_seed
 from services.evaluation.success_probe import ProbeShape, SuccessProbe
 from services.evaluation.success_probe_training import (
@@ -74,6 +76,36 @@ def test_a_start_never_stands_on_both_sides(demonstrations):
     training, held_out = split_by_seed(twice, held_out_share=0.3)
     assert len(training) + len(held_out) == len(twice)
     assert not {d.start_digest for d in training} & {d.start_digest for d in held_out}
+
+
+def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
+    settings = ProbeSettings(num_training_steps=1)
+    others = toy.demonstrations(range(900, 920), noise_m=0.03)
+    checkpoint = train_success_probe(demonstrations, settings, command="x", held_out=others)
+    assert len(checkpoint.metadata.training_episodes) == len(demonstrations)
+    metrics, probe = checkpoint.metadata.metrics, SuccessProbe(checkpoint)
+    for task in toy.TASKS:
+        mine = [d for d in others if d.task == task]
+        told = probe.probabilities([final_ending(d, 80) for d in mine])
+        wins, losses = ([p for p, d in zip(told, mine, strict=True) if d.success is w]
+                        for w in (True, False))  # fmt: skip
+        auc = mannwhitneyu(wins, losses).statistic / (len(wins) * len(losses))
+        assert metrics[f"held_out_auc_{task}"] == pytest.approx(auc)
+        assert metrics[f"num_held_out_failures_{task}"] == len(losses) > 0
+    with pytest.raises(ConflictError, match="trained on by the success probe"):
+        train_success_probe(
+            demonstrations, settings, command="x", held_out=[*others, demonstrations[3]]
+        )
+
+
+def test_early_endings_do_not_crowd_out_near_misses(demonstrations):
+    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    labelled = labelled_endings(demonstrations, shape, with_early=True)
+    # Two endings of each episode are late; the three early ones follow them.
+    early = torch.tensor([False, False, True, True, True] * len(demonstrations))
+    failed = labelled.success < 0.5
+    share = labelled.weight[early].sum() / labelled.weight[failed].sum()
+    assert float(share) == pytest.approx(0.1, abs=1e-3)
 
 
 def test_data_hash_sees_every_change(demonstrations):

@@ -1,0 +1,39 @@
+"""The shipped success probe on true endings near the border of success, recorded here and now."""
+
+import sys
+
+import pytest
+import torch
+from scipy.stats import mannwhitneyu
+
+from dextouch.episodes import EpisodeStore
+from services.cli.training_data import LADDER_M, Mix, make_training_data
+from services.evaluation.demonstrations import read_demonstrations
+from services.evaluation.settings import DEFAULT_PROBE
+from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_probe_training import final_ending
+
+pytestmark = pytest.mark.slow
+# Far from the seeds of training and of the checkpoint's own held-out set.
+FIRST_SEED = 40_000
+LEAST_AUC = 0.95
+
+
+def test_it_tells_successes_from_near_misses(tmp_path):
+    torch.set_num_threads(1)
+    seeds = range(FIRST_SEED, FIRST_SEED + 4 * len(LADDER_M))
+    make_training_data(str(tmp_path), seeds, Mix(0.0, ladder=True), num_jobs=1)
+    probe = SuccessProbe.load(DEFAULT_PROBE)
+    episodes = read_demonstrations(EpisodeStore(tmp_path))
+    assert not {e.start_digest for e in episodes} & set(probe.metadata.training_starts)
+    for task in probe.metadata.tasks:
+        mine = [e for e in episodes if e.task == task]
+        told = probe.probabilities([final_ending(e, e.num_steps - 1) for e in mine])
+        wins, losses = ([p for p, e in zip(told, mine, strict=True) if e.success is outcome]
+                        for outcome in (True, False))  # fmt: skip
+        auc = mannwhitneyu(wins, losses).statistic / (len(wins) * len(losses))
+        sys.stdout.write(
+            f"\n{task}: {len(wins)} successes, {len(losses)} failures, AUC {auc:.3f} "
+            f"| bound {LEAST_AUC}\n"
+        )
+        assert auc >= LEAST_AUC

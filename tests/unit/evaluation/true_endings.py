@@ -1,0 +1,49 @@
+"""True endings near the border of success, on which the shipped probe is tested.
+
+`true_endings.npz` holds the last image and the last three touches of 108 episodes of the twin,
+none of which was trained on. Make it anew, when the twin's pictures change, with
+
+    dextouch train data --store endings --ladder --first 30000 --count 54 --miss-fraction 0
+    python -m tests.unit.evaluation.true_endings endings
+"""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.episodes import EpisodeStore
+from services.evaluation.demonstrations import read_demonstrations
+from services.evaluation.success_probe import NUM_SEEN_STEPS, Ending
+
+FILE = Path(__file__).with_suffix(".npz")
+
+
+def read(task: str) -> tuple[list[Ending], np.ndarray]:
+    """The endings of a task, and which of them the twin calls successes."""
+    with np.load(FILE) as kept:
+        chosen = kept["task"] == task
+        endings = [
+            Ending(np.repeat(image[None], NUM_SEEN_STEPS, axis=0), tactile_kpa, task)
+            for image, tactile_kpa in zip(
+                kept["image"][chosen], kept["tactile_kpa"][chosen], strict=True
+            )
+        ]
+        return endings, kept["success"][chosen]
+
+
+def main(store: str) -> None:
+    """Keep the endings of a store."""
+    episodes = read_demonstrations(EpisodeStore(store))
+    np.savez_compressed(
+        FILE,
+        task=[e.task for e in episodes],
+        seed=[e.seed for e in episodes],
+        success=[e.success for e in episodes],
+        image=[e.images[-1] for e in episodes],
+        tactile_kpa=[e.tactile_kpa[-NUM_SEEN_STEPS:] for e in episodes],
+    )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1])
