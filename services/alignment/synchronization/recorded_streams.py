@@ -39,6 +39,8 @@ BASE_FRAME = "base"
 BASE_NAME = "T_world_base"
 # Bytes of values that are read at once, as the episode holds them.
 PIECE_BYTES = 16 << 20
+# Of a quaternion; trackers send zeros where they lost their target.
+LEAST_NORM = 1e-9
 # From raw values to those of the episode.
 Conversion = Callable[[np.ndarray], np.ndarray]
 
@@ -162,12 +164,13 @@ def date_stream(recording: Recording, name: str) -> DatedStream:
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
         convert = _keypoints_conversion(descriptor, calibration)
     elif descriptor.kind == "pose":
+        T_tracker_body = T_world_base = None
         if MOUNTS.get(name) in calibration:
-            convert = partial(_move_to_body, T_tracker_body=_rigid(calibration, MOUNTS[name]))
+            T_tracker_body = _rigid(calibration, MOUNTS[name])
         if descriptor.frame == BASE_FRAME:
             T_world_base = _base_of(calibration, name)
-            convert = partial(_move_to_world, before=convert, T_world_base=T_world_base)
             descriptor = descriptor.model_copy(update={"frame": "world"})
+        convert = partial(_moved_poses, T_world_base=T_world_base, T_tracker_body=T_tracker_body)
     return DatedStream(recording, descriptor, timing, convert)
 
 
@@ -249,11 +252,17 @@ def _base_of(calibration: dict[str, Matrix], stream: str) -> Float64[np.ndarray,
     return _rigid(calibration, BASE_NAME)
 
 
-def _move_to_body(poses: np.ndarray, *, T_tracker_body: np.ndarray) -> np.ndarray:
-    return pose_from_transform(transform_from_pose(poses) @ T_tracker_body)
-
-
-def _move_to_world(
-    poses: np.ndarray, *, before: Conversion, T_world_base: np.ndarray
+def _moved_poses(
+    poses: np.ndarray, *, T_world_base: np.ndarray | None, T_tracker_body: np.ndarray | None
 ) -> np.ndarray:
-    return pose_from_transform(T_world_base @ transform_from_pose(before(poses)))
+    """Poses of the body in the world; NaN for what is none: not finite, or a zero quaternion."""
+    is_turned = np.linalg.norm(poses[:, 3:], axis=1) >= LEAST_NORM
+    is_pose = is_turned & np.isfinite(poses).all(axis=1)
+    moved = np.where(is_pose[:, None], poses, np.nan).astype(poses.dtype)
+    if is_pose.any() and (T_world_base is not None or T_tracker_body is not None):
+        Ts = transform_from_pose(poses[is_pose])
+        Ts = Ts if T_world_base is None else T_world_base @ Ts
+        Ts = Ts if T_tracker_body is None else Ts @ T_tracker_body
+        moved = np.full(poses.shape, np.nan)
+        moved[is_pose] = pose_from_transform(Ts)
+    return moved

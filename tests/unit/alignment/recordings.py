@@ -11,9 +11,19 @@ START_NS = 10**12
 
 
 def write_recording(
-    store, recording_id, *, streams=("wrist_left", "wrist_right", "head"), seconds=2.0, lost=()
+    store,
+    recording_id,
+    *,
+    streams=("wrist_left", "wrist_right", "head"),
+    seconds=2.0,
+    lost=(),
+    calibration=None,
+    edit=lambda name, values: values,
 ):
-    """A robot that stands still; `lost` are (stream, first, last) samples that never arrived."""
+    """A robot that stands still; `lost` are (stream, first, last) samples that never arrived.
+
+    `calibration` is added to that of the recording, `edit` changes a stream's values.
+    """
     attributes = RecordingAttributes(
         recording_id=recording_id,
         task="stand-bottle",
@@ -21,7 +31,7 @@ def write_recording(
         domain="robot",
         station="test",
         started_t_host_ns=START_NS,
-        calibration={"K_head": K_HEAD},
+        calibration={"K_head": K_HEAD, **(calibration or {})},
     )
     t_ns = np.arange(round(seconds * 100), dtype=np.int64) * 10_000_000
     with store.writer(kind="recording", attributes=attributes) as writer:
@@ -41,7 +51,7 @@ def write_recording(
                 arrived[first:last] &= stream_name != name
             writer.append(
                 name,
-                values=np.repeat(row[None], len(t_ns), axis=0)[arrived],
+                values=edit(name, np.repeat(row[None], len(t_ns), axis=0)[arrived]),
                 t_host_ns=t_ns[arrived] + START_NS,
                 t_device_ns=t_ns[arrived] + 9 * 10**11,
             )

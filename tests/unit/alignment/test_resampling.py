@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.streams.descriptors import StreamDescriptor
-from services.alignment.synchronization.hand_joints import retarget_hands
+from services.alignment.retargeting import RetargetStatus
+from services.alignment.synchronization.hand_joints import retarget_hands, status_on_grid
 from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import place_on_grid, vectors_on_grid
 from services.cli.bench.retargeting.sequences import motion_of
@@ -35,6 +36,13 @@ def test_no_line_is_drawn_through_a_gap():
     # 100 ms without a sample behind the first and before the last.
     at = placed([0, 100, 110, 210], [-5, 0, 5, 50, 99, 100, 105, 110, 115, 205, 215])
     assert np.flatnonzero(at.valid).tolist() == [1, 5, 6, 7]
+
+
+def test_a_step_is_as_good_as_the_worse_of_its_samples():
+    status = np.array([RetargetStatus.SOLVED, RetargetStatus.MISSING, RetargetStatus.PARTIAL])
+    at = placed([0, 10, 20], [0, 5, 10, 12, 20])
+    names = [RetargetStatus(value).name for value in status_on_grid(status, at)]
+    assert names == ["SOLVED", "MISSING", "MISSING", "MISSING", "PARTIAL"]
 
 
 @pytest.mark.parametrize("end", ["first", "last"])
