@@ -8,8 +8,14 @@ import numpy as np
 
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ArrayEntry, shard_path, with_rows
-from dextouch.episodes.journal import JournalWriter, journal_path, part_path
-from dextouch.episodes.shard_reader import with_crc
+from dextouch.episodes.journal import (
+    JournalWriter,
+    journal_path,
+    part_path,
+    read_payloads,
+    read_rows,
+)
+from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows, with_crc
 from dextouch.episodes.zstd import compress
 
 
@@ -60,6 +66,27 @@ class ShardWriter:
         if self._num_pending:
             self._chunk[self._num_pending :] = 0
             self._write_rows()
+
+    def flush_until(self, num_rows: int) -> None:
+        """End the log of a `zstd` array after so many rows, where an append was broken off.
+
+        Only the log itself is believed: an interrupt may lie between a write and its counting.
+        """
+        if self._entry.codec != "zstd":
+            return
+        rows = read_rows(self._stage, self._name)
+        ends = np.cumsum(rows["num_rows"], dtype=np.int64)
+        num_whole = int(np.searchsorted(ends, num_rows, side="right"))
+        chunk = self._chunk
+        if num_whole < len(rows):
+            # Rows of what was broken off completed this storage chunk.
+            (payload,) = read_payloads(self._stage, self._name, rows[num_whole : num_whole + 1])
+            chunk = decode_rows(payload[:-CRC_BYTES], self._entry, what=self._name).copy()
+        self._log.truncate(num_whole)
+        num_waiting = num_rows - (int(ends[num_whole - 1]) if num_whole else 0)
+        if num_waiting:
+            chunk[num_waiting:] = 0
+            self._log.append(with_crc(compress(chunk.tobytes())), num_waiting)
 
     def finish(self) -> ArrayEntry:
         """Turn the log into the shard; what the commit record says about the array comes back."""

@@ -41,8 +41,10 @@ class StreamWriter:
         self._least_step_ns = 1 if kind == "episode" else 0
         # Whether values come as numbers or as encoded images; the first block decides.
         self._plain: bool | None = None
-        # Whether a block was broken off half written: what follows would not line up with it.
+        # Whether a block was broken off half written: what follows would not line up with it. And
+        # the samples of all blocks before it.
         self._is_broken = False
+        self._num_whole = 0
         self._codec = codec_of(descriptor)
         self._dtype = descriptor.numpy_dtype()
         self._images = _EncodedImages(descriptor, options.video)
@@ -141,6 +143,7 @@ class StreamWriter:
                 array.append_encoded(payload, num_images)
         for stamp, column in stamps.items():
             self.arrays[f"{self.descriptor.name}_{stamp}"].append(column)
+        self._num_whole += len(values)
         self._is_broken = False
 
     def _check_unbroken(self) -> None:
@@ -176,7 +179,7 @@ class StreamWriter:
             array.flush()
 
     def keep(self) -> None:
-        """Write all that waits in memory, unless a block was broken off, and give all back.
+        """Write all that waits in memory, but of a block that was broken off, and give all back.
 
         Raises:
             StorageError: the disk fails; what was written before stays.
@@ -186,6 +189,9 @@ class StreamWriter:
                 self._queue.stop(drop=False)
             if not self._is_broken:
                 self._flush()
+            else:
+                for array in self.arrays.values():
+                    array.flush_until(self._num_whole)
         finally:
             self.close()
 
