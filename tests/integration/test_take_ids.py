@@ -134,7 +134,7 @@ async def station_of(spool, uploader):
     app = create_station(AcquisitionSettings(spool=spool, mock=True), uploader)
     async with app.router.lifespan_context(app):
         transport = httpx.ASGITransport(app)
-        async with httpx.AsyncClient(transport=transport, base_url="http://station") as client:
+        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1") as client:
             yield client
 
 
