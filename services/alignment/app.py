@@ -1,5 +1,6 @@
 """Settings in, the alignment service's application out."""
 
+import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
@@ -9,20 +10,29 @@ from dextouch import __version__
 from dextouch.episodes import EpisodeStore
 from dextouch.serving.app import create_service_app
 from services.alignment.job_table import JobTable
+from services.alignment.new_recordings import NewRecordings
 from services.alignment.routes import alignments_router
 from services.alignment.settings import AlignmentSettings
 
 
 def create_app(settings: AlignmentSettings) -> FastAPI:
     """The service; it reads recordings from and writes episodes to the store's folder."""
-    jobs = JobTable(EpisodeStore(settings.store_url), settings)
+    store = EpisodeStore(settings.store_url)
+    jobs = JobTable(store, settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         await jobs.start()
+        watching: list[asyncio.Task[None]] = []
+        if settings.align_new:
+            watch = NewRecordings(store, jobs).watch(settings.look_period_s)
+            watching.append(asyncio.create_task(watch))
         try:
             yield
         finally:
+            for task in watching:
+                task.cancel()
+            await asyncio.gather(*watching, return_exceptions=True)
             await jobs.close()
 
     async def readiness() -> Sequence[str]:

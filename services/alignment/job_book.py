@@ -83,6 +83,11 @@ class JobBook:
             next_after=shown[-1] if len(rest) > limit else None,
         )
 
+    @property
+    def recording_ids(self) -> set[str]:
+        """Recordings that there are jobs of."""
+        return {job.recording_id for job in self._jobs.values()}
+
     def next(self) -> AlignmentJob | None:
         """The job that has waited longest."""
         return next((job for job in self._jobs.values() if job.state == "waiting"), None)

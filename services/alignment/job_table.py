@@ -11,10 +11,16 @@ from pathlib import Path
 import structlog
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import ConflictError, DexTouchError, StorageError, UnavailableError
+from dextouch.errors import (
+    ConflictError,
+    DexTouchError,
+    InvalidInputError,
+    StorageError,
+    UnavailableError,
+)
 from services.alignment import job_steps
 from services.alignment.job_book import RETRY_AFTER_S, JobBook
-from services.alignment.jobs import check_recordings
+from services.alignment.jobs import check_recordings, episode_id_of
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentRequest
 from services.alignment.settings import AlignmentSettings
 from services.alignment.synchronization.progress import Progress
@@ -40,7 +46,10 @@ class JobTable:
         max_open = settings.num_workers + settings.max_waiting
         self.book = JobBook(max_open=max_open, max_kept=settings.max_kept)
         self._changed = asyncio.Condition()
-        self._workers = [AlignmentWorker(settings.store_url) for _ in range(settings.num_workers)]
+        self._workers = [
+            AlignmentWorker(settings.store_url, settings.log_level)
+            for _ in range(settings.num_workers)
+        ]
         self._threads = ThreadPoolExecutor(settings.num_workers, thread_name_prefix="align")
         self._at_work: dict[str, AlignmentWorker] = {}
         self._tasks: list[asyncio.Task[None]] = []
@@ -99,6 +108,20 @@ class JobTable:
             await self.book.add(jobs)
         await self._announce()
         return tuple(self.book.get(alignment_id) for alignment_id in ids.values())
+
+    async def refuse(self, recording_id: str, error: InvalidInputError) -> None:
+        """Keep a failed job of a recording that cannot be aligned, so that its reason is listed.
+
+        Raises:
+            NotFoundError: no such recording.
+            LimitExceededError: too many are waiting.
+        """
+        recording = await asyncio.to_thread(self._store.recording, recording_id)
+        options = self._settings.options
+        job = job_steps.submitted(episode_id_of(recording, options), recording_id, options)
+        async with self.book.step:
+            await self.book.add([job_steps.failed(job, error)])
+        logger.warning("alignment_failed", recording_id=recording_id, reason=error.message)
 
     async def wait(self, alignment_id: str) -> AlignmentJob:
         """The job once it has ended."""

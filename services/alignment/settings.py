@@ -23,6 +23,9 @@ class AlignmentSettings(ServiceSettings):
     alignments run at once, each in a process of its own (as many as processors if not given),
     `max_waiting` more may wait, `max_kept` are remembered; a job whose process died `max_attempts`
     times is failed.
+
+    With `align_new`, recordings that arrive in the store are aligned by themselves, each once; the
+    store is looked through every `look_period_s`.
     """
 
     model_config = service_config("alignment")
@@ -34,3 +37,5 @@ class AlignmentSettings(ServiceSettings):
     max_waiting: int = Field(default=10_000, ge=1, le=100_000)
     max_kept: int = Field(default=10_000, ge=1, le=100_000)
     max_attempts: int = Field(default=3, ge=1, le=100)
+    align_new: bool = True
+    look_period_s: float = Field(default=2.0, gt=0, le=3600)

@@ -23,10 +23,11 @@ class AlignmentWorker:
 
     Args:
         store_url: of the store, as the process opens it.
+        log_level: of the process's log.
     """
 
-    def __init__(self, store_url: str) -> None:
-        self._store_url = store_url
+    def __init__(self, store_url: str, log_level: str = "warning") -> None:
+        self._store_url, self._log_level = store_url, log_level
         self._child: subprocess.Popen[bytes] | None = None
         self._guard = threading.Lock()
         # Held by whoever talks with the process.
@@ -48,7 +49,7 @@ class AlignmentWorker:
             with self._guard:
                 if self._child is not None and self._child.poll() is None:
                     return
-                child = self._child = _spawn(self._store_url)
+                child = self._child = _spawn(self._store_url, self._log_level)
             _answer(child, "the alignment process does not start")
 
     def run(self, recording_id: str, options: AlignmentOptions, tell: Tell) -> AlignmentReport:
@@ -97,7 +98,7 @@ class AlignmentWorker:
             _close_pipes(child)
 
 
-def _spawn(store_url: str) -> subprocess.Popen[bytes]:
+def _spawn(store_url: str, log_level: str) -> subprocess.Popen[bytes]:
     # The child finds the same packages, wherever this process found them, and keeps to one
     # processor where libraries would take all.
     environment = os.environ | {
@@ -105,7 +106,7 @@ def _spawn(store_url: str) -> subprocess.Popen[bytes]:
         "OMP_NUM_THREADS": "1",
     }
     return subprocess.Popen(  # noqa: S603 - our own interpreter and module
-        [sys.executable, "-m", "services.alignment.worker_process", store_url],
+        [sys.executable, "-m", "services.alignment.worker_process", store_url, log_level],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         env=environment,

@@ -87,20 +87,21 @@ def _problem(error: DexTouchError, recording_id: str) -> Problem:
 
 
 def main() -> None:
-    """Serve the store that the first argument names."""
+    """Serve the store that the first argument names; the second is the log's level."""
+    store_url, log_level = sys.argv[1:]
     # The parent decides when to end; a Ctrl-C at the terminal reaches both.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICENESS)
     # Answers have the real standard output for themselves.
     answers = os.fdopen(os.dup(1), "wb")
     os.dup2(2, 1)
-    configure_logging(service="alignment", log_format="auto", level="info")
+    configure_logging(service="alignment", log_format="auto", level=log_level)
 
     def say(answer: dict[str, object]) -> None:
         answers.write(json.dumps(answer).encode() + b"\n")
         answers.flush()
 
-    serve(sys.argv[1], say)
+    serve(store_url, say)
 
 
 if __name__ == "__main__":

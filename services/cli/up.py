@@ -43,6 +43,9 @@ class UpSettings(BaseSettings):
     )
     station: str = Field(default="mock station", min_length=1, max_length=64)
     mock_episode_id: str | None = None
+    align_new: bool = Field(
+        default=True, description="turn saved takes into episodes by themselves"
+    )
     without: tuple[str, ...] = Field(default=(), description="services to leave out")
     dashboard_port: int = Field(default=0, ge=0, le=65535)
     acquisition_port: int = Field(default=0, ge=0, le=65535)
@@ -126,7 +129,13 @@ def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
     from services.alignment.app import create_app
     from services.alignment.settings import AlignmentSettings
 
-    return create_app(AlignmentSettings(store_url=_store_url(settings)))
+    return create_app(
+        AlignmentSettings(
+            store_url=_store_url(settings),
+            align_new=settings.align_new,
+            log_level=settings.log_level,
+        )
+    )
 
 
 def _acquisition(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:

@@ -53,6 +53,49 @@ async def test_all_services_in_one_process(tmp_path, capsys):
     assert urls["dashboard"] in capsys.readouterr().out
 
 
+async def answered(client, method, url, **more):
+    answer = await client.request(method, url, **more)
+    assert answer.is_success, answer.text
+    return answer.json()
+
+
+async def save_a_take(client, station_url, num_seconds):
+    """As an operator does it; the id of the take."""
+    prompt = {"task": "stand_bottle", "instruction": "stand the bottle up"}
+    recorder = f"{station_url}/v1/recorder"
+    await answered(client, "POST", f"{recorder}/arm", json=prompt)
+    started = await answered(client, "POST", f"{recorder}/record")
+    while (await answered(client, "GET", recorder))["duration_s"] < num_seconds:  # noqa: ASYNC110
+        await asyncio.sleep(0.2)
+    await answered(client, "POST", f"{recorder}/stop")
+    await answered(client, "POST", f"{recorder}/save", json={"accept_incomplete": True})
+    return started["recording_id"]
+
+
+async def test_a_saved_take_becomes_an_episode_by_itself(tmp_path, monkeypatch):
+    # Mocks play in real time: on a busy machine they have gaps that ordinary limits refuse.
+    monkeypatch.setenv("DEXTOUCH_ALIGNMENT_OPTIONS__MAX_GAP_MS", "10000")
+    settings = up.UpSettings(
+        data=tmp_path / "data", json=tmp_path / "urls.json", without=("twin", "world_model")
+    )
+    stop = asyncio.Event()
+    running = asyncio.create_task(up.run(settings, stop))
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
+    async with httpx.AsyncClient(trust_env=False, timeout=60) as client:
+        recording_id = await save_a_take(client, urls["acquisition"], 3.0)
+        jobs = []
+        while not jobs or jobs[0]["state"] in {"waiting", "running"}:
+            await asyncio.sleep(0.2)
+            listed = await answered(client, "GET", f"{urls['alignment']}/v1/alignments")
+            jobs = listed["alignments"]
+        listed = await answered(client, "GET", f"{urls['episode_store']}/v1/episodes")
+    stop.set()
+    assert await running == 0
+    assert [(job["recording_id"], job["state"]) for job in jobs] == [(recording_id, "done")]
+    episodes = [episode["episode_id"] for episode in listed["episodes"]]
+    assert episodes == [jobs[0]["alignment_id"]]
+
+
 async def test_a_taken_port_is_a_clear_refusal(tmp_path):
     place = bind("other", host="127.0.0.1", port=0)
     place.socket.listen()

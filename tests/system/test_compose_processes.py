@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[2]
 KEY = "0123456789abcdef-of-the-system-test"
 TAKE_S = 4.0
 UPLOAD_TIMEOUT_S = 30.0
+ALIGNMENT_TIMEOUT_S = 300.0
 STOP_LIMIT_S = 10.0
 PRETRAINED = ROOT / "services/world_model/pretrained"
 # A working tree in which the model has not been trained yet has nothing to serve there.
@@ -118,6 +119,16 @@ def test_a_recording_becomes_an_episode(ask, recording_id):
     assert ("recording", recording_id) in lineage
     streams = {stream["name"] for stream in attributes["streams"]}
     assert {"tactile_left", "tactile_right", "wrist_left", "head", "action"} <= streams
+
+
+def test_the_recording_is_aligned_unasked(composed, ask, recording_id):
+    def ended():
+        jobs = ask("GET", "alignment", "/v1/alignments")["alignments"]
+        # With ordinary options, so that on a busy machine it may well end as failed.
+        states = {j["state"] for j in jobs if j["options"]["max_gap_ms"] == 50}
+        return states and states <= {"done", "failed"}
+
+    wait_for("alignment", ALIGNMENT_TIMEOUT_S, ended, composed.logs)
 
 
 @pytest.mark.parametrize("service", ["twin"])

@@ -22,7 +22,7 @@ DEXTOUCH = [sys.executable, "-m", "services.cli.main"]
 def commands_of_the_readme():
     """The commands of its first two blocks, without what `make` installs."""
     section = README.read_text(encoding="utf-8").split("## Try it")[1].split("\n## ")[0]
-    lines = "\n".join(re.findall(r"```\n(.*?)```", section, re.DOTALL)).splitlines()
+    lines = "".join(re.findall(r"```\n(.*?)```", section, re.DOTALL)).splitlines()
     typed = [shlex.split(line, comments=True) for line in lines]
     quick = {("make", "demo"): ["dextouch", "demo", "--seeds", "1"], ("make", "test"): []}
     return [quick.get(tuple(words), [Path(words[0]).name, *words[1:]]) for words in typed if words]
@@ -37,9 +37,11 @@ def in_folder(folder, words, **more):
 
 def episodes_of_up(folder):
     """What the store service of `dextouch up` lists once all services answer."""
-    running = in_folder(folder, ["up", "--json", "urls.json"])
+    urls = folder / "urls.json"
+    urls.unlink(missing_ok=True)
+    running = in_folder(folder, ["up", "--json", str(urls)])
     try:
-        while not (urls := folder / "urls.json").exists() or not urls.read_text().endswith("\n"):
+        while not urls.exists() or not urls.read_text().endswith("\n"):
             assert running.poll() is None, "dextouch up ended by itself"
             time.sleep(0.1)
         address = json.loads(urls.read_text())["episode_store"]

@@ -33,7 +33,11 @@ def build_apps(store: str, jobs_folder: Path, world_model: Checkpoint) -> dict[s
     }
     return {
         "episode_store": create_store(EpisodeStoreSettings(store_url=store)),
-        "alignment": create_alignment(AlignmentSettings(store_url=store, jobs_folder=jobs_folder)),
+        "alignment": create_alignment(
+            AlignmentSettings(
+                store_url=store, jobs_folder=jobs_folder, align_new=False, log_level="warning"
+            )
+        ),
         "twin": create_world_app(
             {"twin": TwinWorld(TwinSettings(cameras=("camera_head",)))},
             WorldServiceSettings(),

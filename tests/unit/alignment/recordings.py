@@ -19,6 +19,7 @@ def write_recording(
     lost=(),
     calibration=None,
     edit=lambda name, values: values,
+    task="stand-bottle",
 ):
     """A robot that stands still; `lost` are (stream, first, last) samples that never arrived.
 
@@ -26,7 +27,7 @@ def write_recording(
     """
     attributes = RecordingAttributes(
         recording_id=recording_id,
-        task="stand-bottle",
+        task=task,
         instruction="",
         domain="robot",
         station="test",

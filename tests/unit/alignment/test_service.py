@@ -22,7 +22,7 @@ class FakeWorker:
     held = threading.Event()
     dies = False
 
-    def __init__(self, store_url):
+    def __init__(self, store_url, log_level="warning"):
         self._store = EpisodeStore(store_url)
         self._killed, self._talking = threading.Event(), threading.Lock()
 
@@ -68,8 +68,9 @@ def serve(store, worker):
     """Opens the service as often as a test wants to."""
 
     class Service:
-        def __init__(self, **settings):
-            self._app = create_app(AlignmentSettings(store_url=str(store.root), **settings))
+        def __init__(self, *, align_new=False, **settings):
+            settings |= {"store_url": str(store.root), "align_new": align_new}
+            self._app = create_app(AlignmentSettings(**settings))
 
         async def __aenter__(self):
             self._lifespan = self._app.router.lifespan_context(self._app)

@@ -1,0 +1,140 @@
+"""Recordings that arrive are aligned by themselves: each once, and failures are listed."""
+
+import asyncio
+from contextlib import asynccontextmanager
+
+import pytest
+from httpx import ASGITransport, AsyncClient
+
+from dextouch.episodes import EpisodeStore
+from services.alignment import job_table
+from services.alignment.app import create_app
+from services.alignment.jobs import align_recording
+from services.alignment.options import AlignmentOptions
+from services.alignment.settings import AlignmentSettings
+from tests.unit.alignment.recordings import write_recording
+from tests.unit.alignment.test_service import FakeWorker
+
+LOOK_PERIOD_S = 0.01
+
+
+@pytest.fixture
+def worker(monkeypatch):
+    kind = type("Worker", (FakeWorker,), {"held": asyncio.Event(), "started": []})
+    kind.held.wait = lambda _: True
+    run = kind.run
+    kind.run = lambda self, name, *more: kind.started.append(name) or run(self, name, *more)
+    monkeypatch.setattr(job_table, "AlignmentWorker", kind)
+    return kind
+
+
+@pytest.fixture
+def store(tmp_path):
+    return EpisodeStore(tmp_path / "store")
+
+
+@asynccontextmanager
+async def served(store, **settings):
+    """The service, as its client asks for all of its jobs."""
+    settings = {"store_url": str(store.root), "look_period_s": LOOK_PERIOD_S} | settings
+    app = create_app(AlignmentSettings(**settings))
+
+    async def jobs(**query):
+        answer = await client.get("/v1/alignments", params=query)
+        return {job["recording_id"]: job for job in answer.json()["alignments"]}
+
+    async with (
+        app.router.lifespan_context(app),
+        AsyncClient(transport=ASGITransport(app), base_url="http://alignment") as client,
+    ):
+        yield jobs
+
+
+async def until(condition):
+    """Until a condition of other tasks holds; pytest's own limit ends what never happens."""
+    while not await condition():  # noqa: ASYNC110 - of other tasks
+        await asyncio.sleep(LOOK_PERIOD_S)
+
+
+async def looked(store, jobs):
+    """Until the watcher has been through all that was in the store, and every job has ended."""
+    write_recording(store, "last")
+
+    async def done():
+        found = await jobs()
+        return "last" in found and {job["state"] for job in found.values()} <= {"done", "failed"}
+
+    await until(done)
+
+
+async def test_recordings_that_arrive_become_episodes_once(store, worker):
+    write_recording(store, "before")
+    async with served(store) as jobs:
+        write_recording(store, "while-it-runs")
+        await looked(store, jobs)
+        await looked_again(jobs)
+        assert {job["state"] for job in (await jobs()).values()} == {"done"}
+    async with served(store) as jobs:
+        await looked_again(jobs)
+    assert sorted(worker.started) == ["before", "last", "while-it-runs"]
+    assert len(store.list()) == 3
+
+
+async def looked_again(jobs):
+    """Some more looks of the watcher."""
+    for _ in range(5):
+        await jobs()
+        await asyncio.sleep(LOOK_PERIOD_S)
+
+
+async def test_what_cannot_be_aligned_is_listed_with_its_reason_and_not_tried_again(store, worker):
+    write_recording(store, "headless", streams=("wrist_left", "wrist_right"))
+    async with served(store) as jobs:
+        await looked(store, jobs)
+        failed = await jobs(state="failed")
+        assert list(failed) == ["headless"]
+        assert "head" in failed["headless"]["problem"]["detail"]
+        await looked_again(jobs)
+        assert await jobs(state="failed") == failed
+    async with served(store) as jobs:
+        await looked_again(jobs)
+        assert await jobs(state="failed") == failed
+    assert worker.started == ["last"]
+
+
+@pytest.mark.parametrize("deleted", [False, True])
+async def test_a_recording_with_an_episode_is_left_alone_even_in_the_trash(store, worker, deleted):
+    write_recording(store, "take")
+    report = align_recording(store, "take", AlignmentOptions(model_rate_hz=30))
+    if deleted:
+        store.delete(report.episode_id)
+    async with served(store) as jobs:
+        await looked(store, jobs)
+    assert worker.started == ["last"]
+
+
+async def test_takes_of_a_calibration_are_left_alone(store, worker):
+    write_recording(store, "rest", task="calibrate-glove")
+    async with served(store) as jobs:
+        await looked(store, jobs)
+        assert list(await jobs()) == ["last"]
+
+
+async def test_more_recordings_than_may_wait_are_all_aligned(store, worker):
+    names = [f"take-{number}" for number in range(5)]
+    for name in names:
+        write_recording(store, name)
+    async with served(store, num_workers=1, max_waiting=1) as jobs:
+
+        async def done():
+            return [n for n, job in (await jobs()).items() if job["state"] == "done"] == names
+
+        await until(done)
+    assert sorted(worker.started) == names
+
+
+async def test_without_align_new_nothing_happens_unasked(store, worker):
+    write_recording(store, "take")
+    async with served(store, align_new=False) as jobs:
+        await looked_again(jobs)
+        assert await jobs() == {}
