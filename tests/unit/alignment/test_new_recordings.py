@@ -16,6 +16,7 @@ from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
 
 LOOK_PERIOD_S = 0.01
+LIMIT_S = 120
 
 
 @pytest.fixture
@@ -51,9 +52,10 @@ async def served(store, **settings):
 
 
 async def until(condition):
-    """Until a condition of other tasks holds; pytest's own limit ends what never happens."""
-    while not await condition():  # noqa: ASYNC110 - of other tasks
-        await asyncio.sleep(LOOK_PERIOD_S)
+    """Until a condition of other tasks holds."""
+    async with asyncio.timeout(LIMIT_S):
+        while not await condition():  # noqa: ASYNC110 - of other tasks
+            await asyncio.sleep(LOOK_PERIOD_S)
 
 
 async def looked(store, jobs):
