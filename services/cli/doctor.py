@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from services.cli.extras import install_hint
+
 
 @dataclass(frozen=True)
 class Finding:
@@ -23,17 +25,17 @@ class Finding:
 
 
 _PACKAGES = {
-    "zstandard": ("episodes", "store"),
-    "serial": ("gloves over serial", "station"),
-    "hid": ("trackers over HID", "station"),
-    "usb": ("trackers over USB", "station"),
-    "cv2": ("cameras and calibration", "station"),
-    "fastapi": ("HTTP services", "serve"),
-    "redis": ("the Redis bus", "serve"),
-    "scipy": ("alignment", "align"),
-    "mujoco": ("the physics twin", "twin"),
-    "torch": ("world model and policies", "model"),
-    "gymnasium": ("the Gymnasium bridge", "gym"),
+    "zstandard": "episodes",
+    "serial": "gloves over serial",
+    "hid": "trackers over HID",
+    "usb": "trackers over USB",
+    "cv2": "cameras and calibration",
+    "fastapi": "HTTP services",
+    "redis": "the Redis bus",
+    "scipy": "alignment",
+    "mujoco": "the physics twin",
+    "torch": "world model and policies",
+    "gymnasium": "the Gymnasium bridge",
 }
 
 
@@ -44,9 +46,9 @@ def examine() -> list[Finding]:
         Finding("Python", version, ok=version.startswith("3.11"), do="install Python 3.11"),
         Finding("processor cores", str(os.cpu_count())),
     ]
-    for package, (purpose, extra) in _PACKAGES.items():
+    for package, purpose in _PACKAGES.items():
         there = importlib.util.find_spec(package) is not None
-        hint = "" if there else f"pip install 'dextouch-wm[{extra}]'"
+        hint = "" if there else install_hint(package)
         findings.append(
             Finding(f"{package} ({purpose})", "yes" if there else "no", ok=there, do=hint)
         )

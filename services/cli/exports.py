@@ -19,7 +19,6 @@ from dextouch.errors import (
     ConflictError,
     InvalidInputError,
     NotFoundError,
-    UnavailableError,
 )
 
 Reader = EpisodeReader | RecordingReader
@@ -85,24 +84,6 @@ def _export_lerobot(readers: Iterator[EpisodeReader], options: argparse.Namespac
 
 _SINGLE = {"mcap": _Single(".mcap", _export_mcap), "rrd": _Single(".rrd", _export_rrd)}
 _JOINT = {"umi": _export_umi, "lerobot": _export_lerobot}
-_EXTRAS = {"rrd": "rerun"}
-
-
-@contextmanager
-def _needs(format_name: str) -> Iterator[None]:
-    """Say which extra brings a missing package.
-
-    Raises:
-        UnavailableError: a package of the format is not installed.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        extra = _EXTRAS.get(format_name, "export")
-        raise UnavailableError(
-            f"format {format_name!r} needs the package {error.name!r}; "
-            f"pip install 'dextouch-wm[{extra}]'"
-        ) from error
 
 
 @contextmanager
@@ -242,15 +223,10 @@ def _import(options: argparse.Namespace) -> Report:
 
 
 def main(argv: Sequence[str]) -> int:
-    """`dextouch export` and `dextouch import`, told apart by the first word.
-
-    Raises:
-        UnavailableError: a package of the format is not installed.
-    """
+    """`dextouch export` and `dextouch import`, told apart by the first word."""
     word, *rest = argv
     options = (_export_parser() if word == "export" else _import_parser()).parse_args(rest)
-    with _needs(options.format):
-        report = _export(options) if word == "export" else _import(options)
+    report = _export(options) if word == "export" else _import(options)
     if options.json is not None:
         options.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
     return 0

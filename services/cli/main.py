@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 from dextouch import __version__
 from dextouch.errors import DexTouchError, UnknownNameError
+from services.cli.extras import missing_package
 
 
 class Command(NamedTuple):
@@ -120,17 +121,26 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"dextouch: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return EXIT_USAGE
+    return _run(name, rest)
+
+
+def _run(name: str, rest: list[str]) -> int:
+    """One command's exit status; a refusal and a package that is not installed are one line."""
     try:
         name, command, rest = find_command(name, rest)
         module = importlib.import_module(command.module)
-        status = module.main([*command.before, *rest])
+        return int(module.main([*command.before, *rest]) or 0)
+    except ModuleNotFoundError as error:
+        refusal = missing_package(error)
+        if refusal is None:
+            raise
     except DexTouchError as error:
-        print(f"dextouch {name}: {error.message}", file=sys.stderr)
-        return EXIT_REFUSED
+        refusal = error
     except KeyboardInterrupt:
         print(f"dextouch {name}: interrupted", file=sys.stderr)
         return 130
-    return int(status or 0)
+    print(f"dextouch {name}: {refusal.message}", file=sys.stderr)
+    return EXIT_REFUSED
 
 
 if __name__ == "__main__":

@@ -15,6 +15,7 @@ from dextouch.data_folder import data_folder
 from dextouch.errors import UnknownNameError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings
+from services.cli.extras import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 
 LOOPBACK = "127.0.0.1"
@@ -85,7 +86,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
             places[name] = bind(name, host=LOOPBACK, port=settings.port(name))
             held.callback(places[name].socket.close)
         urls = {name: place.url for name, place in places.items()}
-        placed = [(places[name], build(settings, urls)) for name, build in builders.items()]
+        placed = [(places[name], _build(name, settings, urls)) for name in builders]
         ready = asyncio.Event()
         announcing = asyncio.create_task(_announce(settings, places, ready))
         held.callback(announcing.cancel)
@@ -93,12 +94,26 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
     return 0
 
 
-def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
+def _build(name: str, settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
+    try:
+        return BUILDERS[name](settings, urls)
+    except ModuleNotFoundError as error:
+        otherwise = f", or leave this service out with --without {name}"
+        refusal = missing_package(error, otherwise if name in _optional() else "")
+        if refusal is None:
+            raise
+        raise refusal from error
+
+
+def _optional() -> list[str]:
     needed = ("episode_store", "acquisition", "dashboard")
-    optional = [name for name in BUILDERS if name not in needed]
+    return [name for name in BUILDERS if name not in needed]
+
+
+def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
     for name in settings.without:
-        if name not in optional:
-            raise UnknownNameError("service to leave out", name, optional)
+        if name not in _optional():
+            raise UnknownNameError("service to leave out", name, _optional())
     return {name: build for name, build in BUILDERS.items() if name not in settings.without}
 
 

@@ -1,0 +1,59 @@
+"""Which optional extra brings a package, for messages about one that is not installed."""
+
+from dextouch.errors import DexTouchError, UnavailableError
+
+# By the name under which a package is imported; of several extras, the one it matters most to.
+EXTRA_OF = {
+    "zarr": "store",
+    "zstandard": "store",
+    "google_crc32c": "store",
+    "av": "store",
+    "serial": "station",
+    "fastcrc": "station",
+    "hid": "station",
+    "usb": "station",
+    "cv2": "station",
+    "fastapi": "serve",
+    "uvicorn": "serve",
+    "httptools": "serve",
+    "rich": "serve",
+    "redis": "serve",
+    "httpx": "serve",
+    "pydantic_settings": "serve",
+    "structlog": "serve",
+    "prometheus_client": "serve",
+    "jinja2": "serve",
+    "websockets": "serve",
+    "scipy": "align",
+    "numba": "align",
+    "torch": "model",
+    "safetensors": "model",
+    "mujoco": "twin",
+    "gymnasium": "gym",
+    "pyarrow": "export",
+    "mcap": "export",
+    "numcodecs": "export",
+    "rerun": "rerun",
+    "obstore": "s3",
+}
+
+
+def install_hint(package: str) -> str:
+    """The command that installs what brings a package."""
+    return f"pip install 'dextouch-wm[{EXTRA_OF[package]}]'"
+
+
+def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouchError | None:
+    """What to say of a package that is not installed; None where no extra brings it.
+
+    Args:
+        error: of the import.
+        otherwise: what else may be done.
+    """
+    package = (error.name or "").partition(".")[0]
+    if package not in EXTRA_OF:
+        return None
+    return UnavailableError(
+        f"the package {package!r} is not installed; {install_hint(package)}, or "
+        f"'dextouch-wm[all]' for everything{otherwise}. `dextouch doctor` lists what is missing"
+    )

@@ -1,0 +1,158 @@
+"""What is not installed is named with the extra that brings it, by every command; no tracebacks."""
+
+import importlib.metadata
+import json
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from services.cli.extras import EXTRA_OF, missing_package
+
+ROOT = Path(__file__).parents[3]
+# Runs every line of standard input as a command, in an environment without some packages.
+CHILD = """
+import contextlib, io, json, sys
+
+class Without:
+    def __init__(self, finder):
+        self.finder = finder
+    def __getattr__(self, name):
+        return getattr(self.finder, name)
+    def find_spec(self, name, path=None, target=None):
+        absent = name.partition(".")[0] in sys.argv[1:]
+        return None if absent else self.finder.find_spec(name, path, target)
+
+sys.meta_path[:] = [Without(finder) for finder in sys.meta_path]
+from services.cli import main
+
+answers = {}
+for line in sys.stdin.read().splitlines():
+    err = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(err):
+        try:
+            status = main.main(line.split())
+        except SystemExit as end:
+            status = end.code
+    answers[line] = (status, err.getvalue())
+print(json.dumps(answers))
+"""
+NAMED = re.compile(r"pip install 'dextouch-wm\[(\w+)\]'")
+# One of each command, and the words of those that have some.
+COMMANDS = (
+    "demo --seeds 1",
+    "up",
+    "twin record --task stand_bottle --seeds 0",
+    "twin serve --help",
+    "station --mock_store x",
+    "station calibrate show nothing",
+    "store list",
+    "export --format mcap nothing --to x.mcap",
+    "export --format lerobot nothing --to x",
+    "import --format umi nothing.zip",
+    "align run --all",
+    "align serve --help",
+    "train data --count 0",
+    "train world-model --help",
+    "train imagined --help",
+    "train policy --help",
+    "train probe --help",
+    "serve --help",
+    "evaluate --help",
+    "bench --help",
+    "bench store --help",
+    "bench acquisition --help",
+)
+HELP = "\n".join(("--help", "train --help", *COMMANDS))
+
+
+def run_without(folder, packages, lines):
+    (folder / "data/store/episodes").mkdir(parents=True)
+    environment = {"PYTHONPATH": f"{ROOT}:{ROOT / 'shared'}", "PATH": "", "HOME": str(folder)}
+    child = subprocess.run(
+        [sys.executable, "-c", CHILD, *packages],
+        input=lines,
+        cwd=folder,
+        env=environment | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert child.returncode == 0, child.stderr[-2000:]
+    return json.loads(child.stdout)
+
+
+@pytest.mark.parametrize(
+    ("installed", "refused"),
+    [
+        ((), set(COMMANDS)),
+        (("store",), set(COMMANDS) - {"bench clocks --help"}),
+        (
+            ("store", "station", "serve"),
+            {
+                "demo --seeds 1",
+                "up",
+                "twin record --task stand_bottle --seeds 0",
+                "twin serve --help",
+                "export --format lerobot nothing --to x",
+                "align run --all",
+                "align serve --help",
+                "train data --count 0",
+                "train world-model --help",
+                "train imagined --help",
+                "train policy --help",
+                "train probe --help",
+                "serve --help",
+                "evaluate --help",
+                "bench store --help",
+            },
+        ),
+        (
+            ("store", "station", "serve", "align", "twin", "gym", "export"),
+            {
+                "demo --seeds 1",
+                "up",
+                "train world-model --help",
+                "train imagined --help",
+                "train policy --help",
+                "train probe --help",
+                "serve --help",
+                "evaluate --help",
+            },
+        ),
+    ],
+    ids=["base", "store", "station", "no model"],
+)
+def test_commands_name_the_extra_that_is_missing(tmp_path, installed, refused):
+    absent = [package for package, extra in EXTRA_OF.items() if extra not in installed]
+    answers = run_without(tmp_path, absent, HELP)
+    assert answers["--help"][0] == answers["train --help"][0] == 0
+    named = {line: NAMED.search(err) for line, (_, err) in answers.items()}
+    assert {line for line, match in named.items() if match} == refused
+    for line in refused:
+        assert answers[line][0] == 3, answers[line]
+        assert named[line][1] not in installed
+        assert len(answers[line][1].splitlines()) == 1
+
+
+def test_up_says_that_a_service_can_be_left_out(tmp_path):
+    (_, err) = run_without(tmp_path, ["torch", "safetensors"], "up")["up"]
+    assert "--without world_model" in err
+
+
+def test_extras_bring_what_is_said_of_them():
+    text = (ROOT / "pyproject.toml").read_text(encoding="utf-8")
+    extras = tomllib.loads(text)["project"]["optional-dependencies"]
+    distributions = importlib.metadata.packages_distributions()
+    for package, extra in EXTRA_OF.items():
+        if package in distributions:  # not every optional one is installed
+            wanted = {re.split(r"[\[<>=]", line)[0] for line in extras[extra]}
+            brings = {name.lower().replace("_", "-") for name in distributions[package]}
+            assert wanted & brings, f"{package}: not in extra {extra!r}"
+
+
+def test_a_module_of_ours_that_is_missing_is_an_error_of_ours():
+    assert missing_package(ModuleNotFoundError("no", name="services.nothing")) is None
