@@ -29,6 +29,7 @@ from services.alignment.worker import AlignmentWorker
 logger = structlog.get_logger(__name__)
 
 JOBS_FOLDER = ".alignments"
+STOP_PERIOD_S = 0.05
 
 
 class JobTable:
@@ -83,9 +84,11 @@ class JobTable:
             if job.state == "running":
                 async with self.book.step:
                     await self.book.note(job_steps.put_back(job))
-        await asyncio.to_thread(self._threads.shutdown)
-        # Once more: a worker may have been about to start.
-        await asyncio.to_thread(self._stop_workers)
+        ended = asyncio.ensure_future(asyncio.to_thread(self._threads.shutdown))
+        while not ended.done():
+            # Again: a worker may have been about to start when it was stopped.
+            await asyncio.to_thread(self._stop_workers)
+            await asyncio.wait([ended], timeout=STOP_PERIOD_S)
         self.book.close()
 
     async def submit(self, request: AlignmentRequest) -> tuple[AlignmentJob, ...]:

@@ -269,6 +269,16 @@ async def test_jobs_outlive_the_service_and_go_on_by_themselves(serve, store, wo
     assert store.list(kind="episode") == sorted(ids)
 
 
+async def test_a_worker_that_starts_while_the_service_stops_is_stopped(serve, worker):
+    worker.held.clear()
+    stopped, run, stop = threading.Event(), worker.run, worker.stop
+    worker.run = lambda self, *order: stopped.wait() and run(self, *order)
+    worker.stop = lambda self: stop(self) or stopped.set()
+    async with serve(num_workers=1) as client:
+        started = await client.post("/v1/alignments", json={"recording_id": "take"})
+        await poll(client, started.json()["alignment_id"], lambda job: job["state"] == "running")
+
+
 async def test_two_services_do_not_share_jobs(serve):
     async with serve():
         with pytest.raises(ConflictError, match="another alignment service"):
