@@ -1,7 +1,9 @@
 """Under tests, and only there, every annotated array shape is checked at run time."""
 
 import os
+from pathlib import Path
 
+import pytest
 from hypothesis import settings
 from jaxtyping import install_import_hook
 
@@ -14,3 +16,18 @@ if "DEXTOUCH_VM_GUEST" not in os.environ:
 # No deadline: machines that are busy with other things are slow, not wrong.
 settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
+
+ROOT = Path(__file__).parents[1]
+
+
+def _shown_names() -> set[str]:
+    return {path.name for path in ROOT.iterdir() if not path.name.startswith(".")}
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _nothing_is_left_in_the_checkout():
+    """Tests write into their own folders; what lands in the current one lands here."""
+    before = _shown_names()
+    yield
+    left = sorted(_shown_names() - before)
+    assert not left, f"tests left {', '.join(left)} in {ROOT}"

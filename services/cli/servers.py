@@ -65,6 +65,8 @@ def bind(name: str, *, host: str, port: int) -> Place:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
+        # At once: until somebody listens there, others could bind the same port.
+        listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise ConflictError(

@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -12,7 +13,7 @@ from pydantic import AliasChoices, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from dextouch.data_folder import data_folder
-from dextouch.errors import UnknownNameError
+from dextouch.errors import ConflictError, UnknownNameError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings
 from services.cli.extras import missing_package
@@ -25,6 +26,8 @@ Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
 
 class UpSettings(BaseSettings):
     """Where data goes and which ports are taken; 0 takes any free one.
+
+    A port that was asked for must be free; a default that is taken gives way to any free one.
 
     Everything that is recorded lies below `data`. Mock devices play episode `mock_episode_id` of
     this store, or a made-up pattern when none is named.
@@ -48,12 +51,12 @@ class UpSettings(BaseSettings):
         default=True, description="turn saved takes into episodes by themselves"
     )
     without: tuple[str, ...] = Field(default=(), description="services to leave out")
-    dashboard_port: int = Field(default=0, ge=0, le=65535)
-    acquisition_port: int = Field(default=0, ge=0, le=65535)
-    episode_store_port: int = Field(default=0, ge=0, le=65535)
-    alignment_port: int = Field(default=0, ge=0, le=65535)
-    twin_port: int = Field(default=0, ge=0, le=65535)
-    world_model_port: int = Field(default=0, ge=0, le=65535)
+    dashboard_port: int = Field(default=8080, ge=0, le=65535)
+    episode_store_port: int = Field(default=8081, ge=0, le=65535)
+    alignment_port: int = Field(default=8082, ge=0, le=65535)
+    acquisition_port: int = Field(default=8083, ge=0, le=65535)
+    twin_port: int = Field(default=8084, ge=0, le=65535)
+    world_model_port: int = Field(default=8085, ge=0, le=65535)
     log_level: Literal["debug", "info", "warning", "error"] = "warning"
     json_path: Path | None = Field(
         default=None,
@@ -83,7 +86,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
     with ExitStack() as held:
         places = {}
         for name in builders:
-            places[name] = bind(name, host=LOOPBACK, port=settings.port(name))
+            places[name] = _bind(name, settings)
             held.callback(places[name].socket.close)
         urls = {name: place.url for name, place in places.items()}
         placed = [(places[name], _build(name, settings, urls)) for name in builders]
@@ -92,6 +95,17 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
         held.callback(announcing.cancel)
         await serve_all(placed, stop=stop, ready=ready)
     return 0
+
+
+def _bind(name: str, settings: UpSettings) -> Place:
+    port = settings.port(name)
+    try:
+        return bind(name, host=LOOPBACK, port=port)
+    except ConflictError:
+        if f"{name}_port" in settings.model_fields_set:
+            raise
+        print(f"{name}: port {port} is taken, so it gets any free one", file=sys.stderr)
+        return bind(name, host=LOOPBACK, port=0)
 
 
 def _build(name: str, settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:

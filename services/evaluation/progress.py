@@ -1,4 +1,4 @@
-"""Steps of a long job in; a progress bar on a terminal, silence elsewhere."""
+"""Progress of a long job on standard error: a bar at a terminal, a line a tenth elsewhere."""
 
 from types import TracebackType
 
@@ -8,7 +8,7 @@ from rich.progress import Progress as RichProgress
 
 
 class Progress:
-    """A progress bar on standard error, drawn only when a person is looking.
+    """A progress bar at a terminal; elsewhere (a log, a pipe) a line at every tenth.
 
     Args:
         title: what is going on.
@@ -16,7 +16,8 @@ class Progress:
     """
 
     def __init__(self, title: str, total: int) -> None:
-        console = Console(stderr=True)
+        self._console = console = Console(stderr=True)
+        self._title, self._total, self._done = title, total, 0
         columns = (
             TextColumn(title),
             BarColumn(),
@@ -42,3 +43,10 @@ class Progress:
         """One step is done; the figures are shown beside the bar."""
         told = "  ".join(f"{name} {value:.3g}" for name, value in figures.items())
         self._bar.update(self._task, advance=1, told=told)
+        tenths = self._done * 10 // self._total
+        self._done += 1
+        if not self._console.is_terminal and self._done * 10 // self._total > tenths:
+            self._console.print(
+                f"   {self._title} {self._done} of {self._total}  {told}".rstrip(),
+                highlight=False,
+            )

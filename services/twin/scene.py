@@ -5,11 +5,22 @@ from functools import cached_property
 
 import mujoco
 import numpy as np
+import structlog
 from jaxtyping import Bool, Int64
 
 from dextouch.tactile.layout import SIDES
 from services.twin.hands import Domain, TwinHand, twin_hand
 from services.twin.mjcf import scene_xml
+
+logger = structlog.get_logger(__name__)
+
+
+def _log_warning(text: str) -> None:
+    logger.warning("physics_warning", text=text)
+
+
+# Without a handler MuJoCo appends its warnings to MUJOCO_LOG.TXT in the current folder.
+mujoco.set_mju_user_warning(_log_warning)
 
 
 @dataclass(frozen=True)

@@ -98,12 +98,29 @@ async def test_a_saved_take_becomes_an_episode_by_itself(tmp_path, monkeypatch):
 
 async def test_a_taken_port_is_a_clear_refusal(tmp_path):
     place = bind("other", host="127.0.0.1", port=0)
-    place.socket.listen()
     port = place.socket.getsockname()[1]
     settings = up.UpSettings(data=tmp_path, dashboard_port=port)
     with pytest.raises(ConflictError, match="--dashboard_port"):
         await up.run(settings, asyncio.Event())
     place.socket.close()
+
+
+def test_a_default_port_that_is_taken_gives_way(capsys):
+    place = bind("other", host="127.0.0.1", port=0)
+    port = place.socket.getsockname()[1]
+    settings = up.UpSettings.model_construct(_fields_set=set(), dashboard_port=port)
+    other = up._bind("dashboard", settings)
+    assert other.socket.getsockname()[1] not in {0, port}
+    assert f"dashboard: port {port} is taken" in capsys.readouterr().err
+    for bound in (place, other):
+        bound.socket.close()
+
+
+def test_ports_are_those_of_the_compose_file():
+    compose = (Path(__file__).parents[2] / "docker-compose.yml").read_text()
+    for name in up.BUILDERS:
+        port = up.UpSettings.model_fields[f"{name}_port"].default
+        assert f"${{DEXTOUCH_{name.upper()}_PORT:-{port}}}:8000" in compose
 
 
 def test_wrong_flags_are_named():
