@@ -31,7 +31,7 @@ _PACKAGES = {
     "usb": "trackers over USB",
     "cv2": "cameras and calibration",
     "fastapi": "HTTP services",
-    "redis": "the Redis bus",
+    "redis": "rollouts kept in Redis",
     "scipy": "alignment",
     "mujoco": "the physics twin",
     "torch": "world model and policies",
@@ -58,7 +58,7 @@ def examine() -> list[Finding]:
     )
     redis = shutil.which("redis-server")
     findings.append(
-        Finding("redis-server (optional)", redis or "no: the memory bus is used instead")
+        Finding("redis-server (optional)", redis or "no: rollouts are kept in memory")
     )
     libusb = ctypes.util.find_library("usb-1.0")
     findings.append(Finding("libusb (optional)", libusb or "no: trackers by link usb need it"))

@@ -31,7 +31,10 @@ from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
 
 BOOT_NS = 4_000_000_000_000
-FLAG_WITHIN_S = 0.3
+# The promise is tried by `make slow`; the default run must not need an idle machine.
+within_s = pytest.mark.parametrize(
+    "within_s", [60.0, pytest.param(0.3, marks=pytest.mark.slow)], ids=["at all", "in time"]
+)
 
 
 @dataclass
@@ -270,7 +273,8 @@ def test_absent_device_is_an_error(subject):
         subject.driver.open()
 
 
-def test_unplugging_is_flagged_within_300_ms_while_reading(subject):
+@within_s
+def test_unplugging_is_flagged_within_300_ms_while_reading(subject, within_s):
     subject.driver.open()
     exchange(subject, 2)
 
@@ -283,8 +287,8 @@ def test_unplugging_is_flagged_within_300_ms_while_reading(subject):
         start_s = time.monotonic()
         subject.port.unplug()
         with pytest.raises(DeviceError):
-            reading.result(timeout=10.0)
-        assert time.monotonic() - start_s <= FLAG_WITHIN_S
+            reading.result(timeout=60.0)
+        assert time.monotonic() - start_s <= within_s
 
 
 def test_replugging_mends_it_and_invents_nothing(subject):

@@ -26,7 +26,7 @@ async def station(tmp_path, **options):
 
 
 async def until_samples(client, count):
-    async with asyncio.timeout(20):
+    async with asyncio.timeout(300):
         while True:
             answer = (await client.get("/v1/recorder")).json()
             if min(answer["num_samples"].values(), default=0) >= count:

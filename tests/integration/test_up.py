@@ -11,7 +11,8 @@ from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from services.cli import up
 from services.cli.servers import bind
 
-START_LIMIT_S = 120
+# Of a machine that is busy with other things; the solver may be compiled first.
+START_LIMIT_S = 900
 PRETRAINED = Path(up.__file__).parents[1] / "world_model/pretrained"
 # A working tree in which the model has not been trained yet has nothing to serve there.
 WITHOUT = () if list(PRETRAINED.glob("*.safetensors")) else ("world_model",)
@@ -49,7 +50,7 @@ async def test_all_services_in_one_process(tmp_path, capsys):
         worlds = (await client.get(urls["twin"] + "/v1/worlds")).json()["worlds"]
     assert worlds[0]["kind"] == "twin"
     stop.set()
-    assert await asyncio.wait_for(running, 30) == 0
+    assert await running == 0
     assert urls["dashboard"] in capsys.readouterr().out
 
 
@@ -143,4 +144,4 @@ async def test_without_worlds(tmp_path):
     urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
     assert set(urls) == {"episode_store", "alignment", "acquisition", "dashboard"}
     stop.set()
-    assert await asyncio.wait_for(running, 30) == 0
+    assert await running == 0

@@ -18,8 +18,12 @@ from services.acquisition.mocks.bridge_server import BridgeServer
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.settings import AcquisitionSettings
 
-FLAG_WITHIN_S = 0.3
-BACK_WITHIN_S = 2.0
+# The promises are tried by `make slow`; the default run must not need an idle machine.
+within_s = pytest.mark.parametrize(
+    ("flag_within_s", "back_within_s"),
+    [(60.0, 60.0), pytest.param(0.3, 2.0, marks=pytest.mark.slow)],
+    ids=["at all", "in time"],
+)
 DEVICES = {
     "finger_tracker": ("left", {"side": "left", "serial_number": "MF-left"}, "keypoints_left"),
     "pose_tracker": ("head", {"stream": "head", "serial_number": "LHR-head"}, "head"),
@@ -109,7 +113,8 @@ def bridge_process(kind, *options):
 
 
 @pytest.mark.system
-def test_a_killed_bridge_is_flagged_and_its_successor_found(kind):
+@within_s
+def test_a_killed_bridge_is_flagged_and_its_successor_found(kind, flag_within_s, back_within_s):
     stream = DEVICES[kind][2]
     (replay,) = (s for s in pattern_streams() if s.descriptor.name == stream)
     with bridge_process(kind) as (process, port):
@@ -120,13 +125,13 @@ def test_a_killed_bridge_is_flagged_and_its_successor_found(kind):
         killed_s = time.monotonic()
         with pytest.raises(DeviceError):
             read_until_lost(driver)
-        assert time.monotonic() - killed_s <= FLAG_WITHIN_S
+        assert time.monotonic() - killed_s <= flag_within_s
         driver.close()
     with bridge_process(kind, "--port", str(port)):
         listening_s = time.monotonic()
         driver.open()
         samples += read_samples(driver, 20)
-        assert time.monotonic() - listening_s <= BACK_WITHIN_S
+        assert time.monotonic() - listening_s <= back_within_s
         driver.close()
     # Every sample is one of the pattern's, to the precision of float32 numbers on the wire.
     for sample in samples:

@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 import tty
 
 import pytest
@@ -70,10 +69,9 @@ def test_a_port_that_does_not_close_holds_nobody_up(line, monkeypatch):
     transport = SerialTransport(lambda: os.ttyname(line[1]))
     transport.open()
     monkeypatch.setattr(serial.Serial, "close", close_later)
-    began_s = time.monotonic()
+    # It returns although the port cannot close before the end of this test.
     with capture_logs() as logs:
         transport.close()
-    assert time.monotonic() - began_s < 5.0
     assert [log["event"] for log in logs] == ["wait_for_port_to_close"]
     with pytest.raises(DeviceError, match="still being closed"):
         transport.open()

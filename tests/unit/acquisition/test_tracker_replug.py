@@ -19,8 +19,12 @@ from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.usb_backend import UsbPort
 from services.acquisition.supervisor import DeviceSupervisor
 
-FLAG_WITHIN_S = 0.3
-BACK_WITHIN_S = 2.0
+# The promises are tried by `make slow`; the default run must not need an idle machine.
+within_s = pytest.mark.parametrize(
+    ("flag_within_s", "back_within_s"),
+    [(60.0, 60.0), pytest.param(0.3, 2.0, marks=pytest.mark.slow)],
+    ids=["at all", "in time"],
+)
 STREAM = next(s for s in pattern_streams(1.0) if s.descriptor.name == "wrist_left")
 
 
@@ -57,7 +61,7 @@ class Rig:
                 assert self.port.send(unit)
         with self.arrived:
             last = sequences[-1]
-            assert self.arrived.wait_for(lambda: last in self.sequences, 10.0)
+            assert self.arrived.wait_for(lambda: last in self.sequences, 60.0)
 
 
 @pytest.fixture(params=["hid", "usb", "bridge"])
@@ -67,24 +71,25 @@ def rig(request, monkeypatch):
     built = Rig(request.param)
     built.port.plug()
     built.supervisor.start()
-    assert built.supervisor.connected.wait(10.0)
+    assert built.supervisor.connected.wait(60.0)
     yield built
     built.supervisor.stop()
     built.port.unplug()
 
 
-def test_unplugged_and_replugged(rig):
+@within_s
+def test_unplugged_and_replugged(rig, flag_within_s, back_within_s):
     rig.send(range(5))
     start_s = time.monotonic()
     rig.port.unplug()
     rig.port.link.wait_closed()
-    assert time.monotonic() - start_s <= FLAG_WITHIN_S
+    assert time.monotonic() - start_s <= flag_within_s
     assert not rig.supervisor.connected.is_set()
     assert rig.supervisor.counters.last_error
     start_s = time.monotonic()
     rig.port.plug()
-    assert rig.supervisor.connected.wait(10.0)
-    assert time.monotonic() - start_s <= BACK_WITHIN_S
+    assert rig.supervisor.connected.wait(60.0)
+    assert time.monotonic() - start_s <= back_within_s
     rig.send(range(8, 12))
     assert rig.sequences == [*range(5), *range(8, 12)]
     assert rig.supervisor.driver.statistics.lost == 3

@@ -32,12 +32,12 @@ async def test_all_answer_and_stop_in_reverse():
     ]
     stop, ready = asyncio.Event(), asyncio.Event()
     serving = asyncio.create_task(serve_all(placed, stop=stop, ready=ready))
-    await asyncio.wait_for(ready.wait(), 10)
+    await asyncio.wait_for(ready.wait(), 60)
     async with httpx.AsyncClient(trust_env=False) as client:
         answers = [(await client.get(place.url)).json() for place, _ in placed]
     assert answers == ["store", "page"]
     stop.set()
-    await asyncio.wait_for(serving, 10)
+    await asyncio.wait_for(serving, 60)
     assert lives[-2:] == ["page down", "store down"]
 
 
@@ -48,7 +48,7 @@ async def test_a_service_that_cannot_start_ends_all():
         (bind("page", host="127.0.0.1", port=0), app_named("page", lives, fails=True)),
     ]
     with pytest.raises(UnavailableError, match="ended by itself: page"):
-        await asyncio.wait_for(serve_all(placed, stop=asyncio.Event(), ready=asyncio.Event()), 10)
+        await asyncio.wait_for(serve_all(placed, stop=asyncio.Event(), ready=asyncio.Event()), 60)
     assert "store down" in lives
 
 

@@ -129,11 +129,11 @@ class Socket:
         self._to_app.put_nowait({"type": "websocket.receive", "text": text})
 
     async def receive(self):
-        return await asyncio.wait_for(self._from_app.get(), 5)
+        return await asyncio.wait_for(self._from_app.get(), 60)
 
     async def leave(self):
         self._to_app.put_nowait({"type": "websocket.disconnect", "code": 1001})
-        await asyncio.wait_for(self._task, 5)
+        await asyncio.wait_for(self._task, 60)
 
 
 async def test_live_sends_what_is_in_view(make_app, services):
