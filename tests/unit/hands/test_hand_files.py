@@ -106,8 +106,8 @@ def test_random_mjcf_chains_move_as_in_mujoco(seed, tmp_path):
 def test_half_turns_of_zaxis_are_mujocos(tmp_path):
     text = (
         f'<mujoco><worldbody><body name="w">{INERTIAL}<body zaxis="0 0 -2">{INERTIAL}'
-        '<joint name="j0" range="-60 60" axis="1 2 3"/><joint name="j1" range="-9 9"/>'
-        '<joint name="j2" range="-9 9"/><site name="tip" pos="0.01 0.02 0.03"/>'
+        '<joint name="j0" range="-60 60" axis="1 2 3"/><joint name="j1" range="-9 9" axis="1 0 0"/>'
+        '<joint name="j2" range="-9 9" axis="0 1 0"/><site name="tip" pos="0.01 0.02 0.03"/>'
         "</body></body></worldbody></mujoco>"
     )
     mapping = THUMB.format(joints='"j0", "j1", "j2"', tip='site = "tip"')
