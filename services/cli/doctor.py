@@ -57,9 +57,7 @@ def examine() -> list[Finding]:
         Finding("free disk", f"{free_gb:.1f} GB", ok=free_gb > 2, do="free at least 2 GB")
     )
     redis = shutil.which("redis-server")
-    findings.append(
-        Finding("redis-server (optional)", redis or "no: rollouts are kept in memory")
-    )
+    findings.append(Finding("redis-server (optional)", redis or "no: rollouts are kept in memory"))
     libusb = ctypes.util.find_library("usb-1.0")
     findings.append(Finding("libusb (optional)", libusb or "no: trackers by link usb need it"))
     for pattern in ("ttyACM*", "ttyUSB*", "hidraw*", "video*"):
