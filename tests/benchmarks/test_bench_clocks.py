@@ -18,6 +18,7 @@ from services.cli.bench.clocks.scenes import (
     MORE_SCENES,
     SCENES,
     STAMPLESS_SCENES,
+    STOP_SCENES,
     Scene,
     find_scene,
     simulate,
@@ -31,7 +32,7 @@ def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
     command = [sys.executable, "-m", "services.cli.main", "bench", "clocks", "--quick"]
-    options = ["--scenes", "base,step -30 ms", "--seconds", "30", "--out", str(folder)]
+    options = ["--scenes", "base,step -30 ms,stop 500 ms", "--seconds", "30", "--out", str(folder)]
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout, folder
@@ -46,6 +47,7 @@ def test_a_quick_run_measures_every_way(run):
         assert found[scene, "ours, online"] < 0.3 < found[scene, "arrival stamps"]
     verdicts = {r["what"]: r["verdict"] for r in figures["requirements"]}
     assert verdicts["online RMS, seven scenes"] == "pass"
+    assert verdicts["offline RMS, stops"] == "pass"
     assert verdicts["online RMS, stamps of 1 ms"] == "not measured"
     assert "least squares" in text
     assert "No step" in (folder / "bench_clocks.svg").read_text()
@@ -78,6 +80,19 @@ def test_a_scene_is_what_it_says():
     assert np.flatnonzero(np.abs(jumps) > 1e8).size == 1
 
 
+def test_stops_late_paths_and_wrong_stamps_are_what_they_say():
+    quiet = {"drops": 0.0, "jitter_ms": 0.0, "outliers": 0.0, "skew_ppm": 0.0, "grid_ms": 1e-3}
+    stopped = simulate(Scene(stop_ms=80.0, num_stops=5, **quiet), seconds=60.0, seed=0)
+    waits_s = np.diff(stopped.true_ns - stopped.t_device_ns) * 1e-9
+    np.testing.assert_allclose(waits_s[np.abs(waits_s) > 1e-3], [0.08] * 5, atol=1e-6)
+    late = simulate(Scene(late_path_ms=20.0, **quiet), seconds=60.0, seed=0)
+    delays_ms = (late.t_host_ns - late.true_ns) * 1e-6
+    assert np.mean(delays_ms > 21) == pytest.approx(0.25, abs=0.001)
+    wrong = simulate(Scene(wrong_stamps=0.01, **quiet), seconds=600.0, seed=0)
+    ahead_s = (wrong.t_device_ns - wrong.sequence * 10**9 / 60) * 1e-9
+    assert np.mean(ahead_s - ahead_s.min() > 0.019) == pytest.approx(0.01, abs=0.002)
+
+
 @pytest.mark.parametrize("words", [["--seconds", "5"], ["--rounds", "0"]])
 def test_options_that_mean_nothing_are_refused(words, tmp_path):
     parser = stage_parser("clocks")
@@ -89,5 +104,5 @@ def test_options_that_mean_nothing_are_refused(words, tmp_path):
 
 
 def test_every_scene_can_be_named_in_a_list():
-    for name in SCENES | MORE_SCENES | STAMPLESS_SCENES:
+    for name in SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES:
         assert [find_scene(part) for part in name.split(",")] == [find_scene(name)]

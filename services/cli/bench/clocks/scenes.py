@@ -1,4 +1,4 @@
-"""The name of a scene and a seed in; device stamps, arrivals and the true times of samples out.
+"""Simulated takes of device clocks whose truth is known, by the name of a scene and a seed.
 
 A device samples at its own rate by its own clock; its packets wait in queues and in the polling of
 a bus, never overtake each other, and some get lost. Truth is known, so that every way of dating
@@ -16,6 +16,8 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 BASE_DELAY_NS = 2_000_000
 # Crystals wander with the room's temperature, over minutes.
 WANDER_PERIOD_S = 120.0
+WRONG_S = 0.02
+LATE_PATH_S = 60.0
 HOST_ORIGIN_NS = 1_700_000_000_000_000_000
 DEVICE_ORIGIN_NS = 987_654_321_000
 
@@ -33,6 +35,11 @@ class Scene:
         grid_ms: arrivals happen at whole multiples of it (polling of a bus, timer of a chip).
         drops: share of samples that get lost.
         step_ms: jump of the device's clock in the middle; 0 for none.
+        stop_ms: how long the device stands still each time, its clock with it.
+        num_stops: how often, evenly spread.
+        late_path_ms: how much longer samples are on their way from the middle on, for a quarter of
+            the take, a minute at most.
+        wrong_stamps: share of stamps that are 20 ms ahead.
         tick_ns: resolution of the device's stamps.
     """
 
@@ -45,6 +52,10 @@ class Scene:
     grid_ms: float = 1.0
     drops: float = 0.002
     step_ms: float = 0.0
+    stop_ms: float = 0.0
+    num_stops: int = 1
+    late_path_ms: float = 0.0
+    wrong_stamps: float = 0.0
     tick_ns: int = 1
 
     def without_drops(self) -> "Scene":
@@ -91,6 +102,15 @@ MORE_SCENES = {
     "step -3 ms": Scene(step_ms=-3.0),
     "restart -5 s": Scene(step_ms=-5000.0),
 }
+# What breaks the rule that delays only add and clocks run on.
+STOP_SCENES = {
+    "stop 50 ms": Scene(stop_ms=50.0),
+    "stop 500 ms": Scene(stop_ms=500.0),
+    "stop 3 s": Scene(stop_ms=3000.0),
+    "5 stops of 80 ms": Scene(stop_ms=80.0, num_stops=5),
+    "path +20 ms for a minute": Scene(late_path_ms=20.0),
+    "0.2 % of stamps +20 ms": Scene(wrong_stamps=0.002),
+}
 # For streams without stamps: only how many samples got lost makes them hard.
 STAMPLESS_SCENES = {
     "0 % lost": Scene(drops=0.0),
@@ -105,7 +125,7 @@ def find_scene(name: str) -> Scene:
     Raises:
         UnknownNameError: there is none of that name.
     """
-    known = SCENES | MORE_SCENES | STAMPLESS_SCENES
+    known = SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES
     if name not in known:
         raise UnknownNameError("scene", name, list(known))
     return known[name]
@@ -124,9 +144,14 @@ def simulate(scene: Scene, *, seconds: float, seed: int) -> Take:
     sequence = sequence[rng.random(len(sequence)) >= scene.drops]
     device_s = sequence / scene.rate_hz
     true_s = _true_times(scene, device_s) + rng.random() * 1e-2
+    if scene.stop_ms:
+        parts = len(true_s) * np.arange(1, scene.num_stops + 1) // (scene.num_stops + 1)
+        true_s += np.searchsorted(parts, np.arange(len(true_s)), "right") * scene.stop_ms * 1e-3
     arrival_s = _arrivals(scene, true_s, rng)
     step_s = true_s[len(true_s) // 2] if scene.step_ms else np.inf
     device_s = device_s + (true_s >= step_s) * scene.step_ms * 1e-3
+    if scene.wrong_stamps:
+        device_s = device_s + (rng.random(len(device_s)) < scene.wrong_stamps) * WRONG_S
     device_ns = np.rint(device_s * 1e9).astype(np.int64) + DEVICE_ORIGIN_NS
     host_ns, true_ns = (
         np.rint(t_s * 1e9).astype(np.int64) + HOST_ORIGIN_NS for t_s in (arrival_s, true_s)
@@ -147,6 +172,8 @@ def _arrivals(scene: Scene, true_s: np.ndarray, rng: np.random.Generator) -> np.
     delay_s = BASE_DELAY_NS * 1e-9 + rng.exponential(scene.jitter_ms * 1e-3, num)
     waits = rng.random(num) < scene.outliers
     delay_s += waits * rng.exponential(scene.outlier_ms * 1e-3, num)
+    num_late = min(num // 4, round(LATE_PATH_S * scene.rate_hz))
+    delay_s[num // 2 : num // 2 + num_late] += scene.late_path_ms * 1e-3
     grid_s = scene.grid_ms * 1e-3
     # Nothing overtakes: a late packet holds up those behind it.
     return np.asarray(np.maximum.accumulate(np.ceil((true_s + delay_s) / grid_s) * grid_s))

@@ -7,7 +7,7 @@ from typing import Any
 
 from dextouch.errors import InvalidInputError
 from services.cli.bench.clocks.compare import compare, compare_stampless
-from services.cli.bench.clocks.scenes import MORE_SCENES, SCENES, find_scene
+from services.cli.bench.clocks.scenes import MORE_SCENES, SCENES, STOP_SCENES, find_scene
 from services.cli.bench.clocks.scores import WARM_UP_S
 from services.cli.bench.clocks.tables import panels, requirements, tables
 from services.cli.bench.machine import describe_machine
@@ -26,7 +26,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rounds", type=int, help=f"takes a scene ({_USUAL['rounds']}; quick 1)")
     parser.add_argument("--seed", type=int, default=0, help="of the first round (%(default)s)")
-    names = ", ".join([*SCENES, *MORE_SCENES]).replace("%", "%%")
+    names = ", ".join([*SCENES, *MORE_SCENES, *STOP_SCENES]).replace("%", "%%")
     parser.add_argument("--scenes", metavar="A,B", help=f"only these, by comma (all: {names})")
 
 
@@ -38,7 +38,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: takes too short to judge, or no round.
     """
     plan = _plan(options)
-    names = list(SCENES | MORE_SCENES)
+    names = list(SCENES | MORE_SCENES | STOP_SCENES)
     if options.scenes is not None:
         names = [name.strip() for name in options.scenes.split(",")]
     scenes = {name: find_scene(name) for name in names}
