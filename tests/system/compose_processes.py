@@ -131,7 +131,7 @@ class ComposeProcesses:
         raise AssertionError(f"{name}: a command this test cannot start: {command}")
 
     def _environment(self, name):
-        kept = ("PATH", "HOME", "LANG", "OMP_NUM_THREADS")
+        kept = ("PATH", "HOME", "LANG", "OMP_NUM_THREADS", "PYTHONPATH")
         environment = {key: os.environ[key] for key in kept if key in os.environ}
         environment["PYTHONUNBUFFERED"] = "1"
         for key, value in self.services[name].get("environment", {}).items():
