@@ -8,6 +8,7 @@ import httpx
 import pytest
 
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from services.alignment.retargeting import hand_retargeter
 from services.cli import up
 from services.cli.servers import bind
 
@@ -16,6 +17,12 @@ START_LIMIT_S = 900
 PRETRAINED = Path(up.__file__).parents[1] / "world_model/pretrained"
 # A working tree in which the model has not been trained yet has nothing to serve there.
 WITHOUT = () if list(PRETRAINED.glob("*.safetensors")) else ("world_model",)
+
+
+@pytest.fixture(scope="module")
+def solver():
+    """Compiled here: a worker of the service does it too, but after everybody else's work."""
+    hand_retargeter.warm_up()
 
 
 async def written(path):
@@ -36,7 +43,7 @@ async def seen_whole(client, dashboard_url, expected):
         await asyncio.sleep(0.2)
 
 
-async def test_all_services_in_one_process(tmp_path, capsys):
+async def test_all_services_in_one_process(solver, tmp_path, capsys):
     settings = up.UpSettings(data=tmp_path / "data", json=tmp_path / "urls.json", without=WITHOUT)
     stop = asyncio.Event()
     running = asyncio.create_task(up.run(settings, stop))
@@ -73,7 +80,7 @@ async def save_a_take(client, station_url, num_seconds):
     return started["recording_id"]
 
 
-async def test_a_saved_take_becomes_an_episode_by_itself(tmp_path, monkeypatch):
+async def test_a_saved_take_becomes_an_episode_by_itself(solver, tmp_path, monkeypatch):
     # Mocks play in real time: on a busy machine they have gaps that ordinary limits refuse.
     monkeypatch.setenv("DEXTOUCH_ALIGNMENT_OPTIONS__MAX_GAP_MS", "10000")
     settings = up.UpSettings(
