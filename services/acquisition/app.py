@@ -6,7 +6,6 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from dextouch import __version__
 from dextouch.episodes.files import disk_errors
 from dextouch.serving.app import create_service_app
 from services.acquisition.clock import RealClock
@@ -138,7 +137,6 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
 
     return create_service_app(
         name="acquisition",
-        version=__version__,
         settings=settings,
         routers=[recorder_router(running.station), station_router(running.station, uploads)],
         lifespan=lifespan,

@@ -6,7 +6,6 @@ from contextlib import asynccontextmanager
 
 from fastapi import FastAPI
 
-from dextouch import __version__
 from dextouch.episodes import EpisodeStore
 from dextouch.serving.app import create_service_app
 from services.alignment.job_table import JobTable
@@ -40,7 +39,6 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
 
     return create_service_app(
         name="alignment",
-        version=__version__,
         settings=settings,
         routers=[alignments_router(jobs)],
         lifespan=lifespan,

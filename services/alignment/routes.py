@@ -6,6 +6,7 @@ from fastapi import APIRouter, Depends, Query, Response, status
 
 from dextouch.schemas.problems import error_from_problem
 from dextouch.serving.access import RequireScope
+from dextouch.serving.bodies import JSON, KIB, takes
 from services.alignment.job_table import JobTable
 from services.alignment.schemas import (
     ENDED,
@@ -27,6 +28,7 @@ def alignments_router(jobs: JobTable) -> APIRouter:
     )
 
     @router.post("", status_code=status.HTTP_202_ACCEPTED)
+    @takes({JSON: 256 * KIB})
     async def start(
         request: AlignmentRequest,
         response: Response,

@@ -11,6 +11,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from dextouch.errors import ConflictError, UnavailableError
+from dextouch.serving.settings import MAX_WEBSOCKET_BYTES
 
 BACKLOG = 128
 
@@ -138,5 +139,6 @@ def _server(app: FastAPI, grace_s: int) -> Server:
         server_header=False,
         backlog=BACKLOG,
         timeout_graceful_shutdown=grace_s,
+        ws_max_size=MAX_WEBSOCKET_BYTES,
     )
     return Server(config)

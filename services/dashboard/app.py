@@ -8,10 +8,10 @@ from pathlib import Path
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from dextouch import __version__
+from dextouch.serving.access import AccessControl
 from dextouch.serving.app import create_service_app
 from services.dashboard.feeds import Feeds
-from services.dashboard.pages import page_router
+from services.dashboard.pages import page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
@@ -38,6 +38,11 @@ def create_app(
             for name, url in settings.upstream_urls().items()
         }
     feeds = Feeds(upstreams, settings)
+    sessions = Sessions(
+        AccessControl(settings.api_keys),
+        needs_key=bool(settings.api_keys),
+        lifetime_s=3600 * settings.session_hours,
+    )
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -53,17 +58,14 @@ def create_app(
 
     app = create_service_app(
         name="dashboard",
-        version=__version__,
         settings=settings,
         routers=[page_router(), api_router(settings), live_router()],
         lifespan=lifespan,
+        admits=sessions.allows,
     )
     app.state.settings = settings
     app.state.feeds = feeds
-    app.state.sessions = Sessions(
-        app.state.access,
-        needs_key=bool(settings.api_keys),
-        lifetime_s=3600 * settings.session_hours,
-    )
+    app.state.sessions = sessions
+    app.state.refusal_page = refusal_page
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app

@@ -1,18 +1,16 @@
 """The pages for people: the station, signing in and out, and what is refused, in words."""
 
-from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Any
 from urllib.parse import parse_qs
 
-from fastapi import APIRouter, Depends, Request, Response
+from fastapi import APIRouter, Request, Response
 from fastapi.responses import HTMLResponse, RedirectResponse
-from fastapi.routing import APIRoute
 from jinja2 import Environment, FileSystemLoader
 
-from dextouch.errors import AccessDeniedError
+from dextouch.errors import AccessDeniedError, DexTouchError
 from dextouch.schemas.problems import status_of
-from services.dashboard.sessions import COOKIE, Sessions, check_same_site
+from dextouch.serving.bodies import FORM, KIB, takes
+from services.dashboard.sessions import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 
 CONTENT_SECURITY_POLICY = (
@@ -32,27 +30,9 @@ TEMPLATES = Environment(
 )
 
 
-class PageRoute(APIRoute):
-    """A route that answers a refusal with a page instead of problem+json."""
-
-    def get_route_handler(self) -> Callable[[Request], Coroutine[Any, Any, Response]]:
-        """The route's handler around which refusals are caught."""
-        handle = super().get_route_handler()
-
-        async def answer(request: Request) -> Response:
-            try:
-                return await handle(request)
-            except AccessDeniedError as error:
-                return _page(request, "refused.html", status_of(error), reason=error.message)
-
-        return answer
-
-
 def page_router() -> APIRouter:
     """The station's page, signing in and signing out."""
-    router = APIRouter(
-        include_in_schema=False, route_class=PageRoute, dependencies=[Depends(_check_site)]
-    )
+    router = APIRouter(include_in_schema=False)
 
     @router.get("/")
     async def index(request: Request) -> Response:
@@ -63,6 +43,7 @@ def page_router() -> APIRouter:
         return _page(request, "index.html", tasks=tasks, signed_in=sessions.needs_key)
 
     @router.post("/sign_in")
+    @takes({FORM: 4 * KIB}, needs_key=False)
     async def sign_in(request: Request) -> Response:
         fields = parse_qs((await request.body()).decode("utf-8", "replace"))
         sessions: Sessions = request.app.state.sessions
@@ -82,6 +63,7 @@ def page_router() -> APIRouter:
         return answer
 
     @router.post("/sign_out")
+    @takes({FORM: KIB}, needs_key=False)
     async def sign_out(request: Request) -> Response:
         sessions: Sessions = request.app.state.sessions
         sessions.sign_out(request)
@@ -92,11 +74,12 @@ def page_router() -> APIRouter:
     return router
 
 
+def refusal_page(request: Request, error: DexTouchError) -> Response:
+    """What a person sees instead of problem+json."""
+    return _page(request, "refused.html", status_of(error), reason=error.message)
+
+
 def _page(request: Request, name: str, status: int = 200, **values: object) -> HTMLResponse:
     settings: DashboardSettings = request.app.state.settings
     text = TEMPLATES.get_template(name).render(station=settings.station, **values)
     return HTMLResponse(text, status, headers=PAGE_HEADERS)
-
-
-def _check_site(request: Request) -> None:
-    check_same_site(request, request.app.state.settings.allowed_hosts)

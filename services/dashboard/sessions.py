@@ -1,13 +1,11 @@
-"""A browser's key in, a session cookie and same-site checks out."""
+"""Sessions of browsers that signed in with a key."""
 
 import secrets
 import time
 from collections.abc import Callable
-from urllib.parse import urlsplit
 
 from starlette.requests import HTTPConnection
 
-from dextouch.errors import AccessDeniedError
 from dextouch.serving.access import AccessControl
 
 COOKIE = "dextouch_session"
@@ -56,23 +54,3 @@ class Sessions:
         if not self.needs_key:
             return True
         return self._ends_s.get(connection.cookies.get(COOKIE, ""), 0.0) > self._clock_s()
-
-
-def check_same_site(connection: HTTPConnection, allowed_hosts: tuple[str, ...]) -> None:
-    """Refuse requests that another site's page sends through the operator's browser.
-
-    Raises:
-        AccessDeniedError: a host name this page is not served under, or a foreign origin.
-    """
-    host = urlsplit(f"//{connection.headers.get('host', '')}")
-    if host.hostname not in allowed_hosts:
-        raise AccessDeniedError(
-            f"host {host.hostname!r}: expected one of {', '.join(allowed_hosts)} "
-            "(setting allowed_hosts)",
-            reason="missing_scope",
-        )
-    origin = connection.headers.get("origin")
-    if origin is not None and urlsplit(origin).netloc != host.netloc:
-        raise AccessDeniedError(
-            f"origin {origin!r}: expected this page's own", reason="missing_scope"
-        )

@@ -8,8 +8,8 @@ from dextouch.serving.settings import ServiceSettings, service_config
 class DashboardSettings(ServiceSettings):
     """Which services the page shows; one without a URL is left out.
 
-    `upstream_key` is the bearer key that the other services ask for. `allowed_hosts` are the names
-    under which browsers may reach the page (a guard against DNS rebinding).
+    `upstream_key` is the bearer key that the other services ask for. Browsers reach the page under
+    loopback names and those of `allowed_hosts`.
     """
 
     model_config = service_config("dashboard")
@@ -23,7 +23,6 @@ class DashboardSettings(ServiceSettings):
     world_model_url: str | None = None
     upstream_key: SecretStr | None = None
     upstream_timeout_s: float = Field(default=2.0, gt=0, le=30)
-    allowed_hosts: tuple[str, ...] = ("127.0.0.1", "localhost", "::1")
     station_period_s: float = Field(default=0.2, ge=0.05, le=10)
     taxel_period_s: float = Field(default=0.1, ge=0.02, le=10)
     list_period_s: float = Field(default=2.0, ge=0.2, le=60)

@@ -7,7 +7,6 @@ from contextlib import asynccontextmanager
 import structlog
 from fastapi import FastAPI
 
-from dextouch import __version__
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError
 from dextouch.serving.app import create_service_app
@@ -66,7 +65,6 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
 
     app = create_service_app(
         name="episode_store",
-        version=__version__,
         settings=settings,
         routers=[
             recordings_router(

@@ -130,7 +130,9 @@ def upload(spool_root, tmp_path):
     settings = EpisodeStoreSettings(
         store_url=str(tmp_path / "store"), sync_uploads=False, commit_in_process=False
     )
-    with EpisodeStoreClient("http://store", transport=InProcess(create_app(settings))) as client:
+    with EpisodeStoreClient(
+        "http://localhost", transport=InProcess(create_app(settings))
+    ) as client:
         uploader = Uploader(spool_root, client, period_s=1.0)
         assert uploader.upload_all() == ["take"], uploader.status()
     return EpisodeStore(settings.store_url).recording("take")

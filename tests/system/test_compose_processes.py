@@ -150,7 +150,7 @@ def test_the_dashboard_shows_it(composed, recording_id):
     url = composed.running["dashboard"].url
     with httpx.Client(base_url=url, timeout=30, trust_env=False) as browser:
         assert browser.get("/v1/overview").status_code == 401
-        assert browser.post("/sign_in", content=f"key={KEY}").status_code == 303
+        assert browser.post("/sign_in", data={"key": KEY}).status_code == 303
         overview = browser.get("/v1/overview").json()
     levels = {service["name"]: service["level"] for service in overview["services"]}
     assert set(levels) == {"acquisition", "episode_store", "alignment", "twin", "world_model"}

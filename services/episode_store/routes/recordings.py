@@ -11,6 +11,7 @@ from dextouch.schemas.recordings import (
     RecordingList,
     RecordingStatus,
 )
+from dextouch.serving.bodies import AS_SET, JSON, OCTETS, takes
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import RecordingQuery
 from services.episode_store.intake import Intake
@@ -18,6 +19,9 @@ from services.episode_store.reading import SpanQuery, StoreReader
 from services.episode_store.routes.media import MSGPACK, as_response
 from services.episode_store.routes.pages import page_limit
 from services.episode_store.routes.scopes import MAY_READ, MAY_WRITE
+
+# Calibrations and descriptors of a station's streams, or the ledger of a take.
+MAX_ATTRIBUTES_BYTES = 2**20
 
 
 def recordings_router(
@@ -27,6 +31,7 @@ def recordings_router(
     router = APIRouter(prefix="/v1/recordings", tags=["recordings"])
 
     @router.post("", status_code=201, dependencies=[MAY_WRITE])
+    @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def create(attributes: RecordingAttributes) -> RecordingStatus:
         """Begin an upload; repeating it says where it stands."""
         return intake.create(attributes)
@@ -34,8 +39,9 @@ def recordings_router(
     @router.post(
         "/{recording_id}/streams/{stream}/batches/{number}",
         dependencies=[MAY_WRITE],
-        openapi_extra={"requestBody": {"content": {"application/octet-stream": {}}}},
+        openapi_extra={"requestBody": {"content": {OCTETS: {}}}},
     )
+    @takes({OCTETS: AS_SET})
     async def put_batch(
         recording_id: str, stream: str, number: Annotated[int, Path(ge=0)], request: Request
     ) -> BatchReceipt:
@@ -46,6 +52,7 @@ def recordings_router(
         )
 
     @router.post("/{recording_id}/finish", dependencies=[MAY_WRITE])
+    @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def finish(recording_id: str, body: FinishRecording) -> RecordingStatus:
         """Move a complete upload into the store."""
         return intake.finish(recording_id, body)

@@ -36,8 +36,8 @@ STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
     (DeviceError, 503),
     (StorageFullError, 507),
     (StorageError, 500),
-    (AccessDeniedError, 403),
 )
+STATUS_OF_REASON = {"missing_scope": 403, "foreign_origin": 403, "foreign_host": 421}
 CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
     400: InvalidInputError,
     401: AccessDeniedError,
@@ -48,6 +48,7 @@ CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
     409: ConflictError,
     413: LimitExceededError,
     415: InvalidInputError,
+    421: AccessDeniedError,
     422: InvalidInputError,
     429: LimitExceededError,
     502: UnavailableError,
@@ -79,12 +80,13 @@ def status_of(error: DexTouchError) -> int:
     """The HTTP status of an error.
 
     Two classes answer by their details: a limit that waiting helps against (`retry_after_s`) is
-    429, any other 413; a missing or unknown key (`reason`) is 401, a missing scope 403.
+    429, any other 413; a refusal by its `reason`: a missing or unknown key is 401, a missing scope
+    or a foreign origin 403, a foreign host name 421.
     """
     if isinstance(error, LimitExceededError) and "retry_after_s" in error.details:
         return 429
-    if isinstance(error, AccessDeniedError) and error.details.get("reason") != "missing_scope":
-        return 401
+    if isinstance(error, AccessDeniedError):
+        return STATUS_OF_REASON.get(str(error.details.get("reason")), 401)
     return next((status for kind, status in STATUS_OF_CLASS if isinstance(error, kind)), 500)
 
 

@@ -16,6 +16,30 @@ class AccessControl:
     def __init__(self, api_keys: Sequence[ApiKey]) -> None:
         self._keys = [(_digest(key.key.get_secret_value()), key) for key in api_keys]
 
+    @property
+    def has_keys(self) -> bool:
+        """Whether a key is needed at all."""
+        return bool(self._keys)
+
+    def knows(self, authorization: str | None) -> bool:
+        """Whether the header holds one of the keys."""
+        return self._find(authorization) is not None
+
+    def identify(self, authorization: str | None) -> ApiKey:
+        """The key in the header.
+
+        Raises:
+            AccessDeniedError: no key, or an unknown one (`reason` tells which).
+        """
+        if _token(authorization) is None:
+            raise AccessDeniedError(
+                "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
+            )
+        key = self._find(authorization)
+        if key is None:
+            raise AccessDeniedError("unknown key", reason="unknown_key")
+        return key
+
     def check(self, authorization: str | None, scope: str) -> str:
         """The name of the key that may.
 
@@ -25,24 +49,23 @@ class AccessControl:
         """
         if not self._keys:
             return "loopback"
-        kind, _, token = (authorization or "").partition(" ")
-        if kind.lower() != "bearer" or not token:
+        key = self.identify(authorization)
+        if scope not in key.scopes:
             raise AccessDeniedError(
-                "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
-            )
-        presented = _digest(token.strip())
-        # Every key is compared, so that the time tells nothing about which one was near.
-        matches = [key for digest, key in self._keys if hmac.compare_digest(digest, presented)]
-        if not matches:
-            raise AccessDeniedError("unknown key", reason="unknown_key")
-        if scope not in matches[0].scopes:
-            raise AccessDeniedError(
-                f"key {matches[0].name!r} lacks the scope {scope!r}; it has: "
-                f"{', '.join(matches[0].scopes)}",
+                f"key {key.name!r} lacks the scope {scope!r}; it has: {', '.join(key.scopes)}",
                 reason="missing_scope",
                 scope=scope,
             )
-        return matches[0].name
+        return key.name
+
+    def _find(self, authorization: str | None) -> ApiKey | None:
+        token = _token(authorization)
+        if token is None:
+            return None
+        presented = _digest(token)
+        # Every key is compared, so that the time tells nothing about which one was near.
+        matches = [key for digest, key in self._keys if hmac.compare_digest(digest, presented)]
+        return matches[0] if matches else None
 
 
 class RequireScope:
@@ -59,3 +82,8 @@ class RequireScope:
 
 def _digest(text: str) -> bytes:
     return hashlib.sha256(text.encode()).digest()
+
+
+def _token(authorization: str | None) -> str | None:
+    kind, _, token = (authorization or "").partition(" ")
+    return token.strip() or None if kind.lower() == "bearer" else None

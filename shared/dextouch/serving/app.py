@@ -11,6 +11,7 @@ from fastapi.responses import JSONResponse
 from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
 from starlette.exceptions import HTTPException
 
+from dextouch import __version__
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
 from dextouch.schemas.health import Health, Readiness
 from dextouch.schemas.problems import (
@@ -20,6 +21,8 @@ from dextouch.schemas.problems import (
     problem_from_error,
 )
 from dextouch.serving.access import AccessControl
+from dextouch.serving.bodies import BodyRules
+from dextouch.serving.guard import Admits, Guard, GuardMiddleware, SitePolicy
 from dextouch.serving.middleware import RequestMetrics, RequestMiddleware
 from dextouch.serving.settings import ServiceSettings
 
@@ -33,38 +36,44 @@ ReadinessCheck = Callable[[], Awaitable[Sequence[str]]]
 def create_service_app(
     *,
     name: str,
-    version: str,
     settings: ServiceSettings,
     routers: Sequence[APIRouter],
     lifespan: Lifespan | None = None,
     readiness: ReadinessCheck | None = None,
+    admits: Admits | None = None,
 ) -> FastAPI:
     """One service.
 
     Args:
         name: of the service, in health, logs and titles.
-        version: of the package.
-        settings: keys and limits are taken from here.
+        settings: keys, limits, host names and origins are taken from here.
         routers: what the service offers; their routes raise our errors only.
         lifespan: what lives as long as the application (pools, workers).
         readiness: asked at /readyz; names of what is missing.
+        admits: who may act without a key although there are keys (browsers that signed in).
 
     Returns:
-        The application; `app.state.registry` takes further metrics of the service.
+        The application; `app.state.registry` takes further metrics of the service, and
+        `app.state.refusal_page` makes a page of a refusal that a person is to see.
     """
     app = FastAPI(
-        title=name, version=version, docs_url=None, redoc_url=None, lifespan=_started(lifespan)
+        title=name, version=__version__, docs_url=None, redoc_url=None, lifespan=_started(lifespan)
     )
     app.state.access = AccessControl(settings.api_keys)
     app.state.registry = CollectorRegistry()
     app.state.running = False
-    app.add_middleware(
-        RequestMiddleware,
-        metrics=RequestMetrics(app.state.registry),
-        max_body_bytes=settings.max_body_bytes,
+    guard = Guard(
+        access=app.state.access,
+        site=SitePolicy(settings),
+        bodies=BodyRules(routers, max_body_bytes=settings.max_body_bytes),
+        refuse=_refusal,
+        admits=admits,
     )
+    # What is added last is outermost: refusals of the guard have request ids and are counted.
+    app.add_middleware(GuardMiddleware, guard=guard)
+    app.add_middleware(RequestMiddleware, metrics=RequestMetrics(app.state.registry))
     _add_error_handlers(app)
-    app.include_router(_health_router(name, version, readiness))
+    app.include_router(_health_router(name, readiness))
     for router in routers:
         app.include_router(router)
     return app
@@ -88,13 +97,13 @@ def _started(lifespan: Lifespan | None) -> Lifespan:
     return around
 
 
-def _health_router(name: str, version: str, readiness: ReadinessCheck | None) -> APIRouter:
+def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
     router = APIRouter(tags=["health"])
 
     @router.get("/healthz")
     async def healthz() -> Health:
         """The process answers."""
-        return Health(service=name, version=version)
+        return Health(service=name, version=__version__)
 
     @router.get("/readyz", responses={503: {"model": Readiness}})
     async def readyz(request: Request, response: Response) -> Readiness:
@@ -125,11 +134,7 @@ def _add_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(HTTPException)
     async def http(request: Request, error: HTTPException) -> Response:
-        kind = CLASS_OF_STATUS.get(error.status_code, UnavailableError)
-        ours = kind(f"{request.method} {request.url.path}: {error.detail}")
-        response = _problem_response(request, ours, error.status_code)
-        response.headers.update(error.headers or {})
-        return response
+        return _refusal(request, error)
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
@@ -139,6 +144,20 @@ def _add_error_handlers(app: FastAPI) -> None:
         response = _problem_response(request, ours)
         response.headers["x-request-id"] = request.state.request_id
         return response
+
+
+def _refusal(request: Request, error: DexTouchError | HTTPException) -> Response:
+    if isinstance(error, DexTouchError):
+        page = getattr(request.app.state, "refusal_page", None)
+        if page is not None and "text/html" in request.headers.get("accept", ""):
+            shown: Response = page(request, error)
+            return shown
+        return _problem_response(request, error)
+    kind = CLASS_OF_STATUS.get(error.status_code, UnavailableError)
+    ours = kind(f"{request.method} {request.url.path}: {error.detail}")
+    response = _problem_response(request, ours, error.status_code)
+    response.headers.update(error.headers or {})
+    return response
 
 
 def _validation_error(error: RequestValidationError) -> tuple[DexTouchError, int]:

@@ -1,4 +1,4 @@
-"""Around every request: an id, a body limit, timing and counters; plain ASGI, bodies not copied."""
+"""Around every request: an id, timing and counters; plain ASGI, bodies not copied."""
 
 import re
 import time
@@ -10,7 +10,6 @@ import structlog
 from fastapi import Request
 from prometheus_client import CollectorRegistry, Counter, Histogram
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
@@ -39,10 +38,9 @@ class RequestMetrics:
 class RequestMiddleware:
     """Gives `request.state.request_id` and `.timings_s`, and the headers made of them."""
 
-    def __init__(self, app: ASGIApp, *, metrics: RequestMetrics, max_body_bytes: int) -> None:
+    def __init__(self, app: ASGIApp, *, metrics: RequestMetrics) -> None:
         self._app = app
         self._metrics = metrics
-        self._max_body_bytes = max_body_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """One request; anything else (lifespan, websocket) passes."""
@@ -64,9 +62,8 @@ class RequestMiddleware:
                 self._count(scope, message["status"], duration_s)
             await send(message)
 
-        limited = BodyLimit(receive, headers, self._max_body_bytes)
         with structlog.contextvars.bound_contextvars(request_id=state["request_id"]):
-            await self._app(scope, limited, send_with_headers)
+            await self._app(scope, receive, send_with_headers)
 
     def _count(self, scope: Scope, status: int, duration_s: float) -> None:
         # The template, never the path: one counter a route, not one an id.
@@ -77,32 +74,6 @@ class RequestMiddleware:
 
 
 KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
-
-
-class BodyLimit:
-    """A `receive` that refuses more than the limit, announced or not."""
-
-    def __init__(self, receive: Receive, headers: Headers, max_body_bytes: int) -> None:
-        self._receive = receive
-        self._max_body_bytes = max_body_bytes
-        announced = headers.get("content-length", "0")
-        self._announced = int(announced) if announced.isdecimal() else 0
-        self._received = 0
-
-    async def __call__(self) -> Message:
-        """The next message of the request."""
-        self._check(self._announced)
-        message = await self._receive()
-        self._received += len(message.get("body", b""))
-        self._check(self._received)
-        return message
-
-    def _check(self, num_bytes: int) -> None:
-        if num_bytes > self._max_body_bytes:
-            # Starlette's own class, since FastAPI turns any other into a 400.
-            raise HTTPException(
-                413, f"body: got {num_bytes} bytes, expected at most {self._max_body_bytes}"
-            )
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Environment and flags to one frozen settings object per service, and a service to a socket."""
 
 import ipaddress
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 from fastapi import FastAPI
 from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, model_validator
@@ -13,6 +13,13 @@ from dextouch.schemas.problems import first_problems
 MIN_KEY_CHARACTERS = 16
 # A policy may think this long between two chunks without losing its connection.
 KEEP_ALIVE_S = 75
+# Of one message from a browser; the server closes the connection before it is read whole.
+MAX_WEBSOCKET_BYTES = 2**16
+# An IPv6 address stands without brackets.
+HostName = Annotated[str, Field(pattern=r"^([A-Za-z0-9_.-]+|[0-9A-Fa-f:.]+)$")]
+Origin = Annotated[
+    str, Field(pattern=r"^https?://([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?$")
+]
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
@@ -29,7 +36,10 @@ class ApiKey(BaseModel):
 class ServiceSettings(BaseSettings):
     """What every service has; a service derives its own class from it.
 
-    `host` other than loopback needs `api_keys`. Port 0 takes any free port.
+    `host` other than loopback needs `api_keys`. Port 0 takes any free port. Routes have limits of
+    their own for bodies, none is above `max_body_bytes`. Requests without a key must name the
+    service by a loopback name or one of `allowed_hosts` (without port), and those that change
+    something must come from no web page, one of the service itself, or one of `allowed_origins`.
     """
 
     model_config = SettingsConfigDict(
@@ -40,6 +50,14 @@ class ServiceSettings(BaseSettings):
     port: int = Field(default=0, ge=0, le=65535)
     api_keys: tuple[ApiKey, ...] = ()
     max_body_bytes: int = Field(default=16 * 2**20, ge=1024)
+    allowed_hosts: tuple[HostName, ...] = Field(
+        default=(),
+        description="names besides loopback under which requests without a key are answered",
+    )
+    allowed_origins: tuple[Origin, ...] = Field(
+        default=(),
+        description="origins besides the service's own whose pages may act, as https://lab.example",
+    )
     log_format: Literal["auto", "json", "console"] = "auto"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
     shutdown_grace_s: int = Field(default=10, ge=0, le=600)
@@ -105,5 +123,6 @@ def run(app: FastAPI, settings: ServiceSettings) -> None:
         server_header=False,
         proxy_headers=False,
         timeout_keep_alive=KEEP_ALIVE_S,
+        ws_max_size=MAX_WEBSOCKET_BYTES,
         timeout_graceful_shutdown=settings.shutdown_grace_s,
     )

@@ -5,7 +5,6 @@ Documented in docs/rollout_api.md.
 
 import base64
 import json
-from email.message import Message
 from typing import Annotated, Literal, TypeVar
 
 import numpy as np
@@ -26,16 +25,16 @@ from dextouch.schemas.rollouts import (
     WorldList,
 )
 from dextouch.serving.access import RequireScope
+from dextouch.serving.bodies import AS_SET, JSON, KIB, MSGPACK, OCTETS, media_type, takes
 from dextouch.serving.middleware import timed
 from dextouch.streams.packing import unpack
 from dextouch.worlds.rollouts import Answer, RolloutService
 
-MSGPACK = "application/msgpack"
-JSON = "application/json"
-OCTETS = "application/octet-stream"
 SCOPE = "rollout"
 REPLAYED_HEADER = "dextouch-replayed"
 MAX_BODY_BYTES = 2**28
+# 1000 rows of float64, or some hundred rows as JSON.
+MAX_CHUNK_BYTES = 2**20
 BodyT = TypeVar("BodyT", bound=BaseModel)
 
 
@@ -71,6 +70,7 @@ def rollout_router(service: RolloutService) -> APIRouter:
         return WorldList(worlds=tuple(service.worlds()))
 
     @router.post("/rollouts", status_code=201)
+    @takes({JSON: 16 * KIB, MSGPACK: AS_SET})
     async def start(request: Request, selector: Selector) -> Response:
         """Begin a future from a task and seed, or from an observation."""
         with timed(request, "decode"):
@@ -90,6 +90,7 @@ def rollout_router(service: RolloutService) -> APIRouter:
         await service.delete(rollout_id)
 
     @router.post("/rollouts/{rollout_id}/chunks/{chunk}")
+    @takes({OCTETS: MAX_CHUNK_BYTES, JSON: MAX_CHUNK_BYTES})
     async def step(rollout_id: str, chunk: int, request: Request, selector: Selector) -> Response:
         """Advance by the numbered action chunk."""
         with timed(request, "decode"):
@@ -99,6 +100,7 @@ def rollout_router(service: RolloutService) -> APIRouter:
         return _response(request, answer)
 
     @router.post("/rollouts/{rollout_id}/fork", status_code=201)
+    @takes({JSON: KIB})
     async def fork(rollout_id: str, asked: ForkRequest) -> RolloutInfo:
         """Branch at the current step."""
         return await service.fork(rollout_id, seed=asked.seed)
@@ -107,18 +109,16 @@ def rollout_router(service: RolloutService) -> APIRouter:
 
 
 async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
-    kind, _ = _content_type(request)
+    kind, _ = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == MSGPACK:
         return decode_start(body, max_bytes=MAX_BODY_BYTES)
-    if kind == JSON:
-        asked = _from_json(StartRequest, body)
-        return asked, start_from(asked)
-    raise _unknown_kind(kind, JSON, MSGPACK)
+    asked = _from_json(StartRequest, body)
+    return asked, start_from(asked)
 
 
 async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
-    kind, parameters = _content_type(request)
+    kind, parameters = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == JSON:
         rows = _from_json(ActionsBody, body).actions
@@ -126,21 +126,19 @@ async def _actions_of(request: Request) -> Shaped[np.ndarray, "..."]:
             lengths = sorted({len(row) for row in rows})
             raise ShapeError(f"chunk: got rows of {lengths} numbers, expected {ACTION_DIM}")
         return np.array(rows, dtype=np.float64)
-    if kind == OCTETS:
-        dtype = parameters.get("dtype", "")
-        if dtype not in {"float32", "float64"}:
-            raise InvalidInputError(
-                f"chunk: got dtype {dtype!r}, expected the header "
-                f"'Content-Type: {OCTETS}; dtype=float32' or float64"
-            )
-        row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
-        if not body or len(body) % row_bytes:
-            raise ShapeError(
-                f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
-                f"([K, {ACTION_DIM}] {dtype}, little endian)"
-            )
-        return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
-    raise _unknown_kind(kind, OCTETS, JSON)
+    dtype = parameters.get("dtype", "")
+    if dtype not in {"float32", "float64"}:
+        raise InvalidInputError(
+            f"chunk: got dtype {dtype!r}, expected the header "
+            f"'Content-Type: {OCTETS}; dtype=float32' or float64"
+        )
+    row_bytes = ACTION_DIM * np.dtype(dtype).itemsize
+    if not body or len(body) % row_bytes:
+        raise ShapeError(
+            f"chunk: got {len(body)} bytes, expected a multiple of {row_bytes} "
+            f"([K, {ACTION_DIM}] {dtype}, little endian)"
+        )
+    return np.frombuffer(body, np.dtype(dtype).newbyteorder("<")).reshape(-1, ACTION_DIM)
 
 
 def _response(request: Request, answer: Answer, *, status: int = 200) -> Response:
@@ -167,22 +165,8 @@ def _as_json(payload: bytes) -> bytes:
     return json.dumps({"fields": fields, "arrays": shown}).encode()
 
 
-def _content_type(request: Request) -> tuple[str, dict[str, str]]:
-    """Media type and its parameters, both in lower case."""
-    header = Message()
-    header["content-type"] = request.headers.get("content-type", "none/none")
-    parameters = {name.lower(): value.lower() for name, value in header.get_params() or []}
-    return header.get_content_type(), parameters
-
-
 def _from_json(model: type[BodyT], body: bytes) -> BodyT:
     try:
         return model.model_validate_json(body)
     except ValidationError as error:
         raise InvalidInputError(f"body: {first_problems(error)}") from error
-
-
-def _unknown_kind(kind: str, *expected: str) -> InvalidInputError:
-    return InvalidInputError(
-        f"body: got Content-Type {kind!r}, expected {' or '.join(expected)}", got=kind
-    )

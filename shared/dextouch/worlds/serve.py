@@ -2,7 +2,6 @@
 
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
-from importlib.metadata import version
 from typing import Any
 
 from fastapi import FastAPI
@@ -42,7 +41,6 @@ def create_world_app(
 
     return create_service_app(
         name=name,
-        version=version("dextouch-wm"),
         settings=settings,
         routers=[rollout_router(service)],
         lifespan=lifespan,

@@ -76,7 +76,7 @@ def serve(store, worker):
             self._lifespan = self._app.router.lifespan_context(self._app)
             await self._lifespan.__aenter__()
             transport = ASGITransport(self._app, raise_app_exceptions=False)
-            self.client = AsyncClient(transport=transport, base_url="http://alignment")
+            self.client = AsyncClient(transport=transport, base_url="http://localhost")
             return self.client
 
         async def __aexit__(self, *error):

@@ -126,9 +126,9 @@ def test_container_and_unit_let_in_the_same_devices():
 
 
 async def test_alerts_name_exported_metrics():
-    app = create_service_app(name="x", version="0", settings=ServiceSettings(), routers=[])
+    app = create_service_app(name="x", settings=ServiceSettings(), routers=[])
     transport = httpx.ASGITransport(app=app)
-    async with httpx.AsyncClient(transport=transport, base_url="http://x") as client:
+    async with httpx.AsyncClient(transport=transport, base_url="http://localhost") as client:
         await client.get("/healthz")
         exported = set(re.findall(r"^(dextouch_\w+)", (await client.get("/metrics")).text, re.M))
     figures = dict.fromkeys(STATION_FIGURES, 0.0)

@@ -87,7 +87,7 @@ def start(settings):
 
     def starter(**changes):
         app = create_app(settings.model_copy(update=changes))
-        client = EpisodeStoreClient("http://store", transport=InProcess(app))
+        client = EpisodeStoreClient("http://localhost", transport=InProcess(app))
         clients.append(client)
         return client
 

@@ -25,7 +25,7 @@ def store(settings):
 
 @pytest.fixture
 def http(settings):
-    return AsyncClient(transport=ASGITransport(create_app(settings)), base_url="http://store")
+    return AsyncClient(transport=ASGITransport(create_app(settings)), base_url="http://localhost")
 
 
 @pytest.mark.parametrize(
@@ -101,7 +101,7 @@ async def test_refusals_name_the_allowed_number(settings, store):
     app = create_app(
         settings.model_copy(update={"max_answer_bytes": 20_000, "max_window_steps": 8})
     )
-    async with AsyncClient(transport=ASGITransport(app), base_url="http://store") as http:
+    async with AsyncClient(transport=ASGITransport(app), base_url="http://localhost") as http:
         for path, allowed in (
             ("/v1/episodes/e-1/windows?start=0&num_steps=9", 8),
             ("/v1/episodes/e-1/windows?start=0&num_steps=8", 20_000 // (32 * 32 * 3)),

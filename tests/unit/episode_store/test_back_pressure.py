@@ -40,7 +40,11 @@ def post(app, path, num_bytes, receive):
         "path": path,
         "raw_path": path.encode(),
         "query_string": b"",
-        "headers": [(b"content-length", str(num_bytes).encode())],
+        "headers": [
+            (b"host", b"localhost"),
+            (b"content-type", b"application/octet-stream"),
+            (b"content-length", str(num_bytes).encode()),
+        ],
         "client": ("127.0.0.1", 1),
         "server": ("store", 80),
         "state": {},
@@ -97,7 +101,7 @@ def test_the_reserve_stays_free_but_for_finishing(tmp_path):
 @pytest.mark.parametrize("bound", [{"max_batches_in_flight": 1}, {"max_bytes_in_flight": 1024}])
 async def test_a_busy_store_answers_before_it_reads(settings, attributes, glove_data, bound):
     app = create_app(settings.model_copy(update=bound))
-    async with AsyncClient(transport=ASGITransport(app), base_url="http://store") as http:
+    async with AsyncClient(transport=ASGITransport(app), base_url="http://localhost") as http:
         created = await http.post("/v1/recordings", json=attributes.model_dump(mode="json"))
         assert created.status_code == 201
     asked, arrived = asyncio.Event(), asyncio.Event()

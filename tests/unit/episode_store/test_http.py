@@ -34,7 +34,7 @@ def store(settings):
 
 @pytest.fixture
 def http(settings):
-    return AsyncClient(transport=ASGITransport(create_app(settings)), base_url="http://store")
+    return AsyncClient(transport=ASGITransport(create_app(settings)), base_url="http://localhost")
 
 
 def test_windows_and_samples_are_those_of_the_reader(start, store):

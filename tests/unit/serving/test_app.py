@@ -11,10 +11,11 @@ from fastapi import APIRouter, Depends, FastAPI, Request
 from httpx import ASGITransport, AsyncClient
 from pydantic import BaseModel, SecretStr
 
-from dextouch import errors
+from dextouch import __version__, errors
 from dextouch.schemas.problems import Problem, error_from_problem
 from dextouch.serving.access import RequireScope
 from dextouch.serving.app import create_service_app
+from dextouch.serving.bodies import AS_SET, JSON, OCTETS, takes
 from dextouch.serving.middleware import timed
 from dextouch.serving.settings import ApiKey, ServiceSettings
 
@@ -36,7 +37,8 @@ CASES = [
 ]
 
 
-JSON = {"content-type": "application/json"}
+JSON_HEADER = {"content-type": JSON}
+OCTETS_HEADER = {"content-type": OCTETS}
 
 
 class Body(BaseModel):
@@ -59,6 +61,7 @@ def make_app(**kwargs) -> FastAPI:
         return body.number
 
     @router.post("/raw")
+    @takes({JSON: AS_SET, OCTETS: AS_SET})
     async def take_raw(request: Request) -> int:
         with timed(request, "read"):
             return len(await request.body())
@@ -68,14 +71,12 @@ def make_app(**kwargs) -> FastAPI:
         return "in"
 
     settings = kwargs.pop("settings", ServiceSettings(max_body_bytes=2048))
-    return create_service_app(
-        name="probe", version="1", settings=settings, routers=[router], **kwargs
-    )
+    return create_service_app(name="probe", settings=settings, routers=[router], **kwargs)
 
 
 def client_of(app: FastAPI) -> AsyncClient:
     transport = ASGITransport(app, raise_app_exceptions=False)
-    return AsyncClient(transport=transport, base_url="http://probe")
+    return AsyncClient(transport=transport, base_url="http://localhost")
 
 
 def problem_of(response: httpx.Response) -> Problem:
@@ -115,7 +116,9 @@ async def test_unknown_routes_methods_and_bodies_are_problems():
         wrong_method = await client.get("/json")
         assert problem_of(wrong_method).status == 405
         assert wrong_method.headers["allow"] == "POST"
-        assert problem_of(await client.post("/json", content=b"{", headers=JSON)).status == 400
+        assert (
+            problem_of(await client.post("/json", content=b"{", headers=JSON_HEADER)).status == 400
+        )
         missing = problem_of(await client.post("/json", json={"number": "many"}))
         assert missing.status == 422
         assert "body.number" in missing.detail
@@ -130,7 +133,7 @@ async def test_a_body_over_the_limit_is_refused_announced_or_not(path, announced
 
     content = b"x" * 5000 if announced else parts()
     async with client_of(make_app()) as client:
-        response = await client.post(path, content=content, headers=JSON)
+        response = await client.post(path, content=content, headers=JSON_HEADER)
     problem = problem_of(response)
     assert problem.status == 413
     assert "2048" in problem.detail
@@ -154,7 +157,7 @@ async def test_readiness_follows_lifespan_and_check():
         assert (await client.get("/healthz")).json() == {
             "status": "ok",
             "service": "probe",
-            "version": "1",
+            "version": __version__,
         }
         early = await client.get("/readyz")
         assert (early.status_code, early.json()["waiting_for"]) == (503, ["start"])
@@ -181,7 +184,9 @@ async def test_metrics_count_by_route_template_in_an_own_registry():
 
 async def test_request_id_is_kept_when_sane_and_timing_is_told():
     async with client_of(make_app()) as client:
-        kept = await client.post("/raw", content=b"ab", headers={"x-request-id": "take-7"})
+        kept = await client.post(
+            "/raw", content=b"ab", headers=OCTETS_HEADER | {"x-request-id": "take-7"}
+        )
         replaced = await client.post("/raw", content=b"", headers={"x-request-id": "a b\x7f"})
     assert kept.headers["x-request-id"] == "take-7"
     assert len(replaced.headers["x-request-id"]) == 32

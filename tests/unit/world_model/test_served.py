@@ -21,7 +21,7 @@ async def client(checkpoint):
     transport = ASGITransport(app, raise_app_exceptions=False)
     async with (
         app.router.lifespan_context(app),
-        AsyncClient(transport=transport, base_url="http://model") as opened,
+        AsyncClient(transport=transport, base_url="http://localhost") as opened,
     ):
         yield opened
 

@@ -35,7 +35,7 @@ def make_app(**changed):
 
 def client_of(app):
     transport = ASGITransport(app, raise_app_exceptions=False)
-    return AsyncClient(transport=transport, base_url="http://worlds")
+    return AsyncClient(transport=transport, base_url="http://localhost")
 
 
 @pytest.fixture
@@ -159,8 +159,8 @@ async def test_a_key_needs_the_scope_rollout():
         (np.full((4, 67), np.nan).tobytes(), FLOAT64, 422, "row 0, column 0"),
         (np.full((4, 67), np.inf).tobytes(), FLOAT64, 422, "infinite"),
         (actions(4).tobytes(), {"content-type": "application/octet-stream"}, 422, "dtype"),
-        (actions(4).tobytes(), {"content-type": "text/plain"}, 422, "Content-Type"),
-        (actions(4).tobytes(), {}, 422, "Content-Type"),
+        (actions(4).tobytes(), {"content-type": "text/plain"}, 415, "Content-Type"),
+        (actions(4).tobytes(), {}, 415, "Content-Type"),
         (b"{", JSON, 422, "body"),
         (b'{"actions": [[1, 2]]}', JSON, 422, "67"),
         (b'{"actions": []}', JSON, 422, "67"),
@@ -209,7 +209,7 @@ async def test_bad_starts_are_refused(client, changed, says):
         ("/v1/rollouts/none/chunks/0", 404),
         ("/v1/rollouts/none/chunks/first", 422),
         ("/v1/rollouts/%00%ff*/chunks/0", 404),
-        ("/v1/rollouts/none/fork", 422),
+        ("/v1/rollouts/none/fork", 415),
         ("/v1/nothing", 404),
         ("/v1/rollouts/a/chunks/0?steps=some", 422),
     ],

@@ -1,0 +1,132 @@
+"""How large a request body a route takes, and of which media types; enforced before it is read."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from email.message import Message
+from typing import TypeVar
+
+from fastapi import APIRouter
+from fastapi.routing import APIRoute
+from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
+from starlette.types import Message as AsgiMessage
+from starlette.types import Receive, Scope
+
+JSON = "application/json"
+MSGPACK = "application/msgpack"
+OCTETS = "application/octet-stream"
+FORM = "application/x-www-form-urlencoded"
+KIB = 2**10
+# For bodies that grow with what they hold: as large as the setting max_body_bytes allows.
+AS_SET = 2**63
+RULE_ATTRIBUTE = "__dextouch_body_rule__"
+EndpointT = TypeVar("EndpointT", bound=Callable[..., object])
+
+
+@dataclass(frozen=True)
+class BodyRule:
+    """Largest body in bytes by media type; `needs_key` is False for a sign-in only."""
+
+    max_bytes: Mapping[str, int]
+    needs_key: bool = True
+
+
+# Of routes that declare nothing: room for names and options, none for data.
+DEFAULT_RULE = BodyRule({JSON: 64 * KIB})
+# The router answers with 404 or 405 and reads nothing.
+NO_ROUTE = BodyRule({})
+
+
+def takes(
+    max_bytes: Mapping[str, int], *, needs_key: bool = True
+) -> Callable[[EndpointT], EndpointT]:
+    """Declare what the body of a route may be; stands directly above the route's function.
+
+    Routes without it take JSON of at most 64 KiB. Other media types are refused with 415, larger
+    bodies with 413, both before the body is read.
+
+    Args:
+        max_bytes: largest body by media type, such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`.
+        needs_key: False where a service with keys is to be asked without one.
+    """
+
+    def mark(endpoint: EndpointT) -> EndpointT:
+        setattr(endpoint, RULE_ATTRIBUTE, BodyRule(max_bytes, needs_key))
+        return endpoint
+
+    return mark
+
+
+class BodyRules:
+    """The rules of all routes of a service."""
+
+    def __init__(self, routers: Sequence[APIRouter], *, max_body_bytes: int) -> None:
+        routes = [route for router in routers for route in router.routes]
+        self._rules = [
+            (
+                route.path_regex,
+                frozenset(route.methods or ()),
+                getattr(route.endpoint, RULE_ATTRIBUTE, DEFAULT_RULE),
+            )
+            for route in routes
+            if isinstance(route, APIRoute)
+        ]
+        self._max_body_bytes = max_body_bytes
+
+    def rule_of(self, scope: Scope) -> BodyRule:
+        """The rule of the route that a request is for."""
+        for path_regex, methods, rule in self._rules:
+            if scope["method"] in methods and path_regex.match(scope["path"]):
+                return rule
+        return NO_ROUTE
+
+    def limit(self, headers: Headers, rule: BodyRule) -> int:
+        """Bytes that may be read of this request's body.
+
+        Raises:
+            HTTPException: 415, a media type that the route does not take.
+        """
+        if not rule.max_bytes:
+            return self._max_body_bytes
+        largest = min(max(rule.max_bytes.values()), self._max_body_bytes)
+        if headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers:
+            return largest
+        got, _ = media_type(headers.get("content-type"))
+        if got not in rule.max_bytes:
+            raise HTTPException(
+                415, f"body: got Content-Type {got!r}, expected {' or '.join(rule.max_bytes)}"
+            )
+        return min(rule.max_bytes[got], self._max_body_bytes)
+
+
+def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
+    """A Content-Type's media type and parameters in lower case; "none" where there is none."""
+    header = Message()
+    header["content-type"] = content_type or "none/none"
+    parameters = {name.lower(): value.lower() for name, value in header.get_params() or []}
+    return (header.get_content_type() if content_type else "none"), parameters
+
+
+class BodyLimit:
+    """A `receive` that refuses more than the limit, announced or not."""
+
+    def __init__(self, receive: Receive, headers: Headers, max_bytes: int) -> None:
+        self._receive = receive
+        self._max_bytes = max_bytes
+        self._received = 0
+        announced = headers.get("content-length", "0")
+        self._check(int(announced) if announced.isdecimal() else 0)
+
+    async def __call__(self) -> AsgiMessage:
+        """The next message of the request."""
+        message = await self._receive()
+        self._received += len(message.get("body", b""))
+        self._check(self._received)
+        return message
+
+    def _check(self, num_bytes: int) -> None:
+        if num_bytes > self._max_bytes:
+            # Starlette's own class, since FastAPI turns any other into a 400.
+            raise HTTPException(
+                413, f"body: got {num_bytes} bytes, expected at most {self._max_bytes}"
+            )

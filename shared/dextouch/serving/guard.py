@@ -1,0 +1,161 @@
+"""Checks of every request and WebSocket before a route sees it: its page, its key, its body.
+
+A browser lets any page send requests to any address, only not read the answers; by DNS rebinding a
+page even reads them, under a host name of its own. So a request without a key must come from a page
+of this service, or from no page at all.
+"""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import structlog
+from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection, Request
+from starlette.responses import Response
+from starlette.types import ASGIApp, Receive, Scope, Send
+
+from dextouch.errors import AccessDeniedError, DexTouchError
+from dextouch.serving.access import AccessControl
+from dextouch.serving.bodies import BodyLimit, BodyRules
+from dextouch.serving.settings import ServiceSettings, is_loopback
+
+logger = structlog.get_logger(__name__)
+
+SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
+# Health checks and Prometheus ask without a key, under names of containers.
+PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
+HTTP_SCHEMES = {"ws": "http", "wss": "https"}
+DEFAULT_PORTS = {"http": ":80", "https": ":443"}
+HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
+POLICY_VIOLATION = 1008
+MAX_REASON_BYTES = 123
+
+# Whether a request without a key comes from someone who is signed in.
+Admits = Callable[[HTTPConnection], bool]
+Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
+
+
+class SitePolicy:
+    """Which host names and origins are the service's own."""
+
+    def __init__(self, settings: ServiceSettings) -> None:
+        self._hosts = frozenset(name.lower() for name in settings.allowed_hosts)
+        self._origins = frozenset(origin.lower() for origin in settings.allowed_origins)
+
+    def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
+        """Refuse what another site's page sends.
+
+        Args:
+            connection: the request.
+            is_unsafe: it may change something, or opens a WebSocket.
+
+        Raises:
+            AccessDeniedError: a foreign host name or origin (`reason` tells which).
+        """
+        host = ", ".join(connection.headers.getlist("host")).lower()
+        self._check_host(host)
+        if not is_unsafe:
+            return
+        scheme = str(connection.scope["scheme"])
+        scheme = HTTP_SCHEMES.get(scheme, scheme)
+        own = f"{scheme}://{host.removesuffix(DEFAULT_PORTS.get(scheme, ''))}"
+        if "origin" in connection.headers:
+            origin = ", ".join(connection.headers.getlist("origin")).lower()
+            if origin.removesuffix(DEFAULT_PORTS.get(scheme, "")) not in {own, *self._origins}:
+                raise _foreign_origin(f"origin {origin!r}", own)
+            return
+        site = connection.headers.get("sec-fetch-site", "none").lower()
+        if site in {"cross-site", "same-site"}:
+            raise _foreign_origin(f"a page of another origin (Sec-Fetch-Site: {site})", own)
+
+    def _check_host(self, host: str) -> None:
+        parts = HOST.fullmatch(host)
+        name = (parts[1] or parts[2]) if parts else ""
+        if name not in self._hosts and not is_loopback(name):
+            raise AccessDeniedError(
+                f"host: got {host!r}, expected a loopback name or one of the setting "
+                f"allowed_hosts ({', '.join(sorted(self._hosts)) or 'none'}); "
+                "add the name there if browsers or tools are to use it",
+                reason="foreign_host",
+            )
+
+
+@dataclass(frozen=True)
+class Guard:
+    """What a service asks of every request, and the answer of a refusal.
+
+    `admits` is None where nothing is to be had without a key.
+    """
+
+    access: AccessControl
+    site: SitePolicy
+    bodies: BodyRules
+    refuse: Refuse
+    admits: Admits | None = None
+
+    def check_sender(self, connection: HTTPConnection, *, needs_key: bool, is_unsafe: bool) -> None:
+        """Refuse foreign pages, and what may change something without a key.
+
+        Raises:
+            AccessDeniedError: with the reason.
+        """
+        if self.access.has_keys:
+            authorization = connection.headers.get("authorization")
+            # No foreign page knows a key, so host and origin of who has one do not matter.
+            if connection.scope["path"] in PROBES or self.access.knows(authorization):
+                return
+            signed_in = self.admits is not None and self.admits(connection)
+            if is_unsafe and needs_key and not signed_in:
+                self.access.identify(authorization)
+            if self.admits is None:
+                return
+        self.site.check(connection, is_unsafe=is_unsafe)
+
+
+class GuardMiddleware:
+    """Applies a guard; plain ASGI, so that no byte of a refused body is read."""
+
+    def __init__(self, app: ASGIApp, *, guard: Guard) -> None:
+        self._app = app
+        self._guard = guard
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """One request or WebSocket."""
+        if scope["type"] == "http":
+            await self._http(scope, receive, send)
+        elif scope["type"] == "websocket":
+            await self._websocket(scope, receive, send)
+        else:
+            await self._app(scope, receive, send)
+
+    async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
+        request = Request(scope)
+        rule = self._guard.bodies.rule_of(scope)
+        is_unsafe = scope["method"] not in SAFE_METHODS
+        try:
+            self._guard.check_sender(request, needs_key=rule.needs_key, is_unsafe=is_unsafe)
+            max_bytes = self._guard.bodies.limit(request.headers, rule)
+            limited = BodyLimit(receive, request.headers, max_bytes)
+        except (DexTouchError, HTTPException) as error:
+            response = self._guard.refuse(request, error)
+            await response(scope, receive, send)
+            return
+        await self._app(scope, limited, send)
+
+    async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            self._guard.check_sender(HTTPConnection(scope), needs_key=True, is_unsafe=True)
+        except AccessDeniedError as error:
+            logger.warning("refuse_websocket", path=scope["path"], error=error.message)
+            reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
+            return
+        await self._app(scope, receive, send)
+
+
+def _foreign_origin(got: str, own: str) -> AccessDeniedError:
+    return AccessDeniedError(
+        f"got a request of {got}, expected one of {own} or of the setting allowed_origins",
+        reason="foreign_origin",
+    )

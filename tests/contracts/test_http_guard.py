@@ -1,0 +1,283 @@
+"""What every service refuses before it acts: foreign pages, bodies of forms, keyless and long ones.
+
+The attacks are those of a page of another origin in the operator's browser (no-cors requests, DNS
+rebinding), as the Fetch standard lets it send them. A new service joins `APPS`; one that builds
+its application by itself instead of by `create_service_app` fails the first two tests.
+"""
+
+import ast
+from pathlib import Path
+
+import httpx
+import pytest
+
+from dextouch.serving.settings import ApiKey
+from dextouch.worlds.baseline import CopyFirstWorld
+from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from services.acquisition.settings import AcquisitionSettings
+from services.alignment.settings import AlignmentSettings
+from services.cli.up import BUILDERS
+from services.dashboard.settings import DashboardSettings
+from services.episode_store.settings import EpisodeStoreSettings
+from tests.unit.worlds.fakes import SumWorld
+
+ROOT = Path(__file__).parents[2]
+KEY = "a-key-of-some-length"
+SCOPES = ("station", "store_read", "store_write", "align", "rollout", "operate")
+PATH_VALUES = {"number": "0", "chunk": "0"}
+MIB = 2**20
+
+
+def acquisition(folder, **settings):
+    from services.acquisition.app import create_app
+
+    return create_app(AcquisitionSettings(mock=True, spool=folder / "spool", **settings))
+
+
+def alignment(folder, **settings):
+    from services.alignment.app import create_app
+
+    return create_app(AlignmentSettings(store_url=str(folder), **settings))
+
+
+def dashboard(_, **settings):
+    from services.dashboard.app import create_app
+
+    return create_app(DashboardSettings(**settings), {})
+
+
+def episode_store(folder, **settings):
+    from services.episode_store.app import create_app
+
+    return create_app(EpisodeStoreSettings(store_url=str(folder), **settings))
+
+
+def worlds(_, **settings):
+    world = SumWorld()
+    served = {"sum": world, "copy-first": CopyFirstWorld.beside(world.description)}
+    return create_world_app(served, WorldServiceSettings(**settings))
+
+
+APPS = {
+    "acquisition": acquisition,
+    "alignment": alignment,
+    "dashboard": dashboard,
+    "episode_store": episode_store,
+    "twin": worlds,
+    "world_model": worlds,
+}
+
+
+def test_every_service_of_the_project_is_here():
+    assert set(APPS) == set(BUILDERS)
+
+
+def test_applications_are_built_in_one_place():
+    built_in = {
+        path.relative_to(ROOT).as_posix()
+        for folder in ("shared", "services")
+        for path in (ROOT / folder).rglob("*.py")
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Call) and getattr(node.func, "id", "") in {"FastAPI", "Starlette"}
+    }
+    assert built_in == {"shared/dextouch/serving/app.py"}
+
+
+@pytest.fixture(params=sorted(set(APPS) - {"world_model"}))
+def make_app(request, tmp_path):
+    """The factory of one service; the two that serve worlds have the same routes."""
+    return lambda **settings: APPS[request.param](tmp_path, **settings)
+
+
+def keyed():
+    """Settings of a service that others on the network reach."""
+    return {"api_keys": (ApiKey(name="all", key=KEY, scopes=SCOPES),)}
+
+
+def client_of(app, base_url="http://127.0.0.1:8000"):
+    transport = httpx.ASGITransport(app, raise_app_exceptions=False)
+    return httpx.AsyncClient(transport=transport, base_url=base_url)
+
+
+def operations(app, *, unsafe):
+    """Method and path of every route, path parameters filled in."""
+    found = []
+    for path, methods in app.openapi()["paths"].items():
+        filled = path
+        for part in path.split("/"):
+            name = part.partition("{")[2].partition("}")[0]
+            filled = filled.replace("{" + name + "}", PATH_VALUES.get(name, "none"))
+        found += [
+            (method.upper(), filled)
+            for method in methods
+            if (method in {"post", "put", "patch", "delete"}) is unsafe
+        ]
+    if unsafe and any(getattr(route, "path", "") == "/static" for route in app.routes):
+        found.append(("POST", "/sign_in"))
+    assert found
+    return found
+
+
+def assert_refused(answer, status, says):
+    assert answer.status_code == status, (answer.request.method, answer.request.url, answer.text)
+    assert answer.headers["content-type"] == "application/problem+json"
+    problem = answer.json()
+    assert problem["status"] == status
+    assert problem["request_id"] == answer.headers["x-request-id"]
+    assert says in problem["detail"]
+
+
+FOREIGN = [
+    ({"host": "evil.example", "origin": "http://evil.example"}, 421, "allowed_hosts"),
+    ({"host": "evil.example:8000"}, 421, "allowed_hosts"),
+    ({"host": "127.0.0.1.evil.example"}, 421, "allowed_hosts"),
+    ({"host": "localhost@evil.example"}, 421, "allowed_hosts"),
+    ({"host": ""}, 421, "allowed_hosts"),
+    ({"origin": "http://evil.example"}, 403, "allowed_origins"),
+    ({"origin": "null"}, 403, "allowed_origins"),
+    ({"origin": "http://127.0.0.1:8001"}, 403, "allowed_origins"),
+    ({"origin": "https://127.0.0.1:8000"}, 403, "allowed_origins"),
+    ({"origin": "http://localhost:8000"}, 403, "allowed_origins"),
+    ({"sec-fetch-site": "cross-site"}, 403, "allowed_origins"),
+    ({"sec-fetch-site": "same-site"}, 403, "allowed_origins"),
+]
+
+
+@pytest.mark.parametrize(("headers", "status", "says"), FOREIGN)
+async def test_pages_of_other_origins_cannot_act(make_app, headers, status, says):
+    app = make_app()
+    async with client_of(app) as client:
+        for method, path in operations(app, unsafe=True):
+            assert_refused(await client.request(method, path, headers=headers), status, says)
+
+
+async def test_rebound_names_cannot_read(make_app):
+    app = make_app()
+    async with client_of(app, "http://evil.example:8000") as client:
+        for method, path in [*operations(app, unsafe=False), ("GET", "/metrics"), ("GET", "/")]:
+            assert_refused(await client.request(method, path), 421, "allowed_hosts")
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", None])
+async def test_pages_of_other_origins_open_no_websocket(make_app, origin):
+    host = b"127.0.0.1:8000" if origin else b"evil.example"
+    headers = [(b"host", host), (b"origin", (origin or "http://evil.example").encode())]
+    sent = []
+
+    async def receive():
+        return {"type": "websocket.connect"}
+
+    async def send(message):
+        sent.append(message)
+
+    scope = {"type": "websocket", "scheme": "ws", "path": "/v1/live", "raw_path": b"/v1/live"}
+    scope |= {"headers": headers, "query_string": b"", "root_path": "", "subprotocols": []}
+    app = make_app()
+    await app(scope | {"state": {}, "app": app}, receive, send)
+    assert [message["type"] for message in sent] == ["websocket.close"]
+    assert sent[0]["code"] == 1008
+    assert "allowed_" in sent[0]["reason"]
+
+
+async def test_own_pages_tools_and_named_origins_may_act(make_app):
+    allowed = {"allowed_hosts": ("lab-pc", "fd00::7"), "allowed_origins": ("https://lab.example",)}
+    app = make_app(**allowed)
+    accepted = [
+        {},
+        {"origin": "http://127.0.0.1:8000"},
+        {"host": "localhost:1", "origin": "http://LOCALHOST:1"},
+        {"host": "[::1]:9", "origin": "http://[::1]:9"},
+        {"host": "localhost:80", "origin": "http://localhost"},
+        {"host": "LAB-PC:8000", "sec-fetch-site": "same-origin"},
+        {"host": "[fd00::7]"},
+        {"origin": "https://lab.example", "sec-fetch-site": "cross-site"},
+    ]
+    async with client_of(app) as client:
+        for headers in accepted:
+            for method, path in operations(app, unsafe=True):
+                answer = await client.request(method, path, headers=headers)
+                assert answer.status_code not in {403, 415, 421}, (path, headers, answer.text)
+
+
+BY_FORM = ["text/plain", "application/x-www-form-urlencoded", "multipart/form-data; boundary=x", ""]
+
+
+@pytest.mark.parametrize("content_type", BY_FORM)
+async def test_what_a_form_can_send_is_refused(make_app, content_type):
+    """A no-cors request names one of these types, or none (a Blob without a type)."""
+    app = make_app()
+    headers = {"content-type": content_type} if content_type else {}
+    async with client_of(app) as client:
+        for method, path in operations(app, unsafe=True):
+            is_sign_in = path == "/sign_in" and content_type.endswith("urlencoded")
+            answer = await client.request(method, path, content=b"{}", headers=headers)
+            if is_sign_in:
+                assert answer.status_code in {200, 303, 401}
+            else:
+                assert_refused(answer, 415, "application/")
+
+
+async def test_a_service_with_keys_asks_for_one_before_it_reads(make_app):
+    app = make_app(**keyed())
+    asked = []
+
+    async def receive():
+        asked.append(1)
+        return {"type": "http.disconnect"}
+
+    for headers in ([], [(b"authorization", b"Bearer wrong-key-of-length")]):
+        for method, path in operations(app, unsafe=True):
+            if path == "/sign_in":
+                continue
+            sent = []
+
+            async def send(message, sent=sent):
+                sent.append(message)
+
+            scope = {"type": "http", "http_version": "1.1", "scheme": "http", "method": method}
+            scope |= {"path": path, "raw_path": path.encode(), "query_string": b""}
+            known = [(b"host", b"store:8000"), (b"content-type", b"application/json")]
+            scope |= {"headers": [*known, (b"content-length", b"9" * 8), *headers]}
+            await app(scope | {"root_path": "", "client": ("10.0.0.9", 1)}, receive, send)
+            assert sent[0]["status"] in {401, 421}, path
+    assert not asked
+
+
+async def test_probes_and_keys_work_under_any_name(make_app):
+    """Health checks and Prometheus have no key and use the names of containers."""
+    app = make_app(**keyed())
+    async with client_of(app, "http://episode_store:8081") as client:
+        for path in ("/healthz", "/readyz", "/metrics"):
+            assert (await client.get(path)).status_code in {200, 503}
+        header = {"authorization": f"Bearer {KEY}"}
+        for method, path in operations(app, unsafe=True):
+            answer = await client.request(method, path, headers=header)
+            assert answer.status_code not in {415, 421}, (path, answer.text)
+
+
+@pytest.mark.parametrize("announced", [True, False])
+async def test_no_route_reads_a_body_that_is_longer_than_its_own(make_app, announced):
+    """Of JSON no route needs more than 1 MiB; of anything more than `max_body_bytes`."""
+    app = make_app()
+
+    async def parts():
+        for _ in range(17):
+            yield b" " * MIB
+
+    async with client_of(app) as client:
+        for method, path in operations(app, unsafe=True):
+            if method == "DELETE":
+                continue
+            kind = "application/json"
+            if "/batches/" in path:
+                kind = "application/octet-stream"
+            elif path == "/sign_in":
+                kind = "application/x-www-form-urlencoded"
+            content = b" " * (17 * MIB) if announced else parts()
+            answer = await client.request(
+                method, path, content=content, headers={"content-type": kind}
+            )
+            # Routes without a body never read one; bodies of unknown length are refused late.
+            is_bodiless = path.endswith("/cancel")
+            if announced or not is_bodiless:
+                assert_refused(answer, 413, "expected at most")
