@@ -140,5 +140,6 @@ def _server(app: FastAPI, grace_s: int) -> Server:
         backlog=BACKLOG,
         timeout_graceful_shutdown=grace_s,
         ws_max_size=MAX_WEBSOCKET_BYTES,
+        proxy_headers=False,
     )
     return Server(config)
