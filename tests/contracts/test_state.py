@@ -52,6 +52,25 @@ async def test_of_many_writers_exactly_one_wins(state, key):
     assert (await state.get(key)).value == b"%d" % winners[0]
 
 
+async def test_of_many_new_values_only_as_many_as_allowed_are_kept(state, key):
+    await state.set(key + "-other", b"", expected_version=0, ttl_s=60.0)
+    adds = [
+        state.add(f"{key}:{i}", b"%d" % i, within=key + ":", limit=4, ttl_s=60.0) for i in range(24)
+    ]
+    assert (await asyncio.gather(*adds)).count(True) == 4
+    kept = await state.keys(key + ":")
+    assert len(kept) == 4
+    stored = await state.get(kept[0])
+    assert (stored.value.decode(), stored.version) == (kept[0].rpartition(":")[2], 1)
+    assert not await state.add(key + ":z", b"", within=key + ":", limit=4, ttl_s=60.0)
+    await state.delete(kept[0])
+    assert await state.add(key + ":z", b"z", within=key + ":", limit=4, ttl_s=60.0)
+    with pytest.raises(ConflictError) as caught:
+        await state.add(key + ":z", b"", within=key + ":", limit=9, ttl_s=60.0)
+    assert caught.value.details == {"expected": 0, "got": 1}
+    assert (await state.get(key + ":z")).value == b"z"
+
+
 async def test_delete_and_keys(state, key):
     other = key.replace("test:", "tes*:")
     await state.set(key + ":b", b"1", expected_version=0, ttl_s=60.0)

@@ -38,6 +38,16 @@ class StateStore(Protocol):
         """
         ...
 
+    async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
+        """Write a new value unless `limit` live keys start with `within`; False if so many do.
+
+        Counting and writing are one step, so callers at once never exceed the limit together.
+
+        Raises:
+            ConflictError: the key is there already.
+        """
+        ...
+
     async def touch(self, key: str, *, ttl_s: float) -> bool:
         """Start the time to live anew; False when absent."""
         ...
@@ -96,6 +106,14 @@ class MemoryState:
         self._entries[key] = (written, self._clock_s() + _checked_ttl(ttl_s))
         return written.version
 
+    async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
+        """See StateStore."""
+        # Nothing here waits, so nobody else runs between counting and writing.
+        if key not in self._entries and len(await self.keys(within)) >= limit:
+            return False
+        await self.set(key, value, expected_version=0, ttl_s=ttl_s)
+        return True
+
     async def touch(self, key: str, *, ttl_s: float) -> bool:
         """See StateStore."""
         self._expire()
@@ -137,6 +155,16 @@ redis.call('PEXPIRE', KEYS[1], ARGV[3])
 return {1, version + 1}
 """
 
+# KEYS[1] key · ARGV: pattern of the keys to count, limit, value, time to live in ms
+# → -1: stored already, 0: no room, 1: written
+ADD = """
+if redis.call('EXISTS', KEYS[1]) == 1 then return -1 end
+if #redis.call('KEYS', ARGV[1]) >= tonumber(ARGV[2]) then return 0 end
+redis.call('HSET', KEYS[1], 'version', 1, 'value', ARGV[3])
+redis.call('PEXPIRE', KEYS[1], ARGV[4])
+return 1
+"""
+
 
 class RedisState:
     """A store that several processes share; one hash a key, written by one script."""
@@ -144,6 +172,7 @@ class RedisState:
     def __init__(self, link: RedisLink) -> None:
         self._link = link
         self._compare_and_set = link.script(COMPARE_AND_SET)
+        self._add = link.script(ADD)
 
     async def get(self, key: str) -> Versioned | None:
         """See StateStore."""
@@ -158,6 +187,15 @@ class RedisState:
         if not written:
             raise _version_conflict(key, expected=expected_version, got=int(version))
         return int(version)
+
+    async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
+        """See StateStore."""
+        counted = _literal(REDIS_PREFIX + within) + "*"
+        added = await self._add([REDIS_PREFIX + key], [counted, limit, value, _milliseconds(ttl_s)])
+        if added < 0:
+            stored = await self.get(key)
+            raise _version_conflict(key, expected=0, got=stored.version if stored else 0)
+        return bool(added)
 
     async def touch(self, key: str, *, ttl_s: float) -> bool:
         """See StateStore."""

@@ -1,16 +1,20 @@
 """A rollout as its store keeps it: where it stands, the world's snapshot, and the last answer."""
 
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
 
-from dextouch.errors import NotFoundError
+from dextouch.errors import LimitExceededError, NotFoundError, UnavailableError
 from dextouch.schemas.rollouts import RolloutInfo
 from dextouch.serving.state import StateStore
 from dextouch.streams.packing import pack, unpack
 
 KEY_PREFIX = "rollout:"
 MAX_RECORD_BYTES = 2**30
+# A start may wait for others and for its world; after a crash its place is held so long.
+PLACE_TTL_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -78,8 +82,34 @@ class RecordStore:
             raise _unknown(rollout_id)
         return StoredRecord(RolloutRecord.from_bytes(stored.value), stored.version)
 
+    async def add(self, record: RolloutRecord, *, limit: int) -> None:
+        """Write a new rollout, as version 1.
+
+        Raises:
+            LimitExceededError: as many as `limit` are alive or about to begin.
+        """
+        await self._add(record.info.id, record.to_bytes(), limit=limit, ttl_s=self._ttl_s)
+
+    @asynccontextmanager
+    async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
+        """Hold the place of a rollout that is about to begin; gives the version to write over.
+
+        The place is free again if what is done with it fails.
+
+        Raises:
+            LimitExceededError: as many as `limit` are alive or about to begin.
+        """
+        await self._add(rollout_id, b"", limit=limit, ttl_s=max(self._ttl_s, PLACE_TTL_S))
+        try:
+            yield 1
+        except BaseException:
+            # What cannot be deleted now expires.
+            with suppress(NotFoundError, UnavailableError):
+                await self.delete(rollout_id)
+            raise
+
     async def write(self, record: RolloutRecord, *, over_version: int) -> int:
-        """Write over the version it was computed from (0: a new rollout); the new version.
+        """Write over the version it was computed from; the new version.
 
         Raises:
             ConflictError: another version is stored.
@@ -100,13 +130,18 @@ class RecordStore:
         if not await self._store.delete(KEY_PREFIX + rollout_id):
             raise _unknown(rollout_id)
 
-    async def count(self) -> int:
-        """How many rollouts are alive."""
-        return len(await self._store.keys(KEY_PREFIX))
-
     async def ping(self) -> None:
         """Raise UnavailableError when the store cannot be reached."""
         await self._store.ping()
+
+    async def _add(self, rollout_id: str, value: bytes, *, limit: int, ttl_s: float) -> None:
+        key = KEY_PREFIX + rollout_id
+        if not await self._store.add(key, value, within=KEY_PREFIX, limit=limit, ttl_s=ttl_s):
+            raise LimitExceededError(
+                f"{limit} rollouts are alive, expected at most {limit}; delete one, or wait: "
+                f"they expire after {self._ttl_s:g} s without a chunk",
+                retry_after_s=1,
+            )
 
 
 def _unknown(rollout_id: str) -> NotFoundError:

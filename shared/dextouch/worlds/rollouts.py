@@ -114,27 +114,29 @@ class RolloutService:
         description = worker.world.description
         begin = check_start(start, description)
         check_selector(selector, description)
-        await self._check_room()
 
         def reset() -> tuple[StartedRollout[Any], bytes]:
             started = worker.world.reset(begin)
             return started, worker.world.snapshot(started.state)
 
-        started, snapshot = await worker.call(reset)
-        check_answer(started.observation, description, first_step=0, num_steps=1)
-        info = RolloutInfo(
-            id=secrets.token_hex(16),
-            world=world,
-            world_digest=description.digest,
-            task=start.task,
-            instruction=start.instruction,
-            seed=start.seed,
-            action_kind=start.action_kind,
-            next_chunk=0,
-            last_step=0,
-            ttl_s=self.limits.ttl_s,
-        )
-        version = await self._records.write(RolloutRecord(info, snapshot), over_version=0)
+        rollout_id, limit = secrets.token_hex(16), self.limits.max_rollouts
+        async with self._records.place(rollout_id, limit=limit) as placed:
+            started, snapshot = await worker.call(reset)
+            check_answer(started.observation, description, first_step=0, num_steps=1)
+            info = RolloutInfo(
+                id=rollout_id,
+                world=world,
+                world_digest=description.digest,
+                task=start.task,
+                instruction=start.instruction,
+                seed=start.seed,
+                action_kind=start.action_kind,
+                next_chunk=0,
+                last_step=0,
+                ttl_s=self.limits.ttl_s,
+            )
+            record = RolloutRecord(info, snapshot)
+            version = await self._records.write(record, over_version=placed)
         self._live.put(info.id, version, started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = Origin(started.anchor, started.K_head)
@@ -185,10 +187,10 @@ class RolloutService:
         """
         parent = (await self._records.read(rollout_id)).record
         self._worker_of(parent.info)
-        await self._check_room()
         changed = {"id": secrets.token_hex(16)} | ({} if seed is None else {"seed": seed})
         info = parent.info.model_copy(update=changed)
-        await self._records.write(RolloutRecord(info, parent.snapshot), over_version=0)
+        record = RolloutRecord(info, parent.snapshot)
+        await self._records.add(record, limit=self.limits.max_rollouts)
         logger.info("rollout_forked", rollout_id=info.id, parent_id=rollout_id)
         return info
 
@@ -247,15 +249,6 @@ class RolloutService:
                 got=digest,
             )
         return worker
-
-    async def _check_room(self) -> None:
-        alive = await self._records.count()
-        if alive >= self.limits.max_rollouts:
-            raise LimitExceededError(
-                f"{alive} rollouts are alive, expected at most {self.limits.max_rollouts}; delete "
-                f"one, or wait: they expire after {self.limits.ttl_s:g} s without a chunk",
-                retry_after_s=1,
-            )
 
     def _check_length(self, info: RolloutInfo) -> None:
         if info.next_chunk >= self.limits.max_chunks:

@@ -5,12 +5,13 @@ Documented in docs/rollout_api.md.
 
 import base64
 import json
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, TypeVar
 
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 from jaxtyping import Shaped
 from pydantic import BaseModel, ConfigDict, ValidationError
+from starlette.concurrency import run_in_threadpool
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM
@@ -46,18 +47,8 @@ class ActionsBody(BaseModel):
     actions: list[list[float]]
 
 
-def selector_of(
-    cameras: Annotated[list[str] | None, Query()] = None,
-    steps: Literal["last", "all"] = "all",
-    tactile: bool = True,  # noqa: FBT001, FBT002 - a query parameter
-) -> ReturnSelector:
-    """The return selector from the query: ?steps=last&cameras=camera_head&tactile=false."""
-    return ReturnSelector(
-        cameras=None if cameras is None else tuple(cameras), steps=steps, tactile=tactile
-    )
-
-
-Selector = Annotated[ReturnSelector, Depends(selector_of)]
+# From the query: ?steps=last&cameras=camera_head&tactile=false; unknown parameters are refused.
+Selector = Annotated[ReturnSelector, Query()]
 
 
 def rollout_router(service: RolloutService) -> APIRouter:
@@ -112,7 +103,8 @@ async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
     kind, _ = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == MSGPACK:
-        return decode_start(body, max_bytes=MAX_BODY_BYTES)
+        # Megabytes of images would stop the event loop.
+        return await run_in_threadpool(decode_start, body, max_bytes=MAX_BODY_BYTES)
     asked = _from_json(StartRequest, body)
     return asked, start_from(asked)
 

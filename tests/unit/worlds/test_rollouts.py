@@ -1,6 +1,7 @@
 """The rollout service: numbering, replay, branches, expiry, and going on in another process."""
 
 import asyncio
+import threading
 
 import numpy as np
 import pytest
@@ -201,6 +202,64 @@ async def test_limits_on_number_and_length():
     with pytest.raises(LimitExceededError, match="has 2 chunks"):
         await made.step(first, 2, actions(4), ALL)
     now_s[0] = 11.0
+    await begin(made)
+    made.close()
+
+
+@pytest.mark.parametrize("num_processes", [1, 2])
+async def test_of_many_starts_at_once_only_as_many_as_allowed_begin(state, num_processes):
+    for key in await state.keys(""):
+        await state.delete(key)
+    made = [service(state, max_rollouts=4) for _ in range(num_processes)]
+    results = await asyncio.gather(
+        *(begin(made[i % num_processes]) for i in range(24)), return_exceptions=True
+    )
+    begun = [result for result in results if isinstance(result, str)]
+    assert len(begun) == 4
+    refused = [result for result in results if not isinstance(result, str)]
+    assert {type(error) for error in refused} == {LimitExceededError}
+    assert refused[0].details == {"retry_after_s": 1}
+    # A place is free again once a rollout has ended; branches take one, too.
+    await made[0].delete(begun[0])
+    results = await asyncio.gather(
+        *(made[i % num_processes].fork(begun[1]) for i in range(24)), return_exceptions=True
+    )
+    assert sum(not isinstance(result, Exception) for result in results) == 1
+    for each in made:
+        each.close()
+
+
+class Waiting(SumWorld):
+    """Begins when it is let; an instruction of none cannot begin at all."""
+
+    def __init__(self):
+        super().__init__()
+        self.may_begin = threading.Event()
+
+    def reset(self, start):
+        if not start.instruction:
+            raise InvalidInputError("no instruction")
+        self.may_begin.wait(30)
+        return super().reset(start)
+
+
+async def test_starts_that_fail_or_are_cancelled_leave_their_place(state):
+    for key in await state.keys(""):
+        await state.delete(key)
+    world = Waiting()
+    made = service(state, world=world, max_rollouts=1)
+    for _ in range(2):
+        with pytest.raises(InvalidInputError, match="no instruction"):
+            await begin(made, RolloutStart("stand_bottle", 3, ""))
+    starting = asyncio.create_task(begin(made))
+    while not await state.keys(""):  # noqa: ASYNC110 - a store
+        await asyncio.sleep(0)
+    with pytest.raises(LimitExceededError):
+        await begin(made)
+    starting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+    world.may_begin.set()
     await begin(made)
     made.close()
 

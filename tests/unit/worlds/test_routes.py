@@ -3,6 +3,7 @@
 import base64
 import json
 
+import anyio.to_thread
 import hypothesis.strategies as st
 import msgpack
 import numpy as np
@@ -103,6 +104,22 @@ async def test_the_selector_narrows_the_answer(client):
     assert message["fields"]["observation"]["first_step"] == 8
     assert set(message["arrays"]) == {"action_reached", "image/camera_wrist_left"}
     assert message["arrays"]["action_reached"]["shape"] == [1, 67]
+
+
+async def test_a_chunk_waits_for_no_thread_but_its_worlds(client, monkeypatch):
+    """A thread of the pool for its query cost a chunk a tenth of its time."""
+    path = f"/v1/rollouts/{await begin(client)}/chunks/0?steps=last"
+    taken = []
+    run_sync = anyio.to_thread.run_sync
+
+    async def counted(*call, **options):
+        taken.append(call)
+        return await run_sync(*call, **options)
+
+    monkeypatch.setattr(anyio.to_thread, "run_sync", counted)
+    response = await client.post(path, content=actions(4).tobytes(), headers=FLOAT64)
+    assert response.status_code == 200
+    assert not taken
 
 
 async def test_json_answers_hold_the_same(client):
@@ -212,6 +229,8 @@ async def test_bad_starts_are_refused(client, changed, says):
         ("/v1/rollouts/none/fork", 415),
         ("/v1/nothing", 404),
         ("/v1/rollouts/a/chunks/0?steps=some", 422),
+        ("/v1/rollouts/a/chunks/0?pad=hold", 422),
+        ("/v1/rollouts/a/chunks/0?camera=camera_head", 422),
     ],
 )
 async def test_unknown_places(client, path, status):
