@@ -5,7 +5,16 @@ import json
 from contextlib import suppress
 from typing import Annotated, Literal
 
-from fastapi import APIRouter, Body, Depends, Request, Response, WebSocket, WebSocketDisconnect
+from fastapi import (
+    APIRouter,
+    Body,
+    Depends,
+    Path,
+    Request,
+    Response,
+    WebSocket,
+    WebSocketDisconnect,
+)
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
@@ -19,6 +28,8 @@ from services.dashboard.views import heatmap_layout
 
 MAX_VIEW_CHARACTERS = 1000
 WEBSOCKET_REFUSED = 1008
+# As streams are named (dextouch.streams.descriptors).
+CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
 
 class RecorderRequest(BaseModel):
@@ -94,7 +105,7 @@ def api_router(settings: DashboardSettings) -> APIRouter:
         await feeds.retry(recording_id)
 
     @router.get("/cameras/{name}.jpg")
-    async def camera(name: str, request: Request) -> Response:
+    async def camera(name: CameraName, request: Request) -> Response:
         """The newest image of one camera."""
         feeds: Feeds = request.app.state.feeds
         content, media_type = await feeds.camera_image(name)

@@ -77,6 +77,14 @@ async def test_recorder_conflict_is_passed_on(client):
     assert answer.json()["detail"] == "record: got state idle, expected armed"
 
 
+@pytest.mark.parametrize("name", ["%07", "..", "a%3Fb", "a%23", "%F0%9F%93%B7", "x" * 65, "%20"])
+async def test_names_that_no_camera_has_are_refused(client, services, name):
+    answer = await client.get(f"/v1/cameras/{name}.jpg")
+    assert answer.status_code == 422
+    assert "path.name" in answer.json()["detail"]
+    assert not services.asked
+
+
 @pytest.mark.parametrize(
     ("headers", "status"),
     [
