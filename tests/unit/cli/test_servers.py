@@ -1,13 +1,15 @@
 """Several services in one process: known URLs, one stop for all, a failing one is said."""
 
 import asyncio
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 
 import httpx
 import pytest
-from fastapi import FastAPI
+import websockets
+from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 
 from dextouch.errors import ConflictError, UnavailableError
+from dextouch.serving.settings import MAX_WEBSOCKET_BYTES
 from services.cli.servers import bind, serve_all
 
 
@@ -39,6 +41,33 @@ async def test_all_answer_and_stop_in_reverse():
     stop.set()
     await asyncio.wait_for(serving, 60)
     assert lives[-2:] == ["page down", "store down"]
+
+
+async def test_a_longer_websocket_message_ends_the_connection():
+    app = FastAPI()
+
+    @app.websocket("/live")
+    async def live(websocket: WebSocket):
+        await websocket.accept()
+        with suppress(WebSocketDisconnect):
+            while True:
+                await websocket.send_json(len(await websocket.receive_text()))
+
+    place = bind("page", host="127.0.0.1", port=0)
+    stop, ready = asyncio.Event(), asyncio.Event()
+    serving = asyncio.create_task(serve_all([(place, app)], stop=stop, ready=ready))
+    await asyncio.wait_for(ready.wait(), 10)
+    url = place.url.replace("http", "ws") + "/live"
+    async with websockets.connect(url, proxy=None, compression=None) as client:
+        await client.send("x" * MAX_WEBSOCKET_BYTES)
+        assert int(await asyncio.wait_for(client.recv(), 10)) == MAX_WEBSOCKET_BYTES
+        await client.send("x" * (MAX_WEBSOCKET_BYTES + 1))
+        with pytest.raises(websockets.ConnectionClosedError) as caught:
+            await asyncio.wait_for(client.recv(), 10)
+    # RFC 6455, 7.4.1: a message that is too big.
+    assert caught.value.rcvd.code == 1009
+    stop.set()
+    await asyncio.wait_for(serving, 10)
 
 
 async def test_a_service_that_cannot_start_ends_all():
