@@ -24,7 +24,7 @@ MEMORY_BYTES = 32 << 20
 
 @pytest.fixture
 def http(settings):
-    return AsyncClient(transport=ASGITransport(create_app(settings)), base_url="http://store")
+    return AsyncClient(transport=ASGITransport(create_app(settings)), base_url="http://localhost")
 
 
 def test_finishing_and_reading_a_small_upload_takes_little_memory(start, attributes):
