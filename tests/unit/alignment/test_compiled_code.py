@@ -56,7 +56,9 @@ print(json.dumps({"is_loaded": bool(retarget_samples.stats.cache_hits)}))
 
 
 def test_the_first_folder_by_the_content_of_the_code(tmp_path):
+    before = os.umask(0o022)
     folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
+    os.umask(before)
     assert folder.parent == tmp_path / "wanted"
     assert len(folder.name) == 16
     assert folder_of_code(tmp_path / "wanted", tmp_path / "spare") == folder
@@ -84,6 +86,25 @@ def test_code_that_others_may_write_is_not_taken(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda path, _: tmp_path / "wanted" not in path.parents)
     folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
     assert list(folder.iterdir()) == []
+
+
+@pytest.mark.parametrize("umask", [0o002, 0o022, 0o077])
+def test_folders_of_every_umask_are_used_again(tmp_path, umask):
+    before = os.umask(umask)
+    try:
+        found = [folder_of_code(tmp_path / "new" / "wanted", tmp_path / "spare") for _ in range(2)]
+    finally:
+        os.umask(before)
+    assert [folder.parent for folder in found] == [tmp_path / "new" / "wanted"] * 2
+
+
+def test_a_folder_for_temporary_files_may_be_named(tmp_path):
+    (tmp_path / "wanted").mkdir()
+    (tmp_path / "wanted").chmod(0o1777)
+    assert folder_of_code(tmp_path / "wanted", tmp_path / "spare").parent == tmp_path / "wanted"
+    # Where others could put a folder of their own in its place.
+    (tmp_path / "wanted").chmod(0o777)
+    assert folder_of_code(tmp_path / "wanted", tmp_path / "spare").parent == tmp_path / "spare"
 
 
 def test_nowhere_to_write(tmp_path):

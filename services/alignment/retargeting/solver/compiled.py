@@ -23,7 +23,7 @@ def folder_of_code(*bases: Path) -> Path | None:
     """Where compiled code is kept: in the first of these folders that this user may write.
 
     Code of this version that an earlier, read-only one holds (of an image that another user built)
-    is copied. Code is run: it is taken only from folders that nobody but this user and root
+    is copied. Code is run: it is taken only from folders of this user or root that not everybody
     may write.
 
     Args:
@@ -56,11 +56,10 @@ def _is_own(folder: Path) -> bool:
 
 
 def _is_safe(folder: Path) -> bool:
-    """Whether nobody but this user and root may change what lies in it."""
+    """Whether other users than root cannot exchange what lies in it."""
     found = folder.stat()
-    return found.st_uid in (ROOT_UID, os.getuid()) and not found.st_mode & (
-        stat.S_IWGRP | stat.S_IWOTH
-    )
+    is_open = bool(found.st_mode & stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
+    return found.st_uid in (ROOT_UID, os.getuid()) and not is_open
 
 
 def _copy_first(sources: list[Path], folder: Path) -> None:
