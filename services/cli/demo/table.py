@@ -9,9 +9,9 @@ from rich.table import Table
 # Endings of the figures' names, and what made those predictions.
 PREDICTORS = (
     ("", "the model"),
-    ("_hands_still", "told that only the head moves"),
-    ("_hold", "told that nothing moves"),
-    ("_other_take", "given another take's actions"),
+    ("_hands_still", "the model, only the head moves"),
+    ("_hold", "the model, nothing moves"),
+    ("_other_take", "the model, another take's actions"),
     ("_copy", "copy of the first step"),
     ("_zero", "no touch at all"),
     ("_codec", "codec alone (limit)"),
@@ -27,7 +27,7 @@ def show(report: Mapping[str, Any]) -> None:
     console.print(_policies(report["policies"]))
     accuracy = report["success_probe"]["held_out_accuracy"]
     console.print(
-        f"Imagined success is told by a learned probe, right on {accuracy:.0%} of the true"
+        f"Imagined success is judged by a small network, right on {accuracy:.0%} of the true"
     )
     console.print(
         "endings it was measured on; endings that the model imagines wrongly mislead it.\n"

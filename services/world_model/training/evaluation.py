@@ -62,7 +62,7 @@ def evaluate_prediction(
         - _codec encodes and decodes the truth: what the model could reach at best.
         - _other_take is the model given the actions of another held-out episode of the same task
           at the same moment (absent where no task has two episodes).
-        - _hold is the model told that nothing moves, _hands_still that only the head does.
+        - _hold is the model given actions in which nothing moves; in _hands_still the head does.
 
         A model whose own figures are no better than these does not use its actions.
 
