@@ -170,6 +170,25 @@ def test_single_wrong_stamps_move_nothing(wrong_ms, bound_ms):
         assert rms_ms(times_ns, take) <= bound_ms
 
 
+@pytest.mark.parametrize("slower", [1.0006, 1.006, 1.02, 2.0])
+@pytest.mark.parametrize("at_s", [120, 160])
+def test_a_rate_that_changes_is_no_stop(slower, at_s, capsys):
+    """A camera in bad light: its numbers stand for another time from then on."""
+    rng = np.random.default_rng(0)
+    index = np.arange(30 * 240)
+    true_s = np.cumsum(np.where(index < 30 * at_s, 1, slower) / 30)
+    counted_ns = np.rint(index * 1e9 / 30).astype(np.int64)
+    waits_s = BASE_S + rng.exponential(0.8e-3, len(index))
+    host_ns = np.rint(np.maximum.accumulate(true_s + waits_s) * 1e9).astype(np.int64)
+    model = fit_clock(counted_ns, host_ns)
+    error_ms = (model.to_host_ns(counted_ns, host_ns) * 1e-9 - true_s - BASE_S) * 1e3
+    error = float(np.sqrt(np.mean(error_ms**2)))
+    with capsys.disabled():
+        sys.stdout.write(f"\nrate slower by {slower:6.4f}   {error:.3f} ms, bound 0.6")
+    assert model.num_steps == 0
+    assert error <= 0.6
+
+
 @st.composite
 def happenings(draw):
     """Up to three events, each after eleven seconds of the last one's end, and before the end."""

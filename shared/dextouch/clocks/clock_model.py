@@ -15,8 +15,10 @@ WINDOW_S = 60.0
 # Below this many samples or seconds a segment's own slope is mostly noise.
 MIN_SLOPE_SAMPLES = 50
 MIN_SLOPE_SPAN_S = 1.0
-# No crystal's rate changes by more within a take; such a line hangs on two late samples.
+# Beside a silence a line may hang on two late samples; then it leaves its neighbours by more.
 MAX_DRIFT_NS_PER_S = 1e6
+SILENCE_S = 1.0
+NEIGHBOURS = 2
 PATH_DELAY_NOTE = (
     "host times include the stream's smallest path delay, which stamps of one direction cannot "
     "show; subtract the calibrated latency_ns"
@@ -240,20 +242,21 @@ def _knots(x: list[float], y: list[float]) -> list[tuple[float, float]]:
     num_windows = max(1, int(np.ceil((span_s - WINDOW_S) / (WINDOW_S / 2))) + 1)
     if num_windows == 1:
         return _straight(x, _hull(x, y).supporting_line(span_s / 2))
-    fits = []
+    fits: list[tuple[float, LowerHull, bool]] = []
     for start_s in np.linspace(0, span_s - WINDOW_S, num_windows):
         a, b = np.searchsorted(x, [start_s, start_s + WINDOW_S])
         if b - a >= MIN_SAMPLES:
             # Where samples are missing, the window's own middle may lie beside its last one.
             middle_s, hull = (x[a] + x[b - 1]) / 2, _hull(x[a:b], y[a:b])
-            fits.append((middle_s, hull, hull.supporting_line(middle_s)))
+            fits.append((middle_s, hull, bool(np.diff(x[a:b]).max() > SILENCE_S)))
     if not fits:
         return _straight(x, _hull(x, y).supporting_line(span_s / 2))
-    slope = float(np.median([line.slope_ns_per_s for _, _, line in fits]))
-    lines = [
-        (middle_s, line if abs(line.slope_ns_per_s - slope) <= MAX_DRIFT_NS_PER_S else level)
-        for middle_s, hull, line in fits
-        for level in [hull.line_of_slope(slope)]
-    ]
-    knots = [(middle_s, line.at(middle_s)) for middle_s, line in lines]
-    return [(0.0, lines[0][1].at(0.0)), *knots, (span_s, lines[-1][1].at(span_s))]
+    lines = [hull.supporting_line(middle_s) for middle_s, hull, _ in fits]
+    slopes = [line.slope_ns_per_s for line in lines]
+    for index, (_, hull, has_silence) in enumerate(fits):
+        around = slopes[max(0, index - NEIGHBOURS) : index + NEIGHBOURS + 1]
+        usual = float(np.median(around))
+        if has_silence and abs(slopes[index] - usual) > MAX_DRIFT_NS_PER_S:
+            lines[index] = hull.line_of_slope(usual)
+    knots = [(fit[0], line.at(fit[0])) for fit, line in zip(fits, lines, strict=True)]
+    return [(0.0, lines[0].at(0.0)), *knots, (span_s, lines[-1].at(span_s))]

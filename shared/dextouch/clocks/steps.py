@@ -27,7 +27,8 @@ REGULAR_QUANTILE = 0.9
 # A clock that stood still shows in no distance of stamps, only in the arrivals: within a fifth of a
 # second they become late, and stay so. A rise of so much must last for so long, by both clocks.
 SUDDEN_RISES = ((25e6, 1_000_000_000), (5e6, 10_000_000_000))
-# The path may have become longer little by little; the fit follows it after a minute anyway.
+# The path may have become longer little by little and then stay so: the fit follows after a minute
+# anyway. What goes on rising is a rate that changed.
 GRADUAL_RISE = (5e6, 60_000_000_000)
 SUDDEN_S = 0.2
 # It was a delay if arrivals come back within this time: so many of them, as single stamps lie.
@@ -164,7 +165,9 @@ class _Levels:
             start = index + int(early[-1]) + 1 if len(early) else index
             middle_ns = (before_ns + level_ns) / 2
             is_sudden = y[max(start - num_sudden, first) : start].min() < middle_ns
-            if is_sudden or (least_ns, lasts_ns) == GRADUAL_RISE:
+            rest_ns = risen[3 * num // 4 :].min() - risen[num // 4 : num // 2].min()
+            is_level = (least_ns, lasts_ns) == GRADUAL_RISE and abs(rest_ns) < middle_ns - before_ns
+            if is_sudden or is_level:
                 within = int(np.searchsorted(host, host[0] + RETURN_NS))
                 back = np.flatnonzero(y[index : index + within] < middle_ns)
                 return start, index + int(back[0]) if len(back) >= MIN_RETURNED else None
