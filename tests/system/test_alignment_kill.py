@@ -33,6 +33,8 @@ class Service:
             f"--port={self.url.rsplit(':', 1)[1]}",
             "--num_workers=1",
             f"--max_attempts={max_attempts}",
+            # Jobs are those that the tests ask for.
+            "--align_new=false",
         ]
         self._log = (tmp_path / "service.log").open("ab")
         self.process = None
