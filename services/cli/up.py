@@ -84,10 +84,14 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
         stop_on_signals(stop)
     builders = _wanted(settings)
     with ExitStack() as held:
-        places = {}
-        for name in builders:
-            places[name] = _bind(name, settings)
-            held.callback(places[name].socket.close)
+        bound = {}
+        # Ports that were asked for first, lest another service's default takes one of them.
+        for name in sorted(
+            builders, key=lambda name: f"{name}_port" not in settings.model_fields_set
+        ):
+            bound[name] = _bind(name, settings)
+            held.callback(bound[name].socket.close)
+        places = {name: bound[name] for name in builders}
         urls = {name: place.url for name, place in places.items()}
         placed = [(places[name], _build(name, settings, urls)) for name in builders]
         ready = asyncio.Event()

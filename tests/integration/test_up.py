@@ -124,6 +124,28 @@ def test_a_default_port_that_is_taken_gives_way(capsys):
         bound.socket.close()
 
 
+async def test_a_port_that_was_asked_for_is_not_taken_by_another_services_default(
+    tmp_path, monkeypatch, capsys
+):
+    place = bind("other", host="127.0.0.1", port=0)
+    port = place.socket.getsockname()[1]
+    place.socket.close()
+    served = []
+
+    async def serve_all(placed, *, stop, ready):
+        served.extend(place.url for place, _ in placed)
+
+    monkeypatch.setattr(up, "serve_all", serve_all)
+    # The twin is bound before the dashboard; its default is the port that the dashboard is given.
+    settings = up.UpSettings.model_construct(
+        _fields_set={"dashboard_port"},
+        **{**up.UpSettings(data=tmp_path).model_dump(), "twin_port": port, "dashboard_port": port},
+    )
+    await up.run(settings, asyncio.Event())
+    assert served[-1].endswith(f":{port}")
+    assert f"twin: port {port} is taken" in capsys.readouterr().err
+
+
 def test_ports_are_those_of_the_compose_file():
     compose = (Path(__file__).parents[2] / "docker-compose.yml").read_text()
     for name in up.BUILDERS:

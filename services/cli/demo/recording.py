@@ -15,8 +15,10 @@ import numpy as np
 from dextouch.clients.episode_store import EpisodeStoreClient
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.episodes.inspection import UPLOADS
-from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.episodes.spool_reader import SpoolReader
+from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas.problems import Problem, error_from_problem
+from dextouch.schemas.recordings import RecordingAttributes
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mocks.episode import replay_calibration, replay_streams
 from services.acquisition.mocks.faults import FaultScript
@@ -29,6 +31,7 @@ from services.alignment.truth import NEAR_NS, compare_with_truth, match_samples
 
 ALIGNMENT_TIMEOUT_S = 300.0
 UPLOAD_PERIOD_S = 1.0
+STATION = "demo"
 
 
 @dataclass(frozen=True)
@@ -58,7 +61,7 @@ def record_take(
         seed,
         VirtualClock(),
         spool_root=spool_root,
-        name="demo",
+        name=STATION,
         calibration=replay_calibration(truth),
     ) as mock:
         take = mock.run_take(
@@ -87,8 +90,17 @@ def _device_row(take: MockTake, counters: dict[str, Any]) -> dict[str, Any]:
 
 
 def forget_take(store: EpisodeStore, recording_id: str) -> None:
-    """Remove a take of an earlier run, whole or half sent, and the episodes made from it."""
-    shutil.rmtree(store.root / UPLOADS / recording_id, ignore_errors=True)
+    """Remove a take of an earlier run, whole or half sent, and the episodes made from it.
+
+    Raises:
+        ConflictError: another station's take has this id; nothing is removed.
+    """
+    half_sent = store.root / UPLOADS / recording_id
+    if half_sent.exists():
+        _check_own(SpoolReader(half_sent).attributes)
+    if store.exists(recording_id, kind="recording"):
+        _check_own(store.recording(recording_id).attributes)
+    shutil.rmtree(half_sent, ignore_errors=True)
     for episode_id in store.list():
         if episode_id.startswith(f"{recording_id}-"):
             lineage = store.open(episode_id).attributes.lineage
@@ -96,6 +108,14 @@ def forget_take(store: EpisodeStore, recording_id: str) -> None:
                 store.delete(episode_id, for_good=True)
     if store.exists(recording_id, kind="recording"):
         store.delete(recording_id, kind="recording", for_good=True)
+
+
+def _check_own(attributes: RecordingAttributes) -> None:
+    if attributes.station != STATION:
+        raise ConflictError(
+            f"the demo would replace recording {attributes.recording_id!r}, which station "
+            f"{attributes.station!r} made; name another folder by the variable DEXTOUCH_DATA"
+        )
 
 
 def upload(spool_root: Path, store_url: str) -> None:

@@ -126,7 +126,7 @@ def write_episode(
     return store.open(episode_id)
 
 
-def write_recording(store, recording_id="take-0001", *, count=70):
+def write_recording(store, recording_id="take-0001", *, count=70, station="bench-2"):
     """A raw take: counts, NaN poses, JPEG images, repeated stamps, absent device stamps."""
     rng = np.random.default_rng(11)
     t_host_ns = 10**15 + np.sort(rng.integers(0, 10**9, count))
@@ -159,7 +159,7 @@ def write_recording(store, recording_id="take-0001", *, count=70):
         task="stand_bottle",
         instruction="stand the bottle up",
         domain="human",
-        station="bench-2",
+        station=station,
         operator="p17",
         consent=True,
         calibration={"K_head": matrix_rows(K_HEAD), "distortion_head": (DISTORTION,)},

@@ -7,7 +7,8 @@ import pytest
 from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, UnavailableError
+from dextouch.episodes.log import SpoolWriter
+from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas.episodes import LineageEntry
 from services.cli import training_data
 from services.cli.demo.background import served
@@ -22,17 +23,34 @@ from tests.unit.bridges.takes import write_episode, write_recording
 def test_a_take_of_an_earlier_run_is_replaced_with_its_episodes(tmp_path):
     store = EpisodeStore(tmp_path)
     for recording_id in ("demo-human", "demo-human-of-mine"):
-        write_recording(store, recording_id, count=5)
+        write_recording(store, recording_id, count=5, station="demo")
     made = LineageEntry(kind="recording", id="demo-human", sha256="0" * 64)
     write_episode(store, "demo-human-0123456789ab", num_steps=3, lineage=(made,))
     write_episode(store, "demo-human-of-mine-0123", num_steps=3)
-    (tmp_path / ".uploads" / "demo-human").mkdir(parents=True)
+    with SpoolWriter(
+        tmp_path / ".uploads" / "demo-human", store.recording("demo-human").attributes
+    ):
+        pass
     for _ in range(2):
         forget_take(store, "demo-human")
         assert store.list() == ["demo-human-of-mine-0123"]
         assert store.list(kind="recording") == ["demo-human-of-mine"]
     assert store.trash_list() == []
     assert list((tmp_path / ".uploads").iterdir()) == []
+
+
+def test_a_take_of_another_station_is_never_replaced(tmp_path):
+    store = EpisodeStore(tmp_path)
+    write_recording(store, "demo-human", count=5, station="bench-2")
+    with pytest.raises(ConflictError, match="'demo-human', which station 'bench-2' made"):
+        forget_take(store, "demo-human")
+    assert store.list(kind="recording") == ["demo-human"]
+    half_sent = tmp_path / ".uploads" / "demo-robot"
+    with SpoolWriter(half_sent, store.recording("demo-human").attributes):
+        pass
+    with pytest.raises(ConflictError, match="bench-2"):
+        forget_take(store, "demo-robot")
+    assert half_sent.exists()
 
 
 def errors(scale):
