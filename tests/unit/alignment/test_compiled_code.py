@@ -96,6 +96,44 @@ def test_folders_of_every_umask_are_used_again(tmp_path, umask):
     finally:
         os.umask(before)
     assert [folder.parent for folder in found] == [tmp_path / "new" / "wanted"] * 2
+    for made in (found[0], found[0].parent):
+        assert made.stat().st_mode & 0o022 == 0
+    # What numba makes inside has the modes of the umask: others must not get there.
+    is_open = umask & 0o022 != 0o022
+    assert found[0].stat().st_mode & 0o077 == 0 or not is_open
+
+
+@pytest.mark.parametrize("mode", [0o775, 0o757])
+def test_no_folder_that_others_may_write_is_used(tmp_path, mode):
+    wanted, spare = tmp_path / "wanted", tmp_path / "spare"
+    wanted.mkdir()
+    wanted.chmod(mode)
+    assert folder_of_code(wanted, spare).parent == spare
+    wanted.chmod(0o755)
+    folder = folder_of_code(wanted, spare)
+    assert folder.parent == wanted
+    folder.chmod(mode)
+    assert folder_of_code(wanted, spare).parent == spare
+
+
+def test_a_link_that_is_turned_later_changes_nothing(tmp_path):
+    (tmp_path / "real").mkdir(mode=0o755)
+    (tmp_path / "link").symlink_to(tmp_path / "real")
+    folder = folder_of_code(tmp_path / "link", tmp_path / "spare")
+    assert folder.parent == tmp_path / "real"
+    # In a folder for temporary files anybody may make a link of this name.
+    folder.rename(tmp_path / "elsewhere")
+    folder.symlink_to(tmp_path / "elsewhere")
+    assert folder_of_code(tmp_path / "link", tmp_path / "spare").parent == tmp_path / "spare"
+
+
+def test_code_below_a_folder_that_others_may_write_is_not_copied(tmp_path, monkeypatch):
+    name = folder_of_code(tmp_path / "wanted", tmp_path / "spare").name
+    (tmp_path / "wanted" / name / "solver.nbi").write_bytes(b"code")
+    (tmp_path / "wanted").chmod(0o777)
+    monkeypatch.setattr(os, "access", lambda path, _: tmp_path / "wanted" not in path.parents)
+    folder = folder_of_code(tmp_path / "wanted", tmp_path / "spare")
+    assert list(folder.iterdir()) == []
 
 
 def test_a_folder_for_temporary_files_may_be_named(tmp_path):

@@ -17,14 +17,15 @@ from numba import config, njit
 
 PACKAGE = Path(__file__).parent
 ROOT_UID = 0
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def folder_of_code(*bases: Path) -> Path | None:
     """Where compiled code is kept: in the first of these folders that this user may write.
 
     Code of this version that an earlier, read-only one holds (of an image that another user built)
-    is copied. Code is run: it is taken only from folders of this user or root that not everybody
-    may write.
+    is copied. Code is run: it is taken only from folders of this user or root that nobody else may
+    write. Where the umask lets a group write new files, other users cannot enter the folder.
 
     Args:
         bases: for the code of all versions, best first; other users may read what is kept there.
@@ -36,19 +37,34 @@ def folder_of_code(*bases: Path) -> Path | None:
     for path in sorted(PACKAGE.glob("*.py")):
         digest.update(path.read_bytes())
     name = digest.hexdigest()[:16]
-    for index, base in enumerate(bases):
-        folder = base / name
+    tried: list[Path] = []
+    for base in bases:
         try:
-            is_new = not folder.is_dir()
-            folder.mkdir(parents=True, exist_ok=True, mode=0o755)
-            if not (_is_safe(base) and _is_own(folder)):
+            # What a link leads to is checked and used, wherever the link leads later.
+            tried.append(base.resolve() / name)
+            folder = tried[-1]
+            is_new = _make(folder)
+            if not (_is_safe(folder) and _is_own(folder)):
                 continue
-        except OSError:
+        except (OSError, RuntimeError):  # the latter for links in a circle
             continue
         if is_new:
-            _copy_first([earlier / name for earlier in bases[:index]], folder)
+            _copy_first(tried[:-1], folder)
         return folder
     return None
+
+
+def _make(folder: Path) -> bool:
+    """Make a folder and the one above, for this user alone to write; whether it is new."""
+    folder.parent.mkdir(parents=True, exist_ok=True, mode=0o755)
+    if folder.is_dir():
+        return False
+    umask = os.umask(_OTHERS_WRITE)
+    os.umask(umask)
+    # numba leaves the modes of its files to the umask.
+    is_strict = umask & _OTHERS_WRITE == _OTHERS_WRITE
+    folder.mkdir(exist_ok=True, mode=0o755 if is_strict else 0o700)
+    return True
 
 
 def _is_own(folder: Path) -> bool:
@@ -56,10 +72,14 @@ def _is_own(folder: Path) -> bool:
 
 
 def _is_safe(folder: Path) -> bool:
-    """Whether other users than root cannot exchange what lies in it."""
-    found = folder.stat()
-    is_open = bool(found.st_mode & stat.S_IWOTH) and not found.st_mode & stat.S_ISVTX
-    return found.st_uid in (ROOT_UID, os.getuid()) and not is_open
+    """Whether other users than root can neither change what lies in it nor exchange the folder."""
+    found, above = folder.lstat(), folder.parent.stat()
+    return (
+        stat.S_ISDIR(found.st_mode)
+        and not found.st_mode & _OTHERS_WRITE
+        and not (above.st_mode & _OTHERS_WRITE and not above.st_mode & stat.S_ISVTX)
+        and {found.st_uid, above.st_uid} <= {ROOT_UID, os.getuid()}
+    )
 
 
 def _copy_first(sources: list[Path], folder: Path) -> None:
@@ -104,7 +124,7 @@ if _FOLDER is None:
         "compiled_code_not_kept",
         tried=[str(base) for base in _usual_bases()],
         advice="every start compiles for about half a minute; set NUMBA_CACHE_DIR to a folder that "
-        "this user may write",
+        "this user alone may write",
     )
 else:
     config.CACHE_DIR = str(_FOLDER)
