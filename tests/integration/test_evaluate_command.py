@@ -92,6 +92,13 @@ def empty_factory():
     return {}
 '''
 
+# Packages by what stands in their __init__.py.
+PACKAGES = {
+    "needy": "import no_such_dependency\n",
+    "unset": "raise ValueError('MODEL_DIR is not set')\n",
+    "empty": "",
+}
+
 
 @pytest.fixture(scope="module")
 def url():
@@ -111,6 +118,11 @@ def free_port() -> int:
 def folder(tmp_path):
     (tmp_path / "mypolicy.py").write_text(POLICIES)
     (tmp_path / "half.py").write_text("import numpy\nimport no_such_dependency\n")
+    (tmp_path / "asks.py").write_text("raise ModuleNotFoundError('install the simulator first')\n")
+    (tmp_path / "folder").mkdir()
+    for package, text in PACKAGES.items():
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text(text)
     return tmp_path
 
 
@@ -180,8 +192,8 @@ def test_what_a_policy_does_wrong_is_named_and_the_others_are_scored(folder, url
         "first in row 3, column 20",
         "six": f"policy 'six', {where}, chunk 0: act returned 6 rows, expected a multiple of 4",
         "none": "act returned NoneType, expected an array [K, 67]",
-        "ragged": "act returned list that is no array",
-        "gone": "act returned Gone that is no array (buffer was donated)",
+        "ragged": "act returned list, which does not convert to an array",
+        "gone": "act returned Gone, which does not convert to an array (buffer was donated)",
         "long": "act returned 80 rows, expected a multiple of 4, at least 4 and at most 64",
         "narrow": "act returned ndarray of shape [16, 7] and float64, expected an array [K, 67]",
     }
@@ -199,7 +211,9 @@ def in_process(folder, monkeypatch, capsys, free_port):
     monkeypatch.chdir(folder)
     monkeypatch.setattr(sys, "path", [*sys.path])
     monkeypatch.setattr(http_link, "RETRY_PAUSES_S", ())
-    for name in ("mypolicy", "half"):
+    # As it is in the console script `dextouch`; `python -m` sets it.
+    monkeypatch.setattr(sys.modules["__main__"], "__spec__", None)
+    for name in ("mypolicy", "half", "asks", "folder", *PACKAGES):
         monkeypatch.delitem(sys.modules, name, raising=False)
     world = {"url": f"http://127.0.0.1:{free_port}", "world": "twin"}
     flags = ["--real", json.dumps(world), "--imagined", json.dumps({"model": world})]
@@ -220,6 +234,14 @@ def in_process(folder, monkeypatch, capsys, free_port):
         ("mypolicy:empty_factory", ["returned dict without a method act"]),
         ("mypolicy:broken_factory", ["KeyError: 'weights.pt'", 'mypolicy.py", line', "in broken"]),
         ("half:Reach", ["No module named 'no_such_dependency'", 'half.py", line 2']),
+        ("needy.mine:P", ["No module named 'no_such_dependency'", '__init__.py", line 1']),
+        ("unset.mine:P", ["ValueError: MODEL_DIR is not set", '__init__.py", line 1']),
+        ("asks:P", ["install the simulator first", 'asks.py", line 1']),
+        ("empty.mine:P", ["no module 'empty.mine'", "run from the folder that holds it"]),
+        ("absent.mine:P", ["no module 'absent.mine'", "run from the folder that holds it"]),
+        ("mypolicy.mine:P", ["no module 'mypolicy.mine'"]),
+        ("folder:P", ["unknown factory of policy 'folder:P' in folder 'P'; valid: none"]),
+        ("__main__:NoSuchPolicy", ["unknown factory", "'NoSuchPolicy'"]),
         ("mypolicy.py", ["expected MODULE:FACTORY or NAME=MODULE:FACTORY"]),
         ("hold", ["expected MODULE:FACTORY"]),
     ],

@@ -69,14 +69,14 @@ def action_chunk(
 
 
 def _array(answer: object, where: str) -> np.ndarray:
-    # Tensors of torch: one that requires a gradient or lies on a GPU is no array by itself.
+    # Tensors of torch: one that requires a gradient or lies on a GPU does not convert by itself.
     detach = getattr(answer, "detach", None)
     try:
         return np.asarray(answer if detach is None else detach().cpu().double())
     except Exception as error:  # arrays of other libraries convert themselves, or fail to
         raise ShapeError(
-            f"{where} returned {type(answer).__name__} that is no array ({error}), expected "
-            f"[K, {ACTION_DIM}]"
+            f"{where} returned {type(answer).__name__}, which does not convert to an array "
+            f"({error}), expected [K, {ACTION_DIM}]"
         ) from error
 
 

@@ -59,7 +59,9 @@ class PolicySource:
         module = self._module(where)
         if not hasattr(module, self.factory):
             raise UnknownNameError(
-                f"factory of {where} in {module.__file__}", self.factory, _callables(module)
+                f"factory of {where} in {getattr(module, '__file__', None) or self.module}",
+                self.factory,
+                _callables(module),
             )
         factory = getattr(module, self.factory)
         called = f"{where}: {self.module}:{self.factory}"
@@ -81,15 +83,21 @@ class PolicySource:
         if here not in sys.path:
             sys.path.insert(0, here)
         try:
-            found = importlib.util.find_spec(self.module)
-        except ModuleNotFoundError:  # of the package around it
-            found = None
-        if found is None:
-            raise NotFoundError(
-                f"{where}: no module {self.module!r} in {here} or on Python's path; run from the "
-                "folder that holds it, or install it"
+            return _loudly(
+                importlib.import_module, self.module, where=f"{where}: import {self.module}"
             )
-        return _loudly(importlib.import_module, self.module, where=f"{where}: import {self.module}")
+        except InvalidInputError as error:
+            absent = error.__cause__
+            if not isinstance(absent, ModuleNotFoundError) or not self._is_inside(absent.name):
+                raise
+        raise NotFoundError(
+            f"{where}: no module {self.module!r} in {here} or on Python's path; run from the "
+            "folder that holds it, or install it"
+        )
+
+    def _is_inside(self, package: str | None) -> bool:
+        """Whether this is the module itself or a package around it, not something it imports."""
+        return package is not None and f"{self.module}.".startswith(f"{package}.")
 
 
 class _WithoutReset:
@@ -103,11 +111,16 @@ class _WithoutReset:
 
 
 def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401
-    """`ask`, with the traceback in the message: the policy's author needs it."""
+    """`ask`, with the traceback in the message: the policy's author needs it.
+
+    The cause of the error is what the call raised.
+    """
     try:
         return ask(call, *arguments, where=where, **keywords)
     except InvalidInputError as error:
-        raise InvalidInputError(f"{error.message}\n{error.details['traceback']}") from error
+        raise InvalidInputError(
+            f"{error.message}\n{error.details['traceback']}"
+        ) from error.__cause__
 
 
 def _callables(module: ModuleType) -> list[str]:
