@@ -46,7 +46,7 @@ EXIT_USAGE = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status, 2 for a word that is none."""
+    """Run one command; returns its exit status, 2 for an unknown command."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str]], int]] = {
         "train-policy": run_train_policy,
@@ -123,10 +123,10 @@ def run_evaluation(arguments: list[str]) -> int:
             keep=log.keep,
         )
     figures = report.to_report()
-    _print_scores(figures)
     _write_json(settings.json_path, figures)
     if settings.html is not None:
         write_report(figures, ReportPictures(), settings.html)
+    _print_scores(figures)
     _print_failures(figures, log.path)
     return EXIT_FAILED if report.failures else 0
 

@@ -18,31 +18,67 @@ def task_comments(
         agreement: of the task, as `ClosedLoopReport.agreement` has it.
         world: name of the imagined world.
     """
-    num_starts = agreement["num_starts"]
-    if num_starts == 0:
-        return [f"No rollout ended both in the real world and in {world}: nothing to compare."]
-    rows = [row for row in rows if UNDEFINED not in {row["real"], row["imagined"]}]
-    size = (
-        f"{agreement['num_policies']} policies, N = {num_starts} starts each: a single rollout "
-        f"moves a success rate by {1 / num_starts:.2f}."
+    both = f"both worlds (real and {world})"
+    if agreement["num_starts"] == 0:
+        return [f"No start ended in {both} for every policy: nothing to compare."]
+    undefined = []
+    if agreement["pearson"] == UNDEFINED:
+        undefined = [_why_undefined(list(agreement["rates"].values()), world)]
+    return [
+        _compared_starts(rows, agreement, both),
+        _size_of_a_step(rows),
+        _mean_error(agreement["bias"], world),
+        *_widest_gaps(rows, world),
+        *undefined,
+    ]
+
+
+def _compared_starts(
+    rows: Sequence[Mapping[str, Any]], agreement: Mapping[str, Any], both: str
+) -> str:
+    left_out = [repr(row["policy"]) for row in rows if row["policy"] not in agreement["rates"]]
+    unless = f" except {', '.join(left_out)}, none of whose starts did" if left_out else ""
+    num_starts = rows[0]["real_rollouts"] + rows[0]["real_failed"]
+    return (
+        f"Agreement rests on {agreement['num_starts']} of {num_starts} starts, those that ended "
+        f"in {both} for every policy{unless}."
     )
-    undefined = [_why_undefined(rows, world)] if agreement["pearson"] == UNDEFINED else []
-    return [size, _mean_error(agreement["bias"], world), *_widest_gaps(rows, world), *undefined]
+
+
+def _size_of_a_step(rows: Sequence[Mapping[str, Any]]) -> str:
+    """How much one rollout weighs, by the number of real rollouts that ended."""
+    policies: dict[int, list[str]] = {}
+    for row in rows:
+        if row["real_rollouts"]:
+            policies.setdefault(row["real_rollouts"], []).append(repr(row["policy"]))
+    steps = [f"{1 / n:.2f} (N = {n}: {', '.join(names)})" for n, names in policies.items()]
+    if len(steps) == 1:
+        n = next(iter(policies))
+        steps = [f"{1 / n:.2f} (N = {n} for each policy)"]
+    return f"One rollout moves a real success rate by {' or '.join(steps)}."
 
 
 def _mean_error(bias: float, world: str) -> str:
+    start = "On these starts"
     if bias >= NOTABLE_BIAS:
-        return f"{world} flatters: its success rates are {bias:.2f} above the real ones on average."
-    if bias <= -NOTABLE_BIAS:
         return (
-            f"{world} is too strict: its success rates are {-bias:.2f} below the real ones "
+            f"{start} {world} flatters: its success rates are {bias:.2f} above the real ones "
             "on average."
         )
-    return f"On average the success rates of {world} are {bias:+.2f} from the real ones."
+    if bias <= -NOTABLE_BIAS:
+        return (
+            f"{start} {world} is too strict: its success rates are {-bias:.2f} below the real "
+            "ones on average."
+        )
+    return f"{start} the success rates of {world} are {bias:+.2f} from the real ones on average."
 
 
 def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
-    """For each direction the policy farthest off, among those whose 95 % intervals are apart."""
+    """For each direction the policy farthest off, among those whose 95 % intervals are apart.
+
+    The rates are those of the report, each over all its own rollouts that ended.
+    """
+    rows = [row for row in rows if UNDEFINED not in {row["real"], row["imagined"]}]
     sentences = []
     for verb, sign in (("overrates", 1), ("underrates", -1)):
         low, high = ("real", "imagined") if sign > 0 else ("imagined", "real")
@@ -50,20 +86,19 @@ def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
         if apart:
             row = max(apart, key=lambda r: abs(r["imagined"] - r["real"]))
             sentences.append(
-                f"{world} {verb} {len(apart)} of {len(rows)} policies beyond chance (95 % "
-                f"intervals apart); farthest off is {row['policy']!r}: {row['real']:.2f} real, "
-                f"{row['imagined']:.2f} imagined."
+                f"Counting every rollout that ended, {world} {verb} {len(apart)} of {len(rows)} "
+                "policies beyond chance (95 % intervals apart); farthest off is "
+                f"{row['policy']!r}: {row['real']:.2f} real, {row['imagined']:.2f} imagined."
             )
     return sentences
 
 
-def _why_undefined(rows: Sequence[Mapping[str, Any]], world: str) -> str:
-    if len(rows) < 2:
+def _why_undefined(rates: Sequence[Mapping[str, float]], world: str) -> str:
+    if len(rates) < 2:
         return "Pearson is undefined: it takes at least two policies."
-    for name, place in (("real", "in the real world"), ("imagined", f"in {world}")):
-        if len({row[name] for row in rows}) == 1:
-            return (
-                f"Pearson is undefined: every policy has the same success rate "
-                f"({rows[0][name]:.2f}) {place}, so there is nothing to correlate."
-            )
-    return "Pearson is undefined for these scores."
+    same_real = len({rate["real"] for rate in rates}) == 1
+    side, place = ("real", "the real world") if same_real else ("imagined", world)
+    return (
+        "Pearson is undefined: on these starts every policy has the same success rate "
+        f"({rates[0][side]:.2f}) in {place}, so there is nothing to correlate."
+    )

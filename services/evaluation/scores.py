@@ -1,7 +1,9 @@
-"""Outcomes of single rollouts in; success rates, intervals and agreement of worlds out."""
+"""Success rates of policies with intervals, and how far the rates of two worlds agree."""
 
 import math
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,7 +16,15 @@ from services.evaluation.statistics import bootstrap_agreement, wilson_interval
 
 REAL = "real"
 _BOOTSTRAP_SEED = 0
-_AGREEMENT_FIGURES = ("pearson", "mmrv", "spearman", "kendall", "bias", "mean_absolute_error")
+_AGREEMENT_FIGURES: dict[str, Callable[..., float]] = {
+    "pearson": pearson,
+    "mmrv": partial(mmrv, ties="simpler"),
+    "mmrv_paper": partial(mmrv, ties="paper"),
+    "spearman": spearman,
+    "kendall": kendall,
+    "bias": bias,
+    "mean_absolute_error": mean_absolute_error,
+}
 
 
 @dataclass(frozen=True)
@@ -133,28 +143,26 @@ class ClosedLoopReport:
         """How the policies' success rates in a world agree with the real ones, by task.
 
         `mmrv` counts ties (`ties="simpler"`); `mmrv_paper` does not, so it is 0 for a world that
-        gives every policy the same score.
+        gives every policy the same score. `rates` are the success rates that are compared: over
+        the starts that ended in both worlds for every policy, `num_starts` of them.
         """
         return {task: self._agreement(world, task) for task in self.tasks}
 
     def _agreement(self, world: str, task: str) -> dict[str, Any]:
-        real, imagined = matched(self.outcomes(REAL, task), self.outcomes(world, task))
+        outcomes = (self.outcomes(REAL, task), self.outcomes(world, task))
+        compared, real, imagined = matched(self.policies, *outcomes)
         if real.size == 0:
-            return dict.fromkeys(_AGREEMENT_FIGURES, UNDEFINED) | {
-                "num_policies": 0,
-                "num_starts": 0,
-            }
+            undefined = dict.fromkeys(_AGREEMENT_FIGURES, UNDEFINED)
+            return undefined | {"num_policies": 0, "num_starts": 0, "rates": {}}
         pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
-        found: dict[str, Any] = {
-            "pearson": defined(pearson(**pair)),
-            "mmrv": defined(mmrv(**pair, ties="simpler")),
-            "mmrv_paper": defined(mmrv(**pair, ties="paper")),
-            "spearman": defined(spearman(**pair)),
-            "kendall": defined(kendall(**pair)),
-            "bias": bias(**pair),
-            "mean_absolute_error": mean_absolute_error(**pair),
+        found: dict[str, Any] = {n: defined(f(**pair)) for n, f in _AGREEMENT_FIGURES.items()}
+        found |= {
             "num_policies": len(real),
             "num_starts": real.shape[1],
+            "rates": {
+                policy: {side: float(rates[row]) for side, rates in pair.items()}
+                for row, policy in enumerate(compared)
+            },
         }
         for measure in ("pearson", "mmrv"):
             drawn = bootstrap_agreement(
@@ -196,9 +204,11 @@ class ClosedLoopReport:
 
 
 def matched(
-    real: np.ndarray, imagined: np.ndarray
-) -> tuple[Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]]:
-    """Outcomes [policies, starts] without those that have no counterpart.
+    policies: Sequence[str], real: np.ndarray, imagined: np.ndarray
+) -> tuple[
+    list[str], Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]
+]:
+    """The policies that are compared, and their outcomes [policies, starts] in both worlds.
 
     Policies without a single start that ended in both worlds are left out, then starts that did
     not end in both worlds for every policy that is left.
@@ -206,7 +216,8 @@ def matched(
     known = np.isfinite(real) & np.isfinite(imagined)
     rows = known.any(axis=1)
     columns = known[rows].all(axis=0)
-    return real[rows][:, columns], imagined[rows][:, columns]
+    compared = [policy for policy, kept in zip(policies, rows, strict=True) if kept]
+    return compared, real[rows][:, columns], imagined[rows][:, columns]
 
 
 def defined(value: float) -> float | str:

@@ -5,7 +5,7 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 from pydantic_settings import BaseSettings, CliApp
 
 from dextouch.errors import InvalidInputError
@@ -93,7 +93,7 @@ class RunSettings(BaseSettings):
     results: Path | None = Field(
         default=None,
         description="every rollout is added here as a line of JSON when it ends; default: beside "
-        "the report, as .jsonl",
+        "the report, as .jsonl; not the file of --json or --html",
     )
     json_path: Path | None = Field(default=None, alias="json", description="write figures here")
     html: Path | None = Field(default=None, description="write a page here")
@@ -105,6 +105,19 @@ class RunSettings(BaseSettings):
         if not match or int(match[1]) >= int(match[2]):
             raise ValueError(f"got {text!r}, expected FIRST:LAST+1 such as 10000:10010")
         return text
+
+    @model_validator(mode="after")
+    def _writes_each_file_once(self) -> "RunSettings":
+        results = "--results" if self.results else "--results (by default beside the report)"
+        taken: dict[Path, str] = {}
+        files = ((results, self.results_path()), ("--json", self.json_path), ("--html", self.html))
+        for flag, path in files:
+            if path and (other := taken.setdefault(path.resolve(), flag)) != flag:
+                raise ValueError(
+                    f"{other} and {flag} are the same file, {path}; one would overwrite the other: "
+                    "give each its own"
+                )
+        return self
 
     def results_path(self) -> Path:
         """Where rollouts are kept: as asked, beside the report, or in the working folder."""

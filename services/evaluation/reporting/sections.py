@@ -21,7 +21,7 @@ AGREEMENT: tuple[tuple[str, str], ...] = (
     ("mmrv_paper", "MMRV, paper's rule"),
     ("spearman", "Spearman"),
     ("kendall", "Kendall"),
-    ("bias", "mean of imagined less real"),
+    ("bias", "mean of imagined minus real"),
     ("mean_absolute_error", "mean absolute error"),
 )
 _FAILURE_FIELDS = ("policy", "world", "error", "message", "traceback")

@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -73,29 +74,33 @@ def test_a_world_that_calls_everything_a_success_is_not_perfect():
     found = whole["agreement"]["stand"]
     assert found["mmrv"] == pytest.approx((1 + 1 / 6 + 0) / 3)
     assert found["mmrv_interval"][1] > 0.3
-    size, flatters, overrated, undefined = whole["comments"]["stand"]
-    assert size.startswith("3 policies, N = 6 starts each")
+    size, step, flatters, overrated, undefined = whole["comments"]["stand"]
+    assert size == (
+        "Agreement rests on 6 of 6 starts, those that ended in both worlds (real and dream) for "
+        "every policy."
+    )
+    assert step == "One rollout moves a real success rate by 0.17 (N = 6 for each policy)."
     # By hand: (0 + 5/6 + 1) / 3 = 0.61.
     assert flatters == (
-        "dream flatters: its success rates are 0.61 above the real ones on average."
+        "On these starts dream flatters: its success rates are 0.61 above the real ones on average."
     )
     assert "overrates 2 of 3 policies" in overrated
     assert "'c': 0.00 real, 1.00 imagined" in overrated
     assert undefined == (
-        "Pearson is undefined: every policy has the same success rate (1.00) in dream, so there "
-        "is nothing to correlate."
+        "Pearson is undefined: on these starts every policy has the same success rate (1.00) in "
+        "dream, so there is nothing to correlate."
     )
 
 
 def test_comments_on_strict_and_fair_worlds():
     strict = {"real": ALL_ONE["dream"], "dream": ALL_ONE["real"]}
     sentences = " ".join(report(strict).to_report()["comments"]["stand"])
-    assert "dream is too strict: its success rates are 0.61 below" in sentences
+    assert "On these starts dream is too strict: its success rates are 0.61 below" in sentences
     assert "underrates 2 of 3 policies" in sentences
     assert "same success rate (1.00) in the real world" in sentences
     fair = report({"real": ALL_ONE["real"], "dream": ALL_ONE["real"]}).to_report()
-    assert fair["comments"]["stand"][1:] == [
-        "On average the success rates of dream are +0.00 from the real ones."
+    assert fair["comments"]["stand"][2:] == [
+        "On these starts the success rates of dream are +0.00 from the real ones on average."
     ]
     alone = report({"real": {"a": "10"}, "dream": {"a": "10"}}).to_report()
     assert alone["comments"]["stand"][-1].endswith("at least two policies.")
@@ -140,6 +145,53 @@ def test_failed_rollouts_are_missing_not_failures_of_the_policy():
     json.dumps(found, allow_nan=False)
 
 
+def lost(whole: ClosedLoopReport, *keys: tuple[str, str, int]) -> dict[str, Any]:
+    """The report when these rollouts (world, policy, seed) had failed."""
+    kept = [s for s in whole.scores if (s.world, s.policy, s.seed) not in keys]
+    failures = [RolloutFailure(*key[:2], "stand", key[2], "DeviceError", "gone") for key in keys]
+    return ClosedLoopReport(
+        tuple(kept), whole.imagined_worlds, whole.policies, tuple(failures)
+    ).to_report()
+
+
+def test_one_policy_that_fails_narrows_the_agreement_and_the_comments_say_so():
+    ended = {"a": "1" * 10 + "0" * 10, "b": "1" * 5 + "0" * 15, "c": "1" * 20}
+    dream = {"a": "1" * 10 + "0" * 10, "b": "1" * 20, "c": "1" * 20}
+    whole = report({"real": ended, "dream": dream})
+    found = lost(whole, *(("real", "c", seed) for seed in range(1, 20)))
+    size, step, mean, gap, undefined = found["comments"]["stand"]
+    # Only start 0 is left, from which every policy succeeds in both worlds.
+    assert size.startswith("Agreement rests on 1 of 20 starts, those that ended in both worlds")
+    assert step == (
+        "One rollout moves a real success rate by 0.05 (N = 20: 'a', 'b') or 1.00 (N = 1: 'c')."
+    )
+    assert mean.startswith("On these starts the success rates of dream are +0.00 from the real")
+    assert gap.startswith("Counting every rollout that ended, dream overrates 1 of 3 policies")
+    assert "'b': 0.25 real, 1.00 imagined" in gap
+    assert "on these starts every policy has the same success rate (1.00) in the real" in undefined
+    assert found["agreement"]["stand"]["rates"] == {
+        policy: {"real": 1.0, "imagined": 1.0} for policy in "abc"
+    }
+
+
+def test_a_policy_without_a_start_that_ended_twice_is_named_as_left_out():
+    gone = [("model", "c", seed) for seed in range(4)]
+    found = lost(report(GOOD), *gone)
+    assert found["comments"]["stand"][0] == (
+        "Agreement rests on 4 of 4 starts, those that ended in both worlds (real and model) for "
+        "every policy except 'c', none of whose starts did."
+    )
+    assert list(found["agreement"]["stand"]["rates"]) == ["a", "b"]
+
+
+def test_policies_that_ended_from_different_starts_are_not_compared():
+    pair = report({"real": {"a": "10", "b": "01"}, "dream": {"a": "10", "b": "01"}})
+    found = lost(pair, ("dream", "a", 0), ("dream", "b", 1))
+    assert found["comments"]["stand"] == [
+        "No start ended in both worlds (real and dream) for every policy: nothing to compare."
+    ]
+
+
 def test_without_a_common_start_there_is_no_agreement():
     whole = report(GOOD)
     failures = tuple(
@@ -149,6 +201,11 @@ def test_without_a_common_start_there_is_no_agreement():
     found = ClosedLoopReport((), whole.imagined_worlds, whole.policies, failures).to_report()
     assert found["agreement"]["stand"]["pearson"] == "undefined"
     assert found["agreement"]["stand"]["num_starts"] == 0
+    assert set(report(GOOD).agreement("model")["stand"]) - set(found["agreement"]["stand"]) == {
+        f"{measure}_{part}"
+        for measure in ("pearson", "mmrv")
+        for part in ("interval", "undefined_share")
+    }
     assert found["probe_accuracy_on_real"] == "undefined"
 
 

@@ -1,0 +1,102 @@
+"""The command `run`: what it writes and prints, also when rollouts fail, and paths it refuses."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from dextouch.errors import InvalidInputError
+from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from services.evaluation.__main__ import main
+from services.evaluation.checkpoints import save_checkpoint
+from services.evaluation.scores import REAL
+from tests.unit.evaluation import toy
+from tests.unit.worlds.running import served
+
+
+class Stuck(toy.ToyWorld):
+    """An imagined world in which every rollout fails at its first chunk."""
+
+    def step(self, state, actions, *, seed):
+        raise InvalidInputError("stuck: this world imagines nothing")
+
+
+@pytest.fixture(scope="module")
+def url():
+    worlds = {"judge": toy.ToyWorld("judge", judge=True), "stuck": Stuck("stuck", judge=False)}
+    with served(create_world_app(worlds, WorldServiceSettings())) as address:
+        yield address
+
+
+def test_a_study_without_a_single_imagined_ending_is_reported(
+    tmp_path, capsys, url, probe_checkpoint
+):
+    save_checkpoint(tmp_path / "probe.safetensors", probe_checkpoint)
+    status = main(
+        [
+            "run",
+            *("--real", json.dumps({"url": url, "world": "judge"})),
+            *("--imagined", json.dumps({"dream": {"url": url, "world": "stuck"}})),
+            *("--probe", str(tmp_path / "probe.safetensors"), "--builtin", '["hold"]'),
+            *("--tasks", "reach", "--seeds", "2000:2002", "--num_steps", "16"),
+            *("--json", str(tmp_path / "report.json"), "--html", str(tmp_path / "report.html")),
+        ]
+    )
+    shown = capsys.readouterr()
+    assert status == 1
+    assert "2 of 4 rollouts failed" in shown.err
+    assert "hold in dream, 2 x: stuck: this world imagines nothing" in shown.err
+    comment = "No start ended in both worlds (real and dream) for every policy"
+    assert "Pearson undefined, MMRV undefined" in shown.out
+    assert comment in shown.out
+    report = json.loads((tmp_path / "report.json").read_text())
+    assert report["agreement"]["reach"]["mmrv_paper"] == "undefined"
+    assert len(report["failures"]) == 2
+    assert comment in (tmp_path / "report.html").read_text()
+    kept = [json.loads(line) for line in (tmp_path / "report.jsonl").read_text().splitlines()]
+    assert [row["world"] for row in kept] == [REAL, "dream"] * 2
+
+
+def test_a_report_is_written_before_anything_is_printed(
+    tmp_path, monkeypatch, url, probe_checkpoint
+):
+    save_checkpoint(tmp_path / "probe.safetensors", probe_checkpoint)
+
+    def gone(*_words):
+        raise BrokenPipeError
+
+    monkeypatch.setattr("services.evaluation.__main__.print", gone, raising=False)
+    with pytest.raises(BrokenPipeError):
+        main(
+            [
+                "run",
+                *("--real", json.dumps({"url": url, "world": "judge"})),
+                *("--probe", str(tmp_path / "probe.safetensors"), "--builtin", '["hold"]'),
+                *("--tasks", "reach", "--seeds", "2000:2001", "--num_steps", "16"),
+                *("--json", str(tmp_path / "report.json")),
+                *("--html", str(tmp_path / "report.html")),
+            ]
+        )
+    assert len(json.loads((tmp_path / "report.json").read_text())["rollouts"]) == 1
+    assert "hold" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("flags", "named"),
+    [
+        (["--json", "out.jsonl"], ["--results (by default beside the report)", "--json"]),
+        (["--html", "out.jsonl"], ["--results (by default beside the report)", "--html"]),
+        (["--results", "out.json", "--json", "out.json"], ["--results", "--json"]),
+        (["--results", "page", "--html", "./page"], ["--results", "--html"]),
+        (["--json", "page", "--html", "elsewhere/../page"], ["--json", "--html"]),
+        (["--results", "link", "--json", "target"], ["--results", "--json"]),
+    ],
+)
+def test_one_file_for_two_things_is_refused(tmp_path, monkeypatch, flags, named):
+    monkeypatch.chdir(tmp_path)
+    Path("link").symlink_to("target")
+    real = json.dumps({"url": "http://127.0.0.1:1", "world": "twin"})
+    with pytest.raises(InvalidInputError, match="the same file") as caught:
+        main(["run", "--real", real, "--seeds", "1:2", *flags])
+    for flag in named:
+        assert flag in str(caught.value)
