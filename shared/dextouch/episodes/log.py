@@ -23,6 +23,7 @@ from dextouch.episodes.spool_reader import (
 from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.checks import check_batch, check_follows
+from dextouch.streams.descriptors import MAX_STREAMS
 from dextouch.streams.samples import SampleBatch
 
 __all__ = [
@@ -59,7 +60,7 @@ class SpoolWriter:
 
     Raises:
         ConflictError: the folder exists; go on with `SpoolWriter.resume`.
-        InvalidInputError: a recording without a stream.
+        InvalidInputError: a recording without a stream, or with more than MAX_STREAMS.
     """
 
     def __init__(
@@ -254,6 +255,11 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         raise InvalidInputError(
             f"spool {attributes.recording_id!r}: a recording without a stream; "
             "name at least one in its attributes"
+        )
+    if len(attributes.streams) > MAX_STREAMS:
+        raise InvalidInputError(
+            f"spool {attributes.recording_id!r}: got {len(attributes.streams)} streams, expected "
+            f"at most {MAX_STREAMS} streams; put some into one stream of a larger shape"
         )
     # Under another name first, so that a spool that is seen has its attributes.
     unborn = path.with_name(path.name + ".new")

@@ -30,7 +30,7 @@ from dextouch.errors import (
 from dextouch.schemas.episodes import EpisodeAttributes
 from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.checks import ENCODED_UNITS
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.descriptors import MAX_STREAMS, StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
 
 DROPPED_IMAGES = "dropped_before_encoder"
@@ -67,17 +67,28 @@ class EpisodeWriter:
         with disk_errors(f"create {stage}"):
             # Held as long as the writer lives: tells a sweep that this stage is not abandoned.
             self._lock = make_held_folder(stage)
-        for descriptor in attributes.streams:
-            self.add_stream(descriptor)
+        try:
+            for descriptor in attributes.streams:
+                self.add_stream(descriptor)
+        except BaseException:
+            self.discard()
+            self._leave(broken_off=True, error=None)
+            raise
 
     def add_stream(self, descriptor: StreamDescriptor) -> None:
         """Announce a stream.
 
         Raises:
             ConflictError: one of its arrays has the name of an array that exists.
-            InvalidInputError: a `jpeg` or `h264` stream that does not hold uint8 [h, w, 3], or
-                an `h264` stream of odd height or width.
+            InvalidInputError: one stream more than MAX_STREAMS, a `jpeg` or `h264` stream that
+                does not hold uint8 [h, w, 3], or an `h264` stream of odd height or width.
         """
+        if len(self._streams) >= MAX_STREAMS:
+            raise InvalidInputError(
+                f"{attributes_id(self._attributes)}: stream {descriptor.name!r} is one too many, "
+                f"expected at most {MAX_STREAMS} streams; put some into one stream of a larger "
+                f"shape, or write a second {self._kind}"
+            )
         if descriptor.unit in ENCODED_UNITS and (
             descriptor.dtype != "uint8" or len(descriptor.shape) != 3 or descriptor.shape[2] != 3
         ):

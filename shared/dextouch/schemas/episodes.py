@@ -7,7 +7,7 @@ from jaxtyping import Float64
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, field_validator
 
 from dextouch.hands.actions import AnchorPoses
-from dextouch.streams.descriptors import MAX_STREAMS, StreamDescriptor
+from dextouch.streams.descriptors import StreamDescriptor
 
 FORMAT_VERSION: Final = 1
 ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
@@ -136,7 +136,7 @@ class EpisodeAttributes(BaseModel):
     clocks: tuple[ClockReport, ...] = ()
     quality: dict[str, FiniteFloat] = {}
     created_at: AwareDatetime | None = None
-    streams: tuple[StreamDescriptor, ...] = Field(default=(), max_length=MAX_STREAMS)
+    streams: tuple[StreamDescriptor, ...] = ()
 
     @field_validator("K_head")
     @classmethod

@@ -11,7 +11,7 @@ from dextouch.schemas.episodes import (
     Matrix,
     StoreId,
 )
-from dextouch.streams.descriptors import MAX_STREAMS, StreamDescriptor
+from dextouch.streams.descriptors import StreamDescriptor
 
 # Reason of the store's ConflictError where another recording has the id.
 ID_TAKEN = "id_taken"
@@ -54,7 +54,7 @@ class RecordingAttributes(BaseModel):
     lineage: tuple[LineageEntry, ...] = ()
     ledger: tuple[LedgerEntry, ...] = ()
     quality: dict[str, FiniteFloat] = {}
-    streams: tuple[StreamDescriptor, ...] = Field(default=(), max_length=MAX_STREAMS)
+    streams: tuple[StreamDescriptor, ...] = ()
 
 
 class RecordingStatus(BaseModel):

@@ -11,7 +11,8 @@ MAX_SAMPLE_AXES = 7
 # More than the largest picture of H.264 (level 6.2), three bytes a pixel.
 MAX_SAMPLE_BYTES = 1 << 27
 MIN_RATE_HZ = 1e-6
-# Of one recording or episode; each keeps up to eight files open while it is written.
+# Of a new recording or episode; each keeps up to eight files open while it is written. What older
+# releases wrote may have more.
 MAX_STREAMS = 100
 StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
 

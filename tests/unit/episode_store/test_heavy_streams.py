@@ -85,6 +85,6 @@ async def test_a_recording_has_at_most_100_streams(http, attributes):
     streams = [HEAVY.model_dump(mode="json") | {"name": f"s{n}"} for n in range(101)]
     response = await http.post("/v1/recordings", json=body | {"streams": streams})
     assert response.status_code == 422
-    assert "at most 100 items" in response.json()["detail"]
+    assert "at most 100 streams" in response.json()["detail"]
     response = await http.post("/v1/recordings", json=body | {"streams": streams[:100]})
     assert response.status_code == 201

@@ -354,3 +354,40 @@ def test_a_refused_block_leaves_no_trace(made, store):
     data = store.open("stand-bottle-0003").read("force")
     assert data.t_ref_ns.tolist() == [1, 2, 3]
     assert (data.values == 1).all()
+
+
+def streams(count):
+    return tuple(
+        StreamDescriptor(
+            name=f"s{n}", kind="scalar", shape=(), dtype="float32", unit="N", nominal_rate_hz=10
+        )
+        for n in range(count)
+    )
+
+
+def write_streams(store, made, count, announced=0):
+    attributes = made.attributes.model_copy(update={"streams": streams(count)[:announced]})
+    with store.writer(attributes=attributes) as writer:
+        for descriptor in streams(count)[announced:]:
+            writer.add_stream(descriptor)
+        stamps = np.arange(3)
+        for descriptor in streams(count):
+            writer.append(descriptor.name, values=np.zeros(3, "f4"), t_ref_ns=stamps)
+
+
+@pytest.mark.parametrize("announced", [0, 101])
+def test_a_stream_too_many_is_refused_by_name(store, made, announced):
+    """docs/episode_format.md: at most 100 streams."""
+    with pytest.raises(InvalidInputError, match=r"'s100'.*at most 100 streams"):
+        write_streams(store, made, 101, announced)
+    assert store.list() == []
+    assert list((store.root / ".staging").iterdir()) == []
+    write_streams(store, made, 100, min(announced, 100))
+    assert len(store.open(made.attributes.episode_id).attributes.streams) == 100
+
+
+def test_a_take_of_an_older_release_with_more_streams_is_read(store, made, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr("dextouch.episodes.writer.MAX_STREAMS", 1000)
+        write_streams(store, made, 101)
+    assert store.open(made.attributes.episode_id).verify().num_arrays == 2 * 101
