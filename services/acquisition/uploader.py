@@ -104,7 +104,6 @@ class Uploader:
         self._keep_uploaded = keep_uploaded
         self._errors: dict[str, str] = {}
         self._num_refusals: dict[str, int] = {}
-        self.refused: Mapping[str, str] = {}
         # How long the store asked to be left alone.
         self._retry_after_s = 0.0
         self._stopping = threading.Event()
@@ -121,6 +120,13 @@ class Uploader:
         if self._thread.ident is not None:
             self._thread.join()
 
+    @property
+    def refused(self) -> Mapping[str, str]:
+        """What the store said about each take that is set aside, as the spool holds it now."""
+        paths = sorted(path.parent for path in self._spool_root.glob(f"*/{REFUSED_FILE}"))
+        reasons = {path.name: _refusal(path) for path in paths}
+        return {name: reason for name, reason in reasons.items() if reason is not None}
+
     def status(self, *, only_refused: bool = False) -> list[UploadStatus]:
         """Every saved take, and every damaged one; or those alone that the store refused."""
         found = []
@@ -130,6 +136,8 @@ class Uploader:
             try:
                 if not SpoolReader(path).closed:
                     continue
+            except NotFoundError:
+                continue  # removed meanwhile
             except StorageError as error:
                 damage = error.message
             found.append(self._status(path, damage))
@@ -162,14 +170,12 @@ class Uploader:
         asked for nothing else before.
         """
         done = []
-        refused = {}
         self._retry_after_s = 0.0
         for path in _spools(self._spool_root):
-            if (path / UPLOADED_FILE).exists() or self._stopping.is_set():
+            if (path / UPLOADED_FILE).exists() or (path / REFUSED_FILE).exists():
                 continue
-            if (reason := _refusal(path)) is not None:
-                refused[path.name] = reason
-                continue
+            if self._stopping.is_set():
+                break
             try:
                 if self._upload(path):
                     done.append(path.name)
@@ -181,7 +187,6 @@ class Uploader:
                 if "retry_after_s" in error.details:
                     self._retry_after_s = float(str(error.details["retry_after_s"]))
                     break
-        self.refused = refused
         return done
 
     def _status(self, path: Path, damage: str | None) -> UploadStatus:
@@ -321,17 +326,17 @@ def _recover(path: Path) -> bool:
 def _refusal(path: Path) -> str | None:
     """Why the store refused a take for good; None where it did not."""
     try:
-        return (path / REFUSED_FILE).read_text(encoding="utf-8")
+        return (path / REFUSED_FILE).read_text(encoding="utf-8", errors="replace")
     except FileNotFoundError:
         return None
 
 
 def _stored_as(path: Path) -> str | None:
-    """The id that a take has in the store; None where the note of its upload is damaged."""
+    """The id that a take has in the store; None where the note of its upload is damaged or gone."""
     try:
         note = (path / UPLOADED_FILE).read_bytes()
         return RecordingStatus.model_validate_json(note).recording_id
-    except ValidationError:
+    except (ValidationError, FileNotFoundError):
         return None
 
 

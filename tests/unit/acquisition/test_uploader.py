@@ -1,14 +1,16 @@
 import errno
 import os
+import shutil
 
 import numpy as np
 import pytest
 
 from dextouch.episodes.log import SpoolReader, SpoolWriter
-from dextouch.errors import ConflictError, UnavailableError
+from dextouch.errors import ConflictError, StorageFullError, UnavailableError
 from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
+from services.acquisition import uploader as uploader_module
 from services.acquisition.uploader import (
     UPLOADED_FILE,
     Uploader,
@@ -204,6 +206,57 @@ def test_one_refused_take_does_not_hold_up_the_next(tmp_path):
         "a: exists with other attributes",
         None,
     ]
+
+
+@pytest.fixture
+def refusing(tmp_path):
+    """An uploader of takes `b` and `c`, whose store has refused both for good."""
+    for name in ("b", "c"):
+        spool(tmp_path, name)
+    store = FakeStore()
+
+    def refuse(attributes):
+        if attributes.recording_id == "a":
+            raise StorageFullError("store: full", retry_after_s=60)
+        raise ConflictError(f"{attributes.recording_id}: exists with other attributes")
+
+    store.create = refuse
+    uploader = Uploader(tmp_path, store, period_s=1.0)
+    for _ in range(3):
+        uploader.upload_all()
+    return uploader
+
+
+def listed(uploader):
+    return [status.recording_id for status in uploader.status(only_refused=True)]
+
+
+REASONS = {name: f"{name}: exists with other attributes" for name in ("b", "c")}
+
+
+def test_a_take_is_listed_as_refused_from_when_it_is_set_aside_until_it_is_sent_again(refusing):
+    assert (refusing.refused, listed(refusing)) == (REASONS, ["b", "c"])
+    refusing.retry("b")
+    assert (refusing.refused, listed(refusing)) == ({"c": REASONS["c"]}, ["c"])
+
+
+def test_refused_takes_stay_listed_while_the_store_is_full_and_after_a_restart(refusing, tmp_path):
+    refusing.upload_all()
+    spool(tmp_path, "a")
+    refusing.upload_all()
+    assert (refusing.refused, listed(refusing)) == (REASONS, ["b", "c"])
+    restarted = Uploader(tmp_path, None, period_s=1.0)
+    assert (restarted.refused, listed(restarted)) == (REASONS, ["b", "c"])
+
+
+def test_takes_whose_folder_is_removed_by_hand_are_left_out(refusing, tmp_path, monkeypatch):
+    refusing.upload_all()
+    shutil.rmtree(tmp_path / "b")
+    assert (list(refusing.refused), listed(refusing)) == (["c"], ["c"])
+    # Removed while the list is being made.
+    paths = [tmp_path / "b", tmp_path / "c"]
+    monkeypatch.setattr(uploader_module, "_spools", lambda _: iter(paths))
+    assert [status.recording_id for status in refusing.status()] == ["c"]
 
 
 def test_a_second_id_is_valid_and_of_one_take_alone():
