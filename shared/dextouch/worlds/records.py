@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dextouch.errors import LimitExceededError, NotFoundError, UnavailableError
+from dextouch.errors import LimitExceededError, NotFoundError, StorageError, UnavailableError
 from dextouch.schemas.rollouts import RolloutInfo
 from dextouch.serving.state import StateStore
 from dextouch.streams.packing import pack, unpack
@@ -103,9 +103,7 @@ class RecordStore:
         try:
             yield 1
         except BaseException:
-            # What cannot be deleted now expires.
-            with suppress(NotFoundError, UnavailableError):
-                await self.delete(rollout_id)
+            await self._give_up(rollout_id)
             raise
 
     async def write(self, record: RolloutRecord, *, over_version: int) -> int:
@@ -136,12 +134,23 @@ class RecordStore:
 
     async def _add(self, rollout_id: str, value: bytes, *, limit: int, ttl_s: float) -> None:
         key = KEY_PREFIX + rollout_id
-        if not await self._store.add(key, value, within=KEY_PREFIX, limit=limit, ttl_s=ttl_s):
+        try:
+            added = await self._store.add(key, value, within=KEY_PREFIX, limit=limit, ttl_s=ttl_s)
+        except BaseException:
+            # It may be written although the answer was lost.
+            await self._give_up(rollout_id)
+            raise
+        if not added:
             raise LimitExceededError(
-                f"{limit} rollouts are alive, expected at most {limit}; delete one, or wait: "
-                f"they expire after {self._ttl_s:g} s without a chunk",
+                f"the limit of {limit} rollouts is reached; delete one that is no longer needed, "
+                f"or try again later: each expires after {self._ttl_s:g} s without a chunk",
                 retry_after_s=1,
             )
+
+    async def _give_up(self, rollout_id: str) -> None:
+        """Delete a rollout that nobody knows of; what cannot be deleted now expires."""
+        with suppress(StorageError, UnavailableError):
+            await self._store.delete(KEY_PREFIX + rollout_id)
 
 
 def _unknown(rollout_id: str) -> NotFoundError:

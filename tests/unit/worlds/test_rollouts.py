@@ -13,6 +13,8 @@ from dextouch.errors import (
     LimitExceededError,
     NonFiniteError,
     NotFoundError,
+    StorageError,
+    UnavailableError,
     UnknownNameError,
 )
 from dextouch.schemas.rollout_codec import decode_answer
@@ -195,7 +197,7 @@ async def test_limits_on_number_and_length():
     first = await begin(made)
     await made.fork(first)
     for refused in (begin(made), made.fork(first)):
-        with pytest.raises(LimitExceededError, match="2 rollouts are alive"):
+        with pytest.raises(LimitExceededError, match=r"limit of 2 rollouts is reached; delete one"):
             await refused
     for chunk in range(2):
         await made.step(first, chunk, actions(4), ALL)
@@ -261,6 +263,47 @@ async def test_starts_that_fail_or_are_cancelled_leave_their_place(state):
         await starting
     world.may_begin.set()
     await begin(made)
+    made.close()
+
+
+class Failing:
+    """A store of which one command does its work, if any, and then fails."""
+
+    def __init__(self, store, command, error):
+        self._store, self.command, self._error = store, command, error
+
+    def __getattr__(self, name):
+        asked = getattr(self._store, name)
+
+        async def fail(*args, **kwargs):
+            await asked(*args, **kwargs)
+            raise self._error
+
+        return fail if name == self.command else asked
+
+
+async def test_a_store_whose_answer_is_lost_holds_no_place(state):
+    for key in await state.keys(""):
+        await state.delete(key)
+    failing = Failing(state, "", UnavailableError("answer lost"))
+    made = service(failing, max_rollouts=2)
+    first = await begin(made)
+    failing.command = "add"
+    for asked in (begin(made), made.fork(first)):
+        with pytest.raises(UnavailableError, match="answer lost"):
+            await asked
+    failing.command = ""
+    await begin(made)
+    with pytest.raises(LimitExceededError):
+        await begin(made)
+    made.close()
+
+
+@pytest.mark.parametrize("error", [StorageError("read-only replica"), UnavailableError("gone")])
+async def test_the_error_of_a_start_stays_when_its_place_cannot_be_freed(error):
+    made = service(Failing(MemoryState(), "delete", error), Waiting())
+    with pytest.raises(InvalidInputError, match="no instruction"):
+        await begin(made, RolloutStart("stand_bottle", 3, ""))
     made.close()
 
 
