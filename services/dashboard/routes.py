@@ -18,16 +18,20 @@ from fastapi import (
 from fastapi.responses import JSONResponse
 from pydantic import BaseModel, ConfigDict, Field
 from starlette.requests import HTTPConnection
+from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError, InvalidInputError
+from dextouch.serving.access import not_signed_in
 from services.dashboard.feeds import Feeds
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
-from services.dashboard.topics import Viewer
+from services.dashboard.topics import Message, Viewer
 from services.dashboard.views import heatmap_layout
 
 MAX_VIEW_CHARACTERS = 1000
 WEBSOCKET_REFUSED = 1008
+# A session that ends closes its live link so soon.
+SESSION_CHECK_S = 1.0
 # As streams are named (dextouch.streams.descriptors).
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
@@ -55,7 +59,7 @@ def guard(connection: HTTPConnection) -> None:
     """Refuse browsers that did not sign in."""
     sessions: Sessions = connection.app.state.sessions
     if not sessions.allows(connection):
-        raise AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
+        raise not_signed_in()
 
 
 def api_router(settings: DashboardSettings) -> APIRouter:
@@ -130,7 +134,7 @@ def live_router() -> APIRouter:
         sender = asyncio.create_task(_send_news(websocket, viewer))
         try:
             with suppress(WebSocketDisconnect):
-                while True:
+                while websocket.application_state is WebSocketState.CONNECTED:
                     viewer.look_at(_view(await websocket.receive_text()))
         finally:
             viewer.look_at(())
@@ -142,12 +146,21 @@ def live_router() -> APIRouter:
 
 
 async def _send_news(websocket: WebSocket, viewer: Viewer) -> None:
-    while True:
-        for message in await viewer.news():
-            if isinstance(message, bytes):
-                await websocket.send_bytes(message)
-            else:
-                await websocket.send_text(message)
+    """Send until the session ends."""
+    messages: list[Message] = []
+    try:
+        while True:
+            guard(websocket)
+            for message in messages:
+                if isinstance(message, bytes):
+                    await websocket.send_bytes(message)
+                else:
+                    await websocket.send_text(message)
+            messages = []
+            with suppress(TimeoutError):
+                messages = await asyncio.wait_for(viewer.news(), SESSION_CHECK_S)
+    except AccessDeniedError as error:
+        await websocket.close(WEBSOCKET_REFUSED, error.message)
 
 
 def _view(text: str) -> list[str]:

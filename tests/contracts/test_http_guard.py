@@ -183,8 +183,9 @@ async def test_pages_of_other_origins_open_no_websocket(make_app, origin):
 
 
 async def test_own_pages_tools_and_named_origins_may_act(make_app):
-    allowed = {"allowed_hosts": ("lab-pc", "fd00::7"), "allowed_origins": ("https://lab.example",)}
-    app = make_app(**allowed)
+    origins = ("https://lab.example:443", "http://[FE80:0:0:0:0:0:0:2]:80", "https://Desk.lab:8443")
+    hosts = ("lab-pc", "fd00::7", "FE80:0:0:0:0:0:0:1")
+    app = make_app(allowed_hosts=hosts, allowed_origins=origins)
     accepted = [
         {},
         {"origin": "http://127.0.0.1:8000"},
@@ -193,13 +194,36 @@ async def test_own_pages_tools_and_named_origins_may_act(make_app):
         {"host": "localhost:80", "origin": "http://localhost"},
         {"host": "LAB-PC:8000", "sec-fetch-site": "same-origin"},
         {"host": "[fd00::7]"},
+        {"host": "[fe80::1]:8000", "origin": "http://[fe80::1]:8000"},
+        {"host": "[FE80:0::1]"},
         {"origin": "https://lab.example", "sec-fetch-site": "cross-site"},
+        {"origin": "http://[fe80::2]"},
+        {"origin": "https://desk.lab:8443"},
     ]
     async with client_of(app) as client:
         for headers in accepted:
             for method, path in operations(app, unsafe=True):
                 answer = await client.request(method, path, headers=headers)
                 assert answer.status_code not in {403, 415, 421}, (path, headers, answer.text)
+
+
+@pytest.mark.parametrize(
+    "origin",
+    ["https://lab.example:80", "http://lab.example", "http://lab.example:443", "https://[::1:2]:x"],
+)
+async def test_a_default_port_is_that_of_the_origins_own_scheme(origin):
+    async with client_of(dashboard(None, allowed_origins=("https://lab.example",))) as client:
+        answer = await client.post("/v1/recorder/arm", json={}, headers={"origin": origin})
+        assert_refused(answer, 403, "allowed_origins")
+
+
+async def test_a_dashboard_sends_who_is_not_signed_in_to_its_page():
+    """Its routes take no bearer key, so none is asked for."""
+    async with client_of(dashboard(None, **keyed())) as client:
+        for method, path in [("POST", "/v1/recorder/arm"), ("GET", "/v1/overview")]:
+            for key in ({}, {"authorization": f"Bearer {KEY}"}):
+                answer = await client.request(method, path, headers=key)
+                assert_refused(answer, 401, "not signed in: open / and sign in")
 
 
 BY_FORM = ["text/plain", FORM, "multipart/form-data; boundary=x", ""]
@@ -219,6 +243,34 @@ async def test_what_a_form_can_send_is_refused(make_app, content_type):
                 assert_refused(answer, 415, FORM)
             else:
                 assert_refused(answer, 415, "application/")
+
+
+HOSTILE_TYPES = [
+    "application/json; charset*=utf-8''x",
+    "application/json; charset*=undefined''x",
+    "application/json; charset*=\x00''x",
+    "application/json; charset*0*=utf-8''%ff; charset*1=x",
+    "application/json; dtype*=utf-8''float32",
+    'application/json; charset="\\',
+    "application/json; =; *; *0=; a*b=c; ;",
+    "application/json" + ";a*=b" * 1000,
+    "\xff/\xfe; \xff*=\xff''\xff",
+    "; ; =",
+    "*",
+]
+
+
+@pytest.mark.parametrize("content_type", HOSTILE_TYPES)
+async def test_no_content_type_breaks_a_service(make_app, content_type):
+    """Extended parameters (RFC 8187) change nothing: their media type is what counts."""
+    app = make_app()
+    headers = {"content-type": content_type.encode("latin-1")}
+    async with client_of(app) as client:
+        for method, path in operations(app, unsafe=True):
+            answer = await client.request(method, path, content=b"{}", headers=headers)
+            assert answer.status_code != 500, (path, answer.text)
+            is_refused = path in FORMS or not content_type.startswith("application/json")
+            assert (answer.status_code == 415) is (is_refused or "/batches/" in path), path
 
 
 async def test_a_service_with_keys_asks_for_one_before_it_reads(make_app):

@@ -10,6 +10,11 @@ from dextouch.errors import AccessDeniedError
 from dextouch.serving.settings import ApiKey
 
 
+def not_signed_in() -> AccessDeniedError:
+    """The refusal of a browser without a session."""
+    return AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
+
+
 class AccessControl:
     """The keys of one service; without keys (loopback only, see settings) everyone may."""
 

@@ -100,10 +100,18 @@ class BodyRules:
 
 
 def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
-    """A Content-Type's media type and parameters in lower case; "none" where there is none."""
+    """A Content-Type's media type and parameters in lower case; "none" where there is none.
+
+    Extended parameters (`name*=charset'language'value`), which no media type here has, are left
+    out.
+    """
     header = Message()
     header["content-type"] = content_type or "none/none"
-    parameters = {name.lower(): value.lower() for name, value in header.get_params() or []}
+    parameters = {
+        name.lower(): value.lower()
+        for name, value in header.get_params() or []
+        if isinstance(value, str)
+    }
     return (header.get_content_type() if content_type else "none"), parameters
 
 

@@ -7,6 +7,7 @@ of this service, or from no page at all.
 
 import re
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import structlog
@@ -16,9 +17,14 @@ from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from dextouch.errors import AccessDeniedError, DexTouchError
-from dextouch.serving.access import AccessControl
+from dextouch.serving.access import AccessControl, not_signed_in
 from dextouch.serving.bodies import BodyLimit, BodyRules
-from dextouch.serving.settings import ServiceSettings, is_loopback
+from dextouch.serving.settings import (
+    ServiceSettings,
+    canonical_host,
+    canonical_origin,
+    is_loopback,
+)
 
 logger = structlog.get_logger(__name__)
 
@@ -26,7 +32,6 @@ SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 # Health checks and Prometheus ask without a key, under names of containers.
 PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 HTTP_SCHEMES = {"ws": "http", "wss": "https"}
-DEFAULT_PORTS = {"http": ":80", "https": ":443"}
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 POLICY_VIOLATION = 1008
 MAX_REASON_BYTES = 123
@@ -40,8 +45,8 @@ class SitePolicy:
     """Which host names and origins are the service's own."""
 
     def __init__(self, settings: ServiceSettings) -> None:
-        self._hosts = frozenset(name.lower() for name in settings.allowed_hosts)
-        self._origins = frozenset(origin.lower() for origin in settings.allowed_origins)
+        self._hosts = frozenset(settings.allowed_hosts)
+        self._origins = frozenset(settings.allowed_origins)
 
     def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
         """Refuse what another site's page sends.
@@ -59,10 +64,10 @@ class SitePolicy:
             return
         scheme = str(connection.scope["scheme"])
         scheme = HTTP_SCHEMES.get(scheme, scheme)
-        own = f"{scheme}://{host.removesuffix(DEFAULT_PORTS.get(scheme, ''))}"
+        own = _canonical(f"{scheme}://{host}")
         if "origin" in connection.headers:
             origin = ", ".join(connection.headers.getlist("origin")).lower()
-            if origin.removesuffix(DEFAULT_PORTS.get(scheme, "")) not in {own, *self._origins}:
+            if _canonical(origin) not in {own, *self._origins}:
                 raise _foreign_origin(f"origin {origin!r}", own)
             return
         site = connection.headers.get("sec-fetch-site", "none").lower()
@@ -71,7 +76,10 @@ class SitePolicy:
 
     def _check_host(self, host: str) -> None:
         parts = HOST.fullmatch(host)
-        name = (parts[1] or parts[2]) if parts else ""
+        name = ""
+        if parts is not None:
+            with suppress(ValueError):
+                name = canonical_host(parts[1] or parts[2])
         if name not in self._hosts and not is_loopback(name):
             raise AccessDeniedError(
                 f"host: got {host!r}, expected a loopback name or one of the setting "
@@ -107,6 +115,8 @@ class Guard:
                 return
             signed_in = self.admits is not None and self.admits(connection)
             if is_unsafe and needs_key and not signed_in:
+                if self.admits is not None:
+                    raise not_signed_in()
                 self.access.identify(authorization)
             if self.admits is None:
                 return
@@ -152,6 +162,13 @@ class GuardMiddleware:
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
             return
         await self._app(scope, receive, send)
+
+
+def _canonical(origin: str) -> str:
+    try:
+        return canonical_origin(origin)
+    except ValueError:
+        return origin
 
 
 def _foreign_origin(got: str, own: str) -> AccessDeniedError:

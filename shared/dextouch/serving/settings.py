@@ -1,10 +1,19 @@
 """Environment and flags to one frozen settings object per service, and a service to a socket."""
 
 import ipaddress
+import re
 from typing import Annotated, Literal, TypeVar
 
 from fastapi import FastAPI
-from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    SecretStr,
+    ValidationError,
+    model_validator,
+)
 from pydantic_settings import BaseSettings, CliApp, SettingsConfigDict
 
 from dextouch.errors import InvalidInputError
@@ -15,11 +24,49 @@ MIN_KEY_CHARACTERS = 16
 KEEP_ALIVE_S = 75
 # Of one message from a browser; the server closes the connection before it is read whole.
 MAX_WEBSOCKET_BYTES = 2**16
-# An IPv6 address stands without brackets.
-HostName = Annotated[str, Field(pattern=r"^([A-Za-z0-9_.-]+|[0-9A-Fa-f:.]+)$")]
-Origin = Annotated[
-    str, Field(pattern=r"^https?://([A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?$")
-]
+HOST_NAME = re.compile(r"[a-z0-9_.-]+")
+ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
+DEFAULT_PORTS = {"http": 80, "https": 443}
+MAX_PORT = 65535
+
+
+def canonical_host(text: str) -> str:
+    """A host name as browsers write it: in lower case, an IPv6 address short and without brackets.
+
+    Raises:
+        ValueError: no host name; also one with a port.
+    """
+    name = text.lower()
+    if HOST_NAME.fullmatch(name):
+        return name
+    try:
+        return str(ipaddress.IPv6Address(name))
+    except ValueError:
+        raise ValueError(
+            f"got {text!r}, expected a name or an address without its port (every port is "
+            "answered), IPv6 without brackets"
+        ) from None
+
+
+def canonical_origin(text: str) -> str:
+    """An origin as browsers write it: in lower case, without the default port of its scheme.
+
+    Raises:
+        ValueError: no origin of a web page.
+    """
+    parts = ORIGIN.fullmatch(text.lower())
+    if parts is None or int(parts[4] or 0) > MAX_PORT:
+        raise ValueError(
+            f"got {text!r}, expected http(s)://HOST or http(s)://HOST:PORT without a path"
+        )
+    scheme, name, address, port = parts.groups()
+    host = f"[{canonical_host(address)}]" if address else name
+    is_default = port is None or int(port) == DEFAULT_PORTS[scheme]
+    return f"{scheme}://{host}" if is_default else f"{scheme}://{host}:{int(port)}"
+
+
+HostName = Annotated[str, AfterValidator(canonical_host)]
+Origin = Annotated[str, AfterValidator(canonical_origin)]
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 

@@ -174,6 +174,36 @@ async def test_live_refuses_foreign_sites(make_app):
     assert (await socket.receive())["type"] == "websocket.close"
 
 
+@pytest.mark.parametrize("looks", [True, False])
+@pytest.mark.parametrize("ends_by", ["signing out", "time"])
+async def test_live_ends_with_its_session(make_app, looks, ends_by):
+    app = make_app(api_keys=({"name": "operator", "key": KEY, "scopes": ("operate",)},))
+    async with (
+        app.router.lifespan_context(app),
+        httpx.AsyncClient(
+            transport=httpx.ASGITransport(app), base_url="http://localhost"
+        ) as client,
+    ):
+        await client.post("/sign_in", data={"key": KEY})
+        cookie = "; ".join(f"{name}={value}" for name, value in client.cookies.items())
+        socket = Socket(app, {"host": "localhost", "cookie": cookie})
+        assert (await socket.receive())["type"] == "websocket.accept"
+        if looks:
+            socket.look_at("taxels")
+            await socket.receive()
+        if ends_by == "time":
+            app.state.sessions._clock_s = lambda: float("inf")
+        else:
+            await client.post("/sign_out", headers={"content-length": "0"})
+        while (message := await socket.receive())["type"] == "websocket.send":
+            assert looks
+        assert message["type"] == "websocket.close"
+        assert message["code"] == 1008
+        assert "not signed in" in message["reason"]
+        await socket.leave()
+    assert all(not topic._viewers for topic in app.state.feeds.topics.values())
+
+
 async def test_live_survives_nonsense(make_app):
     app = make_app()
     async with app.router.lifespan_context(app):

@@ -1,5 +1,7 @@
 """Settings: one class gives environment and flags, refuses what it does not know, and is frozen."""
 
+import json
+
 import pytest
 from pydantic import ValidationError
 
@@ -45,6 +47,30 @@ def test_open_addresses_need_keys(monkeypatch):
     settings = load_settings(ProbeSettings, ["--host", EVERYWHERE])
     assert settings.api_keys[0].scopes == ("x",)
     assert "0123456789abcdef" not in repr(settings)
+
+
+@pytest.mark.parametrize(
+    "name", ["192.168.1.5:8080", "desk.lab:80", "[fe80::1]", "fe80::1::2", "*", "", "a b", "café"]
+)
+def test_host_names_that_could_never_match_are_refused(name):
+    with pytest.raises(InvalidInputError, match=r"allowed_hosts.*without its port"):
+        load_settings(ProbeSettings, ["--allowed_hosts", json.dumps([name])])
+
+
+@pytest.mark.parametrize(
+    "origin",
+    [
+        "lab.example",
+        "https://lab.example/",
+        "http://fe80::1",
+        "http://[:::]",
+        "http://a:99999",
+        "*",
+    ],
+)
+def test_origins_that_could_never_match_are_refused(origin):
+    with pytest.raises(InvalidInputError, match=r"allowed_origins.*got .*, expected "):
+        load_settings(ProbeSettings, ["--allowed_origins", json.dumps([origin])])
 
 
 def test_settings_are_frozen_and_closed():
