@@ -14,8 +14,13 @@ READER = {"name": "reader", "key": "another-key-of-length", "scopes": ("station"
 
 
 @pytest.fixture
-def address(serve):
-    return serve(create_app(DashboardSettings(station="desk 3", api_keys=(OPERATOR, READER))))
+def app():
+    return create_app(DashboardSettings(station="desk 3", api_keys=(OPERATOR, READER)))
+
+
+@pytest.fixture
+def address(serve, app):
+    return serve(app)
 
 
 def sign_in(page, key):
@@ -57,6 +62,49 @@ def test_signing_out_ends_the_session(page, address):
     page.get_by_role("button", name="Sign out").click()
     expect(page.get_by_label("Key")).to_be_visible()
     page.goto(address)
+    expect(page.get_by_label("Key")).to_be_visible()
+
+
+def test_other_pages_of_a_browser_that_signs_out_go_to_the_sign_in(page, address):
+    page.goto(address)
+    sign_in(page, KEY)
+    expect(page.locator("#link")).to_have_text("live")
+    other = page.context.new_page()
+    other.goto(address)
+    other.get_by_role("button", name="Sign out").click()
+    expect(page.get_by_label("Key")).to_be_visible()
+
+
+def test_a_page_that_lost_session_and_link_goes_to_the_sign_in(page, address, app):
+    """As after a restart: the link breaks, and the new one is refused for a reason no page sees."""
+    links = []
+
+    def connect(link):
+        link.connect_to_server()
+        links.append(link)
+
+    page.route_web_socket("**/v1/live", connect)
+    page.goto(address)
+    sign_in(page, KEY)
+    expect(page.locator("#link")).to_have_text("live")
+    app.state.sessions._ends_s.clear()
+    links[-1].close(code=1001)
+    expect(page.get_by_label("Key")).to_be_visible()
+
+
+def test_a_button_of_a_session_that_ended_goes_to_the_sign_in(page, serve, serve_station, tmp_path):
+    station = serve_station(tmp_path / "spool")
+    app = create_app(DashboardSettings(api_keys=(OPERATOR,), acquisition_url=station))
+    # The page hears nothing of the end of its link.
+    page.route_web_socket(
+        "**/v1/live", lambda link: link.connect_to_server().on_close(lambda code, reason: None)
+    )
+    page.goto(serve(app))
+    sign_in(page, KEY)
+    expect(page.locator("#recorder_state")).to_have_text("idle")
+    page.get_by_label("Instruction").fill("stand the bottle")
+    app.state.sessions._ends_s.clear()
+    page.get_by_role("button", name="Arm").click()
     expect(page.get_by_label("Key")).to_be_visible()
 
 

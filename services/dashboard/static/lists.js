@@ -2,6 +2,7 @@
 
 import { element, levelBadge } from "./dom.js";
 import { age } from "./format.js";
+import { ask } from "./session.js";
 
 export function showServices(list, services) {
   list.replaceChildren(...services.map((service) => element("li", { title: service.message },
@@ -30,7 +31,7 @@ function refusedItem(take, say) {
   button.addEventListener("click", async () => {
     button.disabled = true;
     try {
-      const answer = await fetch(`/v1/uploads/${encodeURIComponent(take.recording_id)}/retry`, { method: "POST" });
+      const answer = await ask(`/v1/uploads/${encodeURIComponent(take.recording_id)}/retry`, { method: "POST" });
       if (!answer.ok) say((await answer.json()).detail ?? `refused (${answer.status})`);
     } catch (error) {
       say(`The dashboard did not answer: ${error.message}`);

@@ -1,5 +1,7 @@
 // The one websocket: tells the server what is in view, hands out what comes back, reconnects by itself.
 
+import { ask } from "./session.js";
+
 const FIRST_RETRY_MS = 500;
 const LONGEST_RETRY_MS = 8000;
 
@@ -31,8 +33,10 @@ export class LiveLink {
         this.onTopic(message.topic, message.data);
       }
     };
-    socket.onclose = () => {
+    socket.onclose = async () => {
       this.onState(false);
+      // Why a socket is refused no page sees; the answer to a request tells whether the session ended.
+      await ask("/v1/heatmap", { signal: AbortSignal.timeout(LONGEST_RETRY_MS) }).catch(() => null);
       setTimeout(() => this.open(), this.retry_ms);
       this.retry_ms = Math.min(2 * this.retry_ms, LONGEST_RETRY_MS);
     };

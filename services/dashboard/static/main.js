@@ -6,10 +6,11 @@ import { drawScale, HandCanvas, readTaxels } from "./hands.js";
 import { showCameras, showRefused, showServices, showTakes } from "./lists.js";
 import { LiveLink } from "./live.js";
 import { RecorderPanel } from "./recorder.js";
+import { ask } from "./session.js";
 import { startTheme } from "./theme.js";
 
 const find = (id) => document.getElementById(id);
-const heatmap = await (await fetch("/v1/heatmap")).json();
+const heatmap = await (await ask("/v1/heatmap")).json();
 const hands = {
   left: new HandCanvas(find("hand_left"), find("hand_left_text"), "left", heatmap),
   right: new HandCanvas(find("hand_right"), find("hand_right_text"), "right", heatmap),

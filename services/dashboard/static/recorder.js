@@ -2,6 +2,7 @@
 
 import { element, setText } from "./dom.js";
 import { stopwatch } from "./format.js";
+import { ask } from "./session.js";
 
 const CONFIRM_MS = 3000;
 const FIELDS = ["task", "instruction", "domain", "operator", "consent"];
@@ -119,7 +120,7 @@ export class RecorderPanel {
     }
     const body = this.body(action);
     try {
-      const answer = await fetch(`/v1/recorder/${action}`, {
+      const answer = await ask(`/v1/recorder/${action}`, {
         method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(body),
       });
       const data = await answer.json();

@@ -103,7 +103,7 @@ class ServiceSettings(BaseSettings):
     )
     allowed_origins: tuple[Origin, ...] = Field(
         default=(),
-        description="origins besides the service's own whose pages may act, as https://lab.example",
+        description="what browsers call the service behind a TLS proxy, as https://lab.example",
     )
     log_format: Literal["auto", "json", "console"] = "auto"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
