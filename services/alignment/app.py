@@ -24,7 +24,7 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
         await jobs.start()
         watching: list[asyncio.Task[None]] = []
         if settings.align_new:
-            watch = NewRecordings(store, jobs).watch(settings.look_period_s)
+            watch = NewRecordings(store, jobs).watch(settings.period_s)
             watching.append(asyncio.create_task(watch))
         try:
             yield

@@ -2,12 +2,14 @@
 
 import asyncio
 import re
+import time
+from collections.abc import Sequence
+from contextlib import suppress
 
 import structlog
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, RecordingReader
 from dextouch.errors import (
-    CorruptDataError,
     DexTouchError,
     InvalidInputError,
     LimitExceededError,
@@ -23,6 +25,8 @@ logger = structlog.get_logger(__name__)
 CALIBRATION_TASKS = "calibrate-"
 # As `episode_id_of` makes them.
 EPISODE_ID = re.compile(r"(.+)-[0-9a-f]{12}")
+# What cannot be read may be repaired, brought over to this format, or on a disk that comes back.
+RETRY_S = 60.0
 
 
 class NewRecordings:
@@ -30,7 +34,9 @@ class NewRecordings:
 
     A recording is left alone when there is a job of it, whatever became of that; when an episode
     made from it is in the store or its trash, under any options; or when it is a calibration take.
-    One that cannot be aligned becomes a failed job with the reason.
+    One that cannot be aligned becomes a failed job with the reason. One that cannot be read is
+    logged and tried again after RETRY_S. One that comes back under the id of another that was
+    deleted while this was watching counts as new unless an episode was made from its content.
 
     Args:
         store: of recordings and episodes.
@@ -40,6 +46,9 @@ class NewRecordings:
     def __init__(self, store: EpisodeStore, jobs: JobTable) -> None:
         self._store, self._jobs = store, jobs
         self._seen: set[str] = set()
+        self._deleted: set[str] = set()
+        # Why, and when that was found.
+        self._unreadable: dict[str, tuple[str, float]] = {}
 
     async def watch(self, period_s: float) -> None:
         """Look again and again, until cancelled; a failure is logged when it is a new one."""
@@ -52,10 +61,11 @@ class NewRecordings:
                 if error.message != failure:
                     logger.warning("new_recordings_not_aligned", reason=error.message)
                 failure = error.message
-            except Exception:
-                # The watcher's supervisor: alignments that are asked for must still be answered.
-                logger.exception("watching_broke")
-                return
+            except Exception as error:
+                # The watcher's supervisor: what arrives after this must be aligned, too.
+                if repr(error) != failure:
+                    logger.exception("watching_broke")
+                failure = repr(error)
             await asyncio.sleep(period_s)
 
     async def look(self) -> None:
@@ -64,37 +74,76 @@ class NewRecordings:
         Raises:
             StorageError: the store cannot be listed, or jobs cannot be kept.
         """
-        known = frozenset(self._seen | self._jobs.book.recording_ids)
-        new = await asyncio.to_thread(_not_aligned, self._store, known)
-        for recording_id, wanted in new.items():
-            if wanted:
-                try:
-                    await self._ask(recording_id)
-                except LimitExceededError:
-                    return
-                except (CorruptDataError, NotFoundError) as error:
-                    reason = error.message
-                    logger.warning("alignment_failed", recording_id=recording_id, reason=reason)
-            self._seen.add(recording_id)
-
-    async def _ask(self, recording_id: str) -> None:
-        recording = await asyncio.to_thread(self._store.recording, recording_id)
-        if recording.attributes.task.startswith(CALIBRATION_TASKS):
+        listed = await asyncio.to_thread(self._store.list, kind="recording")
+        new = self._new(listed)
+        if not new:
             return
+        aligned = await asyncio.to_thread(_aligned, self._store)
+        with suppress(LimitExceededError):
+            for recording_id in new:
+                is_old = recording_id not in self._deleted and len(recording_id) <= MAX_STEM
+                if (is_old and recording_id in aligned) or await self._ask(
+                    recording_id, aligned.get(recording_id, ())
+                ):
+                    self._seen.add(recording_id)
+                    self._deleted.discard(recording_id)
+
+    def _new(self, listed: Sequence[str]) -> list[str]:
+        """Those that were neither asked for nor left alone, nor found unreadable just now."""
+        there = set(listed)
+        self._deleted |= self._seen - there
+        self._seen &= there
+        self._seen |= (self._jobs.book.recording_ids & there) - self._deleted
+        self._unreadable = {k: found for k, found in self._unreadable.items() if k in there}
+        since_s = time.monotonic() - RETRY_S
+        just_now = {k for k, (_, found_s) in self._unreadable.items() if found_s > since_s}
+        return [item for item in listed if item not in self._seen | just_now]
+
+    async def _ask(self, recording_id: str, episode_ids: Sequence[str]) -> bool:
+        """Ask for a recording unless it is to be left alone; False if it cannot be read."""
+        try:
+            recording = await asyncio.to_thread(self._store.recording, recording_id)
+        except DexTouchError as error:
+            before, _ = self._unreadable.get(recording_id, ("", 0.0))
+            if error.message != before:
+                reason = error.message
+                logger.warning("alignment_failed", recording_id=recording_id, reason=reason)
+            self._unreadable[recording_id] = error.message, time.monotonic()
+            return False
+        self._unreadable.pop(recording_id, None)
+        if recording.attributes.task.startswith(CALIBRATION_TASKS):
+            return True
+        if await asyncio.to_thread(_has_episode, self._store, recording, episode_ids):
+            return True
         try:
             await self._jobs.submit(AlignmentRequest(recording_id=recording_id))
         except InvalidInputError as error:
             await self._jobs.refuse(recording_id, error)
+        except NotFoundError:
+            return False  # deleted meanwhile
+        return True
 
 
-def _not_aligned(store: EpisodeStore, known: frozenset[str]) -> dict[str, bool]:
-    """Recordings that are not known yet, and whether each still needs an episode."""
-    new = [item for item in store.list(kind="recording") if item not in known]
-    if not new:
-        return {}
-    matches = (EPISODE_ID.fullmatch(episode_id) for episode_id in _episode_ids(store))
-    aligned = {match[1] for match in matches if match}
-    return {item: len(item) > MAX_STEM or item not in aligned for item in new}
+def _aligned(store: EpisodeStore) -> dict[str, list[str]]:
+    """Episodes by the id of the recording, those that somebody deleted included."""
+    found: dict[str, list[str]] = {}
+    for episode_id in _episode_ids(store):
+        if match := EPISODE_ID.fullmatch(episode_id):
+            found.setdefault(match[1], []).append(episode_id)
+    return found
+
+
+def _has_episode(
+    store: EpisodeStore, recording: RecordingReader, episode_ids: Sequence[str]
+) -> bool:
+    """Whether one of these episodes was made from the content of this recording."""
+    for episode_id in episode_ids:
+        # Of the trash, or damaged.
+        with suppress(DexTouchError):
+            lineage = store.open(episode_id).attributes.lineage
+            if any(entry.sha256 == recording.content_sha256 for entry in lineage):
+                return True
+    return False
 
 
 def _episode_ids(store: EpisodeStore) -> list[str]:

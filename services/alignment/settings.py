@@ -25,7 +25,7 @@ class AlignmentSettings(ServiceSettings):
     times is failed.
 
     With `align_new`, recordings that arrive in the store are aligned by themselves, each once; the
-    store is looked through every `look_period_s`.
+    store is listed every `look_period_s` (2 s for a folder, 30 s for a bucket if not given).
     """
 
     model_config = service_config("alignment")
@@ -38,4 +38,12 @@ class AlignmentSettings(ServiceSettings):
     max_kept: int = Field(default=10_000, ge=1, le=100_000)
     max_attempts: int = Field(default=3, ge=1, le=100)
     align_new: bool = True
-    look_period_s: float = Field(default=2.0, gt=0, le=3600)
+    look_period_s: float | None = Field(default=None, gt=0, le=3600)
+
+    @property
+    def period_s(self) -> float:
+        """Seconds between two looks for new recordings."""
+        if self.look_period_s is not None:
+            return self.look_period_s
+        # Listing a bucket takes a request for every thousand files in it.
+        return 30.0 if self.store_url.startswith("s3://") else 2.0

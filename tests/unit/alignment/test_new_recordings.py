@@ -1,14 +1,19 @@
 """Recordings that arrive are aligned by themselves: each once, and failures are listed."""
 
 import asyncio
+import shutil
 from contextlib import asynccontextmanager
+from pathlib import Path
 
 import pytest
 from httpx import ASGITransport, AsyncClient
+from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
-from services.alignment import job_table
+from dextouch.errors import StorageFullError
+from services.alignment import job_table, new_recordings
 from services.alignment.app import create_app
+from services.alignment.job_log import JobLog
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.settings import AlignmentSettings
@@ -17,6 +22,7 @@ from tests.unit.alignment.test_service import FakeWorker
 
 LOOK_PERIOD_S = 0.01
 LIMIT_S = 120
+OLD_STORE = Path(__file__).parents[2] / "golden" / "store_v1"
 
 
 @pytest.fixture
@@ -58,13 +64,13 @@ async def until(condition):
             await asyncio.sleep(LOOK_PERIOD_S)
 
 
-async def looked(store, jobs):
+async def looked(store, jobs, name="last"):
     """Until the watcher has been through all that was in the store, and every job has ended."""
-    write_recording(store, "last")
+    write_recording(store, name)
 
     async def done():
         found = await jobs()
-        return "last" in found and {job["state"] for job in found.values()} <= {"done", "failed"}
+        return name in found and {job["state"] for job in found.values()} <= {"done", "failed"}
 
     await until(done)
 
@@ -140,3 +146,95 @@ async def test_without_align_new_nothing_happens_unasked(store, worker):
     async with served(store, align_new=False) as jobs:
         await looked_again(jobs)
         assert await jobs() == {}
+
+
+async def test_a_recording_that_cannot_be_read_keeps_no_other_from_being_aligned(
+    store, worker, monkeypatch
+):
+    monkeypatch.setattr(new_recordings, "RETRY_S", 0.0)
+    old = store.root / "recordings" / "golden"
+    shutil.copytree(OLD_STORE / "recordings" / "golden", old)
+    with capture_logs() as logs:
+        async with served(store) as jobs:
+            await looked(store, jobs)
+            await looked_again(jobs)
+            assert list(await jobs()) == ["last"]
+            (logged,) = [entry for entry in logs if entry.get("recording_id") == "golden"]
+            assert (logged["event"], logged["log_level"]) == ("alignment_failed", "warning")
+            assert "dextouch store migrate" in logged["reason"]
+            store.migrate("golden", kind="recording")
+
+            async def asked():
+                return "golden" in await jobs()
+
+            await until(asked)
+
+
+async def test_the_watcher_goes_on_after_an_error_that_nobody_expected(store, worker, monkeypatch):
+    listed, failures = EpisodeStore.list, [RuntimeError("broken")] * 3
+
+    def list_later(*args, **kind):
+        if failures:
+            raise failures.pop()
+        return listed(*args, **kind)
+
+    monkeypatch.setattr(EpisodeStore, "list", list_later)
+    with capture_logs() as logs:
+        async with served(store) as jobs:
+            await looked(store, jobs)
+    assert not failures
+    (logged,) = [entry for entry in logs if entry["event"] == "watching_broke"]
+    assert logged["exc_info"]
+
+
+async def test_a_job_that_cannot_be_kept_is_asked_for_again(store, worker, monkeypatch):
+    write_recording(store, "take")
+    append, failures = JobLog.append, [StorageFullError("jobs: no space left")] * 3
+
+    def append_later(*args):
+        if failures:
+            raise failures.pop()
+        return append(*args)
+
+    monkeypatch.setattr(JobLog, "append", append_later)
+    async with served(store) as jobs:
+        await looked(store, jobs)
+        assert sorted(await jobs()) == ["last", "take"]
+
+
+async def test_another_recording_under_the_id_of_a_deleted_one_is_aligned(store, worker):
+    write_recording(store, "take")
+    async with served(store) as jobs:
+        await looked(store, jobs)
+        store.delete("take", kind="recording")
+        await looked(store, jobs, "without")
+        write_recording(store, "take", seconds=3.0)
+
+        async def aligned():
+            return len([name for name in store.list() if name.startswith("take-")]) == 2
+
+        await until(aligned)
+
+
+async def test_a_recording_that_comes_back_is_not_aligned_again(store, worker):
+    write_recording(store, "take")
+    align_recording(store, "take", AlignmentOptions(model_rate_hz=30))
+    async with served(store) as jobs:
+        await looked(store, jobs)
+        store.delete("take", kind="recording")
+        await looked(store, jobs, "without")
+        store.restore("take", kind="recording")
+        await looked(store, jobs, "with")
+        assert sorted(await jobs()) == ["last", "with", "without"]
+
+
+@pytest.mark.parametrize(
+    ("settings", "period_s"),
+    [
+        ({"store_url": "/data/store"}, 2.0),
+        ({"store_url": "s3://takes/lab"}, 30.0),
+        ({"store_url": "s3://takes/lab", "look_period_s": 5.0}, 5.0),
+    ],
+)
+def test_a_bucket_is_listed_less_often(settings, period_s):
+    assert AlignmentSettings(**settings).period_s == period_s
