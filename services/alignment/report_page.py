@@ -42,8 +42,9 @@ def _doubts(report: AlignmentReport) -> list[str]:
     for clock in report.clocks:
         whys = {
             "skew": f"its clock is off by {_number(clock.skew_ppm, 0)} ppm",
-            "residual": f"samples come {_number(clock.residual_rms_ms, 1)} ms later than they "
-            "should, more than a sample period",
+            "residual": "even the promptest samples come later than they should by more than a "
+            f"sample period ({_number(clock.residual_rms_ms, 1)} ms RMS of all)",
+            "stop": "device clock stood still or path got longer",
         }
         if clock.warnings:
             reasons = " and ".join(whys[warning] for warning in clock.warnings)

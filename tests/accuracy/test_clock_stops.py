@@ -6,7 +6,7 @@ the true events, which no program could know.
 """
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -35,10 +35,10 @@ class Simulated:
     stretch: np.ndarray
 
 
-def simulate(path, events, *, seed, seconds):
+def simulate(path, events, *, seed, seconds, rate_hz=60):
     """Events are (kind, at_s, size_s) by the device's count of samples, in order."""
     rng = np.random.default_rng(seed)
-    period_s = 0.016 if path == "usb beat" else 1 / 60
+    period_s = 0.016 if path == "usb beat" else 1 / rate_hz
     count_s = np.arange(int(seconds / period_s)) * period_s
     count_s = count_s[rng.random(len(count_s)) >= 0.002]
     true_s, device_s = count_s * (1 + SKEW) + rng.random() * 0.01, count_s + 987.654
@@ -64,7 +64,7 @@ def arrivals(path, events, times, rng):
     count_s, true_s = times
     arrival_s = true_s + BASE_S
     if path != "usb beat":
-        arrival_s = arrival_s + rng.exponential(0.8e-3, len(true_s))
+        arrival_s = arrival_s + rng.exponential(2e-3 if path == "wide" else 0.8e-3, len(true_s))
         arrival_s = arrival_s + (rng.random(len(true_s)) < 0.01) * rng.exponential(
             0.02, len(true_s)
         )
@@ -189,6 +189,88 @@ def test_a_rate_that_changes_is_no_stop(slower, at_s, capsys):
     assert error <= 0.6
 
 
+def dated(take, rate_hz=60):
+    """As an alignment dates a stream that sends its time."""
+    count = len(take.true_ns)
+    batch = SampleBatch(
+        t_host_ns=take.host_ns,
+        t_device_ns=take.device_ns,
+        sequence=np.full(count, -1),
+        values=np.zeros((count, 1), dtype=np.float32),
+    )
+    descriptor = StreamDescriptor(
+        name="glove",
+        kind="scalar",
+        shape=(1,),
+        dtype="float32",
+        unit="1",
+        nominal_rate_hz=rate_hz,
+        capabilities=ClockCapabilities(device_time=True),
+    )
+    timed = time_stream(batch, descriptor)
+    error_ms = (timed.t_host_ns - take.true_ns[timed.kept]) * 1e-6 - BASE_S * 1e3
+    return timed.report, error_ms
+
+
+@pytest.mark.parametrize(("size_s", "lasts_s"), [(0.03, 1.5), (0.03, 4.0), (0.2, 2.5)])
+@pytest.mark.parametrize("path", ["exponential", "late stamps", "wifi clumps"])
+def test_a_delay_at_the_end_of_a_take_moves_nothing_and_is_a_warning(path, size_s, lasts_s):
+    for seed in range(3):
+        take = simulate(path, [("late", 30 - lasts_s, size_s)], seed=seed, seconds=30)
+        report, error_ms = dated(take)
+        assert (report.num_steps, report.warnings) == (0, ("stop",))
+        assert error_ms.std() <= BOUNDS_MS[path]
+
+
+@pytest.mark.parametrize(
+    ("event", "seconds", "num_steps", "warnings"),
+    [
+        (("stop", 15.0, 0.03), 30, 1, ("stop",)),
+        (("stop", 27.0, 3.0), 30, 1, ("stop",)),
+        (("late", 18.0, 0.006), 30, 1, ("stop",)),
+        (("late", 10.0, 0.03), 30, 0, ()),
+        (("stop", 40.0, 0.03), 170, 1, ()),
+        (("step", 15.0, 0.03), 30, 1, ()),
+    ],
+)
+def test_a_stop_that_may_be_a_delay_is_a_warning(event, seconds, num_steps, warnings):
+    """A delay is over when arrivals come back; two minutes without are enough for a stop."""
+    for seed in range(3):
+        report, _ = dated(simulate("exponential", [event], seed=seed, seconds=seconds))
+        assert (report.num_steps, report.warnings) == (num_steps, warnings)
+
+
+@pytest.mark.parametrize(
+    ("path", "rate_hz", "events"),
+    [
+        ("exponential", 120, [("burst", 30.0, 0.3)]),
+        ("exponential", 60, [("burst", 30.0, 3.0)]),
+        ("exponential", 60, [("late", 20.0, 0.06)]),
+        ("wide", 500, []),
+        ("wide", 1000, []),
+        ("wifi clumps", 60, []),
+    ],
+)
+def test_what_a_path_does_is_no_residual_where_times_are_right(path, rate_hz, events):
+    take = simulate(path, events, seed=0, seconds=60, rate_hz=rate_hz)
+    report, error_ms = dated(take, rate_hz)
+    assert np.abs(error_ms).max() <= 0.2
+    assert report.residual_rms_ms > 1000 / rate_hz
+    assert report.warnings == ()
+
+
+@pytest.mark.parametrize("rate_share", [0.01, 0.02])
+def test_times_beside_the_truth_by_more_than_a_period_are_a_residual(rate_share):
+    """A clock that runs fast for ten seconds and slow for ten: no line follows it."""
+    take = simulate("exponential", [], seed=0, seconds=60)
+    since_s = (take.true_ns - take.true_ns[0]) * 1e-9
+    beside_s = rate_share * 20 / (2 * np.pi) * np.sin(2 * np.pi * since_s / 20)
+    wavers = replace(take, device_ns=take.device_ns + np.rint(beside_s * 1e9).astype(np.int64))
+    report, error_ms = dated(wavers)
+    assert np.mean(np.abs(error_ms) > 1000 / 60) > 0.3
+    assert report.warnings == ("residual",)
+
+
 @st.composite
 def happenings(draw):
     """Up to three events, each after eleven seconds of the last one's end, and before the end."""
@@ -211,23 +293,6 @@ def test_no_combination_is_silently_wrong(events, path, seed):
     take = simulate(path, events, seed=seed, seconds=55)
     times_ns, _ = offline(take)
     error_ms = rms_ms(times_ns, take)
-    count = len(take.true_ns)
-    batch = SampleBatch(
-        t_host_ns=take.host_ns,
-        t_device_ns=take.device_ns,
-        sequence=np.full(count, -1),
-        values=np.zeros((count, 1), dtype=np.float32),
-    )
-    descriptor = StreamDescriptor(
-        name="glove",
-        kind="scalar",
-        shape=(1,),
-        dtype="float32",
-        unit="1",
-        nominal_rate_hz=60,
-        capabilities=ClockCapabilities(device_time=True),
-    )
-    warnings = time_stream(batch, descriptor).report.warnings
-    assert error_ms <= 2.0 or warnings
+    assert error_ms <= 2.0 or dated(take)[0].warnings
     judged = slice(600, None)
     assert rms_ms(times_ns, take, judged) <= 0.5 + 1.5 * rms_ms(online(take), take, judged)

@@ -5,7 +5,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.clocks import date_by_counting, find_lost_samples, fit_clock, unwrap_counter
+from dextouch.clocks import (
+    date_by_counting,
+    find_lost_samples,
+    fit_clock,
+    lateness_ns,
+    unwrap_counter,
+)
 from dextouch.clocks.counters import prefers_sequence
 from dextouch.errors import ClockFitError
 from dextouch.schemas.episodes import ClockMethod, ClockReport, ClockWarning
@@ -17,6 +23,8 @@ MIN_COUNTED_SAMPLES = 60
 # Crystals are good to 100 ppm. A nominal rate that stands for a clock may be off by percents.
 MAX_SKEW_PPM = 1000.0
 MAX_RATE_ERROR_PPM = 20_000.0
+# A path's ordinary scatter exceeds the period of a fast stream.
+MIN_LATENESS_NS = 5e6
 
 
 @dataclass(frozen=True)
@@ -48,6 +56,8 @@ class _Dated:
     num_steps: int = 0
     skew_ppm: float | None = None
     residual_rms_ns: float | None = None
+    lateness_ns: float = 0.0
+    has_unsure_stops: bool = False
 
 
 def time_stream(
@@ -103,7 +113,8 @@ def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
     skew_limit_ppm = MAX_SKEW_PPM if dated.method == "device" else MAX_RATE_ERROR_PPM
     doubts: dict[ClockWarning, bool] = {
         "skew": abs(dated.skew_ppm or 0.0) > skew_limit_ppm,
-        "residual": (dated.residual_rms_ns or 0.0) > period_ns,
+        "residual": dated.lateness_ns > max(period_ns, MIN_LATENESS_NS),
+        "stop": dated.has_unsure_stops,
     }
     return tuple(name for name, is_so in doubts.items() if is_so)
 
@@ -138,6 +149,8 @@ def _fitted(
         model.num_steps,
         model.skew_ppm,
         model.residual_rms_ns,
+        model.lateness_ns,
+        model.has_unsure_stops,
     )
 
 
@@ -151,7 +164,15 @@ def _counted(batch: SampleBatch, period_ns: int) -> _Dated:
         return arrivals
     waited_ns = (batch.t_host_ns - take.t_host_ns).astype(np.float64)
     rms_ns = float(np.sqrt(np.mean(waited_ns**2)))
-    return _Dated(take.t_host_ns, "counting", take.num_lost, take.num_steps, take.skew_ppm, rms_ns)
+    return _Dated(
+        take.t_host_ns,
+        "counting",
+        take.num_lost,
+        take.num_steps,
+        take.skew_ppm,
+        rms_ns,
+        lateness_ns(waited_ns, batch.t_host_ns),
+    )
 
 
 def _unwrap(

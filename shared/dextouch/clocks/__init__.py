@@ -1,6 +1,6 @@
 """Clocks: straight counters, and device time to host time, offline and as samples arrive."""
 
-from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock
+from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock, lateness_ns
 from dextouch.clocks.counters import TickCounter
 from dextouch.clocks.look_ahead import (
     CountedSample,
@@ -37,5 +37,6 @@ __all__ = [
     "date_by_counting",
     "find_lost_samples",
     "fit_clock",
+    "lateness_ns",
     "unwrap_counter",
 ]

@@ -10,6 +10,10 @@ from dextouch.clocks.steps import find_steps, find_wrong_stamps
 from dextouch.errors import ClockFitError, InvalidInputError
 
 MIN_SAMPLES = 10
+# Even the promptest of so many samples, of a second or more, are late where a fit is wrong.
+MIN_PROMPT_SAMPLES = 10
+PROMPT_S = 1.0
+LATE_QUANTILE = 0.9
 # One straight line holds for a minute of a crystal's wander; longer takes get a bent one.
 WINDOW_S = 60.0
 # Below this many samples or seconds a segment's own slope is mostly noise.
@@ -64,12 +68,19 @@ class ClockModel:
         skew_ppm: how much faster the host's clock runs, mean over all segments.
         residual_rms_ns: root mean square of arrival minus fitted time: the path's queueing, not
             the error of the fit (which is far smaller).
+        lateness_ns: how much later than fitted the promptest sample of a second arrives (90 %
+            quantile over all seconds), delays that were found left out. Near zero where the fit
+            is right, on paths with queues, clumps and stalls too.
+        has_unsure_stops: whether a stop of the device's clock may have been a delay, or a delay at
+            the end of the take a stop.
         path_delay_note: what these host times still contain.
     """
 
     segments: tuple[ClockSegment, ...]
     skew_ppm: float
     residual_rms_ns: float
+    lateness_ns: float = 0.0
+    has_unsure_stops: bool = False
     path_delay_note: str = PATH_DELAY_NOTE
 
     @property
@@ -138,7 +149,7 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
     device, host = _checked(t_device_ns, t_host_ns)
     right = np.delete(np.arange(len(device)), find_wrong_stamps(device))
     device, host = device[right], host[right]
-    cuts, waiting = find_steps(device, host)
+    cuts, waiting, has_unsure_stops = find_steps(device, host)
     bounds = list(zip([0, *cuts], [*cuts, len(device)], strict=True))
     fitted_to = [a + np.flatnonzero(~waiting[a:b]) for a, b in bounds]
     slopes = [_slope(device[points], host[points]) for points in fitted_to]
@@ -155,7 +166,32 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
         [segment.to_host_ns(device[a:b]) for segment, (a, b) in zip(segments, bounds, strict=True)]
     )
     residual_ns = (host - fitted).astype(np.float64)
-    return ClockModel(segments, mean_slope * 1e-3, float(np.sqrt(np.mean(residual_ns**2))))
+    return ClockModel(
+        segments,
+        skew_ppm=mean_slope * 1e-3,
+        residual_rms_ns=float(np.sqrt(np.mean(residual_ns**2))),
+        lateness_ns=lateness_ns(residual_ns[~waiting], host[~waiting]),
+        has_unsure_stops=has_unsure_stops,
+    )
+
+
+def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
+    """How much later than fitted the promptest sample of a second is, 90 % quantile over seconds.
+
+    Queues, clumps and stalls let some samples through in time; only where the fit is wrong, or a
+    delay lasts, all of them are late.
+
+    Args:
+        residual_ns: arrival minus fitted time of every sample.
+        host: their arrivals, in order; a slow stream's seconds are ten periods long.
+    """
+    if len(host) < MIN_PROMPT_SAMPLES:
+        return 0.0
+    second_ns = max(PROMPT_S * 1e9, MIN_PROMPT_SAMPLES * float(np.median(np.diff(host))))
+    starts = np.unique((host - host[0]) // round(second_ns), return_index=True)[1]
+    promptest_ns = np.minimum.reduceat(residual_ns, starts)
+    is_full = np.diff(starts, append=len(host)) >= MIN_PROMPT_SAMPLES // 2
+    return float(np.quantile(promptest_ns[is_full], LATE_QUANTILE)) if is_full.any() else 0.0
 
 
 def _checked(

@@ -34,6 +34,10 @@ SUDDEN_S = 0.2
 # It was a delay if arrivals come back within this time: so many of them, as single stamps lie.
 RETURN_NS = 120_000_000_000
 MIN_RETURNED = 3
+# What rises so near to the end of a take, and stays, is more often a delay than a stop, unless it
+# rises by more than paths hold back without pause.
+END_NS = 5_000_000_000
+MAX_END_DELAY_NS = 500e6
 
 
 class Steps(NamedTuple):
@@ -42,10 +46,27 @@ class Steps(NamedTuple):
     Attributes:
         cuts: first samples after a step or a stop, in order.
         waiting: samples [n] that all waited longer than those around them, for a second or more.
+        is_unsure: whether the take ends, or the clock steps, too early after a stop (or after
+            samples that wait until the end) to tell stops from delays.
     """
 
     cuts: list[int]
     waiting: Bool[np.ndarray, " n"]
+    is_unsure: bool
+
+
+class _Rise(NamedTuple):
+    """A rise of the offset that lasts.
+
+    Attributes:
+        first: sample after it.
+        last: first sample that waits no longer; None where the clock stood still.
+        is_unsure: whether it might be the other one.
+    """
+
+    first: int
+    last: int | None
+    is_unsure: bool
 
 
 def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
@@ -54,10 +75,12 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
     A step lasts, a delay does not: the smallest apparent offset of the second before is compared
     with that of the second after. Where a device samples regularly, a step shows in the distance
     of its stamps too. What does not show there was a delay if it ended within two minutes;
-    otherwise the clock stood still, or the path became longer for good, which looks the same.
+    otherwise the clock stood still, or the path became longer for good, which looks the same. In
+    the last five seconds of a take a rise below half a second counts as a delay.
     Where device time runs back there is a step in any case.
     """
     waiting = np.zeros(len(device), dtype=bool)
+    is_unsure = False
     cuts: list[int] = (np.flatnonzero(np.diff(device) < 0) + 1).tolist()
     period_ns = float(np.median(np.diff(host)))
     count = int(np.clip(CONFIRM_S * 1e9 / max(period_ns, 1.0), 5, 500))
@@ -68,12 +91,13 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
             exact = stamps.place(cut, change_ns)
             if exact is not None and all(abs(exact - known) > count for known in cuts):
                 cuts.append(exact)
-        for first, last in levels.rises(sorted(cuts)):
-            if last is None:
-                cuts.append(first)
+        for rise in levels.rises(sorted(cuts)):
+            is_unsure |= rise.is_unsure
+            if rise.last is None:
+                cuts.append(rise.first)
             else:
-                waiting[first:last] = True
-    return Steps(sorted(set(cuts)), waiting)
+                waiting[rise.first : rise.last] = True
+    return Steps(sorted(set(cuts)), waiting, is_unsure)
 
 
 def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
@@ -127,21 +151,21 @@ class _Levels:
         rises = [(a, change_ns[a : b + 1].max()) for a, b in _runs(change_ns, threshold_ns)]
         return sorted((self._count + index, float(height)) for index, height in falls + rises)
 
-    def rises(self, cuts: list[int]) -> list[tuple[int, int | None]]:
+    def rises(self, cuts: list[int]) -> list[_Rise]:
         """Where the offset rose between known cuts and stayed, and where it came back, if ever."""
         bounds = [0, *cuts, len(self._device)]
-        found: list[tuple[int, int | None]] = []
+        found: list[_Rise] = []
         known = 0
         for index in (np.flatnonzero(self._rise_ns > self._threshold_ns) + 1).tolist():
             after = int(np.searchsorted(bounds, index, side="right"))
             first = max(bounds[after - 1], known, index - self._count)
             if first < index and (rise := self._rise(first, index, bounds[after])) is not None:
                 found.append(rise)
-                known = rise[0] if rise[1] is None else rise[1]
+                known = rise.first if rise.last is None else rise.last
         return found
 
-    def _rise(self, first: int, index: int, last: int) -> tuple[int, int | None] | None:
-        """First sample of a rise that shows at `index`, first one after it; None if none lasts.
+    def _rise(self, first: int, index: int, last: int) -> _Rise | None:
+        """The rise that shows at `index`; None if none lasts.
 
         Args:
             first: of the samples before it that tell the level.
@@ -168,10 +192,24 @@ class _Levels:
             rest_ns = risen[3 * num // 4 :].min() - risen[num // 4 : num // 2].min()
             is_level = (least_ns, lasts_ns) == GRADUAL_RISE and abs(rest_ns) < middle_ns - before_ns
             if is_sudden or is_level:
-                within = int(np.searchsorted(host, host[0] + RETURN_NS))
-                back = np.flatnonzero(y[index : index + within] < middle_ns)
-                return start, index + int(back[0]) if len(back) >= MIN_RETURNED else None
+                return self._stop_or_delay(start, (first, index, last), (before_ns, level_ns))
         return None
+
+    def _stop_or_delay(
+        self, start: int, around: tuple[int, int, int], levels_ns: tuple[float, float]
+    ) -> _Rise:
+        """What a rise was: arrivals come back below the middle of its two levels after a delay."""
+        first, index, last = around
+        host = self._host[index:last]
+        within = int(np.searchsorted(host, host[0] + RETURN_NS))
+        back = np.flatnonzero(self._straight_ns[index : index + within] < sum(levels_ns) / 2)
+        if len(back) >= MIN_RETURNED:
+            return _Rise(start, index + int(back[0]), is_unsure=False)
+        is_at_end = last == len(self._host) and host[-1] - host[0] < END_NS
+        is_delay = is_at_end and levels_ns[1] - levels_ns[0] < MAX_END_DELAY_NS
+        # Fewer samples than a second of them are too few to date the end of the take by.
+        is_delay = is_delay and index - first >= self._count
+        return _Rise(start, last if is_delay else None, is_unsure=within == len(host))
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:

@@ -15,9 +15,10 @@ ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
 # What dates a stream's samples: the device's stamps, its sequence numbers, the count of those that
 # it must have sent, or the arrivals as they are.
 ClockMethod = Literal["device", "sequence", "counting", "arrival"]
-# Why the times of a stream are in doubt: its clock is far off its nominal rate, or samples arrive
-# later than the fit says by more than a sample period (root mean square).
-ClockWarning = Literal["skew", "residual"]
+# Why the times of a stream are in doubt: its clock is far off its nominal rate, even the promptest
+# samples arrive later than the fit says by more than a sample period, or a stop of the clock cannot
+# be told from a path that got longer.
+ClockWarning = Literal["skew", "residual", "stop"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 Domain = Literal["human", "robot"]
 Origin = Literal["recorded", "twin", "imagined"]

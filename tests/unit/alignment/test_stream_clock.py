@@ -72,7 +72,7 @@ def test_a_device_that_stood_still_is_dated_right_on_both_sides(stamps, stop_s):
     )
     timed = time_stream(batch, descriptor)
     np.testing.assert_allclose(timed.t_host_ns - true_ns, 0, atol=100_000)
-    assert (timed.num_steps, timed.report.num_steps, timed.report.warnings) == (1, 1, ())
+    assert (timed.num_steps, timed.report.num_steps, timed.report.warnings) == (1, 1, ("stop",))
 
 
 @pytest.mark.parametrize(
@@ -88,13 +88,31 @@ def test_a_clock_far_off_its_rate_is_a_warning(stamps, skew_ppm, warnings):
     assert timed.report.warnings == warnings
 
 
-def test_arrivals_later_than_a_period_are_a_warning():
+def test_clumps_are_no_warning():
+    """The last sample of each does not wait, and tells the clock."""
     batch, descriptor = take(stamps=True, numbers=True)
     # Five at a time: they wait for 40, 30, 20, 10 and 0 ms.
     clumps_ns = np.repeat(batch.t_host_ns[4::5] // PERIOD_NS * PERIOD_NS, 5)
-    report = time_stream(dataclasses.replace(batch, t_host_ns=clumps_ns), descriptor).report
+    timed = time_stream(dataclasses.replace(batch, t_host_ns=clumps_ns), descriptor)
+    np.testing.assert_allclose(timed.t_host_ns - 10**12, timed.kept * PERIOD_NS, atol=500_000)
+    report = timed.report
     assert report.residual_rms_ms == pytest.approx(np.sqrt(600), abs=0.01)
-    assert report.warnings == ("residual",)
+    assert report.warnings == ()
+
+
+@pytest.mark.parametrize(("late_ms", "warnings"), [(8, ()), (30, ("residual",))])
+def test_samples_that_are_all_later_than_a_period_are_a_warning(late_ms, warnings):
+    """A clock loses so much in ten seconds and gains it in ten: the line lies below its arcs."""
+    index = np.arange(6000, dtype=np.int64)
+    arc = 1 - np.abs(index / 1000 % 2 - 1)
+    _, descriptor = take(stamps=True, numbers=True)
+    batch = SampleBatch(
+        t_host_ns=10**12 + index * PERIOD_NS + np.rint(arc * late_ms * 1e6).astype(np.int64),
+        t_device_ns=index * PERIOD_NS,
+        sequence=index,
+        values=np.zeros((6000, 1), dtype=np.float32),
+    )
+    assert time_stream(batch, descriptor).report.warnings == warnings
 
 
 def test_doubts_are_on_the_line_and_the_page_of_a_report():
@@ -106,7 +124,7 @@ def test_doubts_are_on_the_line_and_the_page_of_a_report():
             skew_ppm=-4200.0,
             residual_rms_ms=71.25,
             num_steps=3,
-            warnings=("skew", "residual"),
+            warnings=("skew", "residual", "stop"),
         ),
     )
     report = AlignmentReport(
@@ -121,10 +139,11 @@ def test_doubts_are_on_the_line_and_the_page_of_a_report():
         quality={},
         content_sha256="0" * 64,
     )
-    console = Console(width=200, record=True, file=io.StringIO())
+    console = Console(width=300, record=True, file=io.StringIO())
     console.print(report_page(report))
     for text in (report_line(report), console.export_text()):
-        assert "glove_right: times in doubt: its clock is off by -4200 ppm and samples" in text
+        assert "glove_right: times in doubt: its clock is off by -4200 ppm and even" in text
+        assert "(71.2 ms RMS of all) and device clock stood still or path got longer" in text
         assert "glove_left: times" not in text
 
 
