@@ -1,11 +1,13 @@
 """A store in, the revision of every committed id out, or word that nothing changed."""
 
 import os
+import re
 import time
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import COMMIT_FILE, Kind
+from dextouch.schemas.episodes import ID_PATTERN
 
 # Stamps of a file system can be this coarse: a change as young may have a twin with its stamp.
 SETTLED_NS = 2_000_000_000
@@ -63,6 +65,11 @@ class FolderChanges:
             try:
                 state = os.stat(f"{self._folder}/{name}/{COMMIT_FILE}")  # noqa: PTH116
             except (FileNotFoundError, NotADirectoryError):
+                continue
+            except PermissionError:
+                # Reading it says why; what has no id is no episode.
+                if re.fullmatch(ID_PATTERN, name):
+                    found[name] = (0, 0)
                 continue
             found[name] = (state.st_mtime_ns, state.st_ino)
         return found

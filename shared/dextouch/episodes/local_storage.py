@@ -1,6 +1,7 @@
 """Groups in a folder of this machine: a commit is a rename, an id is the name of a folder."""
 
 import builtins
+import re
 import shutil
 import uuid
 from pathlib import Path
@@ -17,6 +18,7 @@ from dextouch.episodes.trash import put_into_trash, remove_for_good
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas.episodes import ID_PATTERN
 
 
 def local_folder(url: str | Path) -> Path:
@@ -77,7 +79,8 @@ class LocalStorage:
 
     def exists(self, kind: Kind, item_id: str) -> bool:
         """Whether an id is committed."""
-        return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
+        with disk_errors(f"look at {kind} {item_id}"):
+            return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
 
     def revision(self, kind: Kind, item_id: str) -> int:
         """A number that changes when an id is deleted and written again.
@@ -102,7 +105,7 @@ class LocalStorage:
         with disk_errors(f"list {kind}s"):
             if not folder.is_dir():
                 return []
-            return sorted(path.name for path in folder.iterdir() if (path / COMMIT_FILE).is_file())
+            return sorted(path.name for path in folder.iterdir() if _is_committed(path))
 
     def delete(self, kind: Kind, item_id: str) -> None:
         """Remove a group for good; it vanishes at once, its bytes a moment later.
@@ -168,6 +171,14 @@ class LocalStorage:
 
     def _existing(self, kind: Kind, item_id: str) -> Path:
         folder = self._folder(kind, item_id)
-        if not (folder / COMMIT_FILE).is_file():
+        if not self.exists(kind, item_id):
             raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
         return folder
+
+
+def _is_committed(folder: Path) -> bool:
+    """Whether a group is there; one that may not be looked into counts: opening it says why."""
+    try:
+        return (folder / COMMIT_FILE).is_file()
+    except PermissionError:
+        return re.fullmatch(ID_PATTERN, folder.name) is not None

@@ -1,14 +1,18 @@
 """The catalog: every filter, pages that stand still, hours, and no look at what did not change."""
 
 import os
+import shutil
+import tempfile
 import time
+from contextlib import contextmanager
 from datetime import UTC, datetime
+from pathlib import Path
 
 import pytest
 from pydantic import ValidationError
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.errors import InvalidInputError, LimitExceededError, StorageError
 from services.episode_store import changes as changes_module
 from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
 from tests.unit.episode_store.episodes import write_episode
@@ -191,3 +195,45 @@ def test_over_http(start, store):
     for unknown in ({"opertor": "ada"}, {"min_quality": "coverage"}, {"created_after": "noon"}):
         with pytest.raises(InvalidInputError):
             client.episodes(**unknown)
+
+
+NOBODY = 65534
+
+
+@contextmanager
+def no_superuser():
+    """Permissions count within, also where the tests run as root."""
+    before = os.geteuid()
+    os.seteuid(NOBODY if before == 0 else before)
+    try:
+        yield
+    finally:
+        os.seteuid(before)
+
+
+@pytest.fixture
+def reachable():
+    """A folder that every user can reach, unlike those of pytest."""
+    base = Path(tempfile.mkdtemp(prefix="dextouch-store-"))
+    base.chmod(0o755)
+    yield base
+    shutil.rmtree(base)
+
+
+def test_an_episode_that_may_not_be_read_hides_no_other(reachable):
+    store = EpisodeStore(reachable)
+    for name in ("closed", "open"):
+        write_episode(store, name)
+    # As mkfs leaves it in a disk of its own.
+    (reachable / "episodes" / "lost+found").mkdir(mode=0)
+    closed = reachable / "episodes" / "closed"
+    closed.chmod(0)
+    with no_superuser():
+        assert ids(Catalog(store)) == "open"
+        # Opening it says what is wrong.
+        assert store.list() == ["closed", "open"]
+        for look in (store.open, store.exists, store.revision, store.num_bytes):
+            with pytest.raises(StorageError, match=r"closed.*Permission denied"):
+                look("closed")
+    closed.chmod(0o755)
+    assert ids(Catalog(store)) == "closedopen"
