@@ -192,10 +192,13 @@ class JournalWriter:
 
     def close(self) -> None:
         """Give the files back."""
-        for descriptor in (self._part, self._journal):
+        # Forgotten before it is closed: after an interrupt between the two the number may already
+        # be that of another file.
+        for field in ("_part", "_journal"):
+            descriptor: int = getattr(self, field)
+            setattr(self, field, -1)
             if descriptor >= 0:
                 os.close(descriptor)
-        self._part = self._journal = -1
 
     def _cut(self) -> None:
         for descriptor, size in (
