@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, WriteOptions
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -95,9 +95,10 @@ def reference(made, tmp_path_factory):
     return made.write(EpisodeStore(tmp_path_factory.mktemp("reference")))
 
 
-def begin_recording(store, recording_id="take-1", num_samples=40):
+def begin_recording(store, recording_id="take-1", num_samples=40, options=None):
     writer = store.writer(
         kind="recording",
+        options=options,
         attributes=RecordingAttributes(
             recording_id=recording_id,
             station="s1",
@@ -208,6 +209,56 @@ def test_of_two_writers_of_one_id_the_first_to_commit_wins(place):
     reader = place.again().recording("take-1")
     np.testing.assert_array_equal(reader.read("force").values, values)
     reader.verify()
+
+
+def test_a_take_whose_id_was_taken_meanwhile_is_kept_under_another(place):
+    late, values = begin_recording(place.store, num_samples=17)
+    with begin_recording(place.again(), num_samples=4)[0]:
+        pass
+    with pytest.raises(ConflictError, match="exists already") as caught:
+        late.__exit__(None, None, None)
+    reader = place.again().recording("take-1-recovered-1")
+    reader.verify()
+    assert reader.attributes.recovered
+    np.testing.assert_array_equal(reader.read("force").values, values)
+    said = "kept as 'take-1-recovered-1', marked as recovered"
+    assert said in " ".join(caught.value.__notes__)
+    assert place.again().recording("take-1").num_samples("force") == 4
+    assert nothing_waits(place.store)
+
+
+def test_of_a_writer_that_keeps_nothing_nothing_is_left_when_its_id_was_taken(place):
+    options = WriteOptions(recoverable=False)
+    late, _ = begin_recording(place.store, options=options)
+    with begin_recording(place.again(), num_samples=4)[0]:
+        pass
+    with pytest.raises(ConflictError, match="exists already"):
+        late.__exit__(None, None, None)
+    assert place.again().list(kind="recording") == ["take-1"]
+    assert nothing_waits(place.store)
+
+
+def nothing_waits(store):
+    """Neither a stage nor an upload is left on this machine."""
+    return store.recover() == () and not any(
+        (store.root / folder).is_dir() and any((store.root / folder).iterdir())
+        for folder in (".staging", ".outbox/recordings")
+    )
+
+
+@pytest.mark.parametrize("order", ["damaged first", "damaged last"])
+def test_a_damaged_stage_does_not_keep_others_from_being_recovered(store, place, order):
+    damaged, whole = ("a", "b") if order == "damaged first" else ("b", "a")
+    for recording_id in (damaged, whole):
+        die(begin_recording(store, recording_id)[0])
+    (journal,) = store.root.glob(f".staging/recording-{damaged}-*/force.journal")
+    data = bytearray(journal.read_bytes())
+    data[10] ^= 1
+    journal.write_bytes(data)
+    with pytest.raises(CorruptDataError, match=f"recording-{damaged}|'force'") as caught:
+        store.recover()
+    assert place.again().list(kind="recording") == [whole]
+    assert f"recovered: recording {whole!r}" in " ".join(caught.value.__notes__)
 
 
 def test_an_id_can_be_used_again_after_it_was_deleted(place):

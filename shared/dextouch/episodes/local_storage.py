@@ -12,7 +12,13 @@ from dextouch.episodes.format import COMMIT_FILE, Kind
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.stage import Attributes, attributes_id
-from dextouch.episodes.stage_recovery import RecoveredGroup, recover_stage
+from dextouch.episodes.stage_recovery import (
+    RecoveredGroup,
+    ids_below,
+    raise_first,
+    recover_all,
+    recover_stage,
+)
 from dextouch.episodes.staging import STAGING, abandoned_stages, new_stage, sweep_stages
 from dextouch.episodes.trash import put_into_trash, remove_for_good
 from dextouch.episodes.write_options import WriteOptions
@@ -156,15 +162,18 @@ class LocalStorage:
         """Complete what killed writers left behind, as far as they went.
 
         Raises:
-            CorruptDataError: damage that is no torn end; that stage is as it was.
+            CorruptDataError: damage that is no torn end; that stage is as it was, all others are
+                completed.
         """
-        found = (recover_stage(stage, self.root) for stage in abandoned_stages(self.root))
-        return [group for group in found if group is not None]
+        stages = abandoned_stages(self.root)
+        found, failures = recover_all(stages, lambda stage: recover_stage(stage, self.root))
+        raise_first(failures, found)
+        return found
 
     def sweep(self) -> int:
         """Remove stages of which nothing can be made; how many went comes back."""
         with disk_errors("sweep"):
-            return sweep_stages(self.root, self.root)
+            return sweep_stages(self.root, ids_below(self.root))
 
     def _folder(self, kind: Kind, item_id: str) -> Path:
         return self.root / f"{kind}s" / item_id

@@ -2,8 +2,10 @@
 
 import builtins
 import hashlib
+import shutil
 import uuid
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
 from dextouch.episodes.files import disk_errors, write_file
@@ -12,8 +14,14 @@ from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_address import ObjectAddress, parse_address
 from dextouch.episodes.object_bucket import Bucket
 from dextouch.episodes.object_files import CachedBucket, ObjectGroup
-from dextouch.episodes.stage import Attributes, attributes_id, kind_of, read_stage, write_stage
-from dextouch.episodes.stage_recovery import RecoveredGroup, recover_stage
+from dextouch.episodes.stage import Attributes, attributes_id, read_committed, write_stage
+from dextouch.episodes.stage_recovery import (
+    RecoveredGroup,
+    raise_first,
+    recover_all,
+    recover_stage,
+    samples_of,
+)
 from dextouch.episodes.staging import abandoned_stages, new_stage, sweep_stages, unheld_folders
 from dextouch.episodes.uploads import delete_group, group_key, sweep_orphans, upload_group
 from dextouch.episodes.write_options import WriteOptions
@@ -43,7 +51,9 @@ def open_object_storage(
 
 
 class UploadingWriter(EpisodeWriter):
-    """Writes a group in the work folder; its commit uploads it, and so does an interrupt.
+    """Writes a group in the work folder; its commit uploads it.
+
+    An interrupt during the upload leaves the group in the outbox, from where `recover` uploads it.
 
     Args:
         stage: new folder.
@@ -58,10 +68,16 @@ class UploadingWriter(EpisodeWriter):
     def _commit(self) -> None:
         super()._commit()
         # The lock that came along from the stage is still held: `recover` leaves it to us.
-        self.upload()
+        try:
+            self.upload()
+        except ConflictError:
+            # Back where what is broken off is kept under another id, or removed.
+            with disk_errors(f"move {self._target}"):
+                self._target.rename(self._stage)
+            raise
 
     def _complete(self) -> RecoveredGroup | None:
-        # What was committed waits in the outbox, if anywhere.
+        # What could not be uploaded waits in the outbox.
         return self.complete(self._stage) if self._stage.exists() else None
 
 
@@ -176,37 +192,27 @@ class ObjectStorage:
         """Complete what killed writers left behind, and uploads that were cut off.
 
         Raises:
-            CorruptDataError: damage that is no torn end; that stage is as it was.
+            CorruptDataError: damage that is no torn end; that stage is as it was, all others are
+                completed.
             StorageError, UnavailableError: the bucket cannot be reached; repeat it later.
         """
         if not self._root.is_dir():
             return []
         self._own_work_folder()
-        for stage in abandoned_stages(self._root):
-            self._recover_stage(stage)
+        _, failures = recover_all(abandoned_stages(self._root), self._recover_stage)
         found: builtins.list[RecoveredGroup] = []
-        failures: builtins.list[UnavailableError] = []
         for kind in KINDS:
-            for folder in unheld_folders(self._outbox / f"{kind}s"):
-                waiting = _counts(kind, folder)
-                try:
-                    self._upload(kind, folder)
-                except ConflictError:
-                    # Its writer lost the race for the id; there is nobody left to be told.
-                    continue
-                except UnavailableError as error:
-                    # One id may be held by a dead writer: the others need not wait for it.
-                    failures.append(error)
-                else:
-                    found.append(waiting)
-        if failures:
-            raise failures[0]
+            waiting = unheld_folders(self._outbox / f"{kind}s")
+            uploaded, failed = recover_all(waiting, partial(self._deliver, kind))
+            found += uploaded
+            failures += failed
+        raise_first(failures, found)
         return found
 
     def sweep(self) -> int:
         """Remove stages of which nothing can be made, and files of dead uploads in the bucket."""
         with disk_errors("sweep"):
-            removed = sweep_stages(self._root, self._outbox)
+            removed = sweep_stages(self._root, self._is_taken)
         return removed + sweep_orphans(self._bucket)
 
     def _upload(self, kind: Kind, folder: Path) -> None:
@@ -216,6 +222,37 @@ class ObjectStorage:
             raise type(error)(
                 f"{error.message}; {kind} {folder.name!r} waits in {folder}, `recover` uploads it"
             ) from error
+        except KeyboardInterrupt as interrupt:
+            if (folder / COMMIT_FILE).exists():
+                interrupt.add_note(
+                    f"{kind} {folder.name!r} waits in {folder}, `recover` uploads it"
+                )
+            raise
+
+    def _deliver(self, kind: Kind, folder: Path) -> RecoveredGroup | None:
+        """Upload a group that nobody holds; a recording under another id if its own was taken."""
+        if not (folder / COMMIT_FILE).exists():
+            # What is left of one that was uploaded.
+            with disk_errors(f"remove {folder}"):
+                shutil.rmtree(folder)
+            return None
+        with disk_errors(f"read {folder}"):
+            record = decode_commit((folder / COMMIT_FILE).read_bytes(), what=folder.name)[0]
+        attributes = read_committed(folder, kind)
+        try:
+            self._upload(kind, folder)
+        except ConflictError:
+            if kind == "episode":
+                # It can be made again; there is nobody left to be told.
+                shutil.rmtree(folder, ignore_errors=True)
+                return None
+            stage = new_stage(self._root, kind, folder.name)
+            write_stage(folder, attributes)
+            with disk_errors(f"move {folder}"):
+                stage.parent.mkdir(parents=True, exist_ok=True)
+                folder.rename(stage)
+            return self._complete(stage)
+        return RecoveredGroup(kind, folder.name, samples_of(record, attributes))
 
     def _complete(self, stage: Path) -> RecoveredGroup | None:
         group = self._recover_stage(stage)
@@ -224,21 +261,10 @@ class ObjectStorage:
         return group
 
     def _recover_stage(self, stage: Path) -> RecoveredGroup | None:
-        self._free_id(stage)
-        return recover_stage(stage, self._outbox)
+        return recover_stage(stage, self._outbox, self._is_taken)
 
-    def _free_id(self, stage: Path) -> None:
-        """Give a recording another id if its own was taken while its writer was dead."""
-        attributes = read_stage(stage)
-        if attributes is None or (stage / COMMIT_FILE).exists():
-            return
-        kind, item_id = kind_of(attributes), attributes_id(attributes)
-        number, free = 0, item_id
-        while self.exists(kind, free):
-            number += 1
-            free = f"{item_id[:112]}-recovered-{number}"
-        if number:
-            write_stage(stage, attributes.model_copy(update={f"{kind}_id": free}))
+    def _is_taken(self, kind: Kind, item_id: str) -> bool:
+        return (self._outbox / f"{kind}s" / item_id).exists() or self.exists(kind, item_id)
 
     def _own_work_folder(self) -> None:
         """Refuse a work folder whose remains would be uploaded to the wrong place."""
@@ -257,10 +283,3 @@ class ObjectStorage:
 
     def _missing(self, kind: Kind, item_id: str) -> NotFoundError:
         return NotFoundError(f"{kind} {item_id!r}: not in the store {self._address}")
-
-
-def _counts(kind: Kind, folder: Path) -> RecoveredGroup:
-    with disk_errors(f"read {folder}"):
-        record = decode_commit((folder / COMMIT_FILE).read_bytes(), what=folder.name)[0]
-    counts = {name: entry.shape[0] for name, entry in record.arrays.items()}
-    return RecoveredGroup(kind, folder.name, counts)

@@ -20,6 +20,7 @@ from dextouch.episodes.files import (
     write_file,
 )
 from dextouch.episodes.format import (
+    ATTRIBUTES_KEY,
     COMMIT_FILE,
     METADATA_FILE,
     ArrayEntry,
@@ -78,6 +79,22 @@ def read_stage(stage: Path) -> Attributes | None:
         raise CorruptDataError(f"{stage.name}: {STAGE_FILE} is damaged ({error})") from error
 
 
+def read_committed(stage: Path, kind: Kind) -> Attributes:
+    """The attributes in the group metadata of a stage with a commit record.
+
+    Raises:
+        CorruptDataError: they are damaged.
+    """
+    path = stage / METADATA_FILE
+    with disk_errors(f"read {path}"):
+        data = path.read_bytes()
+    model = EpisodeAttributes if kind == "episode" else RecordingAttributes
+    try:
+        return model.model_validate_json(json.dumps(json.loads(data)["attributes"][ATTRIBUTES_KEY]))
+    except (ValueError, KeyError, TypeError, RecursionError, ValidationError) as error:
+        raise CorruptDataError(f"{stage.name}: {METADATA_FILE} is damaged ({error})") from error
+
+
 def commit_stage(
     stage: Path, target: Path, attributes: Attributes, entries: Mapping[str, ArrayEntry]
 ) -> None:
@@ -105,23 +122,44 @@ def commit_stage(
     publish_stage(stage, target, record)
 
 
+def change_attributes(stage: Path, record: CommitRecord, attributes: Attributes) -> CommitRecord:
+    """Give a stage with a whole commit record other attributes; its new record comes back.
+
+    After a kill between the two files their ids differ; do it again then.
+    """
+    group = group_metadata(json_ready(attributes))
+    update = {"id": attributes_id(attributes), "attributes_sha256": sha256_hex(group)}
+    changed = record.model_copy(update=update)
+    with disk_errors(f"commit {changed.id}"):
+        replace_file(stage / METADATA_FILE, group)
+        replace_file(stage / COMMIT_FILE, encode_commit(changed)[0])
+    return changed
+
+
 def publish_stage(stage: Path, target: Path, record: CommitRecord) -> None:
     """Move a stage with a whole commit record into place.
 
     Raises:
-        ConflictError: something is in that place.
+        ConflictError: something is in that place; the stage can be recovered as before.
     """
     if target.exists():
         raise _taken(target)
+    known = read_stage(stage)
     # What a crash is mended from goes only when there is nothing left to mend.
     for name in record.arrays:
         forget_journal(stage, name)
     with disk_errors(f"commit {record.id}"):
-        for name in (STAGE_FILE, partial_name(STAGE_FILE)):
+        partials = (partial_name(name) for name in (STAGE_FILE, METADATA_FILE, COMMIT_FILE))
+        for name in (STAGE_FILE, *partials):
             (stage / name).unlink(missing_ok=True)
         sync_folder(stage)
         target.parent.mkdir(parents=True, exist_ok=True)
-        _move_into_place(stage, target)
+        try:
+            _move_into_place(stage, target)
+        except ConflictError:
+            if known is not None:
+                write_stage(stage, known)
+            raise
         sync_folder(target.parent)
 
 

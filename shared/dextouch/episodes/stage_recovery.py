@@ -1,7 +1,9 @@
 """What a killed writer left in its stage → a committed group that says it was recovered."""
 
 import hashlib
+import math
 import shutil
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
@@ -33,12 +35,17 @@ from dextouch.episodes.stage import (
     STAGE_FILE,
     Attributes,
     attributes_id,
+    change_attributes,
     commit_stage,
     kind_of,
     publish_stage,
+    read_committed,
     read_stage,
 )
-from dextouch.errors import CorruptDataError, StorageError
+from dextouch.episodes.zstd import content_bytes
+from dextouch.errors import CorruptDataError, DexTouchError, StorageError
+
+IsTaken = Callable[[Kind, str], bool]
 
 
 @dataclass(frozen=True)
@@ -50,12 +57,48 @@ class RecoveredGroup:
     num_samples: dict[str, int]
 
 
-def recover_stage(stage: Path, root: Path) -> RecoveredGroup | None:
+def ids_below(root: Path) -> IsTaken:
+    """Whether the folder of an id is there."""
+    return lambda kind, item_id: (root / f"{kind}s" / item_id).exists()
+
+
+def recover_all(
+    folders: Iterable[Path], recover: Callable[[Path], RecoveredGroup | None]
+) -> tuple[list[RecoveredGroup], list[DexTouchError]]:
+    """Recover one folder after the other, also when one fails; what was made, and what failed."""
+    found: list[RecoveredGroup] = []
+    failures: list[DexTouchError] = []
+    for folder in folders:
+        try:
+            group = recover(folder)
+        except DexTouchError as error:
+            failures.append(error)
+        else:
+            found += [] if group is None else [group]
+    return found, failures
+
+
+def raise_first(failures: Sequence[DexTouchError], found: Sequence[RecoveredGroup]) -> None:
+    """Raise the first failure, if any, with notes about the others and about what was recovered."""
+    if not failures:
+        return
+    for other in failures[1:]:
+        failures[0].add_note(f"also: {other.message}")
+    if found:
+        names = ", ".join(f"{group.kind} {group.item_id!r}" for group in found)
+        failures[0].add_note(f"recovered: {names}")
+    raise failures[0]
+
+
+def recover_stage(
+    stage: Path, root: Path, is_taken: IsTaken | None = None
+) -> RecoveredGroup | None:
     """Cut every stream of a stage to its last whole storage chunk and commit the stage.
 
     Args:
         stage: that no writer holds any more.
-        root: of the store.
+        root: folder in which the group appears.
+        is_taken: whether an id cannot be had; whether its folder is in `root` when None.
 
     Returns:
         What was recovered; None where nothing is worth keeping, and the stage is as it was.
@@ -63,19 +106,14 @@ def recover_stage(stage: Path, root: Path) -> RecoveredGroup | None:
     Raises:
         CorruptDataError: damage that is no torn end; nothing is changed.
     """
+    is_taken = is_taken or ids_below(root)
     record = _whole_commit(stage)
     if record is not None:
-        target = root / f"{record.kind}s" / record.id
-        if not target.exists():
-            publish_stage(stage, target, record)
-            counts = {name: entry.shape[0] for name, entry in record.arrays.items()}
-            return RecoveredGroup(record.kind, record.id, counts)
-    # Another writer was first with the id where there is a whole commit record; what can be made
-    # again was told so, and so was a migration that never got to put its group into place.
+        return _publish(stage, root, record, is_taken)
     attributes = read_stage(stage)
     if attributes is None:
         return None
-    # Before any shard becomes a log again: a commit record must never vouch for that.
+    # Before any shard becomes a log again: a torn commit record must not be taken for a whole one.
     for name in (METADATA_FILE, COMMIT_FILE):
         (stage / name).unlink(missing_ok=True)
     kind = kind_of(attributes)
@@ -89,21 +127,40 @@ def recover_stage(stage: Path, root: Path) -> RecoveredGroup | None:
     for stream in attributes.streams:
         for name, entry in stream_arrays(stream, kind).items():
             entries[name] = _cut_array(stage, name, entry, num_samples[stream.name])
-    attributes = _free_id(attributes, root).model_copy(update={"recovered": True})
+    attributes = _as_recovered(attributes, is_taken)
     target = root / f"{kind}s" / attributes_id(attributes)
     commit_stage(stage, target, attributes, entries)
     return RecoveredGroup(kind, target.name, num_samples)
 
 
-def is_recoverable(stage: Path, root: Path) -> bool:
+def _publish(
+    stage: Path, root: Path, record: CommitRecord, is_taken: IsTaken
+) -> RecoveredGroup | None:
+    """Move a stage with a whole commit record into place, under another id if its own was taken."""
+    attributes = read_committed(stage, record.kind)
+    if attributes_id(attributes) != record.id or is_taken(record.kind, record.id):
+        # What can be made again was told so, and so was a migration that never got to put its
+        # group into place.
+        if not (stage / STAGE_FILE).is_file():
+            return None
+        record = change_attributes(stage, record, _as_recovered(attributes, is_taken))
+    publish_stage(stage, root / f"{record.kind}s" / record.id, record)
+    return RecoveredGroup(record.kind, record.id, samples_of(record, attributes))
+
+
+def samples_of(record: CommitRecord, attributes: Attributes) -> dict[str, int]:
+    """Samples by stream."""
+    return {stream.name: record.arrays[stream.name].shape[0] for stream in attributes.streams}
+
+
+def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
     """Whether `recover_stage` would make something of an abandoned stage.
 
     A damaged stage counts: somebody should look at it before it goes.
     """
     record = _whole_commit(stage)
     if record is not None:
-        in_place = (root / f"{record.kind}s" / record.id).exists()
-        return not in_place or (stage / STAGE_FILE).exists()
+        return (stage / STAGE_FILE).exists() or not is_taken(record.kind, record.id)
     try:
         attributes = read_stage(stage)
         if attributes is None:
@@ -173,6 +230,8 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
             f"{stage.name}: array {name!r} has no storage chunk that ends after "
             f"{num_samples} samples; it was not written by this release"
         )
+    if entry.codec == "zstd" and num_kept:
+        entry = _as_written(entry, read_payloads(stage, name, rows[:1])[0])
     digest = hashlib.sha256()
     for row in rows[:num_kept]:
         payload = read_payloads(stage, name, np.array([row]))[0][:-CRC_BYTES]
@@ -189,12 +248,24 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
     return with_rows(entry, num_samples).model_copy(update={"sha256": digest.hexdigest()})
 
 
-def _free_id(attributes: Attributes, root: Path) -> Attributes:
-    """The same attributes, under another id if theirs was taken in the meantime."""
+def _as_written(entry: ArrayEntry, payload: bytes) -> ArrayEntry:
+    """The entry with as many rows a storage chunk as this one of its log has.
+
+    Releases before wrote half a second of samples, however large.
+    """
+    row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
+    chunk_rows, rest = divmod(content_bytes(payload), row_bytes)
+    if rest or not chunk_rows:
+        return entry
+    return entry.model_copy(update={"chunk_rows": chunk_rows})
+
+
+def _as_recovered(attributes: Attributes, is_taken: IsTaken) -> Attributes:
+    """The same attributes, marked, under another id if theirs was taken in the meantime."""
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     number = 0
     free = item_id
-    while (root / f"{kind}s" / free).exists():
+    while is_taken(kind, free):
         number += 1
         free = f"{item_id[:112]}-recovered-{number}"
-    return attributes.model_copy(update={f"{kind}_id": free})
+    return attributes.model_copy(update={f"{kind}_id": free, "recovered": True})

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dextouch.episodes.files import is_folder_at
 from dextouch.episodes.format import Kind
-from dextouch.episodes.stage_recovery import is_recoverable
+from dextouch.episodes.stage_recovery import IsTaken, is_recoverable
 
 STAGING = ".staging"
 # Names of stages end in a uuid4 in hexadecimal.
@@ -50,16 +50,16 @@ def abandoned_stages(root: Path) -> Iterator[Path]:
     return unheld_folders(root / STAGING)
 
 
-def sweep_stages(root: Path, groups: Path) -> int:
+def sweep_stages(root: Path, is_taken: IsTaken) -> int:
     """Remove abandoned stages of which `recover_stage` would make nothing; how many went.
 
     Args:
         root: folder with the stages.
-        groups: folder in which committed stages appear.
+        is_taken: whether an id cannot be had.
     """
     removed = 0
     for stage in abandoned_stages(root):
-        if not is_recoverable(stage, groups):
+        if not is_recoverable(stage, is_taken):
             shutil.rmtree(stage)
             removed += 1
     return removed

@@ -221,7 +221,8 @@ class EpisodeStore:
         Uploads that were cut off are completed.
 
         Raises:
-            CorruptDataError: damage that is no torn end; that stage is as it was.
+            CorruptDataError: damage that is no torn end; that stage is as it was, all others are
+                completed. Notes name them, and other failures.
         """
         return tuple(self._storage.recover())
 

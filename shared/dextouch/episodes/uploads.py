@@ -37,8 +37,7 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
         folder: of the group, named by its id.
 
     Raises:
-        ConflictError: the id has other content there; the folder is removed, as when a writer
-            loses the race for an id.
+        ConflictError: the id has other content there; the folder stays.
         UnavailableError: no connection, or another writer is at the id; the folder stays.
         StorageError: the upload failed; the folder stays.
     """
@@ -46,18 +45,16 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
     with disk_errors(f"upload {name}"):
         commit = (folder / COMMIT_FILE).read_bytes()
     content = decode_commit(commit, what=name)[1]
-    try:
-        if not _is_committed(bucket, group, content, name):
-            _claim(bucket, group, content, name)
-            _put_files(bucket, group, folder)
-            # Asked again: a sweep may have taken this upload for dead.
-            _claim(bucket, group, content, name)
-            if not bucket.put(f"{group}/{COMMIT_FILE}", commit, create=True):
-                _is_committed(bucket, group, content, name)
-    except ConflictError:
-        shutil.rmtree(folder, ignore_errors=True)
-        raise
+    if not _is_committed(bucket, group, content, name):
+        _claim(bucket, group, content, name)
+        _put_files(bucket, group, folder)
+        # Asked again: a sweep may have taken this upload for dead.
+        _claim(bucket, group, content, name)
+        if not bucket.put(f"{group}/{COMMIT_FILE}", commit, create=True):
+            _is_committed(bucket, group, content, name)
     with disk_errors(f"remove what was uploaded of {name}"):
+        # First, so that nobody takes what a kill leaves of the rest for a group.
+        (folder / COMMIT_FILE).unlink()
         shutil.rmtree(folder)
 
 

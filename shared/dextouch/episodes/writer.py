@@ -224,8 +224,9 @@ class EpisodeWriter:
                 write_stage(self._stage, self._with_losses())
             group = self._complete()
         except DexTouchError as failure:
+            where = f" in {self._stage}" if self._stage.exists() else ""
             told = (
-                f"{what}: what was appended is kept in {self._stage}, but could not be completed "
+                f"{what}: what was appended is kept{where}, but could not be completed "
                 f"({failure.message}); EpisodeStore.recover completes it"
             )
         else:

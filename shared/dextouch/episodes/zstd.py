@@ -49,6 +49,15 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
         raise CorruptDataError(f"{what}: no zstd frame of {size} bytes ({error})") from error
 
 
+def content_bytes(frame: bytes) -> int:
+    """How many bytes a zstd frame says that it holds; 0 if it says nothing or is none."""
+    try:
+        said = int(zstandard.get_frame_parameters(frame).content_size)
+    except zstandard.ZstdError:
+        return 0
+    return 0 if said == zstandard.CONTENTSIZE_UNKNOWN else said
+
+
 def frame_bytes(frame: bytes) -> int | None:
     """Where the first zstd frame of some bytes ends, going from block to block; None if nowhere."""
     place, length = _size_field(frame)

@@ -1,15 +1,17 @@
 """Takes that an exception, a Ctrl-C or a full disk breaks off: what was appended is kept."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore, WriteOptions
+from dextouch.episodes import EpisodeStore, WriteOptions, stage
 from dextouch.episodes.journal import JournalWriter
 from dextouch.episodes.shard_writer import ShardWriter
 from dextouch.errors import (
@@ -305,6 +307,80 @@ def test_a_take_whose_id_was_taken_meanwhile_is_kept_under_another(store):
     assert "'take-1-recovered-1'" in " ".join(caught.value.__notes__)
     assert kept_numbers(store, "take-1-recovered-1") == list(range(17))
     assert store.recording("take-1").num_samples("force") == 4
+
+
+@pytest.mark.parametrize("how", ["commits", "was killed"])
+def test_an_id_that_is_taken_at_the_last_moment_costs_nothing(store, monkeypatch, how):
+    """Another writer commits between the look at the id and the move into its place."""
+    late, first = (store.writer(kind="recording", attributes=take(FORCE)) for _ in range(2))
+    record(late, 0, 17)
+    record(first, 0, 4)
+    forget = stage.forget_journal
+
+    def commit_first(*arguments):
+        monkeypatch.setattr(stage, "forget_journal", forget)
+        first.__exit__(None, None, None)
+        forget(*arguments)
+
+    if how == "was killed":
+        _die_before_its_move(late, monkeypatch)
+    monkeypatch.setattr(stage, "forget_journal", commit_first)
+    end = store.recover if how == "was killed" else lambda: late.__exit__(None, None, None)
+    with pytest.raises(ConflictError, match="exists already"):
+        end()
+    store.sweep()
+    store.recover()
+    assert kept_numbers(store, "take-1-recovered-1") == list(range(17))
+    assert store.recording("take-1").num_samples("force") == 4
+    assert stages(store) == []
+
+
+def _die_before_its_move(writer, monkeypatch):
+    """As a kill would, once the commit record is written."""
+    with monkeypatch.context() as patch:
+        patch.setattr(stage, "publish_stage", lambda *_: None)
+        writer._commit()
+    os.close(writer._lock)
+
+
+def test_the_attributes_of_a_whole_take_are_those_of_its_end(store, monkeypatch):
+    """Its writer died with the commit record on the disk, and its id was taken."""
+    late = store.writer(kind="recording", attributes=take(FORCE))
+    record(late, 0, 17)
+    late.set_attributes(take(FORCE, success=True))
+    first = store.writer(kind="recording", attributes=take(FORCE))
+    _die_before_its_move(late, monkeypatch)
+    with first:
+        record(first, 0, 4)
+    (group,) = store.recover()
+    assert (group.item_id, group.num_samples) == ("take-1-recovered-1", {"force": 17})
+    assert store.recording("take-1-recovered-1").attributes.success is True
+
+
+@pytest.mark.parametrize("call", range(1, 9))
+def test_ctrl_c_while_a_log_is_closed_is_no_error_of_the_disk(store, monkeypatch, call):
+    """Four arrays of two files each, as the take is finished."""
+    real, calls = os.close, []
+
+    def interrupted(descriptor):
+        real(descriptor)
+        calls.append(descriptor)
+        if len(calls) == call:
+            raise KeyboardInterrupt
+
+    writer = store.writer(kind="recording", attributes=take(FORCE))
+    record(writer, 0, 17)
+    names = {name: getattr(os, name) for name in dir(os)}
+    with monkeypatch.context() as patch:
+        fake = SimpleNamespace(**names | {"close": interrupted})
+        patch.setattr("dextouch.episodes.journal.os", fake)
+        with pytest.raises(KeyboardInterrupt):
+            writer.__exit__(None, None, None)
+    assert kept_numbers(store) == list(range(17))
+    # The lock is free.
+    assert stages(store) == []
+    with pytest.raises(OSError, match="Bad file descriptor"):
+        os.fstat(writer._lock)
 
 
 def test_what_is_known_at_the_end_is_kept_too(store):

@@ -1,6 +1,7 @@
 """Object storage: addresses, uploads that die, deletions, and services that refuse."""
 
 import os
+import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -25,10 +26,15 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episodes.conftest import episode_of
 
 EPISODE = "stand-bottle-0003"
+FORCE = StreamDescriptor(
+    name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10
+)
 
 
 @pytest.fixture(scope="session")
@@ -240,6 +246,82 @@ def test_what_could_not_be_uploaded_waits(s3_server, store, made):
     assert store.sweep() == 0
     assert [group.item_id for group in store.recover()] == [EPISODE]
     assert store.open(EPISODE).verify().num_arrays == 2 * len(made.values)
+
+
+def begin_take(store, num_samples):
+    writer = store.writer(
+        kind="recording",
+        attributes=RecordingAttributes(
+            recording_id="take-1",
+            task="t",
+            instruction="",
+            domain="human",
+            station="bench",
+            streams=(FORCE,),
+        ),
+    )
+    numbers = np.arange(num_samples)
+    values = np.repeat(numbers[:, None], 2, axis=1).astype("f4")
+    writer.append("force", values=values, t_host_ns=numbers)
+    return writer
+
+
+def test_a_take_that_waits_gets_another_id_if_its_own_is_taken(s3_server, store, url, tmp_path):
+    writer = begin_take(store, 17)
+    with s3_server.checking_credentials(), pytest.raises(StorageError, match="refused"):
+        writer.__exit__(None, None, None)
+    other = EpisodeStore(url, CREDENTIALS, tmp_path / "other")
+    with begin_take(other, 4):
+        pass
+    (group,) = store.recover()
+    assert (group.item_id, group.num_samples) == ("take-1-recovered-1", {"force": 17})
+    reader = other.recording("take-1-recovered-1")
+    reader.verify()
+    assert reader.attributes.recovered
+    assert reader.read("force").t_host_ns.tolist() == list(range(17))
+    assert other.recording("take-1").num_samples("force") == 4
+    assert store.recover() == ()
+
+
+@pytest.mark.parametrize("place", ["force/c/0/0", "/commit.json"])
+def test_ctrl_c_during_the_upload_says_where_the_take_waits(store, monkeypatch, place):
+    writer, put = begin_take(store, 17), Bucket.put
+
+    def interrupted(self, key, content, *, create=False):
+        if key.endswith(place):
+            raise KeyboardInterrupt
+        return put(self, key, content, create=create)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Bucket, "put", interrupted)
+        with pytest.raises(KeyboardInterrupt) as caught:
+            writer.__exit__(None, None, None)
+    waiting = store.root / ".outbox" / "recordings" / "take-1"
+    told = " ".join(getattr(caught.value, "__notes__", []))
+    assert f"recording 'take-1' waits in {waiting}, `recover` uploads it" in told
+    assert waiting.is_dir()
+    assert [group.item_id for group in store.recover()] == ["take-1"]
+    assert store.recording("take-1").verify().num_arrays == 4
+
+
+def test_ctrl_c_while_an_uploaded_take_is_removed_here_costs_nothing(store, monkeypatch):
+    writer, rmtree = begin_take(store, 17), shutil.rmtree
+
+    def interrupted(path, **options):
+        if ".outbox" not in path.parts:
+            rmtree(path, **options)
+            return
+        (path / "commit.json").unlink(missing_ok=True)
+        rmtree(path / "force")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("dextouch.episodes.uploads.shutil.rmtree", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            writer.__exit__(None, None, None)
+    assert store.recover() == ()
+    assert not any((store.root / ".outbox" / "recordings").iterdir())
+    assert store.recording("take-1").verify().num_arrays == 4
 
 
 def test_an_upload_under_a_foreign_claim_waits_and_overwrites_nothing(store, bucket, made):
