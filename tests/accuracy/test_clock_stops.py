@@ -240,6 +240,21 @@ def test_a_stop_that_may_be_a_delay_is_a_warning(event, seconds, num_steps, warn
         assert (report.num_steps, report.warnings) == (num_steps, warnings)
 
 
+@pytest.mark.parametrize("until_s", [20.0, 40.0])
+def test_a_delay_of_an_irregular_device_is_a_warning(until_s):
+    """Nothing in its stamps tells a delay from a step back of its clock."""
+    for seed in range(3):
+        rng = np.random.default_rng(seed)
+        true_s = np.cumsum(rng.uniform(0.5, 1.5, 1800)) / 60
+        delay_s = np.where((true_s >= 10) & (true_s < until_s), 0.03, 0.0)
+        for size in (0, 1):
+            waits_s = BASE_S + rng.exponential(0.8e-3, len(true_s)) + size * delay_s
+            arrival_s = np.maximum.accumulate(true_s + waits_s)
+            true_ns, host_ns = (np.rint(t_s * 1e9).astype(int) for t_s in (true_s, arrival_s))
+            take = Simulated(true_ns, host_ns, true_ns, np.zeros(len(true_ns), dtype=int))
+            assert ("stop" in dated(take)[0].warnings) == (size == 1)
+
+
 @pytest.mark.parametrize(
     ("path", "rate_hz", "events"),
     [

@@ -47,7 +47,7 @@ class Steps(NamedTuple):
         cuts: first samples after a step or a stop, in order.
         waiting: samples [n] that all waited longer than those around them, for a second or more.
         is_unsure: whether the take ends, or the clock steps, too early after a stop (or after
-            samples that wait until the end) to tell stops from delays.
+            samples that wait until the end) to tell stops from delays, or irregular stamps do not.
     """
 
     cuts: list[int]
@@ -91,6 +91,7 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
             exact = stamps.place(cut, change_ns)
             if exact is not None and all(abs(exact - known) > count for known in cuts):
                 cuts.append(exact)
+                is_unsure |= change_ns > 0 and not stamps.is_regular
         for rise in levels.rises(sorted(cuts)):
             is_unsure |= rise.is_unsure
             if rise.last is None:
