@@ -357,6 +357,32 @@ def test_the_attributes_of_a_whole_take_are_those_of_its_end(store, monkeypatch)
     assert store.recording("take-1-recovered-1").attributes.success is True
 
 
+@pytest.mark.parametrize("file", ["zarr.json", "commit.json"])
+def test_a_recovery_that_dies_while_it_changes_the_id_is_repeated(store, monkeypatch, file):
+    """Even where the first id is free again by then."""
+    real = stage.replace_file
+
+    def die(path, data):
+        if path.name == file:
+            raise KeyboardInterrupt
+        real(path, data)
+
+    late, first = (store.writer(kind="recording", attributes=take(FORCE)) for _ in range(2))
+    record(late, 0, 17)
+    _die_before_its_move(late, monkeypatch)
+    with first:
+        record(first, 0, 4)
+    with monkeypatch.context() as patch:
+        patch.setattr(stage, "replace_file", die)
+        with pytest.raises(KeyboardInterrupt):
+            store.recover()
+    store.delete("take-1", kind="recording")
+    (group,) = store.recover()
+    reader = store.recording(group.item_id)
+    reader.verify()
+    assert reader.read("force").t_host_ns.tolist() == list(range(17))
+
+
 @pytest.mark.parametrize("call", range(1, 9))
 def test_ctrl_c_while_a_log_is_closed_is_no_error_of_the_disk(store, monkeypatch, call):
     """Four arrays of two files each, as the take is finished."""
