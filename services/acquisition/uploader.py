@@ -310,14 +310,11 @@ def recover_spool(spool_root: Path) -> list[str]:
 
 def _recover(path: Path) -> bool:
     spool = SpoolWriter.resume(path)
-    names = [descriptor.name for descriptor in spool.attributes.streams]
-    if not any(spool.num_samples(name) for name in names):
+    if not any(spool.num_samples(stream.name) for stream in spool.attributes.streams):
         spool.abandon()
         shutil.rmtree(path)
         return False
-    marks = tuple(LedgerEntry(stream=name, event="interrupted", count=1) for name in names)
-    ledger = (*spool.attributes.ledger, *marks)
-    spool.set_attributes(spool.attributes.model_copy(update={"ledger": ledger, "recovered": True}))
+    spool.set_attributes(spool.attributes.as_interrupted())
     spool.close()
     logger.warning("recover_take", recording_id=path.name)
     return True

@@ -44,6 +44,7 @@ from dextouch.episodes.stage import (
 )
 from dextouch.episodes.zstd import content_bytes
 from dextouch.errors import CorruptDataError, DexTouchError, StorageError
+from dextouch.schemas.recordings import RecordingAttributes
 
 IsTaken = Callable[[Kind, str], bool]
 
@@ -127,6 +128,8 @@ def recover_stage(
     for stream in attributes.streams:
         for name, entry in stream_arrays(stream, kind).items():
             entries[name] = _cut_array(stage, name, entry, num_samples[stream.name])
+    if isinstance(attributes, RecordingAttributes):
+        attributes = attributes.as_interrupted()
     attributes = _as_recovered(attributes, is_taken)
     target = root / f"{kind}s" / attributes_id(attributes)
     commit_stage(stage, target, attributes, entries)

@@ -56,6 +56,11 @@ class RecordingAttributes(BaseModel):
     quality: dict[str, FiniteFloat] = {}
     streams: tuple[StreamDescriptor, ...] = ()
 
+    def as_interrupted(self) -> "RecordingAttributes":
+        """The same for a take that broke off: `recovered`, and every stream's ledger says so."""
+        marks = [LedgerEntry(stream=s.name, event="interrupted", count=1) for s in self.streams]
+        return self.model_copy(update={"ledger": (*self.ledger, *marks), "recovered": True})
+
 
 class RecordingStatus(BaseModel):
     """Where an upload stands: the batch number that each stream expects next."""

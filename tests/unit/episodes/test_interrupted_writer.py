@@ -49,11 +49,14 @@ def record(writer, first, count=1):
     writer.append("force", values=values, t_host_ns=numbers)
 
 
-def kept_numbers(store, recording_id="take-1"):
+def kept_numbers(store, recording_id="take-1", *, broken_off=True):
     """The numbers of the samples of `force`; stamps and values agree, and nothing is damaged."""
     reader = store.recording(recording_id)
     reader.verify()
     assert reader.attributes.recovered
+    ledger = [(entry.stream, entry.event) for entry in reader.attributes.ledger]
+    marked = [stream.name for stream in reader.attributes.streams] if broken_off else []
+    assert ledger == [(name, "interrupted") for name in marked]
     batch = reader.read("force")
     assert batch.values[:, 0].tolist() == batch.t_host_ns.tolist()
     return batch.t_host_ns.tolist()
@@ -305,7 +308,7 @@ def test_a_take_whose_id_was_taken_meanwhile_is_kept_under_another(store):
     with pytest.raises(ConflictError, match="exists already") as caught:
         late.__exit__(None, None, None)
     assert "'take-1-recovered-1'" in " ".join(caught.value.__notes__)
-    assert kept_numbers(store, "take-1-recovered-1") == list(range(17))
+    assert kept_numbers(store, "take-1-recovered-1", broken_off=False) == list(range(17))
     assert store.recording("take-1").num_samples("force") == 4
 
 
@@ -330,7 +333,7 @@ def test_an_id_that_is_taken_at_the_last_moment_costs_nothing(store, monkeypatch
         end()
     store.sweep()
     store.recover()
-    assert kept_numbers(store, "take-1-recovered-1") == list(range(17))
+    assert kept_numbers(store, "take-1-recovered-1", broken_off=False) == list(range(17))
     assert store.recording("take-1").num_samples("force") == 4
     assert stages(store) == []
 
