@@ -161,7 +161,7 @@ def test_a_closed_rollout_is_gone_and_may_be_closed_again(client):
 
 def test_too_many_rollouts(client):
     started = [client.start(world="sum", **ASKED) for _ in range(8)]
-    with pytest.raises(LimitExceededError, match="expected at most 8") as caught:
+    with pytest.raises(LimitExceededError, match="the limit of 8 rollouts is reached") as caught:
         client.start(world="sum", **ASKED)
     assert caught.value.details["retry_after_s"] == 1
     for rollout in started:
