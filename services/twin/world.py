@@ -4,7 +4,7 @@ import hashlib
 import json
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -18,7 +18,9 @@ from dextouch.hands.actions import (
 )
 from dextouch.streams.packing import pack, unpack
 from dextouch.worlds.world import (
+    EVERYTHING,
     Observation,
+    ReturnSelector,
     RolloutStart,
     StartedRollout,
     SteppedRollout,
@@ -108,13 +110,19 @@ class TwinWorld:
         anchor = stage.start(stage.plan(start.seed))
         log = _StepLog(stage, self._settings.cameras)
         log.step()
+        log.draw()
         state = TwinState(start.task, start.seed, 0, stage.simulation.state(), anchor)
         return StartedRollout(
             state, log.observation(0, anchor), anchor, stage.rig.K["camera_head"].copy()
         )
 
     def step(
-        self, state: TwinState, actions: Float64[np.ndarray, "steps 67"], *, seed: int
+        self,
+        state: TwinState,
+        actions: Float64[np.ndarray, "steps 67"],
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[TwinState]:
         """See World; wrists, fingers and head are sent along the actions."""
         del seed
@@ -122,12 +130,14 @@ class TwinWorld:
         commands = poses_from_actions(checked, state.anchor)
         stage = self._stage(state.task)
         stage.simulation.set_state(state.physics, step_index=state.step * STEPS_PER_GRID)
-        log = _StepLog(stage, self._settings.cameras)
+        log = _StepLog(stage, tuple(filter(selector.wants, self._settings.cameras)))
         for row in range(len(checked)):
             for step_index in stage.simulation.advance(command_row(commands, row)):
                 if step_index % STEPS_PER_TACTILE == 0:
                     log.touch()
             log.step()
+            if selector.steps == "all" or row == len(checked) - 1:
+                log.draw()
         after = TwinState(
             state.task,
             state.seed,
@@ -135,7 +145,8 @@ class TwinWorld:
             stage.simulation.state(),
             state.anchor,
         )
-        return SteppedRollout(after, log.observation(state.step + 1, state.anchor))
+        seen = log.observation(state.step + 1, state.anchor, steps=selector.steps)
+        return SteppedRollout(after, seen)
 
     def snapshot(self, state: TwinState) -> bytes:
         """See World."""
@@ -201,16 +212,23 @@ class _StepLog:
         self._tactile.append(mean.astype(np.float32))
         self._since_step = []
         self._grid.sample()
+
+    def draw(self) -> None:
+        """Take the images of the step that was closed last."""
         for camera, images in self._images.items():
             images.append(self._stage.rig.image(self._stage.simulation, camera))
 
-    def observation(self, first_step: int, anchor: AnchorPoses) -> Observation:
-        """All closed steps; success is judged at the last one."""
+    def observation(
+        self, first_step: int, anchor: AnchorPoses, *, steps: Literal["all", "last"] = "all"
+    ) -> Observation:
+        """All closed steps or the last one; success is judged at the last one."""
+        first = 0 if steps == "all" else len(self._tactile) - 1
+        reached = actions_from_poses(self._grid.trajectory(), anchor)
         return Observation(
-            first_step=first_step,
+            first_step=first_step + first,
             images={camera: np.stack(images) for camera, images in self._images.items()},
-            tactile_kpa=np.stack(self._tactile),
-            action_reached=actions_from_poses(self._grid.trajectory(), anchor),
+            tactile_kpa=np.stack(self._tactile[first:]),
+            action_reached=reached[first:],
             reached_is_measured=True,
             success=self._stage.task.succeeded(self._stage.simulation),
         )

@@ -24,8 +24,10 @@ from dextouch.hands.actions import (
 )
 from dextouch.streams.packing import pack, unpack
 from dextouch.worlds.world import (
+    EVERYTHING,
     ActionKind,
     Observation,
+    ReturnSelector,
     RolloutStart,
     StartedRollout,
     SteppedRollout,
@@ -116,7 +118,12 @@ class ModelWorld:
         return StartedRollout(state, _first_observation(state), anchor, K_head)
 
     def step(
-        self, state: ModelState, actions: Float64[np.ndarray, "steps 67"], *, seed: int
+        self,
+        state: ModelState,
+        actions: Float64[np.ndarray, "steps 67"],
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[ModelState]:
         """Imagine one action chunk of 4k ≤ 16 steps.
 
@@ -125,7 +132,8 @@ class ModelWorld:
             InvalidInputError: actions that no hand can follow.
             UnavailableError: the model gave numbers that are not finite.
         """
-        return self.step_batch([state], np.asarray(actions)[None], seeds=[seed])[0]
+        chunks = np.asarray(actions)[None]
+        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
 
     def step_batch(
         self,
@@ -133,12 +141,19 @@ class ModelWorld:
         actions: Float64[np.ndarray, "batch steps 67"],
         *,
         seeds: Sequence[int],
+        selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[ModelState]]:
-        """`step` for each entry at once; answers differ from single ones by rounding only."""
-        if not len(states) == len(actions) == len(seeds) or len(states) == 0:
+        """`step` for each entry at once; answers differ from single ones by rounding only.
+
+        Images of the last latent are always decoded, since the next chunk starts from the last of
+        them; the others only if somebody asks.
+        """
+        asked = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+        counts = (len(states), len(actions), len(seeds), len(asked))
+        if len(set(counts)) != 1 or len(states) == 0:
             raise ShapeError(
-                f"chunks: got {len(states)} states, {len(actions)} action chunks and {len(seeds)} "
-                "seeds, expected one of each for every rollout"
+                f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
+                f"{counts[3]} selectors, expected one of each for every rollout"
             )
         chunks = [self._checked_chunk(chunk) for chunk in actions]
         requests = [_request(state, chunk) for state, chunk in zip(states, chunks, strict=True)]
@@ -146,12 +161,17 @@ class ModelWorld:
         noise = stack_noise(
             [self._model.noise(inputs.num_steps, _generator(seed)) for seed in seeds]
         )
-        future = self._model.predict(inputs, noise, sampling_steps=self._sampling_steps)
+        wanted = any(one.steps == "all" and one.wants(CAMERA) for one in asked)
+        future = self._model.predict(
+            inputs, noise, sampling_steps=self._sampling_steps, all_images=wanted
+        )
         _refuse_non_finite(future)
         images, touches = to_uint8(future.images).numpy(), future.tactile_kpa.numpy()
         return [
-            _advance(state, chunk, image, touch)
-            for state, chunk, image, touch in zip(states, chunks, images, touches, strict=True)
+            _advance(state, chunk, imagined, selector)
+            for state, chunk, imagined, selector in zip(
+                states, chunks, zip(images, touches, strict=True), asked, strict=True
+            )
         ]
 
     def snapshot(self, state: ModelState) -> bytes:
@@ -256,17 +276,22 @@ def _request(state: ModelState, chunk: np.ndarray) -> PredictionRequest:
 
 
 def _advance(
-    state: ModelState, chunk: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray
+    state: ModelState,
+    chunk: np.ndarray,
+    imagined: tuple[np.ndarray, np.ndarray],
+    selector: ReturnSelector,
 ) -> SteppedRollout[ModelState]:
-    """The new state and what was imagined.
+    """The new state and what is asked for of what was imagined: images (maybe the last), touch.
 
     The model senses no pose: the next chunk starts from the last action that was given.
     """
+    images, tactile_kpa = imagined
+    first = 0 if selector.steps == "all" else len(chunk) - 1
     observation = Observation(
-        first_step=state.step + 1,
-        images={CAMERA: images},
-        tactile_kpa=tactile_kpa,
-        action_reached=chunk,
+        first_step=state.step + 1 + first,
+        images={CAMERA: images[first - len(chunk) :]} if selector.wants(CAMERA) else {},
+        tactile_kpa=tactile_kpa[first:],
+        action_reached=chunk[first:],
         reached_is_measured=False,
     )
     following = replace(

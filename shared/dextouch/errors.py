@@ -11,6 +11,7 @@ DexTouchError
 │   └── PacketError            bytes that are no packet of the announced kind
 ├── NotFoundError              the thing asked for does not exist
 ├── ConflictError              the thing exists in another state than the request assumes
+│   └── EndedError             a rollout is over: start a new one or branch from its end
 ├── LimitExceededError         larger, longer or more than this installation allows
 ├── UnavailableError           a service, model or world that is not ready: try again later
 ├── DeviceError                a device is gone, silent or speaks another protocol
@@ -74,6 +75,18 @@ class NotFoundError(DexTouchError):
 
 class ConflictError(DexTouchError):
     """The thing exists in another state than the request assumes."""
+
+
+class EndedError(ConflictError):
+    """A rollout is over: its world goes no further with it, for a `reason` it names."""
+
+    def __init__(self, message: str, *, reason: str, **details: object) -> None:
+        super().__init__(message, reason=reason, **details)
+
+    @property
+    def reason(self) -> str:
+        """Why, in words."""
+        return str(self.details.get("reason", self.message))
 
 
 class LimitExceededError(DexTouchError):

@@ -16,7 +16,7 @@ from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.worlds.admission import check_answer
 from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.world import Observation, RolloutStart, World
+from dextouch.worlds.world import Observation, ReturnSelector, RolloutStart, World
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import (
@@ -136,6 +136,10 @@ def move(seen: Observation, num_steps: int) -> np.ndarray:
 
 
 def assert_same(one: Observation, other: Observation, *, tolerance: float = 0.0) -> None:
+    assert one.doubt == other.doubt
+    assert (one.object_poses is None) == (other.object_poses is None)
+    if one.object_poses is not None:
+        np.testing.assert_allclose(one.object_poses, other.object_poses, rtol=0, atol=tolerance)
     assert one.first_step == other.first_step
     assert one.success == other.success
     assert set(one.images) == set(other.images)
@@ -209,6 +213,27 @@ def test_a_step_is_pure(world, started):
     np.testing.assert_array_equal(chunk, kept)
 
 
+@pytest.mark.parametrize("steps", ["all", "last"])
+@pytest.mark.parametrize("num_cameras", [None, 0, 1])
+def test_a_selector_changes_what_is_shown_and_nothing_else(world, started, steps, num_cameras):
+    cameras = None if num_cameras is None else world.description.cameras[-num_cameras:]
+    selector = ReturnSelector(cameras=() if num_cameras == 0 else cameras, steps=steps)
+    chunk = move(started.observation, 2 * world.description.chunk_multiple)
+    full = world.step(started.state, chunk, seed=5)
+    asked = world.step(started.state, chunk, seed=5, selector=selector)
+    assert_same(asked.observation, full.observation.selected(selector))
+    check_answer(
+        asked.observation, world.description, first_step=1, num_steps=len(chunk), selector=selector
+    )
+    assert asked.info == full.info
+    assert world.snapshot(asked.state) == world.snapshot(full.state)
+    following = world.step(asked.state, hold(full.observation, 4), seed=6)
+    assert_same(
+        following.observation,
+        world.step(full.state, hold(full.observation, 4), seed=6).observation,
+    )
+
+
 def test_a_step_does_not_depend_on_what_the_world_did_before(candidate, world, started):
     chunk = move(started.observation, world.description.chunk_multiple)
     expected = world.step(started.state, chunk, seed=5).observation
@@ -261,6 +286,13 @@ def test_a_batch_answers_as_single_steps_do(candidate, world, started):
     for stepped, chunk, seed in zip(together, chunks, [5, 6], strict=True):
         alone = world.step(started.state, chunk, seed=seed).observation
         assert_same(stepped.observation, alone, tolerance=candidate.batch_tolerance)
+    selectors = [ReturnSelector(steps="last"), ReturnSelector(cameras=())]
+    mixed = world.step_batch(
+        [started.state] * 2, np.stack(chunks), seeds=[5, 6], selectors=selectors
+    )
+    for one, full, selector in zip(mixed, together, selectors, strict=True):
+        assert_same(one.observation, full.observation.selected(selector))
+        assert world.snapshot(one.state) == world.snapshot(full.state)
 
 
 def test_a_start_from_an_observation_begins_with_it(candidate, world):

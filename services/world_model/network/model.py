@@ -40,9 +40,9 @@ class FirstLatents:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The future after the first step."""
+    """The future after the first step; images of all of its steps, or of the last four alone."""
 
-    images: Float32[Tensor, "batch steps px px 3"]
+    images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
 
 
@@ -132,7 +132,12 @@ class JointWorldModel(nn.Module):
 
     @torch.no_grad()
     def predict(
-        self, inputs: ModelInputs, noise: JointLatents, *, sampling_steps: int | None = None
+        self,
+        inputs: ModelInputs,
+        noise: JointLatents,
+        *,
+        sampling_steps: int | None = None,
+        all_images: bool = True,
     ) -> Prediction:
         """Sample the future of every request.
 
@@ -140,6 +145,7 @@ class JointWorldModel(nn.Module):
             inputs: from `build_inputs`.
             noise: one a request, from `noise`.
             sampling_steps: Euler steps; None takes the configuration's.
+            all_images: decode every image, or only those of the last latent.
         """
         first = self.first_latents(inputs)
 
@@ -153,13 +159,22 @@ class JointWorldModel(nn.Module):
             num_steps=sampling_steps or self.config.sampling_steps,
             shift=self.config.sampling_time_shift,
         )
-        return self.decode(first, JointLatents(video, tactile))
+        return self.decode(first, JointLatents(video, tactile), all_images=all_images)
 
-    def decode(self, first: FirstLatents, residuals: JointLatents) -> Prediction:
-        """Images and pressures after the first step."""
+    def decode(
+        self, first: FirstLatents, residuals: JointLatents, *, all_images: bool = True
+    ) -> Prediction:
+        """Images and pressures after the first step.
+
+        The last latent is decoded by itself, so that its images are the same to the last bit
+        whether the others are decoded or not.
+        """
         video = first.video[:, None] + self.video_residual_std * _first_zero(residuals.video)
         tactile = first.tactile[:, None] + self.tactile_residual_std * residuals.tactile[:, 1:]
-        return Prediction(self.codec.decode(video)[:, 1:], self.tokenizer.decode(tactile))
+        images = self.codec.decode(video[:, [0, -1]])[:, 1:]
+        if all_images and video.shape[1] > 2:
+            images = torch.cat([self.codec.decode(video[:, :-1])[:, 1:], images], dim=1)
+        return Prediction(images, self.tokenizer.decode(tactile))
 
 
 def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:

@@ -15,7 +15,7 @@ import numpy as np
 from gymnasium import spaces
 
 from dextouch.clients.rollouts import Rollout, RolloutClient
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import EndedError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, POSE_SLICES
 from dextouch.schemas.rollouts import Observation, WorldDescription
 
@@ -35,7 +35,9 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     The observation is that of the newest step: `tactile_kpa` [2, 320], `action_reached` [67] and
     one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends
     the episode, `max_chunks` truncates it. A world that does not judge success never ends by
-    itself. `info` holds `success` (None where unknown) and what the world told about the chunk.
+    itself. A world that goes no further with a rollout truncates it: the observation is then the
+    last one again, and `info["ended"]` says why (None otherwise). `info` also holds `success`
+    (None where unknown), `doubt` and what the world told about the chunk.
 
     Args:
         client: of the service.
@@ -103,7 +105,11 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         """Advance by one chunk [chunk_steps, 67], relative to the start's poses."""
         if self._rollout is None:
             raise InvalidInputError("step: there is no episode; call reset first")
-        observation = self._rollout.step(action)
+        try:
+            observation = self._rollout.step(action)
+        except EndedError as error:
+            info = self._info(self._rollout) | {"ended": error.reason}
+            return _seen_now(self._rollout.observation), 0.0, False, True, info
         success = observation.success is True
         truncated = not success and self._rollout.info.next_chunk >= self._max_chunks
         info = self._info(self._rollout)
@@ -124,6 +130,8 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
             "success": rollout.observation.success,
             "last_step": rollout.info.last_step,
             "told": dict(rollout.told),
+            "doubt": rollout.observation.doubt,
+            "ended": None,
         }
 
 

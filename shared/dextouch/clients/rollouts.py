@@ -27,6 +27,7 @@ from dextouch.schemas.rollout_codec import (
     encode_start,
 )
 from dextouch.schemas.rollouts import (
+    EVERYTHING,
     ActionKind,
     ForkRequest,
     Observation,
@@ -41,7 +42,6 @@ from dextouch.schemas.rollouts import (
 MSGPACK = "application/msgpack"
 ACTIONS_TYPE = "application/octet-stream; dtype=float64"
 MAX_ANSWER_BYTES = 2**28
-ALL = ReturnSelector()
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 # An observation of one step made elsewhere, the poses at that step and the head camera's matrix.
@@ -64,7 +64,7 @@ class RolloutClient:
         api_key: str | None = None,
         *,
         timeout_s: float = 60.0,
-        selector: ReturnSelector = ALL,
+        selector: ReturnSelector = EVERYTHING,
     ) -> None:
         self._link = HttpLink(url, api_key=api_key, timeout_s=timeout_s)
         self.selector = selector
@@ -173,6 +173,10 @@ class Rollout:
 
         Returns:
             What was seen at the K steps (the last one if the client's selector says so).
+
+        Raises:
+            EndedError: the world goes no further with this rollout, for the `reason` it names;
+                what was seen last stays in `observation`.
         """
         checked = check_actions(actions, where=f"rollout {self.id}")
         reply = self._link.request(
@@ -228,7 +232,8 @@ def _start_request(**fields: object) -> StartRequest:
 def _query(selector: ReturnSelector) -> str:
     if not selector.tactile:
         raise InvalidInputError("selector: an Observation holds touch; expected tactile=True")
-    cameras = [] if selector.cameras is None else [("cameras", name) for name in selector.cameras]
+    names = () if selector.cameras is None else selector.cameras or ("",)
+    cameras = [("cameras", name) for name in names]
     return urlencode([("steps", selector.steps), *cameras])
 
 

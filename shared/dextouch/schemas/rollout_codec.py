@@ -6,14 +6,14 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, ShapeError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.problems import first_problems
 from dextouch.schemas.rollouts import (
+    Doubt,
     Observation,
-    ReturnSelector,
     RolloutInfo,
     RolloutStart,
     StartRequest,
@@ -23,7 +23,6 @@ from dextouch.streams.packing import pack, unpack
 
 IMAGE_PREFIX = "image/"
 ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
-DEFAULT_SELECTOR = ReturnSelector()
 RIGID_TOLERANCE = 1e-6
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
@@ -36,6 +35,7 @@ class ObservationFields(BaseModel):
     first_step: int
     reached_is_measured: bool
     success: bool | None = None
+    doubt: Doubt | None = Field(default=None, exclude_if=lambda doubt: doubt is None)
 
 
 class AnswerFields(BaseModel):
@@ -79,25 +79,17 @@ def encode_answer(
     rollout: RolloutInfo,
     observation: Observation,
     *,
-    selector: ReturnSelector = DEFAULT_SELECTOR,
+    tactile: bool = True,
     info: dict[str, float] | None = None,
     origin: Origin | None = None,
 ) -> bytes:
-    """The selected part of an observation, with where the rollout stands, as bytes."""
-    shown = observation.last() if selector.steps == "last" else observation
-    arrays = _observation_arrays(shown)
-    if selector.cameras is not None:
-        wanted = {IMAGE_PREFIX + camera for camera in selector.cameras}
-        arrays = {
-            name: array
-            for name, array in arrays.items()
-            if not name.startswith(IMAGE_PREFIX) or name in wanted
-        }
-    if not selector.tactile:
+    """An observation with where the rollout stands, as bytes; without `tactile`, without touch."""
+    arrays = _observation_arrays(observation)
+    if not tactile:
         del arrays["tactile_kpa"]
     if origin is not None:
         arrays |= _origin_arrays(origin)
-    fields = AnswerFields(rollout=rollout, observation=_fields_of(shown), info=info or {})
+    fields = AnswerFields(rollout=rollout, observation=_fields_of(observation), info=info or {})
     return pack(fields.model_dump(mode="json"), arrays)
 
 
@@ -179,15 +171,19 @@ def _fields_of(observation: Observation) -> ObservationFields:
         first_step=observation.first_step,
         reached_is_measured=observation.reached_is_measured,
         success=observation.success,
+        doubt=observation.doubt,
     )
 
 
 def _observation_arrays(observation: Observation) -> dict[str, np.ndarray]:
-    return {
+    arrays = {
         "tactile_kpa": observation.tactile_kpa,
         "action_reached": observation.action_reached,
         **{IMAGE_PREFIX + camera: images for camera, images in observation.images.items()},
     }
+    if observation.object_poses is not None:
+        arrays["object_poses"] = observation.object_poses
+    return arrays
 
 
 def _origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
@@ -207,8 +203,13 @@ def _observation_from(
     }
     tactile_kpa = _array(arrays, "tactile_kpa", where=where)
     action_reached = _array(arrays, "action_reached", where=where)
+    object_poses = arrays.get("object_poses")
     check_observation_arrays(
-        images=images, tactile_kpa=tactile_kpa, action_reached=action_reached, where=where
+        images=images,
+        tactile_kpa=tactile_kpa,
+        action_reached=action_reached,
+        object_poses=object_poses,
+        where=where,
     )
     return Observation(
         first_step=fields.first_step,
@@ -217,6 +218,8 @@ def _observation_from(
         action_reached=action_reached,
         reached_is_measured=fields.reached_is_measured,
         success=fields.success,
+        object_poses=object_poses,
+        doubt=fields.doubt,
     )
 
 

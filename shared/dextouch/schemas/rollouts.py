@@ -1,23 +1,29 @@
 """The nouns of a rollout: worlds and starts as requests, observations and progress as answers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from dextouch.errors import NonFiniteError, ShapeError
+from dextouch.errors import DegenerateRotationError, NonFiniteError, ShapeError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
 MAX_SEED = 2**63 - 1
+# Of the length of a unit quaternion in float32.
+QUATERNION_TOLERANCE: Final = 1e-3
 
 
 class WorldDescription(BaseModel):
-    """What a world is and accepts: the handshake before a rollout."""
+    """What a world is and accepts: the handshake before a rollout.
+
+    `object_names` are, by task, the objects whose poses its observations hold, in their order;
+    a world that gives no poses leaves it empty.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -34,6 +40,62 @@ class WorldDescription(BaseModel):
     chunk_multiple: int = 4
     max_chunk_steps: int = 64
     knows_success: bool = False
+    object_names: dict[str, tuple[str, ...]] = {}
+
+
+class ReturnSelector(BaseModel):
+    """Which part of an observation is asked for.
+
+    `cameras` None means all that the world has, an empty list none; in a query, where an empty
+    list cannot be written, none is `cameras=`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cameras: tuple[str, ...] | None = None
+    steps: Literal["last", "all"] = "all"
+    tactile: bool = True
+
+    @field_validator("cameras")
+    @classmethod
+    def _one_empty_name_means_none(cls, cameras: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        return () if cameras == ("",) else cameras
+
+    def wants(self, camera: str) -> bool:
+        """Whether images of this camera are asked for."""
+        return self.cameras is None or camera in self.cameras
+
+
+EVERYTHING: Final = ReturnSelector()
+
+
+class Doubt(BaseModel):
+    """How far an imagining world trusts what it answers.
+
+    Both numbers are 0 or more, and comparable within one world digest only.
+
+    Attributes:
+        disagreement: of several predictions of the same steps.
+        distance: of where the rollout is from what the world was trained on.
+        outside: the world's own bound is passed: what it shows is no longer to be believed.
+        reason: why it is outside, in words; None as long as it is not.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    disagreement: float = Field(ge=0, allow_inf_nan=False)
+    distance: float = Field(ge=0, allow_inf_nan=False)
+    outside: bool = False
+    reason: str | None = Field(default=None, min_length=1, max_length=500)
+
+    @model_validator(mode="after")
+    def _a_reason_if_outside(self) -> "Doubt":
+        if self.outside != (self.reason is not None):
+            raise ValueError(
+                f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
+                "outside is true and none where it is not"
+            )
+        return self
 
 
 @dataclass(frozen=True)
@@ -42,7 +104,10 @@ class Observation:
 
     `action_reached` is the pose and joint reading as an action, relative to the rollout's step 0:
     measured by a twin or a robot; in an imagined world, which senses no joints, the actions it was
-    given (`reached_is_measured` says which).
+    given (`reached_is_measured` says which). `object_poses` are T_world_object (x y z in m,
+    qw qx qy qz) as an imagined world believes them, in the order of the description's
+    `object_names`; None where the world knows of no objects, as a robot does. `doubt` is about the
+    whole chunk.
     """
 
     first_step: int
@@ -51,20 +116,33 @@ class Observation:
     action_reached: Float64[np.ndarray, "n 67"]
     reached_is_measured: bool
     success: bool | None = None
+    object_poses: Float32[np.ndarray, "n objects 7"] | None = None
+    doubt: Doubt | None = None
 
     def __len__(self) -> int:
         return len(self.tactile_kpa)
 
     def last(self) -> "Observation":
         """Its last step alone."""
-        return Observation(
+        return replace(
+            self,
             first_step=self.first_step + len(self) - 1,
             images={camera: images[-1:] for camera, images in self.images.items()},
             tactile_kpa=self.tactile_kpa[-1:],
             action_reached=self.action_reached[-1:],
-            reached_is_measured=self.reached_is_measured,
-            success=self.success,
+            object_poses=None if self.object_poses is None else self.object_poses[-1:],
         )
+
+    def selected(self, selector: ReturnSelector) -> "Observation":
+        """What a selector asks for: the wanted cameras, and all steps or the last one.
+
+        Of the last step alone everything is left out that belongs to the others: it is an
+        observation of one step that begins where the chunk ends. Touch stays; whether it is sent
+        is decided by who sends.
+        """
+        shown = self.last() if selector.steps == "last" else self
+        wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
+        return replace(shown, images=wanted)
 
 
 @dataclass(frozen=True)
@@ -112,18 +190,11 @@ class ForkRequest(BaseModel):
     seed: int | None = Field(default=None, ge=0, le=MAX_SEED)
 
 
-class ReturnSelector(BaseModel):
-    """Which part of an observation is sent; cameras None means all that the world has."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    cameras: tuple[str, ...] | None = None
-    steps: Literal["last", "all"] = "all"
-    tactile: bool = True
-
-
 class RolloutInfo(BaseModel):
-    """Where a rollout stands; `next_chunk` is the only number that is accepted next."""
+    """Where a rollout stands; `next_chunk` is the only number that is accepted next.
+
+    `ended` is why its world goes no further with it, and left out as long as it does.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -137,6 +208,7 @@ class RolloutInfo(BaseModel):
     next_chunk: int
     last_step: int
     ttl_s: float
+    ended: str | None = Field(default=None, exclude_if=lambda reason: reason is None)
 
 
 def check_observation(observation: Observation, *, where: str) -> None:
@@ -145,6 +217,7 @@ def check_observation(observation: Observation, *, where: str) -> None:
         images=observation.images,
         tactile_kpa=observation.tactile_kpa,
         action_reached=observation.action_reached,
+        object_poses=observation.object_poses,
         where=where,
     )
 
@@ -154,13 +227,15 @@ def check_observation_arrays(
     images: Mapping[str, np.ndarray],
     tactile_kpa: np.ndarray,
     action_reached: np.ndarray,
+    object_poses: np.ndarray | None = None,
     where: str,
 ) -> None:
     """Refuse arrays that do not fit each other or hold NaN or infinity.
 
     Raises:
         ShapeError: kinds of number, lengths or shapes that do not fit.
-        NonFiniteError: in touch or actions.
+        NonFiniteError: in touch, actions or object poses.
+        DegenerateRotationError: an object's quaternion is not of length 1.
     """
     num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
     if num_steps == 0:
@@ -170,6 +245,22 @@ def check_observation_arrays(
     size_px = next((array.shape[1:3] for array in images.values() if array.ndim == 4), (0, 0))
     for camera, array in images.items():
         _check_array(f"images of {camera}", array, ("uint8", (num_steps, *size_px, 3)), where)
+    if object_poses is not None:
+        _check_object_poses(object_poses, num_steps, where)
+
+
+def _check_object_poses(poses: np.ndarray, num_steps: int, where: str) -> None:
+    num_objects = poses.shape[1] if poses.ndim == 3 else 1
+    if num_objects == 0:
+        raise ShapeError(f"{where}: object_poses got 0 objects, expected at least 1 or no poses")
+    _check_array("object_poses", poses, ("float32", (num_steps, num_objects, 7)), where)
+    off = np.abs(np.linalg.norm(poses[:, :, 3:], axis=2) - 1.0)
+    if off.max() > QUATERNION_TOLERANCE:
+        step, index = np.unravel_index(off.argmax(), off.shape)
+        raise DegenerateRotationError(
+            f"{where}: object_poses hold a quaternion (qw qx qy qz) of step {step}, object {index} "
+            f"whose length is off 1 by {off.max():.1e}, expected at most {QUATERNION_TOLERANCE:.0e}"
+        )
 
 
 def _check_array(

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import (
+    DegenerateRotationError,
     DexTouchError,
     InvalidInputError,
     LimitExceededError,
@@ -14,6 +15,7 @@ from dextouch.errors import (
 )
 from dextouch.hands.actions import check_actions
 from dextouch.schemas.rollouts import (
+    EVERYTHING,
     Observation,
     ReturnSelector,
     RolloutStart,
@@ -47,7 +49,7 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
     images = start.observation.images
     wanted = {camera: images[camera] for camera in description.cameras if camera in images}
     observation = replace(start.observation, images=wanted)
-    _check_fits(observation, description, where="start")
+    _check_fits(observation, description, description.cameras, where="start")
     return replace(start, observation=observation)
 
 
@@ -85,14 +87,29 @@ def check_selector(selector: ReturnSelector, description: WorldDescription) -> N
 
 
 def check_answer(
-    observation: Observation, description: WorldDescription, *, first_step: int, num_steps: int
+    observation: Observation,
+    description: WorldDescription,
+    *,
+    first_step: int,
+    num_steps: int,
+    selector: ReturnSelector = EVERYTHING,
 ) -> None:
     """Refuse what a world must not answer.
+
+    Args:
+        observation: what it gave for a chunk.
+        description: of the world.
+        first_step: of the chunk.
+        num_steps: of the chunk.
+        selector: what was asked for: of `steps="last"` one step, the chunk's last, is expected.
 
     Raises:
         NonFiniteError: NaN or infinity in what it gives, as wild actions may bring about.
         DexTouchError: wrong length, size or place: the world broke its promise.
     """
+    if selector.steps == "last":
+        first_step, num_steps = first_step + num_steps - 1, 1
+    cameras = tuple(camera for camera in description.cameras if selector.wants(camera))
     where = f"answer of world {description.name} (the rollout stays as it was)"
     if (observation.first_step, len(observation)) != (first_step, num_steps):
         raise DexTouchError(
@@ -100,17 +117,22 @@ def check_answer(
             f"{num_steps} from {first_step}"
         )
     try:
-        _check_fits(observation, description, where=where)
-    except ShapeError as error:
+        _check_fits(observation, description, cameras, where=where)
+    except (ShapeError, DegenerateRotationError) as error:
         raise DexTouchError(error.message) from error
 
 
-def _check_fits(observation: Observation, description: WorldDescription, *, where: str) -> None:
+def _check_fits(
+    observation: Observation,
+    description: WorldDescription,
+    cameras: tuple[str, ...],
+    *,
+    where: str,
+) -> None:
     check_observation(observation, where=where)
-    if set(observation.images) != set(description.cameras):
+    if set(observation.images) != set(cameras):
         raise ShapeError(
-            f"{where}: got images of {sorted(observation.images)}, expected of "
-            f"{sorted(description.cameras)}"
+            f"{where}: got images of {sorted(observation.images)}, expected of {sorted(cameras)}"
         )
     expected = (description.image_height_px, description.image_width_px)
     for camera, images in observation.images.items():

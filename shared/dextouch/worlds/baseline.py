@@ -9,7 +9,9 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import check_actions
 from dextouch.schemas.rollout_codec import decode_observation, encode_observation
 from dextouch.worlds.world import (
+    EVERYTHING,
     Observation,
+    ReturnSelector,
     RolloutStart,
     StartedRollout,
     SteppedRollout,
@@ -72,17 +74,28 @@ class CopyFirstWorld:
                 "only from an observation made in another world or episode"
             )
         state = replace(
-            start.observation.last(), first_step=0, reached_is_measured=False, success=None
+            start.observation.last(),
+            first_step=0,
+            reached_is_measured=False,
+            success=None,
+            doubt=None,
         )
         return StartedRollout(state, state, start.anchor, start.K_head)
 
     def step(
-        self, state: Observation, actions: np.ndarray, *, seed: int
+        self,
+        state: Observation,
+        actions: np.ndarray,
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[Observation]:
         """See World; there is no noise, so `seed` changes nothing."""
         del seed
+        poses = state.object_poses
         reached = np.array(check_actions(actions, where="world copy-first: actions"))
-        seen = Observation(
+        seen = replace(
+            state,
             first_step=state.first_step + 1,
             images={
                 camera: np.repeat(images, len(reached), axis=0)
@@ -90,9 +103,9 @@ class CopyFirstWorld:
             },
             tactile_kpa=np.repeat(state.tactile_kpa, len(reached), axis=0),
             action_reached=reached,
-            reached_is_measured=False,
+            object_poses=poses if poses is None else np.repeat(poses, len(reached), axis=0),
         )
-        return SteppedRollout(seen.last(), seen)
+        return SteppedRollout(seen.last(), seen.selected(selector))
 
     def snapshot(self, state: Observation) -> bytes:
         """See World."""

@@ -12,18 +12,26 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import LimitExceededError, UnavailableError
-from dextouch.worlds.world import BatchWorld, State, SteppedRollout, World
+from dextouch.worlds.world import (
+    EVERYTHING,
+    BatchWorld,
+    ReturnSelector,
+    State,
+    SteppedRollout,
+    World,
+)
 
 ResultT = TypeVar("ResultT")
 
 
 @dataclass(frozen=True)
 class StepJob(Generic[State]):
-    """One rollout's next chunk."""
+    """One rollout's next chunk and what is asked to be seen of it."""
 
     state: State
     actions: Float64[np.ndarray, "steps 67"]
     seed: int
+    selector: ReturnSelector = EVERYTHING
 
 
 @dataclass(frozen=True)
@@ -138,9 +146,13 @@ class WorldWorker(Generic[State]):
                 [job.state for job in jobs],
                 np.stack([job.actions for job in jobs]),
                 seeds=[job.seed for job in jobs],
+                selectors=[job.selector for job in jobs],
             )
         else:
-            stepped = [self.world.step(job.state, job.actions, seed=job.seed) for job in jobs]
+            stepped = [
+                self.world.step(job.state, job.actions, seed=job.seed, selector=job.selector)
+                for job in jobs
+            ]
         results = [(one, self.world.snapshot(one.state)) for one in stepped]
         return began_s, time.perf_counter() - began_s, results
 

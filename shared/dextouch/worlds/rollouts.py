@@ -9,7 +9,7 @@ import hashlib
 import secrets
 from collections import OrderedDict
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -20,6 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from dextouch.errors import (
     ConflictError,
+    EndedError,
     LimitExceededError,
     UnknownNameError,
 )
@@ -140,7 +141,8 @@ class RolloutService:
         self._live.put(info.id, version, started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
         origin = Origin(started.anchor, started.K_head)
-        return Answer(encode_answer(info, started.observation, selector=selector, origin=origin))
+        shown = started.observation.selected(selector)
+        return Answer(encode_answer(info, shown, tactile=selector.tactile, origin=origin))
 
     async def get(self, rollout_id: str) -> RolloutInfo:
         """Where a rollout stands; does not prolong its life."""
@@ -155,6 +157,7 @@ class RolloutService:
             NotFoundError: no such rollout (any more).
             ConflictError: another chunk is expected; `expected` tells which.
             ShapeError, NonFiniteError, InvalidInputError: actions that do not fit.
+            EndedError: the world goes no further; it stays so for every later chunk.
             LimitExceededError: the rollout is as long as allowed, or too much waits.
         """
         lock = self._locks.setdefault(rollout_id, asyncio.Lock())
@@ -168,9 +171,13 @@ class RolloutService:
             if replayed is not None:
                 logger.info("chunk_replayed", rollout_id=rollout_id, chunk=chunk)
                 return replayed
+            if stored.record.info.ended is not None:
+                raise _over(stored.record.info)
             self._check_length(stored.record.info)
             try:
                 return await self._advance(stored, worker, request)
+            except EndedError as error:
+                raise await self._end(stored, error) from error
             except ConflictError:
                 # Another process was faster: its answer stands, if it was to the same request.
                 replayed = _replay((await self._records.read(rollout_id)).record, chunk, request)
@@ -181,13 +188,17 @@ class RolloutService:
     async def fork(self, rollout_id: str, *, seed: int | None = None) -> RolloutInfo:
         """Branch at the current step: the copy has the same past and goes on by itself.
 
+        A rollout that is over branches where it stood before the chunk that ended it.
+
         Args:
             rollout_id: of the rollout that is branched; it stays as it is.
             seed: of the branch's noise; None keeps the rollout's own.
         """
         parent = (await self._records.read(rollout_id)).record
         self._worker_of(parent.info)
-        changed = {"id": secrets.token_hex(16)} | ({} if seed is None else {"seed": seed})
+        changed: dict[str, object] = {"id": secrets.token_hex(16), "ended": None}
+        if seed is not None:
+            changed["seed"] = seed
         info = parent.info.model_copy(update=changed)
         record = RolloutRecord(info, parent.snapshot)
         await self._records.add(record, limit=self.limits.max_rollouts)
@@ -214,10 +225,14 @@ class RolloutService:
         if state is None:
             state = await worker.call(worker.world.restore, stored.record.snapshot)
         seed = chunk_seed(before.seed, before.next_chunk, before.world_digest)
-        outcome = await worker.step(StepJob(state, request.actions, seed))
+        outcome = await worker.step(StepJob(state, request.actions, seed, request.selector))
         seen, num_steps = outcome.stepped.observation, len(request.actions)
         check_answer(
-            seen, worker.world.description, first_step=before.last_step + 1, num_steps=num_steps
+            seen,
+            worker.world.description,
+            first_step=before.last_step + 1,
+            num_steps=num_steps,
+            selector=request.selector,
         )
         info = before.model_copy(
             update={
@@ -226,12 +241,21 @@ class RolloutService:
             }
         )
         told = outcome.stepped.info
-        payload = encode_answer(info, seen, selector=request.selector, info=told)
+        payload = encode_answer(info, seen, tactile=request.selector.tactile, info=told)
         last = LastAnswer(request.sha256(), payload)
         record = RolloutRecord(info, outcome.snapshot, last)
         version = await self._records.write(record, over_version=stored.version)
         self._live.put(info.id, version, outcome.stepped.state)
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
+
+    async def _end(self, stored: StoredRecord, error: EndedError) -> EndedError:
+        """Keep with the rollout that it is over; the error that all its later chunks get."""
+        record = stored.record
+        info = record.info.model_copy(update={"ended": error.reason})
+        await self._records.write(replace(record, info=info), over_version=stored.version)
+        self._live.drop(info.id)
+        logger.info("rollout_ended", rollout_id=info.id, reason=error.reason)
+        return _over(info)
 
     def _worker(self, world: str) -> WorldWorker[Any]:
         if world not in self._workers:
@@ -286,6 +310,18 @@ def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:
     """Seed of a chunk's noise: the same whoever computes it, whatever else is computed."""
     text = f"{rollout_seed}/{chunk}/{world_digest}".encode()
     return int.from_bytes(hashlib.sha256(text).digest()[:8], "big") & MAX_SEED
+
+
+def _over(info: RolloutInfo) -> EndedError:
+    last_chunk = info.next_chunk - 1 if info.next_chunk else None
+    return EndedError(
+        f"rollout {info.id}: is over: {info.ended}; its last good chunk is "
+        f"{'none' if last_chunk is None else last_chunk} and its last good step {info.last_step}; "
+        "start a new one, or branch from there with other actions",
+        reason=str(info.ended),
+        last_chunk=last_chunk,
+        last_step=info.last_step,
+    )
 
 
 def _replay(record: RolloutRecord, chunk: int, request: _ChunkRequest) -> Answer | None:

@@ -14,8 +14,10 @@ from jaxtyping import Float64
 
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.rollouts import (
+    EVERYTHING,
     ActionKind,
     Observation,
+    ReturnSelector,
     RolloutStart,
     WorldDescription,
     WorldKind,
@@ -24,9 +26,11 @@ from dextouch.schemas.rollouts import (
 State = TypeVar("State")
 
 __all__ = [
+    "EVERYTHING",
     "ActionKind",
     "BatchWorld",
     "Observation",
+    "ReturnSelector",
     "RolloutStart",
     "StartedRollout",
     "State",
@@ -49,7 +53,7 @@ class StartedRollout(Generic[State]):
 
 @dataclass(frozen=True)
 class SteppedRollout(Generic[State]):
-    """A world's answer to an action chunk: the new state and the K steps that were seen."""
+    """A world's answer to an action chunk: the new state and what was asked for of the K steps."""
 
     state: State
     observation: Observation
@@ -75,7 +79,12 @@ class World(Protocol[State]):
         ...
 
     def step(
-        self, state: State, actions: Float64[np.ndarray, "steps 67"], *, seed: int
+        self,
+        state: State,
+        actions: Float64[np.ndarray, "steps 67"],
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[State]:
         """Advance by one checked action chunk.
 
@@ -85,6 +94,13 @@ class World(Protocol[State]):
                 step 0 (measured poses), of the action kind the rollout was started with.
             seed: of the noise of this chunk; the same state, actions and seed give the same
                 observation whatever else the world is doing.
+            selector: what the observation holds: it equals `Observation.selected` of the one that
+                holds everything, so a world need not draw images that nobody asks for. The new
+                state does not depend on it.
+
+        Raises:
+            EndedError: the world goes no further from this state, for the reason it names, rather
+                than answer with noise; the state stays good for `snapshot`.
         """
         ...
 
@@ -111,6 +127,14 @@ class BatchWorld(World[State], Protocol[State]):
         actions: Float64[np.ndarray, "batch steps 67"],
         *,
         seeds: Sequence[int],
+        selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[State]]:
-        """`step` for each entry; who else is in the batch changes no answer."""
+        """`step` for each entry; who else is in the batch changes no answer.
+
+        Args:
+            states: one a rollout.
+            actions: chunks of one length.
+            seeds: one a rollout.
+            selectors: one a rollout; None asks for everything.
+        """
         ...

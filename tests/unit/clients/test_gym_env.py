@@ -49,6 +49,16 @@ def test_success_ends_and_length_truncates(env):
     assert seen["tactile_kpa"].min() > 100
 
 
+def test_a_rollout_that_its_world_ends_is_truncated(env):
+    env.reset(seed=0)
+    before, *_, info = env.step(actions(4))
+    assert (info["ended"], info["doubt"]) == (None, None)
+    seen, reward, terminated, truncated, info = env.step(actions(4, 4e6))
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info["ended"] == "too many to count"
+    np.testing.assert_array_equal(seen["tactile_kpa"], before["tactile_kpa"])
+
+
 def test_without_a_seed_starts_differ(env):
     first, _ = env.reset()
     second, _ = env.reset()

@@ -6,6 +6,7 @@ import pytest
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import (
     ConflictError,
+    EndedError,
     InvalidInputError,
     LimitExceededError,
     NonFiniteError,
@@ -55,6 +56,27 @@ def test_a_rollout_from_task_and_seed(client):
         assert rollout.info.next_chunk == 1
         assert "noise" in rollout.told
         assert rollout.step(actions(4)).first_step == 17
+
+
+def test_no_images_and_the_last_step_only(client):
+    blind = client.selecting(ReturnSelector(cameras=(), steps="last"))
+    with blind.start(world="sum", **ASKED) as rollout:
+        assert rollout.observation.images == {}
+        seen = rollout.step(actions(16))
+        assert (seen.first_step, len(seen), seen.images) == (16, 1, {})
+
+
+def test_an_ended_rollout_is_an_error_of_its_own(client):
+    with client.start(world="sum", **ASKED) as rollout:
+        before = rollout.step(actions(4))
+        for value in (4e6, 0.0):
+            with pytest.raises(EndedError, match="branch") as caught:
+                rollout.step(actions(4, value))
+            assert caught.value.reason == "too many to count"
+            assert caught.value.details["last_chunk"] == 0
+        assert rollout.observation is before
+        with rollout.fork() as branch:
+            assert branch.step(actions(4)).first_step == 5
 
 
 def test_a_rollout_from_an_observation(client):

@@ -17,7 +17,7 @@ from tests.unit.worlds.running import served
 class Stuck(toy.ToyWorld):
     """An imagined world in which every rollout fails at its first chunk."""
 
-    def step(self, state, actions, *, seed):
+    def step(self, state, actions, *, seed, selector):
         raise InvalidInputError("stuck: this world imagines nothing")
 
 

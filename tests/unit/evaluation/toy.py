@@ -8,7 +8,9 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, reanchor
 from dextouch.streams.packing import pack
 from dextouch.worlds.world import (
+    EVERYTHING,
     Observation,
+    ReturnSelector,
     RolloutStart,
     StartedRollout,
     SteppedRollout,
@@ -125,11 +127,19 @@ class ToyWorld:
             seen = start.observation
         return StartedRollout(ToyState(target, 0, seen), seen, start.anchor or ANCHOR, K_HEAD)
 
-    def step(self, state: ToyState, actions: np.ndarray, *, seed: int) -> SteppedRollout[ToyState]:
+    def step(
+        self,
+        state: ToyState,
+        actions: np.ndarray,
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
+    ) -> SteppedRollout[ToyState]:
         del seed
         hands = actions[:, :2] + self.drift_m
         seen = self._observe(state.target, hands, state.step + 1)
-        return SteppedRollout(ToyState(state.target, state.step + len(actions), seen), seen)
+        after = ToyState(state.target, state.step + len(actions), seen)
+        return SteppedRollout(after, seen.selected(selector))
 
     def _observe(self, target: np.ndarray, hands: np.ndarray, first_step: int) -> Observation:
         success = bool(np.linalg.norm(hands[-1] - target) < REACHED_M)

@@ -19,6 +19,8 @@ from dextouch.schemas.rollout_codec import (
     encode_start,
 )
 from dextouch.schemas.rollouts import (
+    EVERYTHING,
+    Doubt,
     Observation,
     ReturnSelector,
     RolloutInfo,
@@ -57,14 +59,31 @@ def golden_observation() -> Observation:
     )
 
 
+def imagined_observation() -> Observation:
+    """The same as an imagining world gives it: two objects' poses, and doubt."""
+    poses = np.zeros((2, 2, 7), np.float32)
+    poses[:, :, 0] = [[0.25, -0.5], [0.125, -0.5]]
+    poses[:, :, 3:] = [0.5, 0.5, -0.5, 0.5]
+    return dataclasses.replace(
+        golden_observation(),
+        reached_is_measured=False,
+        success=None,
+        object_poses=poses,
+        doubt=Doubt(disagreement=0.5, distance=2.25, outside=True, reason="bottle out of view"),
+    )
+
+
 def assert_same(one: Observation, other: Observation) -> None:
-    for field in ("first_step", "reached_is_measured", "success"):
+    for field in ("first_step", "reached_is_measured", "success", "doubt"):
         assert getattr(one, field) == getattr(other, field)
     assert set(one.images) == set(other.images)
     for camera, images in one.images.items():
         np.testing.assert_array_equal(images, other.images[camera])
     np.testing.assert_array_equal(one.tactile_kpa, other.tactile_kpa)
     np.testing.assert_array_equal(one.action_reached, other.action_reached)
+    assert (one.object_poses is None) == (other.object_poses is None)
+    if one.object_poses is not None:
+        np.testing.assert_array_equal(one.object_poses, other.object_poses)
 
 
 @given(
@@ -92,13 +111,64 @@ def test_answers_come_back_with_info_and_origin():
     assert decode_answer(encode_answer(INFO, seen), max_bytes=10**6).origin is None
 
 
+def test_what_an_imagining_world_adds_comes_back():
+    seen = imagined_observation()
+    answer = decode_answer(encode_answer(INFO, seen), max_bytes=10**6)
+    assert_same(answer.observation, seen)
+    assert_same(decode_observation(encode_observation(seen), max_bytes=10**6), seen)
+    start = RolloutStart("t", 1, "x", "commanded", seen.last(), anchor(), K_HEAD)
+    assert_same(
+        decode_start(encode_start(REQUEST, start), max_bytes=10**6)[1].observation, seen.last()
+    )
+
+
+def test_what_older_services_do_not_send_is_none():
+    old = decode_answer((GOLDEN / "answer.msgpack").read_bytes(), max_bytes=10**6)
+    assert (old.observation.object_poses, old.observation.doubt) == (None, None)
+    assert old.rollout.ended is None
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"disagreement": -1.0},
+        {"distance": float("inf")},
+        {"disagreement": float("nan")},
+        {"outside": True},
+        {"reason": "far from everything"},
+        {"outside": True, "reason": ""},
+    ],
+)
+def test_doubt_that_contradicts_itself_is_refused(fields):
+    good = {"disagreement": 0.0, "distance": 0.0, "outside": False, "reason": None}
+    Doubt.model_validate(good)
+    raw, arrays = unpack(encode_observation(observation()), max_bytes=10**6)
+    with pytest.raises(InvalidInputError, match="doubt"):
+        decode_observation(pack(raw | {"doubt": good | fields}, arrays), max_bytes=10**6)
+
+
 def test_last_step_and_one_camera():
-    seen = observation(4, first_step=5)
-    selector = ReturnSelector(cameras=(CAMERAS[1],), steps="last")
-    got = decode_answer(encode_answer(INFO, seen, selector=selector), max_bytes=10**6).observation
+    seen = dataclasses.replace(observation(4, first_step=5), object_poses=poses(4))
+    assert seen.selected(EVERYTHING) == seen
+    got = seen.selected(ReturnSelector(cameras=(CAMERAS[1],), steps="last"))
     assert (got.first_step, len(got), set(got.images)) == (8, 1, {CAMERAS[1]})
+    np.testing.assert_array_equal(got.object_poses, seen.object_poses[-1:])
     np.testing.assert_array_equal(got.tactile_kpa[0], seen.tactile_kpa[-1])
     np.testing.assert_array_equal(got.images[CAMERAS[1]][0], seen.images[CAMERAS[1]][-1])
+
+
+@pytest.mark.parametrize("cameras", [(), ("",)])
+def test_no_camera_at_all(cameras):
+    got = observation(4).selected(ReturnSelector(cameras=cameras))
+    assert (len(got), got.images) == (4, {})
+
+
+def poses(num_steps: int) -> np.ndarray:
+    """Two objects that move along x, standing."""
+    rows = np.zeros((num_steps, 2, 7), np.float32)
+    rows[:, :, 0] = np.arange(num_steps)[:, None]
+    rows[:, :, 3] = 1.0
+    return rows
 
 
 def test_starts_come_back():
@@ -124,6 +194,10 @@ def test_starts_come_back():
                 dataclasses.replace(golden_observation().last(), first_step=0),
                 origin=Origin(anchor(), K_HEAD),
             ),
+        ),
+        (
+            "imagined_answer",
+            lambda: encode_answer(INFO, imagined_observation(), info={"contacts": 2.0}),
         ),
         ("start", lambda: encode_start(REQUEST, RolloutStart("stand_bottle", 3, "x"))),
     ],
@@ -163,6 +237,12 @@ def unpack_all(data: bytes) -> dict[str, object]:
             ShapeError,
             "images of b",
         ),
+        ({"object_poses": poses(2)}, ShapeError, "object_poses"),
+        ({"object_poses": poses(1)[:, :0]}, ShapeError, "0 objects"),
+        ({"object_poses": poses(1)[0]}, ShapeError, "object_poses"),
+        ({"object_poses": poses(1).astype(float)}, ShapeError, "float64"),
+        ({"object_poses": poses(1) * np.float32(np.nan)}, NonFiniteError, "object_poses"),
+        ({"object_poses": poses(1) * np.float32(1.01)}, DegenerateRotationError, "object 0"),
     ],
 )
 def test_arrays_that_do_not_fit_are_named(changed, error, says):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.worlds.world import RolloutStart
+from dextouch.worlds.world import ReturnSelector, RolloutStart
+from services.twin.cameras import CameraRig
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
@@ -67,6 +68,24 @@ def test_leaving_cameras_out_changes_nothing_else(world):
     np.testing.assert_array_equal(got.images["camera_head"], expected.images["camera_head"])
     np.testing.assert_array_equal(got.tactile_kpa, expected.tactile_kpa)
     np.testing.assert_array_equal(got.action_reached, expected.action_reached)
+
+
+@pytest.mark.parametrize(
+    ("asked", "num_images"),
+    [({"steps": "last"}, 3), ({"cameras": ("camera_head",)}, 4), ({"cameras": ()}, 0)],
+)
+def test_only_asked_images_are_drawn(world, monkeypatch, asked, num_images):
+    started = world.reset(RolloutStart("stand_bottle", 1, ""))
+    drawn, image = [], CameraRig.image
+
+    def noting(rig, simulation, camera):
+        drawn.append(camera)
+        return image(rig, simulation, camera)
+
+    monkeypatch.setattr(CameraRig, "image", noting)
+    still = np.repeat(started.observation.action_reached, 4, axis=0)
+    world.step(started.state, still, seed=0, selector=ReturnSelector(**asked))
+    assert len(drawn) == num_images
 
 
 def test_an_unknown_camera_is_refused():

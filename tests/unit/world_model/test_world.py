@@ -14,7 +14,7 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.worlds.world import BatchWorld, Observation, RolloutStart, World
+from dextouch.worlds.world import BatchWorld, Observation, ReturnSelector, RolloutStart, World
 from services.world_model import world as world_module
 from services.world_model.network.inputs import build_inputs
 from services.world_model.training.dataset import cut_window
@@ -162,6 +162,28 @@ def test_company_in_a_batch_changes_nothing_but_rounding(world, toy_episodes):
         np.testing.assert_allclose(alone.tactile_kpa, many.tactile_kpa, rtol=1e-5, atol=1e-5)
         difference = alone.images[CAMERA].astype(int) - many.images[CAMERA].astype(int)
         assert np.abs(difference).max() <= 1
+
+
+def test_only_asked_images_are_decoded(world, toy_episode, monkeypatch):
+    episode, decoded = toy_episode(2), []
+    state = world.reset(make_start(episode)).state
+    codec = world._model.codec
+    decode = codec.decode
+
+    def noting(latents):
+        decoded.append(latents.shape[1])
+        return decode(latents)
+
+    monkeypatch.setattr(codec, "decode", noting)
+    chunk = episode.actions["commanded"][1:17]
+    for asked in ({"steps": "last"}, {"cameras": ()}):
+        stepped = world.step(state, chunk, seed=3, selector=ReturnSelector(**asked))
+        # The first latent and the last, whose last image the next chunk starts from.
+        assert decoded == [2]
+        decoded.clear()
+    assert stepped.state.image.shape == state.image.shape
+    world.step(state, chunk, seed=3)
+    assert sum(decoded) > 2
 
 
 def test_snapshots_resume_exactly(world, toy_episode):

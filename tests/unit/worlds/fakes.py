@@ -4,11 +4,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import EndedError, InvalidInputError
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
 from dextouch.streams.packing import pack, unpack
 from dextouch.worlds.world import (
+    EVERYTHING,
     Observation,
+    ReturnSelector,
     RolloutStart,
     StartedRollout,
     SteppedRollout,
@@ -54,7 +56,10 @@ class SumState:
 
 
 class SumWorld:
-    """Touch is the sum of all joint angles so far plus noise; a chunk with joint 1e6 breaks it."""
+    """Touch is the sum of all joint angles so far plus noise; a chunk with joint 1e6 breaks it.
+
+    A chunk with joint 4e6 ends the rollout.
+    """
 
     def __init__(self, name: str = "sum", digest: str = "d1") -> None:
         self.num_restores = 0
@@ -83,20 +88,30 @@ class SumWorld:
         first = self._seen(state, np.array([state.total]), actions(1))
         return StartedRollout(state, first, anchor(), K_HEAD)
 
-    def step(self, state: SumState, actions: np.ndarray, *, seed: int) -> SteppedRollout[SumState]:
+    def step(
+        self,
+        state: SumState,
+        actions: np.ndarray,
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
+    ) -> SteppedRollout[SumState]:
         self.num_steps += 1
         actions = check_actions(actions)
         if (actions == 1e6).any():
             raise InvalidInputError("sum: joint 1e6 cannot be reached")
         if (actions == 2e6).any():
             raise RuntimeError("a mistake of the world itself")
+        if (actions == 4e6).any():
+            raise EndedError("sum: cannot count on", reason="too many to count")
         noise = np.random.default_rng(seed).normal(size=len(actions))
         totals = state.total + np.cumsum(actions[:, 20] + noise)
         if (actions == 3e6).any():
             totals[:] = np.nan
         new = SumState(state.step + len(actions), float(totals[-1]))
         first = replace(state, step=state.step + 1)
-        return SteppedRollout(new, self._seen(first, totals, actions), {"noise": float(noise[0])})
+        seen = self._seen(first, totals, actions).selected(selector)
+        return SteppedRollout(new, seen, {"noise": float(noise[0])})
 
     def snapshot(self, state: SumState) -> bytes:
         return pack({"step": state.step}, {"total": np.array([state.total])})
@@ -130,9 +145,10 @@ class BatchSumWorld(SumWorld):
         super().__init__("batch-sum")
         self.batch_sizes: list[int] = []
 
-    def step_batch(self, states, actions, *, seeds):
+    def step_batch(self, states, actions, *, seeds, selectors=None):
         self.batch_sizes.append(len(states))
+        asked = selectors or [EVERYTHING] * len(states)
         return [
-            self.step(state, chunk, seed=seed)
-            for state, chunk, seed in zip(states, actions, seeds, strict=True)
+            self.step(state, chunk, seed=seed, selector=selector)
+            for state, chunk, seed, selector in zip(states, actions, seeds, asked, strict=True)
         ]

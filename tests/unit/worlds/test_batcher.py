@@ -2,12 +2,14 @@
 
 import asyncio
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableError
 from dextouch.worlds.batcher import StepJob, WorldWorker
+from dextouch.worlds.world import EVERYTHING, ReturnSelector
 from tests.unit.worlds.fakes import BatchSumWorld, SumState, SumWorld, actions
 
 
@@ -20,11 +22,11 @@ class GatedMixin:
         self.entered = threading.Event()
         self.threads: set[int] = set()
 
-    def step(self, state, actions, *, seed):
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
         self.threads.add(threading.get_ident())
         self.entered.set()
         assert self.gate.wait(20)
-        return super().step(state, actions, seed=seed)
+        return super().step(state, actions, seed=seed, selector=selector)
 
 
 class GatedSum(GatedMixin, SumWorld):
@@ -68,6 +70,22 @@ async def test_what_waits_is_taken_together_and_answers_as_alone():
     for one, outcome in zip(jobs, outcomes, strict=True):
         expected = alone.step(one.state, one.actions, seed=one.seed)
         assert outcome.stepped.state == expected.state
+    worker.close()
+
+
+async def test_each_of_a_batch_is_shown_what_it_asked_for():
+    worker = WorldWorker(GatedBatch())
+    asked = [ReturnSelector(steps="last"), ReturnSelector(cameras=()), EVERYTHING]
+    jobs = [replace(job(), selector=selector) for selector in asked]
+    first, others = await queue_behind_one(worker, jobs)
+    worker.world.gate.set()
+    await first
+    shown = [outcome.stepped.observation for outcome in await asyncio.gather(*others)]
+    assert worker.world.batch_sizes == [3]
+    assert [len(one) for one in shown] == [1, 4, 4]
+    assert [len(one.images) for one in shown] == [2, 0, 2]
+    alone = (await worker.step(jobs[0])).stepped.observation
+    assert len(alone) == 1
     worker.close()
 
 

@@ -9,6 +9,7 @@ import pytest
 from dextouch.errors import (
     ConflictError,
     DexTouchError,
+    EndedError,
     InvalidInputError,
     LimitExceededError,
     NonFiniteError,
@@ -113,10 +114,76 @@ async def test_a_failed_step_changes_nothing(value, error):
     plain.close()
 
 
+async def test_a_rollout_that_its_world_ends_stays_ended(state):
+    world = SumWorld()
+    made = service(state, world=world)
+    rollout_id = await begin(made)
+    good = await made.step(rollout_id, 0, actions(4), ALL)
+    with pytest.raises(EndedError, match="too many to count") as caught:
+        await made.step(rollout_id, 1, actions(4, 4e6), ALL)
+    expected = {"reason": "too many to count", "last_chunk": 0, "last_step": 4}
+    assert caught.value.details == expected
+    info, asked = await made.get(rollout_id), world.num_steps
+    assert (info.next_chunk, info.last_step, info.ended) == (1, 4, "too many to count")
+    # Also in another process, and with actions that the world would take; nobody asks it again.
+    for one in (made, service(state, world=world)):
+        with pytest.raises(EndedError) as again:
+            await one.step(rollout_id, 1, actions(4), ALL)
+        assert (again.value.message, again.value.details) == (caught.value.message, expected)
+    assert world.num_steps == asked
+    assert (await made.step(rollout_id, 0, actions(4), ALL)).payload == good.payload
+    with pytest.raises(ConflictError, match="expected chunk 1"):
+        await made.step(rollout_id, 2, actions(4), ALL)
+
+
+async def test_a_branch_of_an_ended_rollout_goes_on_from_its_last_good_step():
+    made = service()
+    rollout_id = await begin(made)
+    with pytest.raises(EndedError) as caught:
+        await made.step(rollout_id, 0, actions(4, 4e6), ALL)
+    assert caught.value.details["last_chunk"] is None
+    branch = await made.fork(rollout_id)
+    assert branch.ended is None
+    answer = decoded(await made.step(branch.id, 0, actions(4), ALL))
+    assert (answer.observation.first_step, answer.rollout.ended) == (1, None)
+    made.close()
+
+
+async def test_a_world_draws_only_what_is_asked_for():
+    class Noting(SumWorld):
+        def step(self, state, actions, *, seed, selector):
+            asked.append(selector)
+            return super().step(state, actions, seed=seed, selector=selector)
+
+    asked: list[ReturnSelector] = []
+    made = service(world=Noting())
+    rollout_id = await begin(made)
+    selector = ReturnSelector(cameras=("camera_head",), steps="last")
+    answer = decoded(await made.step(rollout_id, 0, actions(8), selector))
+    assert asked == [selector]
+    seen = answer.observation
+    assert (seen.first_step, len(seen), set(seen.images)) == (8, 1, {"camera_head"})
+    made.close()
+
+
+async def test_a_world_that_shows_more_than_asked_breaks_its_promise():
+    class Generous(SumWorld):
+        def step(self, state, actions, *, seed, selector):
+            return super().step(state, actions, seed=seed)
+
+    made = service(world=Generous())
+    rollout_id = await begin(made)
+    with pytest.raises(DexTouchError, match="got 4 steps from 1, expected 1 from 4"):
+        await made.step(rollout_id, 0, actions(4), ReturnSelector(steps="last"))
+    with pytest.raises(DexTouchError, match="images of"):
+        await made.step(rollout_id, 0, actions(4), ReturnSelector(cameras=()))
+    made.close()
+
+
 async def test_a_world_that_breaks_its_promise_is_not_believed():
     class Short(SumWorld):
-        def step(self, state, actions, *, seed):
-            return super().step(state, actions[:-1], seed=seed)
+        def step(self, state, actions, *, seed, selector):
+            return super().step(state, actions[:-1], seed=seed, selector=selector)
 
     made = service(world=Short())
     rollout_id = await begin(made)

@@ -64,6 +64,18 @@ async def test_worlds_are_listed(client):
     assert listed[0]["tasks"] == ["stand_bottle", "stack_bowls"]
 
 
+async def test_an_ended_rollout_is_a_problem_with_its_reason(client):
+    path = f"/v1/rollouts/{await begin(client)}"
+    url = f"{path}/chunks/0?steps=last&cameras="
+    for value in (4e6, 0.0):
+        body = actions(4, value).astype("<f8").tobytes()
+        problem = problem_of(await client.post(url, content=body, headers=FLOAT64))
+        assert (problem.status, problem.title) == (409, "Ended")
+        assert problem.details["reason"] == "too many to count"
+        assert problem.details["last_chunk"] is None
+    assert (await client.get(path)).json()["ended"] == "too many to count"
+
+
 async def test_every_kind_of_chunk_body_means_the_same(client):
     chunk = actions(4, 0.5)
     bodies = [
