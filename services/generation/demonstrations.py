@@ -82,6 +82,8 @@ def imagine_episode(
             "origin": "imagined",
             "lineage": lineage,
             "object_names": (),
+            "object_boxes_m": (),
+            "event_times_s": {},
             "generator_command": None,
             "streams": (),
         }

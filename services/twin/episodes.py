@@ -10,8 +10,10 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
+from services.twin.bounding_boxes import object_boxes_m
 from services.twin.cameras import CAMERAS
 from services.twin.demonstrators import NUM_GRID_STEPS
+from services.twin.events import EventTimes
 from services.twin.hands import Domain
 from services.twin.recorder import GridLog, Recorder, TruthStream, action_stream
 from services.twin.settings import TwinSettings
@@ -90,15 +92,20 @@ def record(stage: Stage, seed: int, options: TakeOptions) -> TruthEpisode:
     recorder, grid = Recorder(stage, images=options.images), GridLog(stage)
     recorder.sample(0)
     grid.sample()
+    events = EventTimes(stage.task)
+    events.sample(0, stage.simulation)
     for row in range(1, NUM_GRID_STEPS):
         for step_index in stage.simulation.advance(command_row(commands, row)):
             recorder.sample(step_index)
         grid.sample()
+        events.sample(row, stage.simulation)
     streams = recorder.streams()
     streams["action"] = action_stream("action", actions_from_poses(grid.trajectory(), anchor))
     if stage.domain == "robot":
         streams["action_commanded"] = action_stream("action_commanded", actions_commanded)
-    attributes = _attributes(stage, seed, options, anchor)
+    attributes = _attributes(stage, seed, options, anchor).model_copy(
+        update={"event_times_s": events.times_s}
+    )
     return TruthEpisode(attributes, streams, np.stack(recorder.pad_forces_n))
 
 
@@ -140,6 +147,10 @@ def _attributes(
             + ("" if frozen is None else f" --freeze-from {frozen}")
         ),
         object_names=stage.task.object_names,
+        object_boxes_m=tuple(
+            (x, y, z, half_x, half_y, half_z)
+            for x, y, z, half_x, half_y, half_z in object_boxes_m(stage.simulation.scene).tolist()
+        ),
         calibration=mounts,
         quality={"noise_m": options.noise_m, "miss": float(options.miss)},
     )

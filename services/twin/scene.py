@@ -6,11 +6,12 @@ from functools import cached_property
 import mujoco
 import numpy as np
 import structlog
-from jaxtyping import Bool, Int64
+from jaxtyping import Int64
 
 from dextouch.tactile.layout import SIDES
 from services.twin.hands import Domain, TwinHand, twin_hand
 from services.twin.mjcf import scene_xml
+from services.twin.object_bodies import ObjectBodies
 
 logger = structlog.get_logger(__name__)
 
@@ -73,36 +74,27 @@ class Scene:
         return np.array(self.model.body_mocapid[bodies], dtype=np.int64)
 
     @cached_property
-    def object_bodies(self) -> Int64[np.ndarray, " objects"]:
-        """Body of each of the task's objects."""
-        return np.array(
-            self._ids(mujoco.mjtObj.mjOBJ_BODY, list(self.object_names)), dtype=np.int64
-        )
+    def bodies(self) -> ObjectBodies:
+        """How the task's objects hang in the world."""
+        return ObjectBodies(self.model, self.object_names)
 
     @cached_property
-    def object_qpos(self) -> Int64[np.ndarray, "objects 7"]:
-        """Places of each object's pose in qpos."""
-        joints = self.model.body_jntadr[self.object_bodies]
-        return self.model.jnt_qposadr[joints][:, None] + np.arange(7)
-
-    @cached_property
-    def object_qvel(self) -> Int64[np.ndarray, "objects 6"]:
-        """Places of each object's velocity in qvel (linear in the world, then angular)."""
-        joints = self.model.body_jntadr[self.object_bodies]
-        return self.model.jnt_dofadr[joints][:, None] + np.arange(6)
-
-    @cached_property
-    def is_hand_geom(self) -> Bool[np.ndarray, " geoms"]:
-        """Which geoms belong to a hand."""
+    def geom_hand(self) -> Int64[np.ndarray, " geoms"]:
+        """Which hand each geom belongs to: 0 left, 1 right, -1 none."""
+        wrists = self._ids(mujoco.mjtObj.mjOBJ_BODY, [f"{side}_wrist" for side in SIDES])
         roots = self.model.body_rootid[self.model.geom_bodyid]
-        return np.isin(
-            roots, self._ids(mujoco.mjtObj.mjOBJ_BODY, [f"{side}_wrist" for side in SIDES])
-        )
+        is_of_hand = roots[:, None] == np.array(wrists)
+        return np.where(is_of_hand.any(axis=1), is_of_hand.argmax(axis=1), -1)
 
     @cached_property
-    def is_object_geom(self) -> Bool[np.ndarray, " geoms"]:
-        """Which geoms belong to one of the task's objects."""
-        return np.isin(self.model.geom_bodyid, self.object_bodies)
+    def geom_object(self) -> Int64[np.ndarray, " geoms"]:
+        """Which of the task's objects each geom belongs to, -1 for none."""
+        return self.bodies.of_body[self.model.geom_bodyid]
+
+    @cached_property
+    def table_geom(self) -> int:
+        """The table top."""
+        return int(self.model.geom("table").id)
 
 
 def compile_scene(domain: Domain, *, objects: str, object_names: tuple[str, ...]) -> Scene:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import mujoco
 import numpy as np
-from jaxtyping import Float32, Float64
+from jaxtyping import Bool, Float32, Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.interpolation import interpolate_poses
@@ -45,6 +45,7 @@ class Simulation:
         self.tactile_kpa: Float32[np.ndarray, "2 320"] = np.zeros((2, 320), dtype=np.float32)
         self.pad_forces_n: Float64[np.ndarray, "2 6"] = np.zeros((2, 6))
         self._skin = TactileReader(scene)
+        self._bodies = scene.bodies
         scene.model.opt.disableflags |= _NO_SENSORS
 
     def place(
@@ -56,7 +57,7 @@ class Simulation:
         """
         mujoco.mj_resetData(self.scene.model, self.data)
         self._apply(pose_from_transform(command.Ts_world_x), command.joints_rad)
-        self.data.qpos[self.scene.object_qpos] = object_poses
+        self._bodies.place(self.data, object_poses)
         self._place_hands(command)
         for _ in range(round(settle_s * PHYSICS_RATE_HZ)):
             mujoco.mj_step(self.scene.model, self.data)
@@ -145,17 +146,41 @@ class Simulation:
 
     def object_poses(self) -> Float64[np.ndarray, "objects 7"]:
         """T_world_object of the task's objects: x y z (m), qw qx qy qz."""
-        return np.array(self.data.qpos[self.scene.object_qpos])
+        return self._bodies.poses(self.data)
 
     def object_speeds(self) -> Float64[np.ndarray, " objects"]:
-        """Largest of each object's linear (m/s) and angular (rad/s) speed components."""
-        return np.abs(self.data.qvel[self.scene.object_qvel]).max(axis=1)
+        """Largest linear (m/s) or angular (rad/s) speed component of each object or its joint."""
+        return self._bodies.speeds(self.data)
+
+    def hand_contacts(self) -> Bool[np.ndarray, "2 objects"]:
+        """Whether each hand (left, right) touches each of the task's objects."""
+        scene = self.scene
+        geoms = self.data.contact.geom[: self.data.ncon]
+        touching = np.zeros((2, len(scene.object_names)), dtype=bool)
+        for one, other in (geoms.T, geoms.T[::-1]):
+            hand, thing = scene.geom_hand[one], scene.geom_object[other]
+            met = (hand >= 0) & (thing >= 0)
+            touching[hand[met], thing[met]] = True
+        return touching
+
+    def hand_touches(self, object_index: int) -> bool:
+        """Whether any part of a hand is in contact with one object."""
+        return bool(self.hand_contacts()[:, object_index].any())
 
     def hand_touches_object(self) -> bool:
         """Whether any part of a hand is in contact with any of the task's objects."""
+        return bool(self.hand_contacts().any())
+
+    def touches_table(self, object_index: int) -> bool:
+        """Whether an object is in contact with the table top (fixed things never are)."""
         geoms = self.data.contact.geom[: self.data.ncon]
-        hand = self.scene.is_hand_geom[geoms].any(axis=1)
-        return bool((hand & self.scene.is_object_geom[geoms].any(axis=1)).any())
+        on_table = (geoms == self.scene.table_geom).any(axis=1)
+        return bool((on_table & (self.scene.geom_object[geoms] == object_index).any(axis=1)).any())
+
+    def objects_touch(self, first_index: int, second_index: int) -> bool:
+        """Whether two of the task's objects are in contact with each other."""
+        pairs = np.sort(self.scene.geom_object[self.data.contact.geom[: self.data.ncon]], axis=1)
+        return bool((pairs == sorted((first_index, second_index))).all(axis=1).any())
 
     @property
     def state_size(self) -> int:

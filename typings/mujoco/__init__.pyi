@@ -10,6 +10,19 @@ class mjtObj(IntEnum):
     mjOBJ_JOINT = 3
     mjOBJ_ACTUATOR = 19
 
+class mjtJoint(IntEnum):
+    mjJNT_FREE = 0
+    mjJNT_SLIDE = 2
+    mjJNT_HINGE = 3
+
+class mjtGeom(IntEnum):
+    mjGEOM_SPHERE = 2
+    mjGEOM_CAPSULE = 3
+    mjGEOM_ELLIPSOID = 4
+    mjGEOM_CYLINDER = 5
+    mjGEOM_BOX = 6
+    mjGEOM_MESH = 7
+
 class mjtState(IntEnum):
     mjSTATE_INTEGRATION = 32767
 
@@ -32,15 +45,23 @@ class MjModel:
     nq: int
     nv: int
     nu: int
+    nbody: int
     ngeom: int
+    body_dofadr: np.ndarray
+    body_dofnum: np.ndarray
     body_jntadr: np.ndarray
+    body_jntnum: np.ndarray
     body_mocapid: np.ndarray
+    body_parentid: np.ndarray
     body_rootid: np.ndarray
     geom_bodyid: np.ndarray
     geom_dataid: np.ndarray
     geom_rgba: np.ndarray
+    geom_size: np.ndarray
+    geom_type: np.ndarray
     jnt_dofadr: np.ndarray
     jnt_qposadr: np.ndarray
+    jnt_type: np.ndarray
     mesh_vert: np.ndarray
     mesh_vertadr: np.ndarray
     mesh_vertnum: np.ndarray
@@ -62,11 +83,14 @@ class MjData:
     qpos: np.ndarray
     qvel: np.ndarray
     sensordata: np.ndarray
+    xpos: np.ndarray
+    xquat: np.ndarray
     def __init__(self, model: MjModel) -> None: ...
 
 def mj_contactForce(m: MjModel, d: MjData, id: int, result: np.ndarray) -> None: ...
 def mj_forward(m: MjModel, d: MjData) -> None: ...
 def mj_getState(m: MjModel, d: MjData, state: np.ndarray, sig: int) -> None: ...
+def mj_kinematics(m: MjModel, d: MjData) -> None: ...
 def mj_multiRay(
     m: MjModel,
     d: MjData,

@@ -24,7 +24,20 @@ _NEST_M: Final = 0.014
 _PALM_ABOVE_RIM_M: Final = 0.026
 _SQUEEZE_M: Final = -0.014
 _OPEN_M: Final = 0.045
+_LIFTED_M, _OVER_BASE_M, _NESTED_M = 0.03, 0.02, 0.012
 _COLOURS: Final = {"bowl_moved": "0.82 0.26 0.26 1", "bowl_base": "0.28 0.34 0.82 1"}
+
+
+def _sideways_m(poses: Float64[np.ndarray, "2 7"]) -> float:
+    return float(np.hypot(*(poses[0, :2] - poses[1, :2])))
+
+
+def _is_nested(poses: Float64[np.ndarray, "2 7"]) -> bool:
+    height_m = poses[0, 2] - poses[1, 2]
+    upright = transform_from_pose(poses)[:, 2, 2]
+    return bool(
+        _sideways_m(poses) < _NESTED_M and 0.002 < height_m < 0.035 and upright.min() > 0.97
+    )
 
 
 class StackBowls:
@@ -33,6 +46,7 @@ class StackBowls:
     name = "stack_bowls"
     instruction = "Lift the left bowl with both hands and stack it into the right bowl."
     object_names = ("bowl_moved", "bowl_base")
+    milestones = ("touched", "lifted", "over_base", "nested", "released")
 
     def objects_mjcf(self) -> str:
         """Two bowls, each a disc and twelve sloping walls."""
@@ -116,13 +130,22 @@ class StackBowls:
 
     def succeeded(self, simulation: Simulation) -> bool:
         """One bowl upright in the other, within 12 mm sideways, both at rest and untouched."""
-        moved, base = simulation.object_poses()
-        offset = moved[:3] - base[:3]
-        upright = transform_from_pose(simulation.object_poses())[:, 2, 2]
         return bool(
-            np.hypot(offset[0], offset[1]) < 0.012
-            and 0.002 < offset[2] < 0.035
-            and upright.min() > 0.97
+            _is_nested(simulation.object_poses())
             and simulation.object_speeds().max() < REST_SPEED
             and not simulation.hand_touches_object()
+        )
+
+    def reached(self, simulation: Simulation) -> tuple[bool, ...]:
+        """Touched by a hand; held 3 cm up; held over the other bowl; in it; let go."""
+        poses = simulation.object_poses()
+        touched = simulation.hand_touches(0)
+        raised = bool(poses[0, 2] > _LIFTED_M)
+        lifted = touched and raised and not simulation.touches_table(0)
+        return (
+            touched,
+            lifted,
+            lifted and _sideways_m(poses) < _OVER_BASE_M,
+            _is_nested(poses),
+            self.succeeded(simulation),
         )

@@ -41,6 +41,7 @@ _HELD_MIDDLES_M: Final[dict[Domain, tuple[float, float, float]]] = {
     "human": (0.0127, -0.0010, -0.0010),
 }
 _RELEASE_S: Final = 0.4
+_LIFTED_M: Final = 0.03
 # Bottle's own z (its cap) points to world -x when it lies at yaw 0.
 _LYING: Final = rotation_from_vector(np.array([0.0, -0.5 * np.pi, 0.0]))
 _ROLL_UP: Final = rotation_from_vector(np.array([0.0, 0.5 * np.pi, 0.0]))
@@ -58,12 +59,21 @@ def _turn_to_x(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
     return rotation_from_vector(turn / max(sine, 1e-12) * np.arctan2(sine, unit[0]))
 
 
+def _is_upright(pose: Float64[np.ndarray, "7"]) -> bool:
+    return bool(transform_from_pose(pose)[2, 2] > 0.99)
+
+
+def _is_at_standing_height(pose: Float64[np.ndarray, "7"]) -> bool:
+    return bool(abs(pose[2] - _HALF_LENGTH_M) < 0.01)
+
+
 class StandBottle:
     """Grasp the lying bottle with the right hand, turn it upright, set it down, let go."""
 
     name = "stand_bottle"
     instruction = "Pick up the bottle lying on the table and stand it upright."
     object_names = ("bottle",)
+    milestones = ("touched", "lifted", "upright", "placed", "released")
 
     def objects_mjcf(self) -> str:
         """A cylinder with foot, collar and a narrower cap."""
@@ -139,10 +149,23 @@ class StandBottle:
     def succeeded(self, simulation: Simulation) -> bool:
         """Upright within 8°, on the table within 1 cm, at rest, untouched."""
         pose = simulation.object_poses()[0]
-        up = transform_from_pose(pose)[2, 2]
         return bool(
-            up > 0.99
-            and abs(pose[2] - _HALF_LENGTH_M) < 0.01
+            _is_upright(pose)
+            and _is_at_standing_height(pose)
             and simulation.object_speeds()[0] < REST_SPEED
             and not simulation.hand_touches_object()
+        )
+
+    def reached(self, simulation: Simulation) -> tuple[bool, ...]:
+        """Touched by a hand; held 3 cm higher than it lay; upright; standing; let go."""
+        pose = simulation.object_poses()[0]
+        touched = simulation.hand_touches(0)
+        raised = bool(pose[2] > _FOOT_RADIUS_M + _LIFTED_M)
+        upright = _is_upright(pose)
+        return (
+            touched,
+            touched and raised and not simulation.touches_table(0),
+            upright,
+            upright and _is_at_standing_height(pose) and simulation.touches_table(0),
+            self.succeeded(simulation),
         )

@@ -32,12 +32,21 @@ class Task(Protocol):
         """Bodies of the task, in the order of poses."""
         ...
 
+    @property
+    def milestones(self) -> tuple[str, ...]:
+        """What happens on the way to success, in order, snake case; the last one is success."""
+        ...
+
     def objects_mjcf(self) -> str:
-        """The bodies, each with a free joint and geoms of class `object`."""
+        """The bodies with geoms of class `object`.
+
+        Each has a free joint, or is a `mocap="true"` body (a thing that stands fixed), or hangs
+        on one by hinges or slides; see `services.twin.object_bodies`.
+        """
         ...
 
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "objects 7"]:
-        """T_world_object at the start: x y z (m), qw qx qy qz."""
+        """T_world_object at the start, joints at rest: x y z (m), qw qx qy qz."""
         ...
 
     def script(
@@ -61,4 +70,11 @@ class Task(Protocol):
 
     def succeeded(self, simulation: Simulation) -> bool:
         """Whether the task is done now: objects in pose, at rest, and no hand touching them."""
+        ...
+
+    def reached(self, simulation: Simulation) -> tuple[bool, ...]:
+        """Whether the condition of each milestone holds now; the last one is `succeeded`.
+
+        Simulation must be at a step where contacts are current, such as every grid step.
+        """
         ...

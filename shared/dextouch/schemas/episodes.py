@@ -1,10 +1,18 @@
 """What an episode says about itself, and the catalog's answers: pydantic models in and out."""
 
+from operator import not_
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, field_validator
+from pydantic import (
+    AwareDatetime,
+    BaseModel,
+    ConfigDict,
+    Field,
+    FiniteFloat,
+    field_validator,
+)
 
 from dextouch.hands.actions import AnchorPoses
 from dextouch.streams.descriptors import StreamDescriptor
@@ -23,6 +31,9 @@ StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 Domain = Literal["human", "robot"]
 Origin = Literal["recorded", "twin", "imagined"]
 Matrix = tuple[tuple[FiniteFloat, ...], ...]
+NonNegativeFinite = Annotated[FiniteFloat, Field(ge=0)]
+# Centre x y z and half sizes x y z of a bounding box.
+Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 
 def matrix_rows(matrix: np.ndarray) -> Matrix:
@@ -111,7 +122,10 @@ class EpisodeAttributes(BaseModel):
 
     `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
     `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures;
-    `recovered` says that the writer died and this is what its journals vouch for.
+    `recovered` says that the writer died and this is what its journals vouch for. `object_boxes_m`
+    has one box an object, centre and half sizes in the object's own frame. `event_times_s` says
+    when each milestone of the task first held, in seconds from step 0; milestones never reached
+    are absent. Where these two are empty they are not written, so that older releases read it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -133,6 +147,8 @@ class EpisodeAttributes(BaseModel):
     generator_command: str | None = None
     lineage: tuple[LineageEntry, ...] = ()
     object_names: tuple[str, ...] = ()
+    object_boxes_m: tuple[Box, ...] = Field(default=(), exclude_if=not_)
+    event_times_s: dict[str, NonNegativeFinite] = Field(default={}, exclude_if=not_)
     calibration: dict[str, Matrix] = {}
     clocks: tuple[ClockReport, ...] = ()
     quality: dict[str, FiniteFloat] = {}

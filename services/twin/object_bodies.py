@@ -1,0 +1,142 @@
+"""How a task's objects hang in the world: free bodies, fixed ones, and drawers or doors of these.
+
+A free body is a child of the world with a free joint. Everything else hangs on a mocap body, a
+child of the world that nothing moves: the object is that body itself (a stand, a cabinet), or a
+descendant of it with hinge or slide joints on the way (a door, a drawer). Mocap poses are part of
+the physics state, so that states and snapshots hold where fixed things stand.
+"""
+
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.transforms import invert, pose_from_transform, transform_from_pose
+
+_FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
+_SINGLE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
+# How far the poses of one cabinet's parts may contradict each other (m, and in R's entries).
+_SAME_PLACE: Final = 1e-6
+
+
+class ObjectBodies:
+    """Where the poses and speeds of a task's objects are in MuJoCo's arrays.
+
+    Args:
+        model: the compiled scene.
+        names: bodies of the objects, in the order of poses.
+
+    Raises:
+        InvalidInputError: a name without a body, or a body that neither has a free joint as a
+            child of the world nor hangs on a mocap body by hinges and slides.
+    """
+
+    def __init__(self, model: mujoco.MjModel, names: tuple[str, ...]) -> None:
+        self._model = model
+        self._names = names
+        self.ids: Int64[np.ndarray, " objects"] = np.array(
+            [mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name) for name in names],
+            dtype=np.int64,
+        )
+        chains = [self._chain(int(body)) for body in self.ids]
+        self.is_free: Bool[np.ndarray, " objects"] = np.array(
+            [self._is_free(*pair) for pair in zip(names, chains, strict=True)], dtype=bool
+        )
+        free_joints = model.body_jntadr[self.ids[self.is_free]]
+        self._free_qpos = model.jnt_qposadr[free_joints][:, None] + np.arange(7)
+        self._speed_dofs = [self._dofs(chain) for chain in chains]
+        self._mocap_rows = [int(model.body_mocapid[chain[-1]]) for chain in chains]
+        self._Ts_root_object = self._rest_poses([chain[-1] for chain in chains])
+        self.of_body = self._nearest_object()
+
+    def _chain(self, body: int) -> list[int]:
+        """A body and its ancestors up to the child of the world."""
+        if body < 0:
+            raise InvalidInputError(
+                f"twin scene: got objects {self._names}, expected the name of a body each"
+            )
+        chain = [body]
+        while self._model.body_parentid[chain[-1]] != 0:
+            chain.append(int(self._model.body_parentid[chain[-1]]))
+        return chain
+
+    def _joint_types(self, body: int) -> list[int]:
+        first = self._model.body_jntadr[body]
+        return [int(kind) for kind in self._model.jnt_type[first:][: self._model.body_jntnum[body]]]
+
+    def _is_free(self, name: str, chain: list[int]) -> bool:
+        if len(chain) == 1 and self._joint_types(chain[0]) == [_FREE]:
+            return True
+        kinds = [kind for body in chain for kind in self._joint_types(body)]
+        if self._model.body_mocapid[chain[-1]] < 0 or not set(kinds) <= set(_SINGLE):
+            raise InvalidInputError(
+                f"twin scene: object {name!r} has joints of types {kinds} up to the world, "
+                "expected a free joint below the world, or hinges and slides below a body of "
+                'mocap="true"'
+            )
+        return False
+
+    def _dofs(self, chain: list[int]) -> Int64[np.ndarray, " dofs"]:
+        first = self._model.body_dofadr[chain]
+        number = self._model.body_dofnum[chain]
+        spans = [np.arange(a, a + n) for a, n in zip(first, number, strict=True)]
+        return np.concatenate(spans).astype(np.int64)
+
+    def _rest_poses(self, roots: list[int]) -> Float64[np.ndarray, "objects 4 4"]:
+        """T_root_object with all joints at rest."""
+        data = mujoco.MjData(self._model)
+        mujoco.mj_kinematics(self._model, data)
+        pairs = zip(roots, self.ids.tolist(), strict=True)
+        Ts = [invert(_body_pose(data, root)) @ _body_pose(data, body) for root, body in pairs]
+        return np.array(Ts).reshape(-1, 4, 4)
+
+    def _nearest_object(self) -> Int64[np.ndarray, " bodies"]:
+        """Object that each body is a part of: itself or its nearest named ancestor; -1 none."""
+        owner = np.full(self._model.nbody, -1, dtype=np.int64)
+        owner[self.ids] = np.arange(len(self.ids))
+        for body in range(1, self._model.nbody):  # parents come before their children
+            if owner[body] < 0:
+                owner[body] = owner[self._model.body_parentid[body]]
+        return owner
+
+    def place(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
+        """Put every object at its pose; joints of fixed things are at rest and stay untouched.
+
+        Raises:
+            InvalidInputError: parts of one fixed thing are asked to be where they cannot both be.
+        """
+        data.qpos[self._free_qpos] = poses[self.is_free]
+        placed: dict[int, np.ndarray] = {}
+        for index in np.flatnonzero(~self.is_free):
+            row = self._mocap_rows[index]
+            T_root = transform_from_pose(poses[index]) @ invert(self._Ts_root_object[index])
+            if row not in placed:
+                placed[row] = T_root
+                pose = pose_from_transform(T_root)
+                data.mocap_pos[row], data.mocap_quat[row] = pose[:3], pose[3:]
+            elif not np.allclose(T_root, placed[row], rtol=0.0, atol=_SAME_PLACE):
+                raise InvalidInputError(
+                    f"twin: got pose {poses[index].tolist()} for {self._names[index]!r}, expected "
+                    "the one that it has with its joint at rest on the thing it hangs on"
+                )
+
+    def poses(self, data: mujoco.MjData) -> Float64[np.ndarray, "objects 7"]:
+        """T_world_object: x y z (m), qw qx qy qz; current even between MuJoCo's own updates."""
+        poses = np.empty((len(self.ids), 7))
+        poses[self.is_free] = data.qpos[self._free_qpos]
+        if not self.is_free.all():
+            mujoco.mj_kinematics(self._model, data)
+            fixed = self.ids[~self.is_free]
+            poses[~self.is_free, :3] = data.xpos[fixed]
+            poses[~self.is_free, 3:] = data.xquat[fixed]
+        return poses
+
+    def speeds(self, data: mujoco.MjData) -> Float64[np.ndarray, " objects"]:
+        """Largest speed component (m/s or rad/s): of a free body, else of the joints below it."""
+        return np.array([np.abs(data.qvel[dofs]).max(initial=0.0) for dofs in self._speed_dofs])
+
+
+def _body_pose(data: mujoco.MjData, body: int) -> Float64[np.ndarray, "4 4"]:
+    return transform_from_pose(np.concatenate([data.xpos[body], data.xquat[body]]))
