@@ -1,145 +1,270 @@
 """Twin episodes to train and test networks on: `dextouch train data`.
 
-About a third of the demonstrations are exact, the others up to 25 mm wrong, and every fifth is a
-miss: the same motion without its objects. Misses teach the model to look instead of guessing
-contact from motion habits. With `--ladder` the seeds take errors of 0 … 40 mm in turn, so that
-successes and near misses are about equally many: use it for the success probe.
+What decides success must be in the data: errors around the few millimetres that decide, misses,
+takes that stop or never begin, retreats, pushes, grasps that slip, hands that wander, and what is
+done for another scene. `--mix` says how much of each. With `--policy` every episode is a rollout
+of that policy in the twin instead. Interrupted runs go on where they were: what is in the store is
+kept.
 """
 
 import argparse
 import json
 import multiprocessing
 import os
-from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-
-import numpy as np
-from rich.progress import track
+from typing import Any
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError
-from services.twin.episodes import TakeOptions, episode_id, record, write_episode
+from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from services.cli.data_mix import MIXES, Mix, options_of
+from services.cli.policy_takes import PolicyChoice, played_by
+from services.evaluation.progress import Progress
+from services.twin.episodes import episode_id, record, write_episode
+from services.twin.hands import DOMAINS, Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
+from services.twin.take_options import STREAM_CHOICES, StreamChoice, TakeOptions
 from services.twin.tasks import TASK_NAMES
 
-EXACT_FRACTION = 0.35
-MAX_NOISE_M = 0.025
-# Success is decided within about 5 mm, so the ladder is dense there.
-LADDER_M = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.040)
-# Takes that stop do so within these steps; before the first nothing has been reached.
-FIRST_FROZEN_STEP, LAST_FROZEN_STEP = 8, 69
 CAMERAS = ("camera_head",)
+DEFAULT_MIX = "evaluator"
 
 
 @dataclass(frozen=True)
-class Mix:
-    """How the episodes of a data set differ from each other.
+class Scope:
+    """What is recorded: of which tasks and hands, how many of the images, and which streams.
 
-    `miss_fraction` have their objects elsewhere. `still_fraction` stop midway, or, half of them,
-    never begin. With `ladder` the error is `LADDER_M` in turn of seeds; without it
-    `exact_fraction` are exact and the others up to `MAX_NOISE_M` wrong.
+    Images show the grid steps (15 Hz) that are multiples of `image_every`, and the last three.
     """
 
-    miss_fraction: float = 0.2
-    exact_fraction: float = EXACT_FRACTION
-    still_fraction: float = 0.0
-    ladder: bool = False
+    tasks: tuple[str, ...] = TASK_NAMES
+    domains: tuple[Domain, ...] = ("robot",)
+    image_every: int = 1
+    streams: StreamChoice = "training"
 
     def __post_init__(self) -> None:
-        for name in ("miss_fraction", "exact_fraction", "still_fraction"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise InvalidInputError(
-                    f"training data: got {name} {getattr(self, name)}, expected 0 … 1"
-                )
+        for task in self.tasks:
+            if task not in TASK_NAMES:
+                raise UnknownNameError("task", task, list(TASK_NAMES))
+        for domain in self.domains:
+            if domain not in DOMAINS:
+                raise UnknownNameError("domain", domain, list(DOMAINS))
 
 
-def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
-    """How the episode of a task and seed is made; the same every time."""
-    draw = np.random.default_rng([seed, len(task)])
-    if mix.ladder:
-        noise_m = LADDER_M[seed % len(LADDER_M)]
-    else:
-        exact = draw.random() < mix.exact_fraction
-        noise_m = 0.0 if exact else float(np.round(draw.uniform(0, MAX_NOISE_M), 3))
-    miss = bool(draw.random() < mix.miss_fraction)
-    frozen_from_step = None
-    if draw.random() < mix.still_fraction:
-        midway = bool(draw.random() < 0.5)
-        step = int(draw.integers(FIRST_FROZEN_STEP, LAST_FROZEN_STEP + 1))
-        frozen_from_step = step if midway else 0
-    return TakeOptions(noise_m, miss, CAMERAS, frozen_from_step)
+@dataclass(frozen=True)
+class _Order:
+    """One episode to make, in whatever process."""
+
+    task: str
+    domain: Domain
+    seed: int
+    options: TakeOptions
+    store: str
+    policy: PolicyChoice | None = None
+
+    @property
+    def episode_id(self) -> str:
+        played = None if self.policy is None else self.policy.label
+        return episode_id(self.task, self.domain, self.seed, self.options, played=played)
 
 
-@lru_cache(maxsize=4)
-def _stage(task: str) -> Stage:
-    return Stage(task, "robot", TwinSettings())
+@dataclass(frozen=True)
+class _Answer:
+    """What became of an order: its success, None where another process was faster, or why not."""
+
+    episode_id: str
+    success: bool | None = None
+    refusal: str | None = None
 
 
-def _make(order: tuple[str, int, TakeOptions, str]) -> bool | None:
-    task, seed, options, url = order
-    store = EpisodeStore(url)
-    if store.exists(episode_id(task, "robot", seed, options)):
-        return None
-    episode = record(_stage(task), seed, options)
-    write_episode(store, episode)
-    return bool(episode.attributes.success)
+@lru_cache(maxsize=12)
+def _stage(task: str, domain: Domain) -> Stage:
+    """Each process compiles each scene once."""
+    return Stage(task, domain, TwinSettings())
+
+
+def _make(order: _Order) -> _Answer:
+    stage = _stage(order.task, order.domain)
+    try:
+        if order.policy is None:
+            episode = record(stage, order.seed, order.options)
+        else:
+            played = played_by(order.policy, stage, order.seed)
+            episode = record(stage, order.seed, order.options, played=played)
+        write_episode(EpisodeStore(order.store), episode)
+    except ConflictError:
+        return _Answer(order.episode_id)
+    except InvalidInputError as error:
+        return _Answer(order.episode_id, refusal=error.message)
+    return _Answer(order.episode_id, bool(episode.attributes.success))
 
 
 def make_training_data(
-    store: str, seeds: range, mix: Mix, *, num_jobs: int | None = None
+    store: str,
+    seeds: range,
+    mix: Mix,
+    *,
+    num_jobs: int | None = None,
+    scope: Scope | None = None,
+    policy: PolicyChoice | None = None,
 ) -> dict[str, int]:
-    """Record one episode a task and seed; what the store has already is kept.
+    """Record one episode a seed, task and domain; what the store has already is kept.
+
+    Args:
+        store: folder of the store.
+        seeds: of the scenes.
+        mix: how the takes are made.
+        num_jobs: processes; one a core by default.
+        scope: tasks, domains and streams.
+        policy: acts instead of the scripts; the mix is not used then.
 
     Returns:
-        How many episodes were `made`, `kept`, and how many of those made `succeeded`.
+        How many episodes were `made`, `kept` or `refused` (the physics diverged, or the policy
+        failed), and how many of those made `succeeded`.
 
     Raises:
-        InvalidInputError: no seeds.
+        InvalidInputError: no seeds, tasks or domains, or a policy with the hands of a human.
     """
-    if len(seeds) == 0:
-        raise InvalidInputError(f"training data: got seeds {seeds}, expected at least one")
-    orders = [
-        (task, seed, options_of(task, seed, mix), store) for seed in seeds for task in TASK_NAMES
-    ]
-    processes = num_jobs or os.cpu_count() or 1
-    # Spawned, not forked: threads and locks of the caller must not be copied half-way.
-    with ProcessPoolExecutor(processes, multiprocessing.get_context("spawn")) as pool:
-        answers = list(
-            track(pool.map(_make, orders), total=len(orders), description="twin episodes")
+    scope = scope or Scope()
+    if not seeds or not scope.tasks or not scope.domains or (num_jobs is not None and num_jobs < 1):
+        raise InvalidInputError(
+            f"training data: got seeds {seeds}, tasks {scope.tasks}, domains {scope.domains} and "
+            f"{num_jobs} jobs, expected at least one of each"
         )
-    made = [answer for answer in answers if answer is not None]
-    return {"made": len(made), "kept": len(answers) - len(made), "succeeded": sum(made)}
+    if policy is not None and scope.domains != ("robot",):
+        raise InvalidInputError("training data: got a policy for human hands; it moves the robot's")
+    target = EpisodeStore(store)
+    # What a killed run left half-written; stages of running writers are not touched.
+    target.sweep()
+    present = set(target.list())
+    orders = list(_orders(store, seeds, mix, scope, policy))
+    missing = [order for order in orders if order.episode_id not in present]
+    counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
+    started_s = time.monotonic()
+    with Progress("twin episodes", len(missing)) as progress:
+        for done, answer in enumerate(_answers(missing, num_jobs or os.cpu_count() or 1), start=1):
+            if answer.refusal is not None:
+                counts["refused"] += 1
+                print(f"{answer.episode_id}: {answer.refusal}")
+            elif answer.success is None:
+                counts["kept"] += 1
+            else:
+                counts["made"] += 1
+                counts["succeeded"] += answer.success
+            each_s = (time.monotonic() - started_s) / done
+            progress.advance(
+                episodes_per_s=1 / each_s, minutes_left=each_s * (len(missing) - done) / 60
+            )
+    return counts
 
 
-def main(argv: Sequence[str]) -> int:
-    """`dextouch train data`."""
+def _orders(
+    store: str, seeds: range, mix: Mix, scope: Scope, policy: PolicyChoice | None
+) -> Iterator[_Order]:
+    for seed in seeds:
+        for task in scope.tasks:
+            made = TakeOptions() if policy is not None else options_of(task, seed, mix)
+            options = replace(
+                made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams
+            )
+            for domain in scope.domains:
+                yield _Order(task, domain, seed, options, store, policy)
+
+
+def _answers(orders: Sequence[_Order], num_jobs: int) -> Iterator[_Answer]:
+    """Answers as they come."""
+    if num_jobs == 1 or len(orders) < 2:
+        yield from map(_make, orders)
+        return
+    with ExitStack() as stack:
+        # Spawned, not forked: threads and locks of the caller must not be copied half-way.
+        pool = stack.enter_context(
+            ProcessPoolExecutor(min(num_jobs, len(orders)), multiprocessing.get_context("spawn"))
+        )
+        # When the caller stops, what has not begun is given up.
+        stack.callback(pool.shutdown, wait=False, cancel_futures=True)
+        for future in as_completed([pool.submit(_make, order) for order in orders]):
+            yield future.result()
+
+
+def _words(choices: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
+    """Reads names with commas between them."""
+
+    def read(text: str) -> tuple[str, ...]:
+        names = tuple(name for name in text.split(",") if name)
+        wrong = [name for name in names if name not in choices]
+        if wrong or not names:
+            raise argparse.ArgumentTypeError(f"got {text!r}, expected some of {','.join(choices)}")
+        return names
+
+    return read
+
+
+def _keywords(text: str) -> dict[str, Any]:
+    try:
+        read = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object") from error
+    if not isinstance(read, dict):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a JSON object")
+    return read
+
+
+def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="dextouch train data", description=__doc__)
     parser.add_argument("--store", required=True, help="folder of the episode store")
     parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")
     parser.add_argument("--count", type=int, default=130, help="seeds a task (%(default)s)")
-    parser.add_argument("--miss-fraction", type=float, default=0.2, help="(%(default)s)")
-    errors = parser.add_mutually_exclusive_group()
-    errors.add_argument("--exact", action="store_true", help="no errors at all")
-    errors.add_argument("--ladder", action="store_true", help="errors of 0 … 40 mm in turn")
     parser.add_argument(
-        "--still-fraction", type=float, default=0.0, help="stop midway or never begin (%(default)s)"
+        "--tasks", type=_words(TASK_NAMES), default=TASK_NAMES, help="with commas (all)"
     )
+    parser.add_argument(
+        "--domains", type=_words(DOMAINS), default=("robot",), help="robot,human (robot)"
+    )
+    mixes = parser.add_mutually_exclusive_group()
+    mixes.add_argument(
+        "--mix", choices=list(MIXES), default=DEFAULT_MIX, help="which takes (%(default)s)"
+    )
+    for name, told in (("exact", "no errors"), ("ladder", "errors of 0 … 40 mm in turn")):
+        mixes.add_argument(
+            f"--{name}", dest="mix", action="store_const", const=name, help=f"{told}, and no others"
+        )
+    parser.add_argument("--miss-fraction", type=float, help="share of misses (as in the mix)")
+    parser.add_argument(
+        "--still-fraction", type=float, help="share of takes that stop or never begin"
+    )
+    parser.add_argument(
+        "--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead"
+    )
+    parser.add_argument(
+        "--policy-arguments", type=_keywords, default={}, help="of the factory, as a JSON object"
+    )
+    parser.add_argument(
+        "--images", type=int, default=1, metavar="N", help="of every N-th step (%(default)s)"
+    )
+    parser.add_argument("--streams", choices=STREAM_CHOICES, default="training")
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
     parser.add_argument("--json", type=Path, help="write the counts here")
-    arguments = parser.parse_args(list(argv))
+    return parser
+
+
+def main(argv: Sequence[str]) -> int:
+    """`dextouch train data`; 1 if an episode could not be made."""
+    arguments = _parser().parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
-    mix = Mix(
-        arguments.miss_fraction,
-        1.0 if arguments.exact else EXACT_FRACTION,
-        arguments.still_fraction,
-        arguments.ladder,
+    mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)
+    scope = Scope(arguments.tasks, arguments.domains, arguments.images, arguments.streams)
+    policy = arguments.policy and PolicyChoice.parse(arguments.policy, arguments.policy_arguments)
+    counts = make_training_data(
+        arguments.store, seeds, mix, num_jobs=arguments.jobs, scope=scope, policy=policy
     )
-    counts = make_training_data(arguments.store, seeds, mix, num_jobs=arguments.jobs)
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
     if arguments.json:
         arguments.json.write_text(json.dumps(counts, indent=2), encoding="utf-8")
-    return 0
+    return 1 if counts["refused"] else 0

@@ -18,10 +18,12 @@ from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
 from services.twin.cameras import CAMERAS
-from services.twin.episodes import TakeOptions, record, write_episode
+from services.twin.episodes import record, write_episode
 from services.twin.hands import DOMAINS, Domain
+from services.twin.motions import MOTION_KINDS, Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
+from services.twin.take_options import STREAM_CHOICES, TakeOptions
 from services.twin.tasks import TASK_NAMES
 
 EXIT_REFUSED = 3
@@ -81,7 +83,12 @@ def _parser() -> argparse.ArgumentParser:
     make.add_argument("--noise", default=0.0, type=float, help="demonstrator's error, metres")
     make.add_argument("--miss-fraction", default=0.0, type=float, help="takes without the objects")
     make.add_argument("--freeze-from", type=int, help="step 0 … 80 from which on nothing moves")
+    make.add_argument("--motion", choices=MOTION_KINDS, help="leave the script for this motion")
+    make.add_argument("--motion-from", type=int, default=0, help="at this step (%(default)s)")
+    make.add_argument("--actions-of", type=int, help="play what is done for this seed instead")
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS)
+    make.add_argument("--image-every", type=int, help="images of every n-th step, not at 30 Hz")
+    make.add_argument("--streams", default="all", choices=STREAM_CHOICES, help="(%(default)s)")
     make.add_argument(
         "--store", default=default_store(), help="where episodes go (%(default)s)", metavar="URL"
     )
@@ -105,6 +112,10 @@ def _orders(arguments: argparse.Namespace) -> list[TakeOrder]:
             bool(draw < arguments.miss_fraction),
             tuple(arguments.cameras),
             arguments.freeze_from,
+            Motion(arguments.motion, arguments.motion_from) if arguments.motion else None,
+            arguments.actions_of,
+            arguments.image_every,
+            arguments.streams,
         )
         orders.append(TakeOrder(arguments.task, arguments.domain, seed, options, arguments.store))
     return orders

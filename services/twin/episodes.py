@@ -1,4 +1,4 @@
-"""Truth episodes: task and seed in, every stream of a scripted take with its success out."""
+"""Truth episodes of the twin: every stream of one take, scripted or played, and its success."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
 from services.twin.bounding_boxes import object_boxes_m
@@ -15,12 +15,27 @@ from services.twin.cameras import CAMERAS
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.events import EventTimes
 from services.twin.hands import Domain
+from services.twin.motions import MotionScene, with_motion
 from services.twin.recorder import GridLog, Recorder, TruthStream, action_stream
 from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
-from services.twin.stage import Stage, command_row
+from services.twin.stage import Plan, Stage, command_row
+from services.twin.take_options import PlayedActions, TakeOptions, episode_id
+
+__all__ = [
+    "TAKE_STEPS",
+    "PlayedActions",
+    "TakeOptions",
+    "TruthEpisode",
+    "demonstrate",
+    "episode_id",
+    "record",
+    "write_episode",
+]
 
 TAKE_STEPS: Final = (NUM_GRID_STEPS - 1) * STEPS_PER_GRID
+# Of the random numbers of motions, beside those of `Stage.plan`.
+_MOTION: Final = 101
 
 
 @dataclass(frozen=True)
@@ -34,32 +49,6 @@ class TruthEpisode:
     attributes: EpisodeAttributes
     streams: dict[str, TruthStream]
     pad_forces_n: Float64[np.ndarray, "samples 2 6"]
-
-
-@dataclass(frozen=True)
-class TakeOptions:
-    """How a demonstration is made, apart from task, domain and seed.
-
-    `noise_m` is the demonstrator's error (0 … 0.2 m), `miss` moves or removes the objects while
-    the motion stays, `images` are the cameras to record. From `frozen_from_step` (0 … 80) on the
-    commands no longer change: 0 holds still from the start.
-    """
-
-    noise_m: float = 0.0
-    miss: bool = False
-    images: tuple[str, ...] = CAMERAS
-    frozen_from_step: int | None = None
-
-    def __post_init__(self) -> None:
-        frozen = self.frozen_from_step
-        if frozen is not None and not 0 <= frozen < NUM_GRID_STEPS:
-            raise InvalidInputError(
-                f"twin: got commands frozen from step {frozen}, expected a step "
-                f"0 … {NUM_GRID_STEPS - 1}"
-            )
-        for camera in self.images:
-            if camera not in CAMERAS:
-                raise UnknownNameError("camera", camera, list(CAMERAS))
 
 
 def demonstrate(
@@ -80,16 +69,26 @@ def demonstrate(
     return record(Stage(task, domain, TwinSettings()), seed, TakeOptions(noise_m, miss, images))
 
 
-def record(stage: Stage, seed: int, options: TakeOptions) -> TruthEpisode:
-    """One scripted take on a stage; the same stage, seed and options give the same bytes."""
+def record(
+    stage: Stage, seed: int, options: TakeOptions, *, played: PlayedActions | None = None
+) -> TruthEpisode:
+    """One take on a stage; the same stage, seed, options and actions give the same bytes.
+
+    Args:
+        stage: a task with the hands of a domain.
+        seed: of the scene, and of all that is drawn.
+        options: how the take is made; they say what is commanded unless `played` does.
+        played: actions that came from elsewhere.
+    """
     plan = stage.plan(seed, noise_m=options.noise_m, miss=options.miss)
     anchor = stage.start(plan)
     # The take obeys exactly the numbers that its `action_commanded` holds: through 67-D and back.
-    actions_commanded = actions_from_poses(plan.commands, anchor)
-    if options.frozen_from_step is not None:
-        actions_commanded[options.frozen_from_step :] = actions_commanded[options.frozen_from_step]
+    if played is None:
+        actions_commanded = _commanded(stage, seed, options, plan, anchor)
+    else:
+        actions_commanded = np.asarray(played.actions, dtype=np.float64)
     commands = poses_from_actions(actions_commanded, anchor)
-    recorder, grid = Recorder(stage, images=options.images), GridLog(stage)
+    recorder, grid = Recorder(stage, options), GridLog(stage)
     recorder.sample(0)
     grid.sample()
     events = EventTimes(stage.task)
@@ -103,22 +102,32 @@ def record(stage: Stage, seed: int, options: TakeOptions) -> TruthEpisode:
     streams["action"] = action_stream("action", actions_from_poses(grid.trajectory(), anchor))
     if stage.domain == "robot":
         streams["action_commanded"] = action_stream("action_commanded", actions_commanded)
-    attributes = _attributes(stage, seed, options, anchor).model_copy(
-        update={"event_times_s": events.times_s}
-    )
+    found: dict[str, object] = {"event_times_s": events.times_s}
+    if played is not None:
+        name = episode_id(stage.task.name, stage.domain, seed, options, played=played.name)
+        found |= {"episode_id": name, "generator_command": played.command}
+    attributes = _attributes(stage, seed, options, anchor).model_copy(update=found)
     return TruthEpisode(attributes, streams, np.stack(recorder.pad_forces_n))
 
 
-def episode_id(task: str, domain: Domain, seed: int, options: TakeOptions) -> str:
-    """A name that tells what is in the episode and differs for every way to make one."""
-    parts = ["twin", task, domain, f"{seed:06d}"]
-    if options.noise_m > 0:
-        parts.append(f"n{round(options.noise_m * 1e6)}um")
-    if options.miss:
-        parts.append("miss")
+def _commanded(
+    stage: Stage, seed: int, options: TakeOptions, plan: Plan, anchor: AnchorPoses
+) -> Float64[np.ndarray, "81 67"]:
+    """What the hands are told in 67-D, relative to what is measured at the start."""
+    if options.actions_of_seed is not None:
+        other = stage.plan(options.actions_of_seed, noise_m=options.noise_m).commands
+        # As measured at that take's start: the hands are where the first command wants them.
+        Ts = transform_from_pose(pose_from_transform(np.stack(other.anchor(0).as_tuple())))
+        return actions_from_poses(other, AnchorPoses(*Ts))
+    commands = plan.commands
+    if options.motion is not None:
+        draw = np.random.default_rng([seed, _MOTION])
+        scene = MotionScene(stage.domain, plan.object_poses)
+        commands = with_motion(commands, options.motion, scene, draw)
+    actions = actions_from_poses(commands, anchor)
     if options.frozen_from_step is not None:
-        parts.append(f"f{options.frozen_from_step}")
-    return "-".join(parts)
+        actions[options.frozen_from_step :] = actions[options.frozen_from_step]
+    return actions
 
 
 def _attributes(
@@ -128,7 +137,6 @@ def _attributes(
         f"T_wrist_{hand.side}_camera_wrist_{hand.side}": matrix_rows(mount)
         for hand, mount in zip(stage.simulation.scene.hands, stage.rig.mounts, strict=True)
     }
-    frozen = options.frozen_from_step
     return EpisodeAttributes(
         episode_id=episode_id(stage.task.name, stage.domain, seed, options),
         task=stage.task.name,
@@ -142,9 +150,7 @@ def _attributes(
         success=stage.task.succeeded(stage.simulation),
         generator_command=(
             f"dextouch twin record --task {stage.task.name} --domain {stage.domain} "
-            f"--seeds {seed}:{seed + 1} --noise {options.noise_m!r} "
-            f"--miss-fraction {float(options.miss)!r}"
-            + ("" if frozen is None else f" --freeze-from {frozen}")
+            f"--seeds {seed}:{seed + 1} {' '.join(options.words())}"
         ),
         object_names=stage.task.object_names,
         object_boxes_m=tuple(
@@ -152,7 +158,7 @@ def _attributes(
             for x, y, z, half_x, half_y, half_z in object_boxes_m(stage.simulation.scene).tolist()
         ),
         calibration=mounts,
-        quality={"noise_m": options.noise_m, "miss": float(options.miss)},
+        quality=options.figures(),
     )
 
 

@@ -13,15 +13,19 @@ from dextouch.hands.actions import ACTION_DIM, HandTrajectory
 from dextouch.hands.skeleton import NUM_KEYPOINTS
 from dextouch.streams.descriptors import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
+from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.hands import HumanHand
 from services.twin.mjcf import PHYSICS_RATE_HZ
-from services.twin.simulation import MODEL_RATE_HZ
+from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
 from services.twin.stage import Stage
+from services.twin.take_options import TakeOptions
 
 TACTILE_RATE_HZ: Final = 60
 POSE_RATE_HZ: Final = 100
 KEYPOINT_RATE_HZ: Final = 120
 IMAGE_RATE_HZ: Final = 30
+# How many of the last grid steps are shown whatever the images' rate: success is judged on them.
+NUM_LAST_SHOWN_STEPS: Final = 3
 _NS_PER_S: Final = 1_000_000_000
 
 
@@ -35,7 +39,7 @@ class TruthStream:
 
 
 def _descriptor(
-    name: str, kind: StreamKind, unit: str, shape: tuple[int, ...], rate_hz: int
+    name: str, kind: StreamKind, unit: str, shape: tuple[int, ...], rate_hz: int | float
 ) -> StreamDescriptor:
     dtype = {"tactile": "float32", "image": "uint8"}.get(kind, "float64")
     sides = [side for side in SIDES if f"_{side}" in name and name != "joints"]
@@ -61,34 +65,44 @@ def _flat(source: Callable[[], np.ndarray]) -> np.ndarray:
 class Recorder:
     """Collects the truth of one take. `sample` is called at every physics step, from step 0."""
 
-    def __init__(self, stage: Stage, *, images: tuple[str, ...]) -> None:
+    def __init__(self, stage: Stage, options: TakeOptions) -> None:
         self._stage = stage
         self._sources: dict[str, tuple[StreamDescriptor, Callable[[], np.ndarray]]] = {}
         self._samples: dict[str, list[np.ndarray]] = {}
         self._due: dict[int, list[str]] = {}
+        self._every = options.image_every
         self.pad_forces_n: list[np.ndarray] = []
-        self._add_touch_and_objects()
-        self._add_hands()
-        for camera in images:
+        self._add_touch()
+        # For training at the grid steps: nobody has to interpolate.
+        self._add_objects(POSE_RATE_HZ if options.streams == "all" else MODEL_RATE_HZ)
+        if options.streams == "all":
+            self._add_hands()
+        for camera in options.images:
             self._add_camera(camera)
 
     def _add(self, descriptor: StreamDescriptor, source: Callable[[], np.ndarray]) -> None:
         self._sources[descriptor.name] = (descriptor, source)
         self._samples[descriptor.name] = []
-        period = PHYSICS_RATE_HZ // round(descriptor.nominal_rate_hz)
-        self._due.setdefault(period, []).append(descriptor.name)
+        if descriptor.kind == "image" and self._every is not None:
+            steps = [step * STEPS_PER_GRID for step in shown_steps(self._every)]
+        else:
+            period = PHYSICS_RATE_HZ // round(descriptor.nominal_rate_hz)
+            steps = list(range(0, NUM_GRID_STEPS * STEPS_PER_GRID, period))
+        for step_index in steps:
+            self._due.setdefault(step_index, []).append(descriptor.name)
 
-    def _add_touch_and_objects(self) -> None:
-        simulation = self._stage.simulation
+    def _add_touch(self) -> None:
         for index, side in enumerate(SIDES):
             self._add(
                 _descriptor(f"tactile_{side}", "tactile", "kPa", (NUM_TAXELS,), TACTILE_RATE_HZ),
                 partial(self._tactile, index),
             )
+
+    def _add_objects(self, rate_hz: int) -> None:
         num_objects = len(self._stage.task.object_names)
         self._add(
-            _descriptor("object_poses", "pose", "pose_m_wxyz", (num_objects, 7), POSE_RATE_HZ),
-            simulation.object_poses,
+            _descriptor("object_poses", "pose", "pose_m_wxyz", (num_objects, 7), rate_hz),
+            self._stage.simulation.object_poses,
         )
 
     def _tactile(self, side_index: int) -> np.ndarray:
@@ -135,17 +149,16 @@ class Recorder:
 
     def _add_camera(self, camera: str) -> None:
         simulation, rig = self._stage.simulation, self._stage.rig
+        rate_hz = IMAGE_RATE_HZ if self._every is None else MODEL_RATE_HZ / self._every
         self._add(
-            _descriptor(camera, "image", "rgb8", (*rig.shape_px, 3), IMAGE_RATE_HZ),
+            _descriptor(camera, "image", "rgb8", (*rig.shape_px, 3), rate_hz),
             lambda: rig.image(simulation, camera),
         )
 
     def sample(self, step_index: int) -> None:
         """Take the samples that are due at this physics step."""
-        for period, names in self._due.items():
-            if step_index % period == 0:
-                for name in names:
-                    self._samples[name].append(np.array(self._sources[name][1]()))
+        for name in self._due.get(step_index, ()):
+            self._samples[name].append(np.array(self._sources[name][1]()))
         if step_index % (PHYSICS_RATE_HZ // TACTILE_RATE_HZ) == 0:
             self.pad_forces_n.append(self._stage.simulation.pad_forces_n.copy())
 
@@ -156,7 +169,11 @@ class Recorder:
             values = np.stack(self._samples[name])
             if descriptor.kind == "keypoints":
                 values = self._keypoints(descriptor, values)
-            finished[name] = timed_stream(descriptor, values)
+            if descriptor.kind == "image" and self._every is not None:
+                shown_ns = _regular_ns(NUM_GRID_STEPS, MODEL_RATE_HZ)[shown_steps(self._every)]
+                finished[name] = TruthStream(descriptor, shown_ns[: len(values)], values)
+            else:
+                finished[name] = timed_stream(descriptor, values)
         return finished
 
     def _keypoints(self, descriptor: StreamDescriptor, joints_rad: np.ndarray) -> np.ndarray:
@@ -167,9 +184,18 @@ class Recorder:
 
 def timed_stream(descriptor: StreamDescriptor, values: np.ndarray) -> TruthStream:
     """Values of a stream that started at 0 and kept its nominal rate."""
-    rate_hz = round(descriptor.nominal_rate_hz)
-    t_ref_ns = (np.arange(len(values), dtype=np.int64) * _NS_PER_S + rate_hz // 2) // rate_hz
+    t_ref_ns = _regular_ns(len(values), round(descriptor.nominal_rate_hz))
     return TruthStream(descriptor, t_ref_ns, values)
+
+
+def _regular_ns(num_samples: int, rate_hz: int) -> Int64[np.ndarray, " n"]:
+    return (np.arange(num_samples, dtype=np.int64) * _NS_PER_S + rate_hz // 2) // rate_hz
+
+
+def shown_steps(image_every: int) -> list[int]:
+    """Grid steps with an image: the multiples of `image_every`, and the last three."""
+    last = range(NUM_GRID_STEPS - NUM_LAST_SHOWN_STEPS, NUM_GRID_STEPS)
+    return sorted({*range(0, NUM_GRID_STEPS, image_every), *last})
 
 
 def action_stream(name: str, actions: np.ndarray) -> TruthStream:

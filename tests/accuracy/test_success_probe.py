@@ -7,7 +7,8 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import EpisodeStore
-from services.cli.training_data import LADDER_M, Mix, make_training_data
+from services.cli.data_mix import LADDER_M, MIXES
+from services.cli.training_data import make_training_data
 from services.evaluation.demonstrations import read_demonstrations
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
@@ -22,7 +23,7 @@ LEAST_AUC = 0.95
 def test_it_tells_successes_from_near_misses(tmp_path):
     torch.set_num_threads(1)
     seeds = range(FIRST_SEED, FIRST_SEED + 4 * len(LADDER_M))
-    make_training_data(str(tmp_path), seeds, Mix(0.0, ladder=True), num_jobs=1)
+    make_training_data(str(tmp_path), seeds, MIXES["ladder"], num_jobs=1)
     probe = SuccessProbe.load(DEFAULT_PROBE)
     episodes = read_demonstrations(EpisodeStore(tmp_path))
     assert not {e.start_digest for e in episodes} & set(probe.metadata.training_starts)

@@ -12,7 +12,8 @@ from services.cli.bench.machine import describe_machine
 from services.cli.bench.report import ResultTable, StageReport
 from services.cli.bench.rounds import interleaved
 from services.cli.bench.stages import Bar
-from services.cli.training_data import Mix, make_training_data
+from services.cli.data_mix import MIXES
+from services.cli.training_data import make_training_data
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
@@ -115,7 +116,7 @@ def _ignoring_round(work: Callable[[], float]) -> Callable[[int], float]:
 
 def _make_episodes(folder: Path, num_episodes: int) -> str:
     seeds = range(-(-num_episodes // len(TASK_NAMES)))
-    make_training_data(str(folder), seeds, Mix())
+    make_training_data(str(folder), seeds, MIXES["demonstrations"])
     return str(folder)
 
 

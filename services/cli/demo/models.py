@@ -11,14 +11,15 @@ from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 
+DEMONSTRATIONS = ("--mix", "demonstrations")
 # Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
-EXACT_DATA = ("--first", "1000", "--count", "120", "--miss-fraction", "0", "--exact")
+EXACT_DATA = ("--first", "1000", "--count", "120", "--exact")
 # Endings near the border of success for the probe, and others to measure it on.
 ENDINGS = (
     "--ladder", "--first", "2000", "--count", "315",
     "--miss-fraction", "0.1", "--still-fraction", "0.1",
 )  # fmt: skip
-UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180", "--miss-fraction", "0")
+UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180")
 
 
 @dataclass(frozen=True)
@@ -50,7 +51,7 @@ def train_models(folder: Path) -> Models:
     )
     world_model = folder / "world_model.safetensors"
     policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
-    train.main(["data", "--store", episodes])
+    train.main(["data", "--store", episodes, *DEMONSTRATIONS])
     train.main(["data", "--store", exact, *EXACT_DATA])
     train.main(["world-model", "--episodes", episodes, "--output", str(world_model)])
     train.main(["policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)])

@@ -8,9 +8,8 @@ from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.log import SpoolWriter
-from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
+from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas.episodes import LineageEntry
-from services.cli import training_data
 from services.cli.demo.background import served
 from services.cli.demo.command import worst_errors
 from services.cli.demo.recording import forget_take
@@ -115,41 +114,6 @@ def test_held_out_seeds_are_never_training_seeds():
     assert plan.take_seed not in plan.seeds
     with pytest.raises(SystemExit):
         parse(["--seeds", "0"])
-
-
-def drawn(mix, seeds=200):
-    return [training_data.options_of("stand_bottle", seed, mix) for seed in range(seeds)]
-
-
-def test_training_episodes_are_the_same_every_time_and_mixed():
-    mixed = drawn(training_data.Mix())
-    assert mixed == drawn(training_data.Mix())
-    assert 20 < sum(options.miss for options in mixed) < 60
-    assert 50 < sum(options.noise_m == 0 for options in mixed) < 90
-    assert max(options.noise_m for options in mixed) <= training_data.MAX_NOISE_M
-    assert all(options.frozen_from_step is None for options in mixed)
-    (exact,) = drawn(training_data.Mix(miss_fraction=0.0, exact_fraction=1.0), seeds=1)
-    assert (exact.noise_m, exact.miss) == (0.0, False)
-
-
-def test_a_ladder_has_every_error_equally_often_and_takes_that_stop():
-    ladder = drawn(training_data.Mix(0.1, still_fraction=0.1, ladder=True), seeds=180)
-    millimetres = [round(options.noise_m * 1e3, 3) for options in ladder]
-    assert {mm: millimetres.count(mm) for mm in millimetres} == dict.fromkeys(
-        (0, 2.5, 5, 7.5, 10, 15, 20, 30, 40), 20
-    )
-    stopped = [o.frozen_from_step for o in ladder if o.frozen_from_step is not None]
-    assert 8 <= len(stopped) <= 30
-    assert 0 in stopped
-    assert 8 <= max(stopped) <= 69
-    assert not any(o.miss or o.frozen_from_step for o in drawn(training_data.Mix(0.0, ladder=True)))
-
-
-@pytest.mark.parametrize("name", ["miss_fraction", "exact_fraction", "still_fraction"])
-@pytest.mark.parametrize("value", [-0.1, 1.1, float("nan")])
-def test_a_fraction_outside_0_to_1_is_refused(name, value):
-    with pytest.raises(InvalidInputError, match=name):
-        training_data.Mix(**{name: value})
 
 
 def test_the_table_shows_undefined_agreement(capsys):

@@ -3,7 +3,7 @@
 `true_endings.npz` holds the last image and the last three touches of 108 episodes of the twin,
 none of which was trained on. Make it anew, when the twin's pictures change, with
 
-    dextouch train data --store endings --ladder --first 30000 --count 54 --miss-fraction 0
+    dextouch train data --store endings --ladder --first 30000 --count 54
     python -m tests.unit.evaluation.true_endings endings
 """
 

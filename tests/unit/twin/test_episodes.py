@@ -1,17 +1,20 @@
 """Truth episodes: the streams that were agreed on, the same bytes for the same seed."""
 
 import hashlib
+import shlex
 
 import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.hands.actions import IDENTITY_POSE_9D
 from services.twin import __main__ as command_line
-from services.twin.episodes import TakeOptions, episode_id, record, write_episode
+from services.twin.episodes import record, write_episode
+from services.twin.motions import MOTION_KINDS, Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
+from services.twin.take_options import PlayedActions, TakeOptions, episode_id
 
 HEAD_ONLY = TakeOptions(images=("camera_head",))
 BLIND = TakeOptions(images=())
@@ -136,7 +139,53 @@ def test_an_episode_goes_through_the_store(robot_take, tmp_path):
 def test_ids_differ_for_every_way_to_make_an_episode():
     options = [TakeOptions(), TakeOptions(noise_m=0.01), TakeOptions(miss=True)]
     options += [TakeOptions(frozen_from_step=step) for step in (0, 40)]
-    assert len({episode_id("stand_bottle", "robot", 1, option) for option in options}) == 5
+    options += [TakeOptions(motion=Motion(kind, step)) for kind in MOTION_KINDS for step in (0, 9)]
+    options += [TakeOptions(actions_of_seed=3), TakeOptions(image_every=4)]
+    options += [TakeOptions(streams="training")]
+    ids = [episode_id("stand_bottle", "robot", 1, option) for option in options]
+    ids.append(episode_id("stand_bottle", "robot", 1, TakeOptions(), played="mine"))
+    assert len(set(ids)) == len(ids) == 17
+
+
+def test_images_of_every_fourth_step_and_the_last_three(bottle_stage, robot_take):
+    options = TakeOptions(images=("camera_head",), image_every=4, streams="training")
+    lean = record(bottle_stage, 3, options)
+    steps = [*range(0, 77, 4), 78, 79, 80]
+    images, whole = lean.streams["camera_head"], robot_take.streams["camera_head"]
+    np.testing.assert_array_equal(images.values, whole.values[::2][steps])
+    np.testing.assert_array_equal(images.t_ref_ns, lean.streams["action"].t_ref_ns[steps])
+    assert set(lean.streams) == {
+        "camera_head", "tactile_left", "tactile_right", "object_poses", "action", "action_commanded"
+    }  # fmt: skip
+    for name in ("tactile_right", "action", "action_commanded"):
+        assert lean.streams[name].values.tobytes() == robot_take.streams[name].values.tobytes()
+    # 100 Hz and 15 Hz meet every fifth of a second.
+    np.testing.assert_array_equal(
+        lean.streams["object_poses"].values[::3],
+        robot_take.streams["object_poses"].values[::20],
+    )
+
+
+def test_actions_of_another_seed_are_those_of_its_own_take(bottle_stage, robot_take):
+    take = record(bottle_stage, 5, TakeOptions(images=(), actions_of_seed=3))
+    own = robot_take.streams["action_commanded"].values
+    np.testing.assert_allclose(take.streams["action_commanded"].values, own, atol=1e-12)
+    assert take.attributes.success is False
+    assert take.attributes.generator_command.endswith("--actions-of 3")
+    assert take.attributes.quality["actions_of_seed"] == 3
+
+
+def test_played_actions_repeat_the_take_they_come_from(bottle_stage, robot_take):
+    actions = robot_take.streams["action_commanded"].values
+    again = record(bottle_stage, 3, BLIND, played=PlayedActions("mine", actions, "by hand"))
+    assert again.attributes.episode_id == "twin-stand_bottle-robot-000003-by_mine"
+    assert again.attributes.generator_command == "by hand"
+    for name, stream in again.streams.items():
+        assert stream.values.tobytes() == robot_take.streams[name].values.tobytes()
+    with pytest.raises(InvalidInputError, match="named 'Mine'"):
+        PlayedActions("Mine", actions, "by hand")
+    with pytest.raises(ShapeError, match="80 played actions"):
+        PlayedActions("mine", actions[1:], "by hand")
 
 
 def test_bad_requests_are_refused(bottle_stage):
@@ -147,6 +196,10 @@ def test_bad_requests_are_refused(bottle_stage):
     for step in (-1, 81):
         with pytest.raises(InvalidInputError, match=r"frozen from step .*0 … 80"):
             TakeOptions(frozen_from_step=step)
+    with pytest.raises(InvalidInputError, match="at most one"):
+        TakeOptions(frozen_from_step=3, actions_of_seed=4)
+    with pytest.raises(InvalidInputError, match=r"every 0 steps, expected 1 … 80"):
+        TakeOptions(image_every=0)
     with pytest.raises(UnknownNameError, match="camera_head"):
         TakeOptions(images=("camera_foot",))
     with pytest.raises(UnknownNameError, match="stand_bottle"):
@@ -163,4 +216,10 @@ def test_the_command_line_records_and_says_so(tmp_path, capsys):
     assert "twin-stack_bowls-robot-000007" in summary.read_text()
     assert EpisodeStore(tmp_path / "store").open("twin-stack_bowls-robot-000007")
     assert command_line.main([*arguments, "--store", str(tmp_path / "store")]) == 3
+    told = shlex.split(
+        EpisodeStore(tmp_path / "store")
+        .open("twin-stack_bowls-robot-000007")
+        .attributes.generator_command
+    )
+    assert command_line.main([*told[2:], "--store", str(tmp_path / "store")]) == 3
     assert "exists already" in capsys.readouterr().err

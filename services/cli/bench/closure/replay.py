@@ -66,7 +66,7 @@ def replay(
     stage = closure_stage(task, "robot")
     anchor = stage.start(Plan(take.object_poses, trajectory))
     commands = poses_from_actions(actions_from_poses(trajectory, anchor), anchor)
-    recorder = Recorder(stage, images=images)
+    recorder = Recorder(stage, TakeOptions(images=images))
     recorder.sample(0)
     for row in range(1, NUM_GRID_STEPS):
         for step_index in stage.simulation.advance(command_row(commands, row)):

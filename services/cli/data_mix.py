@@ -1,0 +1,157 @@
+"""How the episodes of a data set differ from each other: `--mix` of `dextouch train data`."""
+
+import zlib
+from dataclasses import asdict, dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError
+from services.twin.motions import MOTION_KINDS, Motion, MotionKind
+from services.twin.take_options import TakeOptions
+
+# Success is decided within about 5 mm, so the ladder is dense there.
+LADDER_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.040)
+# Largest errors; each take draws its own standard deviation evenly between 0 and this.
+NOISE_RANGES_M: Final = {"fine": 0.012, "medium": 0.025, "coarse": 0.040}
+# From which steps (the last not included) things happen; before step 8 nothing has been reached.
+_FROM_STEPS: Final = {
+    "frozen": (8, 70),
+    "retreat": (5, 70),
+    "slip": (18, 51),
+    "push": (8, 55),
+    "wander": (8, 55),
+}
+# Of the pushes and wanders, those that begin at once, without anything of the script.
+_AT_ONCE: Final = 0.7
+# Seeds of one purpose (training, development, evaluation) lie in blocks of this many.
+_SEED_BLOCK: Final = 10_000
+_SUM_TOLERANCE: Final = 1e-9
+_HOLD: Final = TakeOptions(frozen_from_step=0)
+
+
+@dataclass(frozen=True)
+class Mix:
+    """Which share of the episodes is made how; the shares sum to 1.
+
+    Scripts: `exact`, with errors of up to 12 (`fine`), 25 (`medium`) or 40 mm (`coarse`) standard
+    deviation, or with `LADDER_M` in turn of the seeds (`ladder`). The others have the errors of a
+    script: `miss` has its objects elsewhere; `frozen` stops midway and `hold` never begins;
+    `retreat`, `push`, `slip` and `wander` are motions of `services.twin.motions`; `other_scene`
+    plays what is done for another seed.
+    """
+
+    exact: float = 0.0
+    fine: float = 0.0
+    medium: float = 0.0
+    coarse: float = 0.0
+    ladder: float = 0.0
+    miss: float = 0.0
+    frozen: float = 0.0
+    hold: float = 0.0
+    retreat: float = 0.0
+    push: float = 0.0
+    slip: float = 0.0
+    other_scene: float = 0.0
+    wander: float = 0.0
+
+    def __post_init__(self) -> None:
+        shares = asdict(self)
+        for name, share in shares.items():
+            if not 0 <= share <= 1:
+                raise InvalidInputError(f"training data: got a share of {name} {share}, not 0 … 1")
+        total = sum(shares.values())
+        if abs(total - 1) > _SUM_TOLERANCE:
+            raise InvalidInputError(
+                f"training data: got shares that sum to {total:.6g}, expected 1 ({shares})"
+            )
+        if not any(getattr(self, name) for name in SCRIPTS):
+            raise InvalidInputError(
+                f"training data: got no share of any script, expected some of {list(SCRIPTS)}"
+            )
+
+    def changed(self, *, miss: float | None = None, still: float | None = None) -> "Mix":
+        """The same with other shares of misses, and of takes that stop (half) or never begin.
+
+        Raises:
+            InvalidInputError: shares outside 0 … 1, or nothing left for anything else.
+        """
+        given = {} if miss is None else {"miss": miss}
+        if still is not None:
+            given |= {"frozen": 0.5 * still, "hold": 0.5 * still}
+        rest = {name: share for name, share in asdict(self).items() if name not in given}
+        left, before = 1 - sum(given.values()), sum(rest.values())
+        if not left >= 0 or before == 0:
+            raise InvalidInputError(
+                f"training data: got a share {miss} of misses and {still} of takes that stop, "
+                "expected 0 … 1 in all"
+            )
+        return replace(self, **given, **{name: s * left / before for name, s in rest.items()})
+
+
+SCRIPTS: Final = ("exact", "fine", "medium", "coarse", "ladder")
+MIXES: Final[dict[str, Mix]] = {
+    "evaluator": Mix(
+        exact=0.12, fine=0.25, coarse=0.16, ladder=0.10, miss=0.10, frozen=0.05, hold=0.04,
+        retreat=0.04, push=0.05, slip=0.04, other_scene=0.03, wander=0.02,
+    ),
+    "demonstrations": Mix(exact=0.28, medium=0.52, miss=0.20),
+    "ladder": Mix(ladder=1.0),
+    "exact": Mix(exact=1.0),
+}  # fmt: skip
+
+
+def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
+    """How the episode of a task and seed is made; the same every time.
+
+    Raises:
+        InvalidInputError: a negative seed.
+    """
+    if seed < 0:
+        raise InvalidInputError(f"training data: got seed {seed}, expected 0 or more")
+    draw = np.random.default_rng([seed, zlib.crc32(task.encode())])
+    shares = asdict(mix)
+    kind = _drawn(shares, draw)
+    script = kind if kind in SCRIPTS else _drawn({n: shares[n] for n in SCRIPTS}, draw)
+    noise_m = _noise_m(script, seed, draw)
+    if kind in {"frozen", "hold"}:
+        step = int(draw.integers(*_FROM_STEPS["frozen"]))
+        return TakeOptions(noise_m, frozen_from_step=step) if kind == "frozen" else _HOLD
+    if kind == "miss":
+        return TakeOptions(noise_m, miss=True)
+    if kind == "other_scene":
+        return TakeOptions(noise_m, actions_of_seed=_another_seed(seed, draw))
+    if kind in SCRIPTS:
+        return TakeOptions(noise_m)
+    return _with_motion(kind, noise_m, draw)
+
+
+def _with_motion(kind: str, noise_m: float, draw: np.random.Generator) -> TakeOptions:
+    motions: dict[str, MotionKind] = {kind: kind for kind in MOTION_KINDS}
+    motion = Motion(motions[kind], int(draw.integers(*_FROM_STEPS[kind])))
+    if kind in {"push", "wander"} and draw.random() < _AT_ONCE:
+        # Nothing is left of the script, and so of its error.
+        return TakeOptions(motion=replace(motion, from_step=0))
+    return TakeOptions(noise_m, motion=motion)
+
+
+def _drawn(shares: dict[str, float], draw: np.random.Generator) -> str:
+    ends = np.cumsum(list(shares.values()))
+    place = int(np.searchsorted(ends, draw.random() * ends[-1], side="right"))
+    return list(shares)[place]
+
+
+def _noise_m(script: str, seed: int, draw: np.random.Generator) -> float:
+    if script == "ladder":
+        return LADDER_M[seed % len(LADDER_M)]
+    if script == "exact":
+        return 0.0
+    # To a tenth of a millimetre: it is in the episode's name.
+    return float(np.round(draw.uniform(0, NOISE_RANGES_M[script]), 4))
+
+
+def _another_seed(seed: int, draw: np.random.Generator) -> int:
+    """A seed of the same block, so that nothing of the evaluation's scenes is trained on."""
+    first = seed - seed % _SEED_BLOCK
+    step = int(draw.integers(1, _SEED_BLOCK))
+    return first + (seed - first + step) % _SEED_BLOCK

@@ -1,0 +1,90 @@
+"""What a policy does in the twin, as the actions of an episode: `dextouch train data --policy`."""
+
+import hashlib
+import json
+import re
+import shlex
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+
+from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.schemas.rollouts import RolloutStart
+from services.evaluation.policies.asking import action_chunk, ask
+from services.evaluation.policies.outside import PolicySource
+from services.twin.demonstrators import NUM_GRID_STEPS
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.take_options import PlayedActions
+from services.twin.world import TwinWorld
+
+CAMERAS = ("camera_head",)
+_MAX_LABEL = 32
+
+
+@dataclass(frozen=True)
+class PolicyChoice:
+    """A policy by its address, as evaluation takes it, and its factory's arguments as JSON."""
+
+    address: str
+    arguments: str = "{}"
+
+    @classmethod
+    def parse(cls, address: str, arguments: Mapping[str, Any]) -> "PolicyChoice":
+        """A choice whose address was checked.
+
+        Raises:
+            InvalidInputError: an address that is none.
+        """
+        PolicySource.parse(address)
+        return cls(address, json.dumps(arguments, sort_keys=True))
+
+    @property
+    def label(self) -> str:
+        """Its name in the ids of episodes: another address or other arguments differ."""
+        name = re.sub(r"[^a-z0-9]+", "_", PolicySource.parse(self.address).name.lower()).strip("_")
+        digest = hashlib.sha256(f"{self.address} {self.arguments}".encode()).hexdigest()
+        return f"{name[:_MAX_LABEL]}_{digest[:6]}"
+
+
+@lru_cache(maxsize=1)
+def _world() -> TwinWorld:
+    return TwinWorld(TwinSettings(cameras=CAMERAS))
+
+
+@lru_cache(maxsize=2)
+def _policy(choice: PolicyChoice) -> Policy:
+    return PolicySource.parse(choice.address).load(json.loads(choice.arguments))
+
+
+def played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
+    """The actions of a policy that acts in a closed loop in the twin, from a seed's start.
+
+    The twin repeats itself to the last bit, so an episode with these actions is the rollout.
+
+    Raises:
+        InvalidInputError, ShapeError, NonFiniteError: the policy failed; its traceback is told.
+    """
+    world, policy, task = _world(), _policy(choice), stage.task
+    start = RolloutStart(task=task.name, seed=seed, instruction=task.instruction)
+    begun = world.reset(start)
+    state, seen = begun.state, begun.observation
+    where = f"policy {choice.address!r}, task {task.name!r}, seed {seed}"
+    told = PolicyStart(task.name, task.instruction, seed, begun.anchor, begun.K_head)
+    ask(policy.reset, told, where=f"{where}: reset")
+    # Row 0 is the start itself.
+    rows = [seen.action_reached[:1]]
+    while (left := NUM_GRID_STEPS - sum(map(len, rows))) > 0:
+        chunk = action_chunk(ask(policy.act, seen, where=f"{where}: act"), world.description,
+                             where=f"{where}: act")[:left]  # fmt: skip
+        stepped = world.step(state, chunk, seed=0)
+        state, seen = stepped.state, stepped.observation
+        rows.append(chunk)
+    command = (
+        f"dextouch train data --policy {shlex.quote(choice.address)} --policy-arguments "
+        f"{shlex.quote(choice.arguments)} --tasks {task.name} --first {seed} --count 1"
+    )
+    return PlayedActions(choice.label, np.concatenate(rows), command)
