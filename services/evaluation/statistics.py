@@ -1,19 +1,13 @@
-"""Successes and scores in; intervals and the uncertainty of agreement figures out."""
+"""Success rates, judging figures and agreement figures with their confidence intervals."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from statistics import NormalDist
 
 import numpy as np
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.metrics.policy import mmrv, pearson
-
-AGREEMENT_MEASURES: dict[str, Callable[[np.ndarray, np.ndarray], float]] = {
-    "pearson": lambda real, imagined: pearson(real=real, imagined=imagined),
-    "mmrv": lambda real, imagined: mmrv(real=real, imagined=imagined, ties="simpler"),
-}
+from services.evaluation.resampling import MEASURES, rates_of_draws, start_counts
 
 
 @dataclass(frozen=True)
@@ -145,21 +139,29 @@ def bootstrap_agreement(
             f"agreement: got shapes {real.shape} and {imagined.shape}, "
             "expected the same [policies, starts]"
         )
-    if measure not in AGREEMENT_MEASURES:
+    if measure not in MEASURES:
         raise InvalidInputError(
-            f"agreement measure: got {measure!r}, expected one of {sorted(AGREEMENT_MEASURES)}"
+            f"agreement measure: got {measure!r}, expected one of {sorted(MEASURES)}"
         )
-    num_starts = real.shape[1]
-    figures = np.empty(num_draws)
-    for draw in range(num_draws):
-        columns = generator.integers(0, num_starts, num_starts)
-        figures[draw] = AGREEMENT_MEASURES[measure](
-            real[:, columns].mean(axis=1), imagined[:, columns].mean(axis=1)
-        )
+    counts = start_counts(real.shape[1], generator, num_draws=num_draws)
+    figures = MEASURES[measure](rates_of_draws(real, counts), rates_of_draws(imagined, counts))
+    return interval_of_draws(figures)
+
+
+def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> AgreementInterval:
+    """Percentile interval of the figures [draws] of a bootstrap; undefined draws are NaN.
+
+    Raises:
+        ShapeError: not one axis with at least one draw.
+    """
+    _check_confidence(confidence)
+    if figures.ndim != 1 or len(figures) == 0:
+        raise ShapeError(f"bootstrap: got shape {figures.shape}, expected [draws ≥ 1]")
+    num_draws = len(figures)
     defined = figures[np.isfinite(figures)]
     undefined_share = 1 - len(defined) / num_draws
     enough = undefined_share < 0.5
-    return AgreementInterval(_percentiles(defined, 0.95) if enough else None, undefined_share)
+    return AgreementInterval(_percentiles(defined, confidence) if enough else None, undefined_share)
 
 
 def _percentiles(draws: np.ndarray, confidence: float) -> Interval:
