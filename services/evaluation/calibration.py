@@ -1,0 +1,162 @@
+"""Calibration of a judge: how its log odds become probabilities that come true as often as said.
+
+Two numbers for each task and kind of ending, fitted on episodes that the judge was not trained
+on, and from the same episodes the band of probabilities in which it had better not decide.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+from pydantic import BaseModel, ConfigDict, Field
+
+from dextouch.errors import InvalidInputError
+
+NUM_BINS: Final = 10
+_MAX_NEWTON_STEPS: Final = 50
+# Weight of "as the network says" in the fit of the inverse temperature and the bias, in endings.
+_PRIOR_ENDINGS: Final = 2.0
+# The judge may refuse what lies between 5 % and 95 %, never more.
+_WIDEST_BAND: Final = 0.45
+
+
+class Calibration(BaseModel):
+    """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of a half."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    temperature: float = Field(default=1.0, gt=0)
+    bias: float = 0.0
+    band: float = Field(default=0.0, ge=0, lt=0.5)
+
+    def probabilities(self, log_odds: np.ndarray) -> Float64[np.ndarray, " n"]:
+        """Calibrated probabilities of success."""
+        return sigmoid(np.asarray(log_odds, dtype=np.float64) / self.temperature + self.bias)
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """How far probabilities can be taken at their word: both figures are best at 0."""
+
+    expected_calibration_error: float
+    brier: float
+
+    @classmethod
+    def of(cls, probabilities: np.ndarray, success: np.ndarray) -> "Reliability":
+        """The figures of some endings."""
+        return cls(
+            expected_calibration_error(probabilities, success), brier(probabilities, success)
+        )
+
+
+def sigmoid(log_odds: np.ndarray) -> Float64[np.ndarray, "*n"]:
+    """1 / (1 + exp(−x)), without overflow."""
+    return np.asarray(np.exp(-np.logaddexp(0.0, -log_odds)))
+
+
+def expected_calibration_error(
+    probabilities: np.ndarray, success: np.ndarray, *, num_bins: int = NUM_BINS
+) -> float:
+    """Mean distance of said and true success rates over equally wide bins (Guo et al. 2017).
+
+    Every bin counts by its endings. A perfectly honest judge has an error above 0 as well, of
+    about √(p(1−p)/n) in a bin of n.
+
+    Raises:
+        InvalidInputError: nothing to measure on, or arrays that do not fit.
+    """
+    told, came = _pair(probabilities, success)
+    bins = np.minimum((told * num_bins).astype(int), num_bins - 1)
+    gaps = np.bincount(bins, weights=told - came, minlength=num_bins)
+    return float(np.abs(gaps).sum() / len(told))
+
+
+def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
+    """Mean squared distance of probability and outcome (Brier 1950).
+
+    Raises:
+        InvalidInputError: nothing to measure on, or arrays that do not fit.
+    """
+    told, came = _pair(probabilities, success)
+    return float(np.mean((told - came) ** 2))
+
+
+def fit_calibration(
+    log_odds: np.ndarray, success: np.ndarray, *, risk: float = 0.05
+) -> Calibration:
+    """Temperature, bias and undecided band from endings that the judge was not trained on.
+
+    Platt's scaling with his targets, (n⁺ + 1) / (n⁺ + 2) and 1 / (n⁻ + 2), which keep the fit
+    finite where the judge separates the endings without error (Platt 1999), and a weak pull
+    towards the network's own odds for a handful of endings.
+
+    Args:
+        log_odds: [n] of the network.
+        success: [n], what came true.
+        risk: share of errors that is allowed among the decided endings.
+
+    Raises:
+        InvalidInputError: only one outcome, or a risk that is none.
+    """
+    odds, came = np.asarray(log_odds, dtype=np.float64), np.asarray(success, dtype=bool)
+    if odds.shape != came.shape or came.all() or not came.any() or not 0 < risk < 1:
+        raise InvalidInputError(
+            f"calibration: got {odds.shape} log odds, {came.sum()} successes of {came.shape} and "
+            f"risk {risk}; expected one each, both outcomes and a risk between 0 and 1"
+        )
+    slope, bias = _platt(odds, came)
+    fitted = Calibration(temperature=1 / slope, bias=bias)
+    return fitted.model_copy(
+        update={"band": undecided_band(fitted.probabilities(odds), came, risk=risk)}
+    )
+
+
+def undecided_band(probabilities: np.ndarray, success: np.ndarray, *, risk: float) -> float:
+    """Least half width about 0.5 outside of which the judge errs in at most `risk` of the cases.
+
+    One more error than was seen is assumed, as in conformal risk control, so few endings give a
+    wide band. It is never wider than 0.45, even where the risk is not met then.
+    """
+    told, came = _pair(probabilities, success)
+    sureness = np.abs(told - 0.5)
+    wrong = (told >= 0.5) != (came > 0.5)
+    # Just below a half width of 0 all are decided; each further one leaves out the least sure.
+    for width in np.concatenate([[0.0], np.sort(sureness)]):
+        decided = sureness > width if width else np.ones(len(told), dtype=bool)
+        if width >= _WIDEST_BAND:
+            break
+        if (wrong[decided].sum() + 1) / (decided.sum() + 1) <= risk:
+            return float(width)
+    return _WIDEST_BAND
+
+
+def _platt(odds: np.ndarray, came: np.ndarray) -> tuple[float, float]:
+    """Slope and bias that minimize the cross entropy to Platt's targets, by Newton's method."""
+    wins, losses = int(came.sum()), int((~came).sum())
+    target = np.where(came, (wins + 1) / (wins + 2), 1 / (losses + 2))
+    design = np.stack([odds, np.ones_like(odds)], axis=1)
+    # In units of the odds' own spread, so that the pull does not depend on the network's scale.
+    pull = np.diag([np.mean(odds**2), 1.0]) * _PRIOR_ENDINGS / 4
+    own = np.array([1.0, 0.0])
+    fitted = own.copy()
+    for _ in range(_MAX_NEWTON_STEPS):
+        told = sigmoid(design @ fitted)
+        gradient = design.T @ (told - target) + pull @ (fitted - own)
+        curvature = (design * (told * (1 - told))[:, None]).T @ design + pull
+        step = np.linalg.solve(curvature, gradient)
+        fitted -= step * min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
+        if np.abs(step).max() < 1e-9:
+            break
+    # A judge that orders the endings backwards is not turned round: it is told to know nothing.
+    return max(float(fitted[0]), 1e-3), float(fitted[1])
+
+
+def _pair(probabilities: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    told, came = np.asarray(probabilities, np.float64), np.asarray(success, np.float64)
+    if told.shape != came.shape or told.ndim != 1 or len(told) == 0:
+        raise InvalidInputError(
+            f"calibration: got {told.shape} probabilities and {came.shape} outcomes, expected one "
+            "each, at least one"
+        )
+    return told, came
