@@ -15,6 +15,7 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
 from services.evaluation.demonstrations import read_demonstrations
+from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.hold import HoldPolicy
@@ -76,14 +77,17 @@ def run_train_policy(arguments: list[str]) -> int:
 def run_train_probe(arguments: list[str]) -> int:
     """Train the success probe and keep it."""
     settings = parse(TrainProbeSettings, arguments)
-    stores = [EpisodeStore(url) for url in settings.episodes]
-    demonstrations = read_demonstrations(*stores, tasks=settings.tasks)
-    kept = [EpisodeStore(url) for url in settings.held_out]
+
+    def read(urls: Sequence[str]) -> list[EndingEpisode]:
+        stores = [EpisodeStore(url) for url in urls]
+        return read_ending_episodes(*stores, tasks=settings.tasks) if stores else []
+
     checkpoint = train_success_probe(
-        demonstrations,
+        read(settings.episodes),
         settings.training,
         command=command_line("train-probe", arguments),
-        held_out=read_demonstrations(*kept, tasks=settings.tasks) if kept else (),
+        development=read(settings.development),
+        held_out=read(settings.held_out),
     )
     return _keep(checkpoint, settings.output, settings.json_path)
 

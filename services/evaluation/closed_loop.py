@@ -18,17 +18,13 @@ from dextouch.errors import ConflictError, DexTouchError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.rollouts import Observation, ReturnSelector
 from services.evaluation.demonstrations import CAMERA
+from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.progress import Progress
 from services.evaluation.scores import REAL, ClosedLoopReport, RolloutFailure, RolloutScore
 from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.study_worlds import StudyWorlds, WorldAddress
-from services.evaluation.success_probe import (
-    DECISION_THRESHOLD,
-    NUM_SEEN_STEPS,
-    Ending,
-    SuccessProbe,
-)
+from services.evaluation.success_probe import SuccessProbe
 
 __all__ = ["EvaluationPlan", "MatchedStart", "WorldAddress", "evaluate", "matched_start"]
 
@@ -208,10 +204,16 @@ class _Study:
         with self._begin(start, world) as rollout:
             ending = self._play(rollout, start, policy, world)
             success = rollout.observation.success if world == REAL else None
-        probability = self.probe.probability(ending)
-        decided = probability >= DECISION_THRESHOLD if success is None else success
+        verdict = self.probe.verdict(ending)
         return RolloutScore(
-            world, policy, start.task, start.seed, start.digest, decided, probability
+            world,
+            policy,
+            start.task,
+            start.seed,
+            start.digest,
+            verdict.likely_success if success is None else success,
+            verdict.probability,
+            cannot_tell=None if success is not None else verdict.reason,
         )
 
     def _begin(self, start: MatchedStart, world: str) -> Rollout:
@@ -254,6 +256,4 @@ class _Study:
                 f"{where}: the last chunk shows {len(last)} steps, expected at least "
                 f"{NUM_SEEN_STEPS}; send longer chunks"
             )
-        return Ending(
-            last.images[CAMERA][-NUM_SEEN_STEPS:], last.tactile_kpa[-NUM_SEEN_STEPS:], start.task
-        )
+        return Ending.of(last, start.task, imagined=world != REAL)

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -107,17 +108,38 @@ def data_hash(demonstrations: Iterable[Demonstration]) -> str:
     return digest.hexdigest()
 
 
+@runtime_checkable
+class Seeded(Protocol):
+    """Anything that belongs to a task and a seed of the twin."""
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+
+    @property
+    def instruction(self) -> str:
+        """Its sentence."""
+
+    @property
+    def seed(self) -> int:
+        """What decided where everything lies."""
+
+
+SeededT = TypeVar("SeededT", bound=Seeded)
+
+
 def split_by_seed(
-    demonstrations: Sequence[Demonstration], *, held_out_share: float
-) -> tuple[list[Demonstration], list[Demonstration]]:
+    demonstrations: Sequence[SeededT], *, held_out_share: float, salt: str = ""
+) -> tuple[list[SeededT], list[SeededT]]:
     """Training and held-out episodes; all episodes of a task and seed fall on the same side.
 
-    The side is decided by a hash of task and seed, so it never changes when episodes are added.
+    The side is decided by a hash of task and seed, so it never changes when episodes are added;
+    another `salt` gives another split.
     """
-    training: list[Demonstration] = []
-    held_out: list[Demonstration] = []
+    training: list[SeededT] = []
+    held_out: list[SeededT] = []
     for item in demonstrations:
-        digest = hashlib.sha256(f"{item.task}/{item.seed}".encode()).digest()
+        digest = hashlib.sha256(f"{salt}{item.task}/{item.seed}".encode()).digest()
         share = int.from_bytes(digest[:4], "big") / 2**32
         (held_out if share < held_out_share else training).append(item)
     if not training or not held_out:
@@ -128,7 +150,7 @@ def split_by_seed(
     return training, held_out
 
 
-def instructions_of(demonstrations: Iterable[Demonstration]) -> dict[str, str]:
+def instructions_of(demonstrations: Iterable[Seeded]) -> dict[str, str]:
     """The sentence of every task, as the first episode of it has it."""
     found: dict[str, str] = {}
     for item in demonstrations:

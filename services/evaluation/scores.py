@@ -32,7 +32,8 @@ class RolloutScore:
     """How one rollout ended.
 
     `success` is the world's own verdict in the real world and the probe's decision elsewhere;
-    `probability` is always the probe's, so that the probe itself can be judged.
+    `probability` is always the probe's, so that the probe itself can be judged. `cannot_tell` is
+    why the probe had better not decide an imagined rollout; `success` is the likelier outcome then.
     """
 
     world: str
@@ -42,6 +43,7 @@ class RolloutScore:
     start_digest: str
     success: bool
     probability: float
+    cannot_tell: str | None = None
 
 
 @dataclass(frozen=True)
@@ -136,6 +138,7 @@ class ClosedLoopReport:
             name: successes / len(mine),
             f"{name}_interval": [interval.low, interval.high],
             f"{name}_probability": float(np.mean([s.probability for s in mine])),
+            f"{name}_undecided": sum(s.cannot_tell is not None for s in mine),
             **counts,
         }
 

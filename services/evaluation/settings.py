@@ -34,11 +34,14 @@ class TrainPolicySettings(BaseSettings):
 
 
 class TrainProbeSettings(BaseSettings):
-    """Learn to tell success on the robot episodes of some stores."""
+    """Learn to tell success on the robot episodes of some stores, true and imagined ones."""
 
     model_config = service_config("evaluation_train_probe")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    development: tuple[str, ...] = Field(
+        default=(), description="stores to calibrate on (a share of the seeds of `episodes`)"
+    )
     held_out: tuple[str, ...] = Field(
         default=(), description="stores to measure on (a fifth of the seeds of `episodes`)"
     )

@@ -1,122 +1,46 @@
-"""Success probe: a small network that tells from the end of a rollout whether it succeeded."""
+"""Success probe: the judge that tells from the end of a rollout whether it succeeded.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+It sees images, touch and, of imagined endings, the imagined object poses; never the actions.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64, Int64, UInt8
-from pydantic import BaseModel, ConfigDict
-from torch import nn
+from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.errors import InvalidInputError
+from services.evaluation.calibration import Calibration, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
-from services.evaluation.features import NUM_PAD_FEATURES, pad_features
+from services.evaluation.endings import Ending
+from services.evaluation.judge_network import ProbeNetwork, ProbeShape, probe_batch
+from services.evaluation.success_probe_2 import KIND_2, ProbeNetwork2
 
-# Version 2 of the network; checkpoints of the first are refused by this name.
-KIND = "success-probe-2"
-NUM_SEEN_STEPS = 3
+# Version 3 of the network; checkpoints of the first are refused by this name.
+KIND = "success-probe-3"
 DECISION_THRESHOLD = 0.5
-_CHANNELS = (24, 32, 48, 48)
-_TASK_FEATURES = 8
-
-
-class ProbeShape(BaseModel):
-    """What the probe looks like; kept in the checkpoint."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    tasks: tuple[str, ...]
-    hidden: int = 64
-    image_size_px: int = 64
+Decision = Literal["success", "failure", "cannot tell"]
+TRUE, IMAGINED = "true", "imagined"
+_BATCH = 256
 
 
 @dataclass(frozen=True)
-class Ending:
-    """The last three steps of a rollout: head images, and taxels in kPa."""
+class Verdict:
+    """What the judge says about one ending.
 
-    images: UInt8[np.ndarray, "3 h w 3"]
-    tactile_kpa: Float32[np.ndarray, "3 2 320"]
-    task: str
-
-
-@dataclass(frozen=True)
-class ProbeBatch:
-    """Inputs of the network: last images as bytes, mean touch of the three steps, task index."""
-
-    images: UInt8[torch.Tensor, "n 3 h w"]
-    touch: Float32[torch.Tensor, "n 24"]
-    task: Int64[torch.Tensor, " n"]
-
-    def __getitem__(self, index: torch.Tensor) -> "ProbeBatch":
-        """Some of the endings."""
-        return ProbeBatch(self.images[index], self.touch[index], self.task[index])
-
-
-class ProbeNetwork(nn.Module):
-    """Four strided convolutions on the last image, touch and task beside them, two linear layers.
-
-    The image is all that shows how well an object stands. Few features reach the linear layers,
-    so that they learn where things lie and not one training episode from another.
+    `likely_success` is the more probable outcome, also where the judge had better not decide;
+    `reason` says why it cannot tell. `milestones` are probabilities that each was reached by the
+    end, of those that can be told.
     """
 
-    def __init__(self, shape: ProbeShape) -> None:
-        super().__init__()
-        layers: list[nn.Module] = []
-        channels = 3
-        for width in _CHANNELS:
-            layers.append(nn.Conv2d(channels, width, 3, stride=2, padding=1))
-            layers += [nn.BatchNorm2d(width), nn.GELU()]
-            channels = width
-        side = -(-shape.image_size_px // 2 ** len(_CHANNELS))
-        num_features = channels * side * side + NUM_PAD_FEATURES + _TASK_FEATURES
-        self.eye = nn.Sequential(*layers, nn.Flatten())
-        self.task = nn.Embedding(len(shape.tasks), _TASK_FEATURES)
-        self.head = nn.Sequential(
-            nn.Dropout(0.3), nn.Linear(num_features, shape.hidden), nn.GELU(),
-            nn.Linear(shape.hidden, 1),
-        )  # fmt: skip
-
-    def forward(self, batch: ProbeBatch) -> torch.Tensor:
-        """Log odds [n] of success."""
-        return self.judge(unit_images(batch.images), batch.touch, batch.task)
-
-    def judge(
-        self, images: torch.Tensor, touch: torch.Tensor, task: torch.Tensor
-    ) -> Float32[torch.Tensor, " n"]:
-        """Log odds of images [n, 3, h, w] in −0.5 … 0.5 with their touch and task."""
-        parts = [self.eye(images), touch, self.task(task)]
-        return torch.as_tensor(self.head(torch.cat(parts, dim=1)))[:, 0]
-
-
-def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor, "n 3 h w"]:
-    """Bytes as −0.5 … 0.5."""
-    return images.float() / 255 - 0.5
-
-
-def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
-    """Network tensors of endings; the same code serves training and judging.
-
-    Raises:
-        UnknownNameError: a task the probe was not made for.
-        InvalidInputError: images of another size.
-    """
-    size = (NUM_SEEN_STEPS, shape.image_size_px, shape.image_size_px, 3)
-    for ending in endings:
-        if ending.task not in shape.tasks:
-            raise UnknownNameError("task of the success probe", ending.task, list(shape.tasks))
-        if ending.images.shape != size:
-            raise InvalidInputError(
-                f"success probe: got images {ending.images.shape}, expected {size}"
-            )
-    images = torch.from_numpy(np.stack([e.images[-1] for e in endings]))
-    touch = pad_features(np.stack([e.tactile_kpa for e in endings])).mean(axis=1)
-    return ProbeBatch(
-        images.permute(0, 3, 1, 2).contiguous(),
-        torch.from_numpy(touch),
-        torch.tensor([shape.tasks.index(e.task) for e in endings]),
-    )
+    probability: float
+    decision: Decision
+    likely_success: bool
+    reason: str | None = None
+    milestones: Mapping[str, float] = field(default_factory=dict)
 
 
 class SuccessProbe:
@@ -131,29 +55,104 @@ class SuccessProbe:
 
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.metadata = checkpoint.metadata
-        self.shape = ProbeShape.model_validate(checkpoint.metadata.settings["shape"])
-        self._network = ProbeNetwork(self.shape)
+        settings = checkpoint.metadata.settings
+        self.shape = ProbeShape.model_validate(settings["shape"])
+        self.threshold = float(settings.get("threshold", DECISION_THRESHOLD))
+        self._calibrations = {
+            name: Calibration.model_validate(values)
+            for name, values in settings.get("calibration", {}).items()
+        }
+        self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
+        is_old = checkpoint.metadata.kind == KIND_2
+        self._network = (ProbeNetwork2 if is_old else ProbeNetwork)(self.shape)
         load_weights(self._network, checkpoint, prefix="network")
         self._network.eval()
 
     @classmethod
     def load(cls, path: Path) -> "SuccessProbe":
         """A probe from its file."""
-        return cls(load_checkpoint(path, kind=KIND))
+        return cls(load_checkpoint(path, kind=(KIND, KIND_2)))
 
-    def probabilities(self, endings: Sequence[Ending]) -> Float64[np.ndarray, " n"]:
-        """Probability of success of each ending.
+    def calibration(self, task: str, *, imagined: bool) -> Calibration:
+        """How log odds of a task's endings become probabilities.
+
+        Imagined endings are taken as true ones where none were there to calibrate on.
+        """
+        for kind in (IMAGINED, TRUE) if imagined else (TRUE,):
+            if (name := calibration_name(task, kind)) in self._calibrations:
+                return self._calibrations[name]
+        return Calibration()
+
+    def log_odds(self, endings: Sequence[Ending]) -> Float64[np.ndarray, "n outputs"]:
+        """What the network says: log odds of success and of the task's milestones.
 
         Raises:
             UnknownNameError: a task the probe was not made for.
-            InvalidInputError: no endings, or images of another size.
+            InvalidInputError: no endings, images of another size, or none where they are needed.
         """
         if not endings:
             raise InvalidInputError("success probe: got no endings, expected at least one")
+        if self.metadata.kind == KIND_2 and any(e.images is None for e in endings):
+            raise InvalidInputError(
+                f"success probe: got an ending without images, which a probe of {KIND_2} needs; "
+                "train it anew"
+            )
+        parts = [endings[at : at + _BATCH] for at in range(0, len(endings), _BATCH)]
         with torch.no_grad():
-            odds = self._network(probe_batch(endings, self.shape))
-        return torch.sigmoid(odds.double()).numpy()
+            odds = [self._network(probe_batch(part, self.shape)) for part in parts]
+        return torch.cat(odds).double().numpy()
+
+    def probabilities(self, endings: Sequence[Ending]) -> Float64[np.ndarray, " n"]:
+        """Calibrated probability of success of each ending; raises as `log_odds`."""
+        return self._calibrated(endings, self.log_odds(endings))
+
+    def _calibrated(self, endings: Sequence[Ending], odds: np.ndarray) -> Float64[np.ndarray, " n"]:
+        found = [self.calibration(e.task, imagined=e.imagined) for e in endings]
+        return np.array(
+            [float(one.probabilities(row[:1])[0]) for one, row in zip(found, odds, strict=True)]
+        )
 
     def probability(self, ending: Ending) -> float:
         """Probability of success of one ending."""
         return float(self.probabilities([ending])[0])
+
+    def verdicts(self, endings: Sequence[Ending]) -> list[Verdict]:
+        """What to believe of each ending; raises as `log_odds`."""
+        odds = self.log_odds(endings)
+        probabilities = self._calibrated(endings, odds)
+        return [
+            self._verdict(ending, float(probability), row)
+            for ending, probability, row in zip(endings, probabilities, odds, strict=True)
+        ]
+
+    def verdict(self, ending: Ending) -> Verdict:
+        """What to believe of one ending."""
+        return self.verdicts([ending])[0]
+
+    def _verdict(self, ending: Ending, probability: float, odds: np.ndarray) -> Verdict:
+        band = self.calibration(ending.task, imagined=ending.imagined).band
+        likely = probability >= self.threshold
+        reason = None
+        if ending.doubted is not None:
+            reason = f"the world doubts what it shows: {ending.doubted}"
+        elif band > 0 and abs(probability - self.threshold) <= band:
+            reason = (
+                f"its probability is within {band:.2f} of {self.threshold:g}, where the judge "
+                "errs too often"
+            )
+        decided: Decision = "success" if likely else "failure"
+        names = self.shape.milestones.get(ending.task, ())
+        reached = sigmoid(odds[1:])
+        milestones = {
+            name: float(reached[index])
+            for index, name in enumerate(names)
+            if name in self._told.get(ending.task, ())
+        }
+        return Verdict(
+            probability, decided if reason is None else "cannot tell", likely, reason, milestones
+        )
+
+
+def calibration_name(task: str, kind: str) -> str:
+    """The key of a task's calibration for true or imagined endings, in checkpoints."""
+    return f"{task}/{kind}"

@@ -1,43 +1,31 @@
-"""Training of the success probe on endings of known outcome, and its accuracy on held-out ones."""
+"""Training of the success probe on true and imagined endings of known outcome.
+
+Three sets of episodes with different starts: what is learned from, what the probabilities are
+calibrated on (development), and what the figures in the checkpoint are measured on (held out).
+"""
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float64
 from pydantic import BaseModel, ConfigDict, Field
 from torch.nn import functional
 
-from dextouch.errors import InvalidInputError
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
-from services.evaluation.demonstrations import (
-    Demonstration,
-    data_hash,
-    instructions_of,
-    split_by_seed,
-)
+from services.evaluation.demonstrations import instructions_of, split_by_seed
+from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
+from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, unit_images
 from services.evaluation.progress import Progress
 from services.evaluation.starts import refuse_training_starts
-from services.evaluation.statistics import area_under_roc, balanced_accuracy
-from services.evaluation.success_probe import (
-    KIND,
-    NUM_SEEN_STEPS,
-    Ending,
-    ProbeBatch,
-    ProbeNetwork,
-    ProbeShape,
-    probe_batch,
-    unit_images,
+from services.evaluation.success_probe import DECISION_THRESHOLD, KIND, SuccessProbe
+from services.evaluation.success_probe_data import Labelled, labelled_endings, object_scale
+from services.evaluation.success_probe_figures import (
+    fit_calibrations,
+    held_out_figures,
+    milestones_that_can_be_told,
 )
-
-# Windows that end this early cannot be a success: nothing was done yet.
-EARLY_ENDS = (2, 8, 14)
-LATE_SHIFTS = (0, 1)
-# Of the weight of a task's failures. They are easy: with more weight they would crowd out the
-# near misses that the probe is there for.
-EARLY_SHARE = 0.1
 
 
 class ProbeSettings(BaseModel):
@@ -55,141 +43,166 @@ class ProbeSettings(BaseModel):
     brightness: float = Field(default=0.05, ge=0)
     # At 64 pixels one is about 10 mm on the table, which is what decides success.
     shift_px: int = Field(default=1, ge=0)
+    # Of the endings that have both: how many are learned from without poses, without images.
+    without_poses: float = Field(default=0.4, ge=0, le=1)
+    without_images: float = Field(default=0.3, ge=0, le=1)
+    # In standard deviations of each feature of the poses.
+    pose_noise: float = Field(default=0.03, ge=0)
+    imagined_share: float = Field(default=0.5, gt=0, lt=1)
+    milestone_weight: float = Field(default=0.3, ge=0)
+    development_share: float = Field(default=0.15, gt=0, lt=1)
     held_out_share: float = Field(default=0.2, gt=0, lt=1)
+    # Errors that are allowed among the endings that the judge decides.
+    risk: float = Field(default=0.05, gt=0, lt=1)
 
 
 @dataclass(frozen=True)
-class Labelled:
-    """Endings as tensors, whether each is a success, and how much it counts."""
+class ProbeSets:
+    """Episodes by what they are for; no two sets share a start."""
 
-    batch: ProbeBatch
-    success: torch.Tensor
-    weight: torch.Tensor
+    training: Sequence[EndingEpisode]
+    development: Sequence[EndingEpisode]
+    held_out: Sequence[EndingEpisode]
 
-    def __len__(self) -> int:
-        return len(self.success)
+    @classmethod
+    def split(
+        cls,
+        episodes: Sequence[EndingEpisode],
+        settings: ProbeSettings,
+        *,
+        development: Sequence[EndingEpisode] = (),
+        held_out: Sequence[EndingEpisode] = (),
+    ) -> "ProbeSets":
+        """The sets as they are given; one that is not is a share of the seeds of `episodes`."""
+        training, tested, calibrated = list(episodes), list(held_out), list(development)
+        if not tested:
+            training, tested = split_by_seed(training, held_out_share=settings.held_out_share)
+        if not calibrated:
+            training, calibrated = split_by_seed(
+                training, held_out_share=settings.development_share, salt="development "
+            )
+        return cls(training, calibrated, tested)
 
+    @property
+    def training_starts(self) -> tuple[str, ...]:
+        """Digests of the starts that the weights were learned from, or the calibration."""
+        return tuple(sorted({e.start_digest for e in (*self.training, *self.development)}))
 
-def final_ending(item: Demonstration, end: int) -> Ending:
-    """The three steps of an episode up to and including step `end`."""
-    steps = slice(end - NUM_SEEN_STEPS + 1, end + 1)
-    return Ending(item.images[steps], item.tactile_kpa[steps], item.task)
+    def check(self) -> None:
+        """Refuse sets that share a start.
 
-
-def labelled_endings(
-    demonstrations: Sequence[Demonstration], shape: ProbeShape, *, with_early: bool
-) -> Labelled:
-    """Endings with their outcome, weighted so that both outcomes count the same in every task.
-
-    Args:
-        demonstrations: episodes with known success.
-        shape: of the probe.
-        with_early: add endings from the beginning of the episodes as failures, with a tenth of
-            the weight of all failures, and ones that stop a step earlier.
-
-    Raises:
-        InvalidInputError: a task of which only one outcome is known.
-    """
-    endings: list[Ending] = []
-    success: list[bool] = []
-    early: list[bool] = []
-    for item in demonstrations:
-        last = item.num_steps - 1
-        for shift in LATE_SHIFTS if with_early else (0,):
-            endings.append(final_ending(item, last - shift))
-            success.append(item.success)
-            early.append(False)
-        for end in EARLY_ENDS if with_early else ():
-            endings.append(final_ending(item, end))
-            success.append(False)
-            early.append(True)
-    weight = _weights([e.task for e in endings], np.array(success), np.array(early))
-    return Labelled(
-        probe_batch(endings, shape),
-        torch.tensor(success, dtype=torch.float32),
-        torch.tensor(weight / weight.mean(), dtype=torch.float32),
-    )
-
-
-def _weights(
-    tasks: Sequence[str], success: np.ndarray, early: np.ndarray
-) -> Float64[np.ndarray, " n"]:
-    weight = np.zeros(len(tasks))
-    early_share = EARLY_SHARE if early.any() else 0.0
-    for task in sorted(set(tasks)):
-        of_task = np.array([name == task for name in tasks])
-        for word, chosen, share in (
-            ("successful", of_task & success, 1.0),
-            ("failed", of_task & ~success & ~early, 1.0 - early_share),
-            ("early", of_task & early, early_share),
+        Raises:
+            ConflictError: a held-out or development episode that begins like a training episode.
+        """
+        learned = {e.start_digest for e in self.training}
+        for others, trained_on in (
+            (self.development, learned),
+            (self.held_out, self.training_starts),
         ):
-            if share and not chosen.any():
-                raise InvalidInputError(
-                    f"success probe: no {word} episode of {task!r} among "
-                    f"{of_task.sum()} endings; record with more noise levels"
-                )
-            weight[chosen] = share / max(chosen.sum(), 1)
-    return weight
+            refuse_training_starts(
+                (e.start_digest for e in others), trained_on=trained_on, what="the success probe"
+            )
 
 
 def train_success_probe(
-    demonstrations: Sequence[Demonstration],
+    episodes: Sequence[EndingEpisode],
     settings: ProbeSettings,
     *,
     command: str,
-    held_out: Sequence[Demonstration] = (),
+    development: Sequence[EndingEpisode] = (),
+    held_out: Sequence[EndingEpisode] = (),
 ) -> Checkpoint:
     """Learn to tell success from the end of a rollout.
 
     Args:
-        demonstrations: episodes with known success.
+        episodes: true and imagined ones with known success.
         settings: of the training.
         command: that is kept in the checkpoint.
-        held_out: episodes to measure on; without them a share of the seeds of `demonstrations`.
+        development: episodes to calibrate on; without them a share of the seeds of `episodes`.
+        held_out: episodes to measure on; without them a share of the seeds of `episodes`.
 
     Returns:
-        The weights, with figures of the held-out episodes in the metadata.
+        The weights and the calibration, with figures of the held-out episodes in the metadata.
 
     Raises:
-        ConflictError: a held-out episode that begins like a training episode.
+        ConflictError: a held-out or development episode that begins like a training episode.
         InvalidInputError: a task of which only one outcome is known.
     """
     torch.manual_seed(settings.seed)
+    sets = ProbeSets.split(episodes, settings, development=development, held_out=held_out)
+    sets.check()
     shape = ProbeShape(
-        tasks=tuple(sorted({d.task for d in demonstrations})),
-        image_size_px=demonstrations[0].images.shape[1],
-    )
-    training, tested = list(demonstrations), list(held_out)
-    if not tested:
-        training, tested = split_by_seed(demonstrations, held_out_share=settings.held_out_share)
-    starts = tuple(sorted({d.start_digest for d in training}))
-    refuse_training_starts(
-        (d.start_digest for d in tested), trained_on=starts, what="the success probe"
+        tasks=tuple(sorted({e.task for e in sets.training})),
+        image_size_px=_image_size_px(sets.training),
+        milestones=milestones_of(sets.training),
     )
     network = ProbeNetwork(shape)
-    cpu_s = _optimize(network, labelled_endings(training, shape, with_early=True), settings)
-    metadata = CheckpointMetadata(
+    learned = labelled_endings(sets.training, shape, imagined_share=settings.imagined_share)
+    mean, std = object_scale(learned, len(shape.tasks))
+    network.object_mean.copy_(mean)
+    network.object_std.copy_(std)
+    cpu_s = _optimize(network, learned, settings)
+    tensors = {f"network.{name}": t.clone() for name, t in network.state_dict().items()}
+    plain = Checkpoint(_metadata(sets, settings, shape, command, cpu_s), tensors)
+    return _measured(_calibrated(plain, sets, settings), sets)
+
+
+def _image_size_px(episodes: Sequence[EndingEpisode]) -> int:
+    images = (e.images for item in episodes for e in item.endings.values())
+    return next((int(one.shape[1]) for one in images if one is not None), 64)
+
+
+def _metadata(
+    sets: ProbeSets, settings: ProbeSettings, shape: ProbeShape, command: str, cpu_s: float
+) -> CheckpointMetadata:
+    everything = [*sets.training, *sets.development, *sets.held_out]
+    return CheckpointMetadata(
         kind=KIND,
         command=command,
         seed=settings.seed,
-        data_hash=data_hash([*training, *tested]),
+        data_hash=endings_hash(everything),
         tasks=shape.tasks,
-        training_episodes=tuple(d.episode_id for d in training),
-        training_starts=starts,
+        training_episodes=tuple(e.episode_id for e in (*sets.training, *sets.development)),
+        training_starts=sets.training_starts,
         settings={
-            "shape": shape.model_dump(),
+            "shape": shape.model_dump(mode="json"),
             "training": settings.model_dump(),
-            "instructions": instructions_of(demonstrations),
+            "instructions": instructions_of(everything),
+            "threshold": DECISION_THRESHOLD,
         },
         metrics={
             "training_cpu_s": round(cpu_s, 1),
-            "num_training_episodes": len(training),
-            "num_held_out_episodes": len(tested),
-            **_accuracies(network, labelled_endings(tested, shape, with_early=False), shape),
+            "num_training_episodes": len(sets.training),
+            "num_imagined_training_episodes": sum(e.imagined for e in sets.training),
+            "num_development_episodes": len(sets.development),
+            "num_held_out_episodes": len(sets.held_out),
         },
     )
-    tensors = {f"network.{name}": t.clone() for name, t in network.state_dict().items()}
-    return Checkpoint(metadata, tensors)
+
+
+def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings) -> Checkpoint:
+    """The checkpoint with what the development episodes say of it."""
+    probe = SuccessProbe(checkpoint)
+    found = fit_calibrations(probe, sets.development, risk=settings.risk)
+    added = {
+        "calibration": {name: one.model_dump() for name, one in found.items()},
+        "told_milestones": milestones_that_can_be_told(probe, sets.development),
+    }
+    metadata = checkpoint.metadata
+    return replace(
+        checkpoint,
+        metadata=metadata.model_copy(update={"settings": {**metadata.settings, **added}}),
+    )
+
+
+def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
+    """The checkpoint with its figures on the held-out episodes."""
+    figures = held_out_figures(SuccessProbe(checkpoint), sets.held_out)
+    metadata = checkpoint.metadata
+    return replace(
+        checkpoint,
+        metadata=metadata.model_copy(update={"metrics": {**metadata.metrics, **figures}}),
+    )
 
 
 def _optimize(network: ProbeNetwork, learned: Labelled, settings: ProbeSettings) -> float:
@@ -211,16 +224,44 @@ def _optimize(network: ProbeNetwork, learned: Labelled, settings: ProbeSettings)
             index = torch.multinomial(
                 learned.weight, settings.batch_size, replacement=True, generator=generator
             )
-            batch = learned.batch[index]
+            batch = _some_parts(learned.batch[index], network.object_std, settings, generator)
             images = _disturb(unit_images(batch.images), settings, generator)
-            odds = network.judge(images, batch.touch, batch.task)
-            loss = functional.binary_cross_entropy_with_logits(odds, learned.success[index])
+            loss = _loss(
+                network.judge(images, batch), learned.outcome[index], learned.known[index], settings
+            )
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
             optimizer.step()
             progress.advance(loss=float(loss.detach()))
     network.eval()
     return time.process_time() - started
+
+
+def _loss(
+    odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor, settings: ProbeSettings
+) -> torch.Tensor:
+    """Cross entropy of success, and, with less weight, of the milestones; only of what is known."""
+    each = functional.binary_cross_entropy_with_logits(odds, outcome, reduction="none") * known
+    success = each[:, 0].sum() / known[:, 0].sum().clamp_min(1)
+    milestones = each[:, 1:].sum() / known[:, 1:].sum().clamp_min(1)
+    return success + settings.milestone_weight * milestones
+
+
+def _some_parts(
+    batch: ProbeBatch, object_std: torch.Tensor, settings: ProbeSettings, generator: torch.Generator
+) -> ProbeBatch:
+    """The batch with noise on the poses, and without poses or without images here and there."""
+    drawn = torch.rand(len(batch.task), generator=generator)
+    both = batch.has_image & batch.has_objects
+    no_poses = both & (drawn < settings.without_poses)
+    no_image = both & ~no_poses & (drawn < settings.without_poses + settings.without_images)
+    noise = torch.randn(batch.objects.shape, generator=generator) * settings.pose_noise
+    return replace(
+        batch,
+        objects=batch.objects + noise * object_std[batch.task],
+        has_image=batch.has_image & ~no_image,
+        has_objects=batch.has_objects & ~no_poses,
+    )
 
 
 def _disturb(
@@ -238,20 +279,3 @@ def _disturb(
     reach = settings.shift_px
     rows, columns = torch.randint(-reach, reach + 1, (2,), generator=generator).tolist()
     return torch.roll(images, (rows, columns), dims=(2, 3))
-
-
-def _accuracies(
-    network: ProbeNetwork, tested: Labelled, shape: ProbeShape
-) -> dict[str, float | int]:
-    """Share of right decisions over all tasks; by task AUC, balanced accuracy and counts."""
-    with torch.no_grad():
-        odds = network(tested.batch).double().numpy()
-    success, task_index = tested.success.numpy() > 0.5, tested.batch.task.numpy()
-    figures: dict[str, float | int] = {"held_out_accuracy": float(((odds > 0) == success).mean())}
-    for index, task in enumerate(shape.tasks):
-        scores, positive = odds[task_index == index], success[task_index == index]
-        figures[f"held_out_auc_{task}"] = area_under_roc(scores, positive)
-        figures[f"held_out_balanced_accuracy_{task}"] = balanced_accuracy(scores > 0, positive)
-        figures[f"num_held_out_successes_{task}"] = int(positive.sum())
-        figures[f"num_held_out_failures_{task}"] = int((~positive).sum())
-    return figures

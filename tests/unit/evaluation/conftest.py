@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from services.evaluation.endings import EndingEpisode
 from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
 from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
 from tests.unit.evaluation import toy
@@ -27,4 +28,6 @@ def policy_checkpoint(demonstrations):
 @pytest.fixture(scope="session")
 def probe_checkpoint(demonstrations):
     settings = ProbeSettings(num_training_steps=350, batch_size=32, shift_px=1, learning_rate=3e-3)
-    return train_success_probe(demonstrations, settings, command="a test")
+    return train_success_probe(
+        [EndingEpisode.of(d) for d in demonstrations], settings, command="a test"
+    )

@@ -7,14 +7,16 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from services.evaluation.demonstrations import data_hash, split_by_seed
-from services.evaluation.success_probe import ProbeShape, SuccessProbe
-from services.evaluation.success_probe_training import (
-    ProbeSettings,
-    final_ending,
-    labelled_endings,
-    train_success_probe,
-)
+from services.evaluation.endings import EndingEpisode, final_ending
+from services.evaluation.judge_network import ProbeShape
+from services.evaluation.success_probe import SuccessProbe
+from services.evaluation.success_probe_data import labelled_endings
+from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
 from tests.unit.evaluation import toy
+
+
+def _episodes(demonstrations):
+    return [EndingEpisode.of(d) for d in demonstrations]
 
 
 def test_held_out_accuracy_is_kept_in_the_checkpoint(probe_checkpoint):
@@ -43,18 +45,18 @@ def test_one_and_many_agree(probe_checkpoint):
 
 def test_both_outcomes_weigh_the_same(demonstrations):
     shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
-    labelled = labelled_endings(demonstrations, shape, with_early=True)
+    labelled = labelled_endings(_episodes(demonstrations), shape)
     for task in range(2):
         of_task = labelled.batch.task == task
-        wins = labelled.success > 0.5
+        wins = labelled.outcome[:, 0] > 0.5
         assert float(labelled.weight[of_task & wins].sum()) == pytest.approx(
             float(labelled.weight[of_task & ~wins].sum()), rel=1e-4
         )
 
 
 def test_one_sided_data_is_refused():
-    with pytest.raises(InvalidInputError, match=r"no failed episode of 'reach'"):
-        train_success_probe(toy.demonstrations(range(20)), ProbeSettings(), command="x")
+    with pytest.raises(InvalidInputError, match=r"no failed episode of true 'reach'"):
+        train_success_probe(_episodes(toy.demonstrations(range(20))), ProbeSettings(), command="x")
 
 
 def test_foreign_input_is_refused(probe_checkpoint):
@@ -81,7 +83,9 @@ def test_a_start_never_stands_on_both_sides(demonstrations):
 def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
     settings = ProbeSettings(num_training_steps=1)
     others = toy.demonstrations(range(900, 920), noise_m=0.03)
-    checkpoint = train_success_probe(demonstrations, settings, command="x", held_out=others)
+    checkpoint = train_success_probe(
+        _episodes(demonstrations), settings, command="x", held_out=_episodes(others)
+    )
     assert len(checkpoint.metadata.training_episodes) == len(demonstrations)
     metrics, probe = checkpoint.metadata.metrics, SuccessProbe(checkpoint)
     for task in toy.TASKS:
@@ -94,16 +98,19 @@ def test_it_is_measured_on_the_held_out_episodes_it_is_given(demonstrations):
         assert metrics[f"num_held_out_failures_{task}"] == len(losses) > 0
     with pytest.raises(ConflictError, match="trained on by the success probe"):
         train_success_probe(
-            demonstrations, settings, command="x", held_out=[*others, demonstrations[3]]
+            _episodes(demonstrations),
+            settings,
+            command="x",
+            held_out=_episodes([*others, demonstrations[3]]),
         )
 
 
 def test_early_endings_do_not_crowd_out_near_misses(demonstrations):
     shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
-    labelled = labelled_endings(demonstrations, shape, with_early=True)
-    # Two endings of each episode are late; the three early ones follow them.
-    early = torch.tensor([False, False, True, True, True] * len(demonstrations))
-    failed = labelled.success < 0.5
+    labelled = labelled_endings(_episodes(demonstrations), shape)
+    # Two endings of each episode are late; an early one follows them.
+    early = torch.tensor([False, False, True] * len(demonstrations))
+    failed = labelled.outcome[:, 0] < 0.5
     share = labelled.weight[early].sum() / labelled.weight[failed].sum()
     assert float(share) == pytest.approx(0.1, abs=1e-3)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from dextouch.episodes import EpisodeStore
 from services.evaluation.demonstrations import read_demonstrations
-from services.evaluation.success_probe import NUM_SEEN_STEPS, Ending
+from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 
 FILE = Path(__file__).with_suffix(".npz")
 

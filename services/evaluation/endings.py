@@ -1,0 +1,254 @@
+"""Endings of rollouts, true and imagined: what a judge of success looks at and learns from."""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.schemas.rollouts import Observation
+from services.evaluation.demonstrations import CAMERA, Demonstration
+from services.evaluation.starts import start_digest
+
+NUM_SEEN_STEPS: Final = 3
+OBJECT_POSES: Final = "object_poses"
+# One of each a training episode, in turn of seeds. What ends this early is no success: nothing
+# was done yet. In the middle only the milestones are known.
+EARLY_ENDS: Final = (2, 8, 14)
+MIDDLE_ENDS: Final = (32, 48, 64)
+
+
+@dataclass(frozen=True)
+class Ending:
+    """The last three steps of a rollout: head images, taxels in kPa, and where objects are.
+
+    `object_poses` are T_world_object (x y z m, qw qx qy qz) of at most three objects; an object
+    that nobody knows of is NaN. Only imagined worlds give them. `images` are None where they were
+    not asked for; one of the two has to be there. `doubted` is why the world itself does not
+    trust what it shows.
+    """
+
+    images: UInt8[np.ndarray, "3 h w 3"] | None
+    tactile_kpa: Float32[np.ndarray, "3 2 320"]
+    task: str
+    object_poses: Float32[np.ndarray, "3 objects 7"] | None = None
+    imagined: bool = False
+    doubted: str | None = None
+
+    @classmethod
+    def of(cls, observation: Observation, task: str, *, imagined: bool) -> "Ending":
+        """The ending that the last observation of a rollout shows.
+
+        Raises:
+            InvalidInputError: fewer than three steps.
+        """
+        if len(observation) < NUM_SEEN_STEPS:
+            raise InvalidInputError(
+                f"ending: got {len(observation)} steps, expected at least {NUM_SEEN_STEPS}; send "
+                "longer chunks and ask for all steps of the last one"
+            )
+        images = observation.images.get(CAMERA)
+        poses, doubt = observation.object_poses, observation.doubt
+        return cls(
+            None if images is None else images[-NUM_SEEN_STEPS:],
+            observation.tactile_kpa[-NUM_SEEN_STEPS:],
+            task,
+            None if poses is None else poses[-NUM_SEEN_STEPS:],
+            imagined,
+            doubt.reason if doubt is not None and doubt.outside else None,
+        )
+
+
+@dataclass(frozen=True)
+class EndingEpisode:
+    """One episode of known outcome, as far as a judge learns from it.
+
+    `endings` holds what is seen at the end of some steps, the last step among them; `success` is
+    what these actions led to in reality, also of an imagined episode. `event_times_s` says when
+    each milestone was first reached, None where nobody noted it.
+    """
+
+    episode_id: str
+    task: str
+    instruction: str
+    seed: int
+    success: bool
+    start_digest: str
+    last_step: int
+    endings: Mapping[int, Ending]
+    event_times_s: Mapping[str, float] | None = None
+    step_s: float = 1 / 15
+
+    @property
+    def imagined(self) -> bool:
+        """Whether a world model imagined it."""
+        return self.final.imagined
+
+    @property
+    def final(self) -> Ending:
+        """How it ended."""
+        return self.endings[self.last_step]
+
+    @property
+    def early_step(self) -> int:
+        """The one of `EARLY_ENDS` that this episode is shown at."""
+        return EARLY_ENDS[self.seed % len(EARLY_ENDS)]
+
+    @property
+    def middle_step(self) -> int:
+        """The one of `MIDDLE_ENDS` that this episode is shown at."""
+        return MIDDLE_ENDS[self.seed // len(EARLY_ENDS) % len(MIDDLE_ENDS)]
+
+    def reached(self, milestones: Sequence[str], step: int) -> list[bool] | None:
+        """Whether each milestone was reached by a step; None where nobody noted it."""
+        times = self.event_times_s
+        if times is None:
+            return None
+        now_s = (step + 0.5) * self.step_s
+        return [times.get(name, np.inf) <= now_s for name in milestones]
+
+    @classmethod
+    def of(cls, item: Demonstration) -> "EndingEpisode":
+        """The endings of an episode that is in memory."""
+        last = item.num_steps - 1
+        steps = {last, last - 1, *EARLY_ENDS, *MIDDLE_ENDS} & set(range(2, item.num_steps))
+        return cls(
+            item.episode_id,
+            item.task,
+            item.instruction,
+            item.seed,
+            item.success,
+            item.start_digest,
+            last,
+            {step: final_ending(item, step) for step in sorted(steps)},
+        )
+
+
+def final_ending(item: Demonstration, end: int) -> Ending:
+    """The three steps of an episode up to and including step `end`."""
+    steps = slice(end - NUM_SEEN_STEPS + 1, end + 1)
+    return Ending(item.images[steps], item.tactile_kpa[steps], item.task)
+
+
+def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
+    """The endings of one stored robot episode; only the steps that are shown are decoded.
+
+    Raises:
+        InvalidInputError: the episode does not say whether it succeeded, has no seed, or is too
+            short.
+    """
+    about = reader.attributes
+    last = reader.num_steps - 1
+    if about.success is None or about.seed is None or last <= MIDDLE_ENDS[-1]:
+        raise InvalidInputError(
+            f"episode {about.episode_id!r}: success {about.success}, seed {about.seed}, "
+            f"{last + 1} steps; expected both known, as in episodes of the twin, and more than "
+            f"{MIDDLE_ENDS[-1] + 1} steps"
+        )
+    first = reader.window(0, num_steps=1, cameras=(CAMERA,))
+    episode = EndingEpisode(
+        about.episode_id,
+        about.task,
+        about.instruction,
+        about.seed,
+        about.success,
+        start_digest(first.images[CAMERA][0], first.tactile_kpa[0]),
+        last,
+        {},
+        _event_times(about.event_times_s, success=about.success),
+        1 / about.model_rate_hz,
+    )
+    steps = (episode.early_step, episode.middle_step, last - 1, last)
+    endings = {step: _read_ending(reader, step) for step in steps}
+    return EndingEpisode(**{**vars(episode), "endings": endings})
+
+
+def _event_times(times: Mapping[str, float], *, success: bool) -> Mapping[str, float] | None:
+    """Nothing noted in a failure may mean that nothing was reached; in a success it cannot."""
+    return times if times or not success else None
+
+
+def _read_ending(reader: EpisodeReader, end: int) -> Ending:
+    start = end - NUM_SEEN_STEPS + 1
+    window = reader.window(start, num_steps=NUM_SEEN_STEPS, cameras=(CAMERA,))
+    half_step_ns = 5e8 / reader.attributes.model_rate_hz
+    # Where images were not drawn at these steps, the nearest ones belong to others.
+    are_near = bool((np.abs(window.image_dt_ns[CAMERA]) <= half_step_ns).all())
+    return Ending(
+        window.images[CAMERA] if are_near else None,
+        window.tactile_kpa,
+        reader.attributes.task,
+        _object_poses(reader, window.t_ref_ns, half_step_ns),
+        reader.attributes.origin == "imagined",
+    )
+
+
+def _object_poses(
+    reader: EpisodeReader, t_ref_ns: np.ndarray, half_step_ns: float
+) -> Float32[np.ndarray, "3 objects 7"] | None:
+    if OBJECT_POSES not in reader.streams:
+        return None
+    low, high = int(t_ref_ns[0] - half_step_ns), int(t_ref_ns[-1] + half_step_ns) + 1
+    stored = reader.read(OBJECT_POSES, low, high)
+    if len(stored) == 0:
+        return None
+    nearest = np.abs(stored.t_ref_ns[None, :] - t_ref_ns[:, None]).argmin(axis=1)
+    return np.asarray(stored.values[nearest], dtype=np.float32)
+
+
+def read_ending_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[EndingEpisode]:
+    """All robot episodes of some stores with their endings.
+
+    Args:
+        stores: where to read; true and imagined episodes may be mixed.
+        tasks: only these; empty for all.
+
+    Raises:
+        NotFoundError: not one such episode.
+        ConflictError: two stores hold an episode of the same id.
+    """
+    found: dict[str, EndingEpisode] = {}
+    for store in stores:
+        for episode_id in sorted(store.list(kind="episode")):
+            reader = store.open(episode_id)
+            about = reader.attributes
+            if about.domain != "robot" or (tasks and about.task not in tasks):
+                continue
+            if episode_id in found:
+                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
+            found[episode_id] = read_ending_episode(reader)
+    if not found:
+        raise NotFoundError(
+            f"no robot episode of {', '.join(tasks) or 'any task'} in the store; "
+            "record some with `dextouch train data` first"
+        )
+    return list(found.values())
+
+
+def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...]]:
+    """The milestones of every task in the order in which they are usually reached."""
+    times: dict[str, dict[str, list[float]]] = {}
+    for item in episodes:
+        for name, time_s in (item.event_times_s or {}).items():
+            times.setdefault(item.task, {}).setdefault(name, []).append(time_s)
+    return {
+        task: tuple(sorted(known, key=lambda name: (float(np.median(known[name])), name)))
+        for task, known in times.items()
+    }
+
+
+def endings_hash(episodes: Iterable[EndingEpisode]) -> str:
+    """sha256 over everything that a judge learns from, in the order of the episode ids."""
+    digest = hashlib.sha256()
+    for item in sorted(episodes, key=lambda e: e.episode_id):
+        digest.update(repr((item.episode_id, item.task, item.success)).encode())
+        digest.update(repr(sorted((item.event_times_s or {}).items())).encode())
+        for step, ending in sorted(item.endings.items()):
+            digest.update(str(step).encode())
+            for array in (ending.images, ending.tactile_kpa, ending.object_poses):
+                digest.update(b"" if array is None else np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()

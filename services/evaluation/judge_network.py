@@ -1,0 +1,164 @@
+"""Network of the success probe: the last image, touch and, where they are known, object poses."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64, UInt8
+from pydantic import BaseModel, ConfigDict
+from torch import nn
+
+from dextouch.errors import InvalidInputError, UnknownNameError
+from services.evaluation.endings import NUM_SEEN_STEPS, Ending
+from services.evaluation.features import NUM_PAD_FEATURES, pad_features
+from services.evaluation.object_features import NUM_OBJECT_FEATURES, object_features
+
+NUM_TOUCH_FEATURES = 2 * NUM_PAD_FEATURES
+_CHANNELS = (24, 32, 48, 48)
+_TASK_FEATURES = 8
+_OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
+# A pose further from usual than this many standard deviations tells no more than this.
+_FARTHEST = 5.0
+
+
+class ProbeShape(BaseModel):
+    """What the probe looks like; kept in the checkpoint.
+
+    `milestones` are the further things it tells about each task, in the order of its outputs.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tasks: tuple[str, ...]
+    hidden: int = 64
+    image_size_px: int = 64
+    milestones: Mapping[str, tuple[str, ...]] = {}
+
+    @property
+    def num_outputs(self) -> int:
+        """Success, and the milestones of the task that has most of them."""
+        return 1 + max((len(names) for names in self.milestones.values()), default=0)
+
+
+@dataclass(frozen=True)
+class ProbeBatch:
+    """Inputs of the network: last images as bytes, touch, features of object poses, task index.
+
+    What an ending does not have is zero, and marked in `has_image` and `has_objects`.
+    """
+
+    images: UInt8[torch.Tensor, "n 3 h w"]
+    touch: Float32[torch.Tensor, "n 48"]
+    objects: Float32[torch.Tensor, "n 105"]
+    task: Int64[torch.Tensor, " n"]
+    has_image: Bool[torch.Tensor, " n"]
+    has_objects: Bool[torch.Tensor, " n"]
+
+    def __getitem__(self, index: torch.Tensor) -> "ProbeBatch":
+        """Some of the endings."""
+        return ProbeBatch(*(getattr(self, part.name)[index] for part in fields(self)))
+
+
+class ProbeNetwork(nn.Module):
+    """Four strided convolutions on the image, two layers on the poses, and two on all together.
+
+    Few features of the image reach the last layers, so that they learn where things lie and not
+    one training episode from another. Features of poses are measured in standard deviations of
+    their task, `object_mean` and `object_std`, which training sets.
+    """
+
+    object_mean: torch.Tensor
+    object_std: torch.Tensor
+
+    def __init__(self, shape: ProbeShape) -> None:
+        super().__init__()
+        layers: list[nn.Module] = []
+        channels = 3
+        for width in _CHANNELS:
+            layers.append(nn.Conv2d(channels, width, 3, stride=2, padding=1))
+            layers += [nn.BatchNorm2d(width), nn.GELU()]
+            channels = width
+        side = -(-shape.image_size_px // 2 ** len(_CHANNELS))
+        num_features = channels * side * side + NUM_TOUCH_FEATURES
+        num_features += _OBJECT_OUTPUT + _TASK_FEATURES + 2
+        self.eye = nn.Sequential(*layers, nn.Flatten())
+        self.objects = nn.Sequential(
+            nn.Linear(NUM_OBJECT_FEATURES + _TASK_FEATURES, _OBJECT_HIDDEN), nn.GELU(),
+            nn.Linear(_OBJECT_HIDDEN, _OBJECT_OUTPUT), nn.GELU(),
+        )  # fmt: skip
+        self.task = nn.Embedding(len(shape.tasks), _TASK_FEATURES)
+        self.head = nn.Sequential(
+            nn.Dropout(0.3), nn.Linear(num_features, shape.hidden), nn.GELU(),
+            nn.Linear(shape.hidden, shape.num_outputs),
+        )  # fmt: skip
+        size = (len(shape.tasks), NUM_OBJECT_FEATURES)
+        self.register_buffer("object_mean", torch.zeros(size))
+        self.register_buffer("object_std", torch.ones(size))
+
+    def forward(self, batch: ProbeBatch) -> Float32[torch.Tensor, "n outputs"]:
+        """Log odds [n, outputs] of success and of the milestones of the task."""
+        return self.judge(unit_images(batch.images), batch)
+
+    def judge(
+        self, images: Float32[torch.Tensor, "n 3 h w"], batch: ProbeBatch
+    ) -> Float32[torch.Tensor, "n outputs"]:
+        """Log odds of a batch whose images stand apart, in −0.5 … 0.5."""
+        task = self.task(batch.task)
+        usual = (batch.objects - self.object_mean[batch.task]) / self.object_std[batch.task]
+        poses = self.objects(torch.cat([usual.clamp(-_FARTHEST, _FARTHEST), task], dim=1))
+        has_image, has_objects = batch.has_image[:, None], batch.has_objects[:, None]
+        parts = [
+            self.eye(images) * has_image,
+            poses * has_objects,
+            batch.touch,
+            task,
+            has_image.float(),
+            has_objects.float(),
+        ]
+        return torch.as_tensor(self.head(torch.cat(parts, dim=1)))
+
+
+def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor, "n 3 h w"]:
+    """Bytes as −0.5 … 0.5."""
+    return images.float() / 255 - 0.5
+
+
+def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
+    """Network tensors of endings; the same code serves training and judging.
+
+    Raises:
+        UnknownNameError: a task the probe was not made for.
+        InvalidInputError: images of another size, or neither images nor object poses.
+    """
+    for ending in endings:
+        _check(ending, shape)
+    size_px = shape.image_size_px
+    nothing = np.zeros((size_px, size_px, 3), np.uint8)
+    unknown = np.zeros(NUM_OBJECT_FEATURES, np.float32)
+    images = np.stack([nothing if e.images is None else e.images[-1] for e in endings])
+    objects = [
+        unknown if e.object_poses is None else object_features(e.object_poses) for e in endings
+    ]
+    touch = pad_features(np.stack([e.tactile_kpa for e in endings]))
+    return ProbeBatch(
+        torch.from_numpy(images).permute(0, 3, 1, 2).contiguous(),
+        torch.from_numpy(np.concatenate([touch.mean(axis=1), touch[:, -1]], axis=1)),
+        torch.from_numpy(np.stack(objects)),
+        torch.tensor([shape.tasks.index(e.task) for e in endings]),
+        torch.tensor([e.images is not None for e in endings]),
+        torch.tensor([e.object_poses is not None for e in endings]),
+    )
+
+
+def _check(ending: Ending, shape: ProbeShape) -> None:
+    size = (NUM_SEEN_STEPS, shape.image_size_px, shape.image_size_px, 3)
+    if ending.task not in shape.tasks:
+        raise UnknownNameError("task of the success probe", ending.task, list(shape.tasks))
+    if ending.images is None and ending.object_poses is None:
+        raise InvalidInputError(
+            f"success probe: an ending of {ending.task!r} has neither images nor object poses; "
+            "ask the world for the images of its last chunk"
+        )
+    if ending.images is not None and ending.images.shape != size:
+        raise InvalidInputError(f"success probe: got images {ending.images.shape}, expected {size}")

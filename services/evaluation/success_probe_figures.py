@@ -1,0 +1,138 @@
+"""Calibration of a trained success probe, and its figures on endings that it never saw."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool
+
+from services.evaluation.calibration import Calibration, Reliability, fit_calibration, sigmoid
+from services.evaluation.endings import Ending, EndingEpisode
+from services.evaluation.statistics import area_under_roc, balanced_accuracy
+from services.evaluation.success_probe import IMAGINED, TRUE, SuccessProbe, calibration_name
+
+# With fewer endings of an outcome, nothing is calibrated on them.
+MIN_OUTCOMES: Final = 5
+# A milestone can be told where endings that reached it score this much above others.
+MIN_MILESTONE_AUC: Final = 0.9
+Figures = dict[str, float | int]
+
+
+def fit_calibrations(
+    probe: SuccessProbe, episodes: Sequence[EndingEpisode], *, risk: float
+) -> dict[str, Calibration]:
+    """Calibration of every task and kind of ending that has enough of both outcomes."""
+    found: dict[str, Calibration] = {}
+    for task in probe.shape.tasks:
+        for kind in (TRUE, IMAGINED):
+            endings, success = final_endings(episodes, task, kind)
+            if min(success.sum(), (~success).sum()) < MIN_OUTCOMES:
+                continue
+            odds = probe.log_odds(endings)[:, 0]
+            found[calibration_name(task, kind)] = fit_calibration(odds, success, risk=risk)
+    return found
+
+
+def milestones_that_can_be_told(
+    probe: SuccessProbe, episodes: Sequence[EndingEpisode]
+) -> dict[str, tuple[str, ...]]:
+    """The milestones of every task that the probe tells from endings it did not learn from."""
+    areas = milestone_areas(probe, episodes)
+    return {
+        task: tuple(n for n in names if areas.get((task, n), 0.0) >= MIN_MILESTONE_AUC)
+        for task, names in probe.shape.milestones.items()
+    }
+
+
+def milestone_areas(
+    probe: SuccessProbe, episodes: Sequence[EndingEpisode]
+) -> dict[tuple[str, str], float]:
+    """Area under the ROC curve of every task and milestone of which both outcomes are there."""
+    areas: dict[tuple[str, str], float] = {}
+    for task, names in probe.shape.milestones.items():
+        mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
+        if not mine:
+            continue
+        odds = probe.log_odds([_as_seen(e.final, TRUE) for e in mine])
+        for index, name in enumerate(names):
+            came = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
+            if min(came.sum(), (~came).sum()) >= MIN_OUTCOMES:
+                areas[task, name] = area_under_roc(odds[:, 1 + index], came)
+    return areas
+
+
+def held_out_figures(probe: SuccessProbe, episodes: Sequence[EndingEpisode]) -> Figures:
+    """Share of right decisions over all tasks; by task what is told of true and imagined endings.
+
+    True endings are shown without object poses, as a real robot has none; `poses` are true
+    endings with poses and touch and no image; `imagined` endings are shown as they are.
+
+    Raises:
+        InvalidInputError: a task of which not both outcomes are there.
+    """
+    figures: Figures = {}
+    right: list[bool] = []
+    for task in probe.shape.tasks:
+        endings, success = final_endings(episodes, task, TRUE)
+        right.extend(((probe.probabilities(endings) >= probe.threshold) == success).tolist())
+        figures |= _figures(probe, endings, success, f"held_out_{{}}_{task}")
+        figures[f"num_held_out_successes_{task}"] = int(success.sum())
+        figures[f"num_held_out_failures_{task}"] = int((~success).sum())
+        for kind, (others, outcomes) in {
+            "poses": _with_poses_only(episodes, task),
+            "imagined": final_endings(episodes, task, IMAGINED),
+        }.items():
+            if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
+                figures |= _figures(probe, others, outcomes, f"held_out_{kind}_{{}}_{task}")
+    for (task, name), area in milestone_areas(probe, episodes).items():
+        figures[f"held_out_milestone_auc_{task}_{name}"] = area
+    return {"held_out_accuracy": float(np.mean(right)), **figures}
+
+
+def _figures(
+    probe: SuccessProbe, endings: Sequence[Ending], success: np.ndarray, name: str
+) -> Figures:
+    verdicts = probe.verdicts(endings)
+    told = np.array([v.probability for v in verdicts])
+    likely = np.array([v.likely_success for v in verdicts])
+    decided = np.array([v.decision != "cannot tell" for v in verdicts])
+    before = Reliability.of(sigmoid(probe.log_odds(endings)[:, 0]), success)
+    after = Reliability.of(told, success)
+    found: Figures = {
+        "auc": area_under_roc(told, success),
+        "balanced_accuracy": balanced_accuracy(likely, success),
+        "ece": after.expected_calibration_error,
+        "ece_uncalibrated": before.expected_calibration_error,
+        "brier": after.brier,
+        "brier_uncalibrated": before.brier,
+        "undecided": float(1 - decided.mean()),
+    }
+    if decided.any():
+        found["accuracy_of_decided"] = float((likely == success)[decided].mean())
+    return {name.format(key): value for key, value in found.items()}
+
+
+def final_endings(
+    episodes: Sequence[EndingEpisode], task: str, kind: str
+) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
+    """The last endings of a task, true or imagined, as a judge meets them, and their outcomes."""
+    mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
+    success = np.array([e.success for e in mine], dtype=bool)
+    return [_as_seen(e.final, kind) for e in mine], success
+
+
+def _as_seen(ending: Ending, kind: str) -> Ending:
+    return replace(ending, object_poses=None) if kind == TRUE and not ending.imagined else ending
+
+
+def _with_poses_only(
+    episodes: Sequence[EndingEpisode], task: str
+) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
+    mine = [
+        e
+        for e in episodes
+        if e.task == task and not e.imagined and e.final.object_poses is not None
+    ]
+    success = np.array([e.success for e in mine], dtype=bool)
+    return [replace(e.final, images=None) for e in mine], success
