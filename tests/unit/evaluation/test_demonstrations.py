@@ -107,7 +107,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output, figures = tmp_path / "probe.safetensors", tmp_path / "figures.json"
     flags = ["--episodes", url, "--output", str(output), "--json", str(figures)]
     training = ["--training.num_training_steps", "3", "--training.held_out_share", "0.5"]
-    training += ["--training.development_share", "0.3"]
+    training += ["--training.development_share", "0.2"]
     assert main(["train-probe", *flags, *training]) == 0
     assert "held_out_accuracy" in capsys.readouterr().out
     probe = SuccessProbe.load(output)

@@ -180,7 +180,7 @@ def test_an_ending_of_an_observation():
     ending = Ending.of(outside, "reach", imagined=True)
     assert (ending.images, ending.doubted) == (None, "far away")
     with pytest.raises(InvalidInputError, match="at least 3"):
-        Ending.of(replace(seen, tactile_kpa=seen.tactile_kpa[:2]), "reach", imagined=True)
+        Ending.of(seen.last(), "reach", imagined=True)
 
 
 def test_milestones_are_known_where_somebody_noted_them():
