@@ -35,7 +35,7 @@ from dextouch.worlds.world import (
 )
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
-from services.world_model.network.model import Prediction, stack_noise
+from services.world_model.network.model import Precision, Prediction, stack_noise
 from services.world_model.network.visual_codec import to_uint8
 
 CAMERA = "camera_head"
@@ -63,12 +63,20 @@ class ModelWorld:
     Args:
         checkpoint: loaded, from `read_checkpoint`.
         sampling_steps: Euler steps; None takes the checkpoint's.
+        precision: of the experts' matrix products; codecs are always float32.
     """
 
-    def __init__(self, checkpoint: Checkpoint, *, sampling_steps: int | None = None) -> None:
+    def __init__(
+        self,
+        checkpoint: Checkpoint,
+        *,
+        sampling_steps: int | None = None,
+        precision: Precision = "float32",
+    ) -> None:
         self._model = checkpoint.model
         self._digest = checkpoint.digest
         self._sampling_steps = sampling_steps
+        self._precision: Precision = precision
         config, metadata = checkpoint.metadata.network, checkpoint.metadata
         self._description = WorldDescription(
             name=metadata.name,
@@ -163,7 +171,11 @@ class ModelWorld:
         )
         wanted = any(one.steps == "all" and one.wants(CAMERA) for one in asked)
         future = self._model.predict(
-            inputs, noise, sampling_steps=self._sampling_steps, all_images=wanted
+            inputs,
+            noise,
+            sampling_steps=self._sampling_steps,
+            all_images=wanted,
+            precision=self._precision,
         )
         _refuse_non_finite(future)
         images, touches = to_uint8(future.images).numpy(), future.tactile_kpa.numpy()
@@ -240,10 +252,15 @@ class ModelWorld:
         return chunk
 
 
-def open_world(path: Path | None = None, *, sampling_steps: int | None = None) -> ModelWorld:
+def open_world(
+    path: Path | None = None,
+    *,
+    sampling_steps: int | None = None,
+    precision: Precision = "float32",
+) -> ModelWorld:
     """The world of a checkpoint file; without one, of that which comes with the package."""
     checkpoint = read_checkpoint(path if path is not None else default_checkpoint())
-    return ModelWorld(checkpoint, sampling_steps=sampling_steps)
+    return ModelWorld(checkpoint, sampling_steps=sampling_steps, precision=precision)
 
 
 def _complete(

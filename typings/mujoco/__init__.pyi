@@ -26,6 +26,12 @@ class mjtGeom(IntEnum):
 class mjtState(IntEnum):
     mjSTATE_INTEGRATION = 32767
 
+class mjtCone(IntEnum):
+    mjCONE_PYRAMIDAL = 0
+
+class mjtSolver(IntEnum):
+    mjSOL_CG = 1
+
 class mjtDisableBit(IntEnum):
     mjDSBL_SENSOR = 8192
 
@@ -35,6 +41,9 @@ class _Named:
 class _Option:
     timestep: float
     disableflags: int
+    iterations: int
+    solver: int
+    cone: int
 
 class _Contacts:
     geom: np.ndarray

@@ -101,6 +101,24 @@ STAGES = {
         "tracker loses; ends with what retargeting promises and whether it holds. Rivals are an "
         "extra: pip install -c constraints.txt '.[bench]'.",
     ),
+    "twin": StageEntry(
+        "services.cli.bench.twin.stage",
+        "step the twin by cameras and steps asked, and with coarser solvers",
+        "Steps one chunk of a demonstration with contact from the same state again and again, in "
+        "turns, by the cameras and steps that are asked for; then plays every chunk with contact "
+        "of held-out demonstrations with coarser solvers of MuJoCo. Reports processor time, and "
+        "how far pad forces and objects are from those of the twin as it is served after one "
+        "chunk.",
+    ),
+    "world-model": StageEntry(
+        "services.cli.bench.world_model.stage",
+        "imagine held-out demonstrations: sampling steps, precision, images asked",
+        "Makes demonstrations of the twin that nothing was trained on and lets the world model "
+        "imagine them from their first step, chunk after chunk, with 1, 2 and 4 Euler steps, in "
+        "float32 and bfloat16, beside a world that repeats the first step; then times it by the "
+        "images that are asked for and the rollouts that step together. Reports processor time a "
+        "chunk and errors of images and touch over whole rollouts.",
+    ),
 }
 
 

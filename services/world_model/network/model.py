@@ -1,7 +1,10 @@
 """The joint model: inputs and noise in, images and pressures of the future out."""
 
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from typing import Literal
 
 import torch
 from jaxtyping import Bool, Float32, UInt8
@@ -20,6 +23,8 @@ from services.world_model.network.tactile_expert import TactileExpert
 from services.world_model.network.tactile_tokenizer import TactileTokenizer
 from services.world_model.network.video_expert import VideoExpert
 from services.world_model.network.visual_codec import VisualCodec, to_unit
+
+Precision = Literal["float32", "bfloat16"]
 
 
 @dataclass(frozen=True)
@@ -138,6 +143,7 @@ class JointWorldModel(nn.Module):
         *,
         sampling_steps: int | None = None,
         all_images: bool = True,
+        precision: Precision = "float32",
     ) -> Prediction:
         """Sample the future of every request.
 
@@ -146,12 +152,14 @@ class JointWorldModel(nn.Module):
             noise: one a request, from `noise`.
             sampling_steps: Euler steps; None takes the configuration's.
             all_images: decode every image, or only those of the last latent.
+            precision: of the experts' matrix products, by autocast; codecs are always float32.
         """
         first = self.first_latents(inputs)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
-            guess = self(inputs, first, JointLatents(video, tactile), t)
-            return guess.video, guess.tactile
+            with _products_in(precision, video.device.type):
+                guess = self(inputs, first, JointLatents(video, tactile), t)
+            return guess.video.float(), guess.tactile.float()
 
         video, tactile = flow_matching.sample(
             denoise,
@@ -175,6 +183,18 @@ class JointWorldModel(nn.Module):
         if all_images and video.shape[1] > 2:
             images = torch.cat([self.codec.decode(video[:, :-1])[:, 1:], images], dim=1)
         return Prediction(images, self.tokenizer.decode(tactile))
+
+
+@contextmanager
+def _products_in(precision: Precision, device_type: str) -> Iterator[None]:
+    """Matrix products in this precision; norms keep their float32 weights, of which torch warns."""
+    if precision == "float32":
+        yield
+        return
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message="Mismatch dtype between input and weight")
+        with torch.autocast(device_type, dtype=torch.bfloat16):
+            yield
 
 
 def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:

@@ -1,0 +1,64 @@
+"""Processor time of the twin's chunks by the cameras and steps that are asked for."""
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from dextouch.hands.actions import actions_from_poses
+from dextouch.worlds.world import EVERYTHING, ReturnSelector, RolloutStart
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.world import TwinState, TwinWorld
+
+CHUNK_STEPS: Final = 16
+# Contact falls into the second chunk of both scripts.
+CHUNK: Final = 1
+EVERY_CAMERA: Final = "three cameras, 16 steps"
+HEAD: Final = "head camera, 16 steps"
+HEAD_LAST: Final = "head camera, last step"
+SELECTORS: Final = {
+    EVERY_CAMERA: EVERYTHING,
+    "three cameras, last step": ReturnSelector(steps="last"),
+    HEAD: ReturnSelector(cameras=("camera_head",)),
+    HEAD_LAST: ReturnSelector(cameras=("camera_head",), steps="last"),
+    "no camera": ReturnSelector(cameras=(), steps="last"),
+}
+
+
+class TimedChunk:
+    """One chunk of a demonstration with contact, stepped again and again from the same state.
+
+    Args:
+        task: of the twin.
+        seed: of the demonstration.
+    """
+
+    def __init__(self, task: str, seed: int) -> None:
+        self._world = TwinWorld(TwinSettings())
+        commands = Stage(task, "robot", TwinSettings()).plan(seed).commands
+        started = self._world.reset(RolloutStart(task, seed, ""))
+        rows = actions_from_poses(commands, started.anchor)[1:]
+        state: TwinState = started.state
+        for chunk in range(CHUNK):
+            before = rows[chunk * CHUNK_STEPS :][:CHUNK_STEPS]
+            state = self._world.step(state, before, seed=0).state
+        self._state, self._actions = state, rows[CHUNK * CHUNK_STEPS :][:CHUNK_STEPS]
+
+    def subjects(self) -> dict[str, Callable[[int], float]]:
+        """What to time: processor milliseconds of the chunk with each selector."""
+        return {name: partial(self._timed, selector) for name, selector in SELECTORS.items()}
+
+    def states_are_equal(self) -> bool:
+        """Whether the state after the chunk is the same to the last bit for every selector."""
+        snapshots = {self._world.snapshot(self._step(selector)) for selector in SELECTORS.values()}
+        return len(snapshots) == 1
+
+    def _step(self, selector: ReturnSelector) -> TwinState:
+        return self._world.step(self._state, self._actions, seed=0, selector=selector).state
+
+    def _timed(self, selector: ReturnSelector, round_index: int) -> float:
+        del round_index
+        begin_s = time.process_time()
+        self._step(selector)
+        return 1e3 * (time.process_time() - begin_s)

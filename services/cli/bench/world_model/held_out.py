@@ -1,0 +1,80 @@
+"""Held-out demonstrations of the twin, made on the fly: what an imagined world is held against."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.hands.actions import actions_from_poses
+from dextouch.worlds.world import ReturnSelector, RolloutStart
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.world import TwinWorld
+
+CAMERA: Final = "camera_head"
+CHUNK_STEPS: Final = 16
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """One demonstration: where it starts, its commanded actions, and what really happened.
+
+    Row i of `actions`, `images` and `tactile_kpa` belongs to step i + 1.
+    """
+
+    start: RolloutStart
+    actions: Float64[np.ndarray, "steps 67"]
+    images: UInt8[np.ndarray, "steps h w 3"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+
+    @property
+    def chunks(self) -> list[Float64[np.ndarray, "16 67"]]:
+        """The actions in chunks of 16 steps; a shorter rest is left out."""
+        whole = len(self.actions) // CHUNK_STEPS
+        return [self.actions[CHUNK_STEPS * k :][:CHUNK_STEPS] for k in range(whole)]
+
+
+def held_out(tasks: Sequence[str], seeds: Sequence[int], image_px: int) -> list[HeldOut]:
+    """The twin's demonstrations of these tasks and seeds, seen by the head camera.
+
+    Args:
+        tasks: of the twin.
+        seeds: none of which anything was trained on.
+        image_px: width and height of the images.
+    """
+    settings = TwinSettings(cameras=(CAMERA,), image_height_px=image_px, image_width_px=image_px)
+    world = TwinWorld(settings)
+    return [
+        _played(world, Stage(task, "robot", settings), seed) for task in tasks for seed in seeds
+    ]
+
+
+def _played(world: TwinWorld, stage: Stage, seed: int) -> HeldOut:
+    task = stage.task
+    begun = world.reset(RolloutStart(task.name, seed, task.instruction))
+    actions = actions_from_poses(stage.plan(seed).commands, begun.anchor)[1:]
+    state, seen = begun.state, []
+    for first in range(0, len(actions), CHUNK_STEPS):
+        stepped = world.step(
+            state,
+            actions[first : first + CHUNK_STEPS],
+            seed=0,
+            selector=ReturnSelector(cameras=(CAMERA,)),
+        )
+        state = stepped.state
+        seen.append(stepped.observation)
+    return HeldOut(
+        start=RolloutStart(
+            task.name,
+            seed,
+            task.instruction,
+            observation=begun.observation,
+            anchor=begun.anchor,
+            K_head=begun.K_head,
+        ),
+        actions=actions,
+        images=np.concatenate([one.images[CAMERA] for one in seen]),
+        tactile_kpa=np.concatenate([one.tactile_kpa for one in seen]),
+    )

@@ -1,0 +1,125 @@
+"""`dextouch bench world-model`: one short run as users start it, and errors by hand.
+
+What a run says of speed is not judged here: that is for a quiet machine.
+"""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dextouch.errors import InvalidInputError
+from dextouch.schemas.rollouts import ReturnSelector
+from dextouch.worlds.baseline import CopyFirstWorld
+from services.cli.bench.command import stage_parser
+from services.cli.bench.figures import Figure
+from services.cli.bench.world_model import stage, tables
+from services.cli.bench.world_model.held_out import CAMERA, held_out
+from services.cli.bench.world_model.rollouts import (
+    Imagined,
+    RolloutError,
+    imagine,
+    rollout_error,
+)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A quick run in a process of its own, as shape checks must not be timed."""
+    folder = tmp_path_factory.mktemp("bench")
+    command = [sys.executable, "-m", "services.cli.main", "bench", "world-model", "--quick"]
+    done = subprocess.run(
+        [*command, "--out", str(folder)], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    return folder, json.loads((folder / "bench_world-model.json").read_text())
+
+
+def test_a_quick_run_measures_everything(run):
+    folder, figures = run
+    names = {tables.variant_name(n, p) for n in stage.EULER_STEPS for p in stage.PRECISIONS}
+    assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {tables.COPY_FIRST}
+    assert len(figures["asked_ms"]) == len(stage.SELECTORS) * len(stage.TOGETHER)
+    assert figures["options"]["served"] in names
+    assert "as served" in (folder / "bench_world-model.md").read_text()
+    assert "Imagined touch" in (folder / "bench_world-model.svg").read_text()
+
+
+def test_the_model_is_nearer_to_the_twin_than_standing_still(run):
+    errors = run[1]["errors"]
+    ours, copied = errors[run[1]["options"]["served"]], errors[tables.COPY_FIRST]
+    assert ours["image_levels"] < copied["image_levels"]
+    assert ours["touch_kpa"] < copied["touch_kpa"]
+
+
+def test_half_precision_is_near_full_precision_and_not_the_same(run):
+    # Shape checks know float32 only, so half precision is tried without them.
+    errors = run[1]["errors"]
+    for steps in stage.EULER_STEPS:
+        full = errors[tables.variant_name(steps, "float32")]
+        half = errors[tables.variant_name(steps, "bfloat16")]
+        assert half != full
+        assert half == pytest.approx(full, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def episode():
+    (made,) = held_out(["stand_bottle"], [30_001], 16)
+    return made
+
+
+def test_errors_by_hand(episode):
+    world = CopyFirstWorld(tasks=("stand_bottle",), image_height_px=16, image_width_px=16)
+    imagined = imagine(world, [episode])
+    assert len(imagined.seen[0]) == len(episode.chunks) == 5
+    error = rollout_error(imagined, [episode])
+    first = episode.start.observation
+    off = episode.images[:80].astype(float) - first.images[CAMERA].astype(float)
+    assert error.image_levels == pytest.approx(np.sqrt((off**2).mean()))
+    off_kpa = episode.tactile_kpa[:80].astype(float) - first.tactile_kpa
+    assert error.touch_kpa == pytest.approx(np.sqrt((off_kpa**2).mean()), rel=1e-6)
+    assert error.contact_f1 == 0.0
+
+
+def test_the_truth_itself_has_no_error(episode):
+    world = CopyFirstWorld(tasks=("stand_bottle",), image_height_px=16, image_width_px=16)
+    seen = imagine(world, [episode]).seen[0]
+    true = [
+        type(one)(
+            first_step=one.first_step,
+            images={CAMERA: episode.images[16 * k : 16 * k + 16]},
+            tactile_kpa=episode.tactile_kpa[16 * k : 16 * k + 16],
+            action_reached=one.action_reached,
+            reached_is_measured=False,
+        )
+        for k, one in enumerate(seen)
+    ]
+    assert rollout_error(Imagined([true], 1.0), [episode]) == RolloutError(0.0, 0.0, 1.0)
+
+
+def test_rollouts_may_show_less(episode):
+    world = CopyFirstWorld(tasks=("stand_bottle",), image_height_px=16, image_width_px=16)
+    seen = imagine(world, [episode], ReturnSelector(cameras=(), steps="last")).seen[0]
+    assert [(one.first_step, len(one), one.images) for one in seen] == [
+        (16 * k, 1, {}) for k in range(1, 6)
+    ]
+
+
+def test_verdicts():
+    served = tables.variant_name(2, "float32")
+    assert served == "2 Euler steps, float32"
+    errors = {tables.COPY_FIRST: RolloutError(30.0, 4.0, 0.0), served: RolloutError(15.0, 5.0, 0.9)}
+    found = tables.requirements({served: Figure.of([40.0])}, errors, served)
+    assert [one.figure for one in found] == [40.0, 0.5, 1.25]
+    assert [one.is_met for one in found] == [True, True, False]
+
+
+@pytest.mark.parametrize("words", [["--rounds", "0"], ["--seeds", "0"]])
+def test_options_that_mean_nothing_are_refused(words, tmp_path):
+    parser = stage_parser("world-model")
+    stage.add_options(parser)
+    with pytest.raises(InvalidInputError, match=words[0]):
+        stage.measure(parser.parse_args(words), tmp_path, pytest.fail)
