@@ -105,7 +105,8 @@ def record(
     found: dict[str, object] = {"event_times_s": events.times_s}
     if played is not None:
         name = episode_id(stage.task.name, stage.domain, seed, options, played=played.name)
-        found |= {"episode_id": name, "generator_command": played.command}
+        quality = options.figures() | {"played": 1.0}
+        found |= {"episode_id": name, "generator_command": played.command, "quality": quality}
     attributes = _attributes(stage, seed, options, anchor).model_copy(update=found)
     return TruthEpisode(attributes, streams, np.stack(recorder.pad_forces_n))
 

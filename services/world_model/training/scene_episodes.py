@@ -1,0 +1,274 @@
+"""True episodes of a store as arrays on the model grid, with the poses of their objects.
+
+What decides success in a world model is trained on these: whole episodes, where each object was at
+every step, and what became of it. Only truth is taken: imagined episodes, those that were cut off
+and those whose outcome nobody knows are left out, and counted.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import structlog
+from jaxtyping import Float16, Float32, Float64, Int64, UInt8
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes.window import nearest_indices
+from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.geometry.interpolation import interpolate_poses
+from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
+from dextouch.schemas.episodes import Domain, EpisodeAttributes, Origin
+from dextouch.schemas.rollouts import ActionKind
+
+CAMERA = "camera_head"
+TWIN_ONLY: tuple[Origin, ...] = ("twin",)
+# An image or a pose belongs to a grid step if it is this near, as a share of a step.
+_SAME_STEP = 0.25
+_FROM_STEP = "_from_step"
+logger = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True)
+class SceneEpisode:
+    """One whole episode, all of it relative to or from its step 0.
+
+    `actions` are the commanded ones where the episode has them (`action_kind` says so), and
+    `measured_actions` what was reached; `anchor` are the poses of left wrist, right wrist and head
+    camera that both are relative to. `tactile_kpa` is the mean over each step, `object_poses` are
+    x y z (m), qw qx qy qz in the world. `images` are those of the head camera that show a grid
+    step, and `image_steps` says which. `motion` is "script", "miss", "hold", "frozen", "policy",
+    "other_scene" or the motion that left the script.
+    """
+
+    episode_id: str
+    task: str
+    instruction: str
+    domain: Domain
+    seed: int
+    motion: str
+    noise_m: float
+    success: bool
+    event_times_s: dict[str, float]
+    object_names: tuple[str, ...]
+    object_boxes_m: Float64[np.ndarray, "objects 6"]
+    action_kind: ActionKind
+    actions: Float64[np.ndarray, "steps 67"]
+    measured_actions: Float64[np.ndarray, "steps 67"]
+    anchor: Float64[np.ndarray, "3 4 4"]
+    K_head: Float64[np.ndarray, "3 3"]
+    tactile_kpa: Float16[np.ndarray, "steps 2 320"]
+    object_poses: Float32[np.ndarray, "steps objects 7"]
+    images: UInt8[np.ndarray, "shown h w 3"]
+    image_steps: Int64[np.ndarray, " shown"]
+    content_sha256: str
+
+    @property
+    def scene(self) -> tuple[str, int]:
+        """Task and seed: what must not be on both sides of a split."""
+        return self.task, self.seed
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+
+def load_scene_episodes(
+    url: str,
+    *,
+    tasks: Collection[str] | None = None,
+    domains: Collection[Domain] | None = None,
+    origins: Collection[Origin] = TWIN_ONLY,
+    with_images: bool = True,
+) -> list[SceneEpisode]:
+    """The true episodes of a store, in the order of their ids.
+
+    How many were left out, and why, is logged.
+
+    Args:
+        url: of the store.
+        tasks: only these; None for all.
+        domains: only these; None for both.
+        origins: only these; "imagined" is refused.
+        with_images: False leaves the images in the store.
+
+    Raises:
+        InvalidInputError: imagined episodes are asked for, or no episode is left.
+    """
+    if "imagined" in origins:
+        raise InvalidInputError(
+            "scene episodes: got origins with 'imagined', expected 'twin' or 'recorded': what was "
+            "imagined is no truth to train on"
+        )
+    store = EpisodeStore(url)
+    taken: list[SceneEpisode] = []
+    skipped: Counter[str] = Counter()
+    for episode_id in sorted(store.list()):
+        reader = store.open(episode_id)
+        attributes = reader.attributes
+        if tasks is not None and attributes.task not in tasks:
+            continue
+        if domains is not None and attributes.domain not in domains:
+            continue
+        reason = _unfit(reader, origins)
+        if reason is None:
+            taken.append(read_scene_episode(reader, with_images=with_images))
+        else:
+            skipped[reason] += 1
+    for reason, count in sorted(skipped.items()):
+        logger.warning("skipped_episodes", store=url, reason=reason, count=count)
+    if not taken:
+        raise InvalidInputError(
+            f"scene episodes: the store {url} has none to train on (left out: {dict(skipped)}); "
+            "record some with `dextouch train data`"
+        )
+    return taken
+
+
+def _unfit(reader: EpisodeReader, origins: Collection[Origin]) -> str | None:
+    """Why an episode is no truth to train on."""
+    attributes = reader.attributes
+    if attributes.origin not in origins:
+        return f"origin {attributes.origin}"
+    if attributes.recovered:
+        return "recovered after its writer died"
+    if attributes.success is None:
+        return "success unknown"
+    if attributes.seed is None:
+        return "seed unknown"
+    missing = {"action", "tactile_left", "tactile_right", "object_poses"} - set(reader.streams)
+    return f"without {', '.join(sorted(missing))}" if missing else None
+
+
+def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> SceneEpisode:
+    """One episode of known success and seed.
+
+    Raises:
+        InvalidInputError: success or seed are not known.
+        UnknownNameError: a stream is missing.
+        CorruptDataError: damaged bytes.
+    """
+    attributes = reader.attributes
+    if attributes.success is None or attributes.seed is None:
+        raise InvalidInputError(
+            f"episode {attributes.episode_id!r}: success {attributes.success}, seed "
+            f"{attributes.seed}; expected both known"
+        )
+    window = reader.window(0, reader.num_steps, cameras=())
+    actions = window.actions
+    kind: ActionKind = "commanded" if "action_commanded" in reader.streams else "measured"
+    if kind == "commanded":
+        actions = reader.read("action_commanded").values.astype(np.float64)
+    images, image_steps = _images(reader, window.t_ref_ns) if with_images else _no_images()
+    boxes = np.array(attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
+    return SceneEpisode(
+        episode_id=attributes.episode_id,
+        task=attributes.task,
+        instruction=attributes.instruction,
+        domain=attributes.domain,
+        seed=attributes.seed,
+        motion=motion_of(attributes),
+        noise_m=attributes.quality.get("noise_m", 0.0),
+        success=attributes.success,
+        event_times_s=dict(attributes.event_times_s),
+        object_names=attributes.object_names,
+        object_boxes_m=boxes,
+        action_kind=kind,
+        actions=actions,
+        measured_actions=window.actions,
+        anchor=np.stack(window.anchor.as_tuple()),
+        K_head=window.K_head,
+        tactile_kpa=window.tactile_kpa.astype(np.float16),
+        object_poses=_object_poses(reader, window.t_ref_ns),
+        images=images,
+        image_steps=image_steps,
+        content_sha256=reader.content_sha256,
+    )
+
+
+def motion_of(attributes: EpisodeAttributes) -> str:
+    """What the hands did, by the figures that the twin keeps in `quality`."""
+    quality = attributes.quality
+    if "played" in quality:
+        return "policy"
+    if "actions_of_seed" in quality:
+        return "other_scene"
+    for name, value in quality.items():
+        if name.endswith(_FROM_STEP):
+            motion = name.removesuffix(_FROM_STEP)
+            return "hold" if motion == "frozen" and value == 0 else motion
+    return "miss" if quality.get("miss") else "script"
+
+
+def _no_images() -> tuple[np.ndarray, np.ndarray]:
+    return np.zeros((0, 0, 0, 3), dtype=np.uint8), np.zeros(0, dtype=np.int64)
+
+
+def _step_ns(grid_ns: np.ndarray) -> int:
+    return int(grid_ns[1] - grid_ns[0]) if len(grid_ns) > 1 else 1
+
+
+def _images(reader: EpisodeReader, grid_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Images nearest to the grid steps that they show, and these steps."""
+    if CAMERA not in reader.streams or not reader.num_samples(CAMERA):
+        return _no_images()
+    stamps = reader.stamps_ns(CAMERA)
+    nearest = nearest_indices(stamps, grid_ns)
+    shows = np.abs(stamps[nearest] - grid_ns) <= _SAME_STEP * _step_ns(grid_ns)
+    return reader.images(CAMERA)[nearest[shows]], np.flatnonzero(shows).astype(np.int64)
+
+
+def _object_poses(
+    reader: EpisodeReader, grid_ns: np.ndarray
+) -> Float32[np.ndarray, "steps objects 7"]:
+    """Poses at the grid steps, between the two samples around each where none lies on it."""
+    data = reader.read("object_poses")
+    if np.array_equal(data.t_ref_ns, grid_ns):
+        return data.values.astype(np.float32)
+    left = np.searchsorted(data.t_ref_ns, grid_ns, side="right").clip(1, len(data) - 1) - 1
+    span = data.t_ref_ns[left + 1] - data.t_ref_ns[left]
+    weight = np.clip((grid_ns - data.t_ref_ns[left]) / span, 0.0, 1.0)
+    Ts = transform_from_pose(data.values)
+    each = [interpolate_poses(Ts[:, index], left, weight) for index in range(Ts.shape[1])]
+    return pose_from_transform(np.stack(each, axis=1)).astype(np.float32)
+
+
+def split_by_scene(
+    episodes: Iterable[SceneEpisode], *, held_out_share: float
+) -> tuple[list[SceneEpisode], list[SceneEpisode]]:
+    """Training and held-out episodes; all of a task and seed fall on the same side.
+
+    The side is decided by a hash of task and seed: it never changes when episodes are added.
+
+    Raises:
+        InvalidInputError: a share outside 0 … 1, or an empty side.
+    """
+    training: list[SceneEpisode] = []
+    held_out: list[SceneEpisode] = []
+    for episode in episodes:
+        digest = hashlib.sha256(f"{episode.task}/{episode.seed}".encode()).digest()
+        share = int.from_bytes(digest[:8], "big") / 2**64
+        (held_out if share < held_out_share else training).append(episode)
+    if not training or not held_out:
+        raise InvalidInputError(
+            f"split: {len(training)} episodes to train on and {len(held_out)} held out with a "
+            f"share of {held_out_share}; expected at least one each"
+        )
+    return training, held_out
+
+
+def refuse_shared_scenes(
+    training: Sequence[SceneEpisode], held_out: Sequence[SceneEpisode]
+) -> None:
+    """Refuse a split with the same task and seed on both sides.
+
+    Raises:
+        ConflictError: there is one; the first few are named.
+    """
+    shared = sorted({e.scene for e in training} & {e.scene for e in held_out})
+    if shared:
+        names = ", ".join(f"{task} seed {seed}" for task, seed in shared[:5])
+        raise ConflictError(
+            f"split: {len(shared)} scenes are both trained on and held out ({names}); measure on "
+            "seeds of their own"
+        )

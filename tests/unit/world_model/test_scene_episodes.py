@@ -1,0 +1,133 @@
+"""Scene episodes of a store are what the twin recorded; a split keeps every scene on one side."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError
+from services.twin.episodes import record, write_episode
+from services.twin.motions import Motion
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.take_options import TakeOptions
+from services.world_model.training.scene_episodes import (
+    load_scene_episodes,
+    refuse_shared_scenes,
+    split_by_scene,
+)
+
+HEAD = ("camera_head",)
+LEAN = TakeOptions(images=HEAD, image_every=4, streams="training")
+SHOWN = [*range(0, 77, 4), 78, 79, 80]
+
+
+@pytest.fixture(scope="module")
+def truths():
+    bottle = Stage("stand_bottle", "robot", TwinSettings())
+    bowls = Stage("stack_bowls", "human", TwinSettings())
+    lean_push = replace(LEAN, motion=Motion("push", 0))
+    takes = {
+        "script": record(bottle, 3, replace(LEAN, noise_m=0.005)),
+        "push": record(bottle, 4, lean_push),
+        "human": record(bowls, 3, LEAN),
+        "whole": record(bottle, 5, TakeOptions(images=HEAD, miss=True)),
+    }
+    unfit = {
+        "unknown": {"success": None},
+        "recovered": {"recovered": True},
+        "imagined": {"origin": "imagined"},
+        "unseeded": {"seed": None},
+    }
+    for name, changes in unfit.items():
+        attributes = takes["push"].attributes.model_copy(update={"episode_id": name, **changes})
+        takes[name] = replace(takes["push"], attributes=attributes)
+    return takes
+
+
+@pytest.fixture(scope="module")
+def url(truths, tmp_path_factory):
+    store = EpisodeStore(tmp_path_factory.mktemp("scenes"))
+    for truth in truths.values():
+        write_episode(store, truth)
+    return str(store.root)
+
+
+@pytest.fixture(scope="module")
+def loaded(truths, url):
+    names = {truth.attributes.episode_id: name for name, truth in truths.items()}
+    return {names[episode.episode_id]: episode for episode in load_scene_episodes(url)}
+
+
+def test_only_whole_true_episodes_of_known_outcome_are_taken(loaded, url):
+    assert set(loaded) == {"script", "push", "human", "whole"}
+    only = load_scene_episodes(url, tasks=["stand_bottle"], domains=["robot"], with_images=False)
+    assert {e.task for e in only} == {"stand_bottle"}
+    assert all(len(e.images) == len(e.image_steps) == 0 for e in only)
+    with pytest.raises(InvalidInputError, match="imagined"):
+        load_scene_episodes(url, origins=("twin", "imagined"))
+    with pytest.raises(InvalidInputError, match=r"none to train on .*origin twin"):
+        load_scene_episodes(url, origins=("recorded",))
+
+
+@pytest.mark.parametrize("name", ["script", "push", "human"])
+def test_arrays_are_what_the_twin_recorded(truths, loaded, name):
+    truth, got = truths[name].streams, loaded[name]
+    is_robot = name != "human"
+    sent = truth["action_commanded" if is_robot else "action"].values
+    assert got.action_kind == ("commanded" if is_robot else "measured")
+    np.testing.assert_allclose(got.actions, sent, atol=1e-9)
+    np.testing.assert_allclose(got.measured_actions, truth["action"].values, atol=1e-9)
+    np.testing.assert_array_equal(got.object_poses, truth["object_poses"].values.astype(np.float32))
+    np.testing.assert_array_equal(got.images, truth["camera_head"].values)
+    assert got.image_steps.tolist() == SHOWN
+    # Four samples of 60 Hz a step; those of step 1 are samples 1 … 4.
+    for index, side in enumerate(("left", "right")):
+        means = truth[f"tactile_{side}"].values[1:].reshape(80, 4, 320).mean(axis=1)
+        np.testing.assert_allclose(got.tactile_kpa[1:, index], means, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("name", ["script", "push", "human", "whole"])
+def test_facts_are_those_of_the_take(truths, loaded, name):
+    facts, got = truths[name].attributes, loaded[name]
+    assert (got.task, got.seed, got.success) == (facts.task, facts.seed, facts.success)
+    assert got.scene == (facts.task, facts.seed)
+    assert got.domain == facts.domain
+    assert got.event_times_s == facts.event_times_s
+    assert got.object_names == facts.object_names
+    np.testing.assert_array_equal(got.object_boxes_m, np.array(facts.object_boxes_m))
+    motions = {"script": "script", "push": "push", "human": "script", "whole": "miss"}
+    assert got.motion == motions[name]
+    assert got.noise_m == (0.005 if name == "script" else 0.0)
+
+
+def test_streams_at_their_own_rates_are_brought_to_the_grid(truths, loaded):
+    truth, got = truths["whole"].streams, loaded["whole"]
+    # 30 Hz images: every second one. 100 Hz poses: every 20th is on every third step.
+    np.testing.assert_array_equal(got.images, truth["camera_head"].values[::2])
+    assert got.image_steps.tolist() == list(range(81))
+    poses = truth["object_poses"].values
+    np.testing.assert_allclose(got.object_poses[:80:3], poses[:534:20], atol=1e-6)
+    # Step 1 is at 66.67 ms, two thirds of the way from sample 6 to sample 7.
+    np.testing.assert_allclose(
+        got.object_poses[1, :, :3], poses[6, :, :3] / 3 + poses[7, :, :3] * 2 / 3, atol=1e-6
+    )
+
+
+def test_a_split_keeps_every_scene_on_one_side(loaded):
+    scenes = [replace(loaded["push"], seed=seed) for seed in range(60)]
+    twice = [replace(e, episode_id="again", success=True) for e in scenes]
+    training, held_out = split_by_scene([*scenes, *twice], held_out_share=0.3)
+    assert len(training) + len(held_out) == 120
+    assert 20 <= len(held_out) <= 52
+    refuse_shared_scenes(training, held_out)
+    # Fewer or other episodes leave every scene where it was.
+    fewer, _ = split_by_scene(scenes[::-2], held_out_share=0.3)
+    assert {e.seed for e in fewer} <= {e.seed for e in training}
+    with pytest.raises(ConflictError, match=f"stand_bottle seed {training[0].seed}"):
+        refuse_shared_scenes(training, [training[0]])
+    # Another task with the same seed is another scene.
+    refuse_shared_scenes(training, [replace(training[0], task="stack_bowls")])
+    with pytest.raises(InvalidInputError, match="at least one each"):
+        split_by_scene(scenes[:1], held_out_share=0.3)
