@@ -3,11 +3,12 @@
 from typing import Final
 
 from dextouch.errors import UnknownNameError
+from services.twin.tasks.insert_peg import InsertPeg
 from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle
 from services.twin.tasks.task import Task
 
-_TASKS: Final[dict[str, Task]] = {task.name: task for task in (StandBottle(), StackBowls())}
+_TASKS: Final[dict[str, Task]] = {task.name: task for task in (StandBottle(), StackBowls(), InsertPeg())}
 TASK_NAMES: Final = tuple(_TASKS)
 
 

@@ -1,0 +1,190 @@
+"""Insert Peg: a standing peg is taken from the side and put into the hole of a block."""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import transform, transform_from_pose
+from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
+from services.twin.grasps import CylinderGrasp, opened, pressing
+from services.twin.hands import Domain, twin_hand
+from services.twin.mjcf import numbers
+from services.twin.simulation import Simulation
+from services.twin.tasks.postures import THUMB_UP, relaxed
+from services.twin.tasks.task import REST_SPEED
+
+_RADIUS_M, _HALF_LENGTH_M, _FOOT_HALF_M = 0.022, 0.090, 0.020
+# The hand takes the peg this far above its middle, so that it stays clear of the block.
+_GRIP_M: Final = 0.035
+# Room on each side of the peg in the square hole, and how far the chamfer widens it at the top.
+_CLEARANCE_M, _CHAMFER_M, _CHAMFER_RAD = 0.002, 0.008, 0.9
+_HOLE_HALF_M: Final = _RADIUS_M + _CLEARANCE_M
+_BLOCK_HALF_M, _WALL_HEIGHT_M, _PLATE_HALF_M = 0.056, 0.036, 0.003
+# The block is smooth, so that its chamfer guides; the peg rolls badly, so that it stays on the
+# table when dropped.
+_BLOCK_CONTACT: Final = 'friction="0.25 0.005 0.0001" priority="1"'
+_PEG_CONTACT: Final = 'condim="6" friction="1 0.005 0.003"'
+_COLOURS: Final = {
+    "peg": "0.74 0.14 0.52 1",
+    "foot": "0.94 0.86 0.20 1",
+    "wall": "0.16 0.20 0.30 1",
+    "chamfer": "0.10 0.70 0.72 1",
+}
+# The thumb presses near the middle of the fingers: farther out it would turn the peg in the hand.
+_GRASPS: Final[dict[Domain, CylinderGrasp]] = {
+    "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.020, 0.06),
+    "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.020, 0.06),
+}
+_SQUEEZE_N: Final = 6.0
+_OPEN_M: Final = 0.020
+_LIFT_M: Final = 0.075
+# How far below the table the peg is sent, so that the compliant wrist pushes it in.
+_PUSH_M: Final = 0.010
+# Where the peg's foot is in the frame of the grasp when held, found by closing the hand once.
+_HELD_FEET_M: Final[dict[Domain, tuple[float, float, float]]] = {
+    "robot": (-0.128, -0.0061, -0.0014),
+    "human": (-0.127, -0.0025, 0.0014),
+}
+# Verdict: the foot this near to the table and to the hole's axis, the peg upright within 10°.
+_DEPTH_M, _ASIDE_M, _UPRIGHT = 0.010, _CLEARANCE_M + 0.003, 0.985
+_LIFTED_M, _OVER_HOLE_M = 0.03, 0.02
+
+
+def _wall(index: int) -> str:
+    """A wall of the block and the chamfer plate on top of it, of the side that `index` turns to."""
+    turn, up = 0.5 * np.pi * index, np.array([0.0, 0.0, 1.0])
+    outwards = np.array([np.cos(turn), np.sin(turn), 0.0])
+    along = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    # Walls go round like the blades of a windmill: each ends at the next one's side.
+    half_m = 0.5 * (_BLOCK_HALF_M - _HOLE_HALF_M)
+    middle_m = 0.5 * (_BLOCK_HALF_M + _HOLE_HALF_M)
+    centre = middle_m * outwards + half_m * along + 0.5 * _WALL_HEIGHT_M * up
+    slope = np.cos(_CHAMFER_RAD) * outwards + np.sin(_CHAMFER_RAD) * up
+    normal = np.cos(_CHAMFER_RAD) * up - np.sin(_CHAMFER_RAD) * outwards
+    half_slope_m = 0.5 * _CHAMFER_M / float(np.cos(_CHAMFER_RAD))
+    edge = _HOLE_HALF_M * outwards + _WALL_HEIGHT_M * up
+    plate = edge + half_slope_m * slope - _PLATE_HALF_M * normal
+    return (
+        f'<geom name="socket_wall{index}" class="object" type="box" mass="0.3" '
+        f'size="{numbers((half_m, middle_m, 0.5 * _WALL_HEIGHT_M))}" pos="{numbers(centre)}" '
+        f'xyaxes="{numbers([*outwards, *along])}" {_BLOCK_CONTACT} rgba="{_COLOURS["wall"]}"/>'
+        f'<geom name="socket_chamfer{index}" class="object" type="box" mass="0.05" '
+        f'size="{numbers((half_slope_m, _HOLE_HALF_M + _CHAMFER_M, _PLATE_HALF_M))}" '
+        f'pos="{numbers(plate)}" xyaxes="{numbers([*slope, *along])}" {_BLOCK_CONTACT} '
+        f'rgba="{_COLOURS["chamfer"]}"/>'
+    )
+
+
+def _foot_in_socket_m(poses: Float64[np.ndarray, "2 7"]) -> Float64[np.ndarray, "3"]:
+    """The middle of the peg's lower end in the socket's frame."""
+    T_world_peg, T_world_socket = transform_from_pose(poses)
+    foot_world = T_world_peg[:3, 3] - _HALF_LENGTH_M * T_world_peg[:3, 2]
+    return T_world_socket[:3, :3].T @ (foot_world - T_world_socket[:3, 3])
+
+
+def _is_inserted(poses: Float64[np.ndarray, "2 7"]) -> bool:
+    foot = _foot_in_socket_m(poses)
+    upright = transform_from_pose(poses[0])[2, 2]
+    return bool(foot[2] < _DEPTH_M and np.abs(foot[:2]).max() < _ASIDE_M and upright > _UPRIGHT)
+
+
+class InsertPeg:
+    """Take the standing peg from the side, lift it over the block, push it in, let go."""
+
+    name = "insert_peg"
+    instruction = "Pick up the peg and insert it into the hole of the block."
+    object_names = ("peg", "socket")
+    milestones = ("touched", "lifted", "over_hole", "inserted", "released")
+
+    def objects_mjcf(self) -> str:
+        """A cylinder with a foot of another colour; a fixed block of four walls and chamfers."""
+        foot_z, shaft_half = _FOOT_HALF_M - _HALF_LENGTH_M, _HALF_LENGTH_M - _FOOT_HALF_M
+        walls = "".join(_wall(index) for index in range(4))
+        return (
+            '<body name="peg"><freejoint/>'
+            '<geom name="peg_shaft" class="object" type="cylinder" mass="0.06" '
+            f'size="{numbers((_RADIUS_M, shaft_half))}" pos="0 0 {_FOOT_HALF_M!r}" '
+            f'{_PEG_CONTACT} rgba="{_COLOURS["peg"]}"/>'
+            '<geom name="peg_foot" class="object" type="cylinder" mass="0.08" '
+            f'size="{numbers((_RADIUS_M, _FOOT_HALF_M))}" pos="0 0 {foot_z!r}" '
+            f'{_PEG_CONTACT} rgba="{_COLOURS["foot"]}"/></body>'
+            f'<body name="socket" mocap="true">{walls}</body>'
+        )
+
+    def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "2 7"]:
+        """Peg on the right, block left of the middle, each ±3 cm; the block turned by ±0.25 rad."""
+        poses = np.zeros((2, 7))
+        middles = np.array([[0.10, 0.0], [-0.08, 0.03]])
+        poses[:, :2] = middles + generator.uniform(-0.03, 0.03, size=(2, 2))
+        poses[0, 2:4] = _HALF_LENGTH_M, 1.0
+        half_yaw = 0.5 * generator.uniform(-0.25, 0.25)
+        poses[1, 3], poses[1, 6] = np.cos(half_yaw), np.sin(half_yaw)
+        return poses
+
+    def script(
+        self,
+        object_poses: Float64[np.ndarray, "2 7"],
+        *,
+        domain: Domain,
+        generator: np.random.Generator,
+        noise: tuple[WaypointNoise, WaypointNoise],
+    ) -> list[Waypoint]:
+        """Beside it, around it, close, lift, over the hole, push in, open, away."""
+        grasp = _GRASPS[domain]
+        open_hand = opened(grasp, domain, gap_m=_OPEN_M)
+        press = pressing(grasp, domain, force_n=_SQUEEZE_N)
+        R_axis = grasp.axis_rotation()
+        gripped = grasp.axis_point_m(twin_hand("right", domain))
+        held_foot = gripped + R_axis @ _HELD_FEET_M[domain]
+        start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
+
+        def hand(point_m: np.ndarray, held: np.ndarray, yaw_rad: float) -> HandPose:
+            """The palm to the left; what it holds at `held` in its own frame is at the point."""
+            R = rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ THUMB_UP @ R_axis.T
+            return HandPose(transform(R, point_m - R @ held), open_hand)
+
+        grip = object_poses[0, :3] + [0.0, 0.0, _GRIP_M]
+        beside = moved(hand(grip, gripped, 0.0), start_m + [0.12, -0.02, 0.03])
+        reach = hand(grip + noise[0].offset_m, gripped, noise[0].yaw_rad)
+        took = bent(reach, press)
+        left = hand(object_poses[1, :3] + noise[1].offset_m, held_foot, noise[1].yaw_rad)
+        put = bent(left, press)
+        path = [
+            (0.0, beside),
+            (0.8, reach),
+            (1.15, took),
+            (1.3, took),
+            (1.8, moved(took, [0.0, 0.0, _LIFT_M])),
+            (2.5, moved(put, 0.3 * over_m + [0.0, 0.0, _LIFT_M])),
+            (2.8, moved(put, [0.0, 0.0, 0.055])),
+            (3.4, moved(put, [0.0, 0.0, -_PUSH_M])),
+            (3.6, moved(put, [0.0, 0.0, -_PUSH_M])),
+            (4.0, left),
+            (4.8, moved(left, [0.13, -0.02, 0.03])),
+        ]
+        rest = relaxed("left", domain)
+        return [Waypoint(time_s, rest, pose) for time_s, pose in path]
+
+    def succeeded(self, simulation: Simulation) -> bool:
+        """The foot within 1 cm of the hole's ground, upright within 10°, at rest, untouched."""
+        return bool(
+            _is_inserted(simulation.object_poses())
+            and simulation.object_speeds().max() < REST_SPEED
+            and not simulation.hand_touches_object()
+        )
+
+    def reached(self, simulation: Simulation) -> tuple[bool, ...]:
+        """Touched by a hand; held 3 cm up; its foot over the hole; in it; let go."""
+        poses = simulation.object_poses()
+        foot = _foot_in_socket_m(poses)
+        touched = simulation.hand_touches(0)
+        lifted = touched and bool(foot[2] > _LIFTED_M) and not simulation.touches_table(0)
+        return (
+            touched,
+            lifted,
+            lifted and float(np.hypot(foot[0], foot[1])) < _OVER_HOLE_M,
+            _is_inserted(poses),
+            self.succeeded(simulation),
+        )
