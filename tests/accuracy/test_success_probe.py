@@ -8,7 +8,7 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.episodes import EpisodeStore
 from services.cli.data_mix import LADDER_M, MIXES
-from services.cli.training_data import make_training_data
+from services.cli.training_data import Scope, make_training_data
 from services.evaluation.demonstrations import read_demonstrations
 from services.evaluation.endings import final_ending
 from services.evaluation.settings import DEFAULT_PROBE
@@ -23,8 +23,9 @@ LEAST_AUC = 0.95
 def test_it_tells_successes_from_near_misses(tmp_path):
     torch.set_num_threads(1)
     seeds = range(FIRST_SEED, FIRST_SEED + 4 * len(LADDER_M))
-    make_training_data(str(tmp_path), seeds, MIXES["ladder"], num_jobs=1)
     probe = SuccessProbe.load(DEFAULT_PROBE)
+    scope = Scope(probe.metadata.tasks)
+    make_training_data(str(tmp_path), seeds, MIXES["ladder"], num_jobs=1, scope=scope)
     episodes = read_demonstrations(EpisodeStore(tmp_path))
     assert not {e.start_digest for e in episodes} & set(probe.metadata.training_starts)
     for task in probe.metadata.tasks:

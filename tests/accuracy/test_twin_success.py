@@ -7,12 +7,13 @@ import pytest
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
+from services.twin.tasks import TASK_NAMES
 
 SEEDS = range(100, 104)
 LADDER_M = (0.0, 0.05)
 
 
-@pytest.mark.parametrize("task", ["stand_bottle", "stack_bowls"])
+@pytest.mark.parametrize("task", TASK_NAMES)
 @pytest.mark.parametrize("domain", ["robot", pytest.param("human", marks=pytest.mark.slow)])
 def test_success_falls_with_noise(task, domain, capsys):
     stage = Stage(task, domain, TwinSettings())

@@ -146,7 +146,7 @@ class InsertPeg:
             return HandPose(transform(R, point_m - R @ held), open_hand)
 
         grip = object_poses[0, :3] + [0.0, 0.0, _GRIP_M]
-        beside = moved(hand(grip, gripped, 0.0), start_m + [0.12, -0.02, 0.03])
+        beside = moved(hand(grip, gripped, 0.0), start_m + np.array([0.12, -0.02, 0.03]))
         reach = hand(grip + noise[0].offset_m, gripped, noise[0].yaw_rad)
         took = bent(reach, press)
         left = hand(object_poses[1, :3] + noise[1].offset_m, held_foot, noise[1].yaw_rad)

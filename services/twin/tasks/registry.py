@@ -8,7 +8,9 @@ from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle
 from services.twin.tasks.task import Task
 
-_TASKS: Final[dict[str, Task]] = {task.name: task for task in (StandBottle(), StackBowls(), InsertPeg())}
+_TASKS: Final[dict[str, Task]] = {
+    task.name: task for task in (StandBottle(), StackBowls(), InsertPeg())
+}
 TASK_NAMES: Final = tuple(_TASKS)
 
 
