@@ -1,0 +1,71 @@
+"""How far hands and objects moved in the image against a start image that followed the camera."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from dextouch.geometry.transforms import apply, invert
+from services.world_model.rendering.box_raster import box_corners, object_transforms
+from services.world_model.rendering.camera_motion import CameraMotion
+from services.world_model.rendering.hand_raster import MIN_DEPTH_M, base_points_world
+from services.world_model.rendering.scene_states import SceneStates
+
+# A body that moved less than the first against the warped image did not move; one that moved more
+# than the second did; in between its surroundings are mixed.
+STILL_PX, MOVED_PX = 0.05, 0.3
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Hands and boxes of objects seen by one camera a state.
+
+    `pixels` and `in_front` are of 22 points of each hand, then of the eight corners of each box.
+    """
+
+    Ts_camera_box: Float64[np.ndarray, "n k 4 4"]
+    hands_world: Float64[np.ndarray, "n 2 22 3"]
+    pixels: Float64[np.ndarray, "n points 2"]
+    in_front: Bool[np.ndarray, "n points"]
+
+    @classmethod
+    def seen(cls, states: SceneStates, boxes_m: np.ndarray, K: np.ndarray) -> "Bodies":
+        """Bodies of states, whose objects have boxes [n, k, 6], by cameras [n, 3, 3]."""
+        T_camera_world = invert(states.Ts_world_camera)
+        Ts_object_box = np.tile(np.eye(4), (*boxes_m.shape[:2], 1, 1))
+        Ts_object_box[..., :3, 3] = boxes_m[..., :3]
+        Ts_world_box = object_transforms(states.object_poses) @ Ts_object_box
+        Ts_camera_box = T_camera_world[:, None] @ Ts_world_box
+        hands_world = base_points_world(states)
+        corners = box_corners(Ts_camera_box, boxes_m[..., 3:])
+        points = np.concatenate(
+            [
+                apply(T_camera_world, hands_world.reshape(len(states), -1, 3)),
+                corners.reshape(len(states), -1, 3),
+            ],
+            axis=1,
+        )
+        depth = points[..., 2:]
+        pixels = (points @ np.swapaxes(K, -1, -2))[..., :2] / np.maximum(depth, MIN_DEPTH_M)
+        return cls(Ts_camera_box, hands_world, pixels, depth[..., 0] > MIN_DEPTH_M)
+
+
+def motion_shares(
+    before: Bodies,
+    now: Bodies,
+    owner: Int64[np.ndarray, " n"],
+    motion: CameraMotion,
+) -> Float64[np.ndarray, "n bodies"]:
+    """From 0 (still) to 1 (moved) for left hand, right hand and each object.
+
+    A body moves when any of its points is elsewhere than the warp of the start image shows it.
+    """
+    there = before.pixels[owner]
+    shift = np.linalg.norm(motion.to_start(now.pixels) - there, axis=-1)
+    both = before.in_front[owner] & now.in_front
+    shift = np.where(both, shift, 0.0)
+    # A point that came before the camera, or left it, has moved.
+    shift[before.in_front[owner] != now.in_front] = np.inf
+    hands, boxes = shift[:, :44].reshape(-1, 2, 22), shift[:, 44:].reshape(len(owner), -1, 8)
+    largest = np.concatenate([hands.max(axis=-1), boxes.max(axis=-1)], axis=1)
+    return np.asarray(((largest - STILL_PX) / (MOVED_PX - STILL_PX)).clip(0.0, 1.0))

@@ -1,0 +1,153 @@
+"""Objects as boxes: pixels' rays against the objects' bounding boxes, nearest box first.
+
+A box that is hit carries the start image's texture: the point that is hit moves with the object
+back to where it was at the start and takes the colour the start image shows there.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64, Int64
+
+from dextouch.geometry.transforms import invert, transform_from_pose
+
+# Boxes thinner than this are drawn as thick as this.
+MIN_HALF_M = 1e-3
+# What is nearer along the optical axis is not hit, and not seen.
+NEAR_M = 0.02
+_CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
+
+
+@dataclass(frozen=True)
+class BoxHits:
+    """Pixels that see a box, each with its nearest one.
+
+    `place` numbers the pixels of all images, row by row; `local` is the point of entry in units of
+    the half sizes, `thickness_m` the difference of depth between entry and exit.
+    """
+
+    place: Int64[np.ndarray, " hits"]
+    image: Int64[np.ndarray, " hits"]
+    slot: Int64[np.ndarray, " hits"]
+    depth_m: Float64[np.ndarray, " hits"]
+    thickness_m: Float64[np.ndarray, " hits"]
+    local: Float64[np.ndarray, "hits 3"]
+
+
+def object_transforms(poses: Float64[np.ndarray, "*n 7"]) -> Float64[np.ndarray, "*n 4 4"]:
+    """T_world_object; a quaternion of length zero counts as no turn."""
+    poses = np.array(poses, dtype=np.float64)
+    lengths = np.linalg.norm(poses[..., 3:], axis=-1)
+    poses[lengths < 1e-9, 3:] = [1.0, 0.0, 0.0, 0.0]
+    poses[..., 3:] /= np.maximum(lengths, 1e-9)[..., None] ** (lengths >= 1e-9)[..., None]
+    return transform_from_pose(poses)
+
+
+def box_corners(
+    Ts_camera_box: Float64[np.ndarray, "*n 4 4"], half_m: Float64[np.ndarray, "*n 3"]
+) -> Float64[np.ndarray, "*n 8 3"]:
+    """Corners of boxes in the camera."""
+    corners = _CORNERS * half_m[..., None, :]
+    R_box_camera = np.swapaxes(Ts_camera_box[..., :3, :3], -1, -2)
+    return np.asarray(corners @ R_box_camera + Ts_camera_box[..., None, :3, 3])
+
+
+def cast_boxes(
+    Ts_camera_box: Float64[np.ndarray, "n k 4 4"],
+    half_m: Float64[np.ndarray, "n k 3"],
+    present: Bool[np.ndarray, "n k"],
+    K: Float64[np.ndarray, "n 3 3"],
+    shape_px: tuple[int, int],
+) -> BoxHits:
+    """Rays of pixel centres against boxes (slab method of Kay and Kajiya, 1986).
+
+    Only rays inside the rectangle around a box's corners are tried; a box with corners behind the
+    camera is tried everywhere.
+    """
+    half_m = np.maximum(half_m, MIN_HALF_M)
+    image, slot, v, u = np.nonzero(_tried(Ts_camera_box, half_m, present, K, shape_px))
+    Ts_box_camera = invert(Ts_camera_box)
+    unprojected = (Ts_box_camera[..., :3, :3] @ np.linalg.inv(K)[:, None])[image, slot]
+    pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], axis=1)
+    directions = (unprojected @ pixels[..., None])[..., 0]
+    origins, half = Ts_box_camera[image, slot, :3, 3], half_m[image, slot]
+    # A ray along a face divides by almost nothing, never by nothing.
+    inverse = 1.0 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
+    middle, reach = -origins * inverse, half * np.abs(inverse)
+    enter, leave = (middle - reach).max(axis=1), (middle + reach).min(axis=1)
+    height, width = shape_px
+    place = (image * height + v) * width + u
+    hit = np.flatnonzero((leave > enter) & (enter > NEAR_M))
+    # By pixel, then by depth: the first of each pixel is the nearest.
+    hit = hit[np.lexsort((enter[hit], place[hit]))]
+    seen = hit[np.diff(place[hit], prepend=-1) > 0]
+    entry = origins[seen] + directions[seen] * enter[seen, None]
+    local = (entry / half[seen]).clip(-1.0, 1.0)
+    return BoxHits(
+        place[seen], image[seen], slot[seen], enter[seen], leave[seen] - enter[seen], local
+    )
+
+
+def _tried(
+    Ts_camera_box: np.ndarray,
+    half_m: np.ndarray,
+    present: np.ndarray,
+    K: np.ndarray,
+    shape_px: tuple[int, int],
+) -> Bool[np.ndarray, "n k h w"]:
+    """Pixels inside the rectangle around each present box."""
+    corners = box_corners(Ts_camera_box, half_m)
+    depth = corners[..., 2:]
+    pixels = (corners @ np.swapaxes(K, -1, -2)[:, None])[..., :2] / np.maximum(depth, NEAR_M)
+    everywhere = (depth.min(axis=(2, 3)) < NEAR_M)[..., None]
+    low, high = pixels.min(axis=2), pixels.max(axis=2)
+    low, high = np.where(everywhere, -np.inf, low), np.where(everywhere, np.inf, high)
+    inside = []
+    for axis, count in ((0, shape_px[1]), (1, shape_px[0])):
+        centres = np.arange(count) + 0.5
+        inside.append((centres >= low[..., axis, None]) & (centres <= high[..., axis, None]))
+    across, down = inside
+    return np.asarray((down & present[..., None])[..., None] & across[..., None, :])
+
+
+def positions_at_start(
+    hits: BoxHits,
+    Ts_start_box: Float64[np.ndarray, "n k 4 4"],
+    half_m: Float64[np.ndarray, "n k 3"],
+    K: Float64[np.ndarray, "n 3 3"],
+) -> Float64[np.ndarray, "hits 2"]:
+    """Pixels of the start image that show what is hit; far outside where it was not before it.
+
+    Args:
+        hits: from `cast_boxes`.
+        Ts_start_box: pose of each box in the start camera, at the start.
+        half_m: half sizes.
+        K: of the start camera.
+    """
+    points = hits.local * np.maximum(half_m, MIN_HALF_M)[hits.image, hits.slot]
+    projections = (K[:, None] @ Ts_start_box[..., :3, :])[hits.image, hits.slot]
+    homogeneous = (projections[..., :3] @ points[..., None])[..., 0] + projections[..., 3]
+    depth = homogeneous[:, 2:]
+    return np.asarray(
+        np.where(depth > NEAR_M, homogeneous[:, :2] / np.maximum(depth, NEAR_M), -1e3)
+    )
+
+
+def colours_at_positions(
+    layers: Float[np.ndarray, "b c h w"],
+    owner: Int64[np.ndarray, " points"],
+    positions: Float64[np.ndarray, "points 2"],
+) -> Float64[np.ndarray, "points c"]:
+    """Bilinear samples of several images at positions in pixels; outside, the nearest border."""
+    _, _, height, width = layers.shape
+    limits = np.array([width - 1, height - 1])
+    at = (positions - 0.5).clip(0.0, limits)
+    corner = np.minimum(at.astype(np.int64), np.maximum(limits - 1, 0))
+    right, down = (at - corner).T
+    beyond = np.minimum(corner + 1, limits)
+    (u, v), (u_next, v_next) = corner.T, beyond.T
+    upper = layers[owner, :, v, u] * (1 - right)[:, None]
+    upper += layers[owner, :, v, u_next] * right[:, None]
+    lower = layers[owner, :, v_next, u] * (1 - right)[:, None]
+    lower += layers[owner, :, v_next, u_next] * right[:, None]
+    return np.asarray(upper * (1 - down)[:, None] + lower * down[:, None])

@@ -1,0 +1,187 @@
+"""Both hands as coloured bones: points of the kinematic chains, splatted into the image.
+
+Each bone is a ribbon of points that faces the camera; a point keeps the colour that the start
+image shows where it was at the start. Nearer points win over farther ones by a soft depth test.
+"""
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64
+
+from dextouch.geometry.transforms import apply, invert
+from services.world_model.network.pose_raster import hand_points_m
+from services.world_model.rendering.scene_states import SceneStates
+
+SIDES = ("left", "right")
+MIN_DEPTH_M = 0.05
+# Half the width of a drawn bone, and how far the forearm is drawn behind the wrist.
+_BONE_RADIUS_M, _FOREARM_RADIUS_M, _FOREARM_M = 0.008, 0.024, 0.06
+# Splats lose to others that are this much nearer.
+_SOFT_DEPTH_M = 0.012
+# How much of a pixel a single splat in its middle covers: 1 − exp(−this).
+_OPACITY = 1.6
+_PALM_ROWS, _PALM_COLUMNS = 7, 9
+_WRIST, _FOREARM_END = 0, 21
+_KNUCKLES = (5, 9, 13, 17)
+
+
+@dataclass(frozen=True)
+class _Ribbons:
+    """Fixed recipe of a hand's points: mixtures of 22 base points, and the ribbons' widths."""
+
+    mixture: Float64[np.ndarray, "points 22"]
+    direction: Float64[np.ndarray, "points 22"]
+    lateral_m: Float64[np.ndarray, " points"]
+
+
+@dataclass(frozen=True)
+class HandPoints:
+    """A hand's points on an image: pixels, depths, and which lie in front of the camera."""
+
+    pixels: Float64[np.ndarray, "n 2 points 2"]
+    depth_m: Float64[np.ndarray, "n 2 points"]
+    in_front: Bool[np.ndarray, "n 2 points"]
+
+
+@dataclass(frozen=True)
+class HandRaster:
+    """Both hands on images: coverage (0 … 1) of left and right, colour, nearness in 1/m."""
+
+    coverage: Float32[np.ndarray, "n 2 h w"]
+    colour: Float32[np.ndarray, "n 3 h w"]
+    nearness: Float32[np.ndarray, "n 1 h w"]
+
+
+@cache
+def _ribbons() -> _Ribbons:
+    bones = [(1 + 4 * f + j, 2 + 4 * f + j, _BONE_RADIUS_M, 5) for f in range(5) for j in range(3)]
+    bones += [(_WRIST, 1, _BONE_RADIUS_M, 5), (_WRIST, _FOREARM_END, _FOREARM_RADIUS_M, 5)]
+    mixture, direction, lateral = [], [], []
+    for a, b, radius_m, count in bones:
+        wide = 5 if radius_m == _FOREARM_RADIUS_M else 3
+        for share in np.linspace(0.0, 1.0, count):
+            for side in np.linspace(-0.8, 0.8, wide):
+                row = np.zeros(22)
+                row[a], row[b] = 1.0 - share, share
+                along = np.zeros(22)
+                along[a], along[b] = -1.0, 1.0
+                mixture.append(row)
+                direction.append(along)
+                lateral.append(side * radius_m)
+    for across in np.linspace(0.0, 3.0, _PALM_COLUMNS):
+        left = min(int(across), 2)
+        knuckle = np.zeros(22)
+        knuckle[_KNUCKLES[left]], knuckle[_KNUCKLES[left + 1]] = left + 1 - across, across - left
+        for share in np.linspace(0.15, 1.0, _PALM_ROWS):
+            row = share * knuckle
+            row[_WRIST] += 1.0 - share
+            mixture.append(row)
+            direction.append(np.zeros(22))
+            lateral.append(0.0)
+    return _Ribbons(np.array(mixture), np.array(direction), np.array(lateral))
+
+
+def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
+    """Wrist, four points a finger and a point on the forearm, of both hands."""
+    hands = []
+    for index, side in enumerate(SIDES):
+        points = hand_points_m(states.joints_rad[:, index], side=side)
+        forearm = np.broadcast_to([0.0, 0.0, _FOREARM_M], (len(states), 1, 3))
+        points = np.concatenate([points, forearm], axis=1)
+        hands.append(apply(states.Ts_world_wrist[:, index], points))
+    return np.stack(hands, axis=1)
+
+
+def project_hands(
+    base_world: np.ndarray, K: np.ndarray, T_world_camera: np.ndarray, *, middle_only: bool = False
+) -> HandPoints:
+    """All points of both hands seen by a camera.
+
+    Args:
+        base_world: [n, 2, 22, 3] from `base_points_world`.
+        K: [n, 3, 3] in pixels.
+        T_world_camera: [n, 4, 4].
+        middle_only: every point on the middle of its bone.
+    """
+    ribbons = _ribbons()
+    T_camera_world = invert(T_world_camera)[:, None]
+    base = apply(T_camera_world, base_world)
+    points = ribbons.mixture @ base
+    if not middle_only:
+        sideways = np.cross(ribbons.direction @ base, points)
+        length = np.linalg.norm(sideways, axis=-1, keepdims=True)
+        points = points + sideways / np.maximum(length, 1e-9) * ribbons.lateral_m[:, None]
+    depth = points[..., 2]
+    in_front = depth > MIN_DEPTH_M
+    homogeneous = points @ np.swapaxes(K, -1, -2)[:, None]
+    pixels = homogeneous[..., :2] / np.maximum(depth, MIN_DEPTH_M)[..., None]
+    return HandPoints(pixels, depth, in_front)
+
+
+def colours_at(
+    images: Float32[np.ndarray, "b 3 h w"], points: HandPoints
+) -> Float32[np.ndarray, "b 2 points 3"]:
+    """What images in 0 … 1 show at the pixel of each point; black for points outside."""
+    _, _, height, width = images.shape
+    u = np.floor(points.pixels[..., 0].clip(-1, width)).astype(np.int64)
+    v = np.floor(points.pixels[..., 1].clip(-1, height)).astype(np.int64)
+    seen = points.in_front & (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    rows = np.arange(len(images))[:, None, None]
+    colours = images[rows, :, v.clip(0, height - 1), u.clip(0, width - 1)]
+    return np.where(seen[..., None], colours, np.float32(0.0))
+
+
+def splat_hands(points: HandPoints, colours: np.ndarray, shape_px: tuple[int, int]) -> HandRaster:
+    """Points of both hands drawn with their colours [n, 2, points, 3]; nearer ones win."""
+    height, width = shape_px
+    num_images = len(points.pixels)
+    place, weight, source = _taps(points, shape_px)
+    size = num_images * height * width
+    depth = points.depth_m.reshape(-1)[source]
+    # Weights of about one at a metre: exp does not overflow for any depth above MIN_DEPTH_M.
+    near = weight * np.exp(np.minimum((1.0 - depth) / _SOFT_DEPTH_M, 300.0))
+    is_right = (source // points.depth_m.shape[2]) % 2 == 1
+    total = np.bincount(place, near, size)
+    normal = 1.0 / np.maximum(total, 1e-300)
+    paint = colours.reshape(-1, 3)[source]
+
+    def mean(values: np.ndarray) -> np.ndarray:
+        return np.bincount(place, near * values, size) * normal
+
+    left = np.bincount(place, np.where(is_right, 0.0, weight), size)
+    right = np.bincount(place, np.where(is_right, weight, 0.0), size)
+    cover = 1.0 - np.exp(-_OPACITY * np.stack([left, right]))
+    colour = np.stack([mean(paint[:, channel]) for channel in range(3)])
+    images = (num_images, height, width)
+    return HandRaster(
+        cover.reshape(2, *images).swapaxes(0, 1).astype(np.float32),
+        colour.reshape(3, *images).swapaxes(0, 1).astype(np.float32),
+        mean(1.0 / np.maximum(depth, MIN_DEPTH_M)).reshape(*images)[:, None].astype(np.float32),
+    )
+
+
+def _taps(
+    points: HandPoints, shape_px: tuple[int, int]
+) -> tuple[Int64[np.ndarray, " taps"], Float64[np.ndarray, " taps"], Int64[np.ndarray, " taps"]]:
+    """Flat pixel, weight and point number of the four neighbours of each visible point."""
+    height, width = shape_px
+    flat = points.pixels.reshape(-1, 2) - 0.5
+    shown = points.in_front.ravel() & (flat > -1).all(axis=1)
+    shown &= (flat < [width, height]).all(axis=1)
+    source = np.flatnonzero(shown)
+    corner = np.floor(flat[source])
+    share = flat[source] - corner
+    u, v = corner.astype(np.int64).T
+    image = source // (points.depth_m.shape[1] * points.depth_m.shape[2])
+    places, weights = [], []
+    for down in (0, 1):
+        for right in (0, 1):
+            inside = (u + right >= 0) & (u + right < width)
+            inside &= (v + down >= 0) & (v + down < height)
+            amount = np.abs(1 - right - share[:, 0]) * np.abs(1 - down - share[:, 1])
+            column, row = (u + right).clip(0, width - 1), (v + down).clip(0, height - 1)
+            places.append((image * height + row) * width + column)
+            weights.append(np.where(inside, amount, 0.0))
+    return np.concatenate(places), np.concatenate(weights), np.tile(source, 4)

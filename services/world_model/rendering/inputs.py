@@ -1,0 +1,248 @@
+"""What the renderer's network is given: the warped start image, drawn hands, drawn objects.
+
+Everything is computed for all asked images at once. `change` says where the network may draw: it
+is zero, and the image therefore exactly the warped start, where no body moved against the table
+and the camera stood still.
+"""
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, Int64, UInt8
+from torch import Tensor
+from torch.nn import functional
+
+from services.world_model.rendering.body_motion import Bodies, motion_shares
+from services.world_model.rendering.box_raster import (
+    BoxHits,
+    cast_boxes,
+    colours_at_positions,
+    object_transforms,
+    positions_at_start,
+)
+from services.world_model.rendering.camera_motion import (
+    CameraMotion,
+    is_inside,
+    pixel_centres,
+    sample_images,
+)
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.hand_raster import (
+    colours_at,
+    project_hands,
+    splat_hands,
+)
+from services.world_model.rendering.scene_states import SceneStates
+
+FINE_CHANNELS: Final = 15
+COARSE_CHANNELS: Final = 13
+# How far around a moved body the network may draw.
+_REACH_PX = 4
+_COVERED = 0.05
+# The whole image is the network's once a pixel of it moved this far.
+_CAMERA_MOVED_PX = 0.25
+# Bring lengths of things that hands hold, and nearness of things at arm's length, to about one.
+_PER_M, _NEARNESS_M = 10.0, 0.5
+
+
+@dataclass(frozen=True)
+class Scenes:
+    """Start images with all that is known of them.
+
+    `boxes_m` are centre and half sizes (x y z, x y z) of each object's box in its own frame.
+    """
+
+    images: UInt8[np.ndarray, "b h w 3"]
+    K_head: Float64[np.ndarray, "b 3 3"]
+    states: SceneStates
+    boxes_m: Float64[np.ndarray, "b k 6"]
+
+
+@dataclass(frozen=True)
+class DrawingInputs:
+    """Channels at full size and at half size, and where the network may draw.
+
+    The fine channels begin with the sources that are mixed: the colours of the warped start, of
+    the objects and of the hands.
+    """
+
+    fine: Float32[Tensor, "n 15 h w"]
+    coarse: Float32[Tensor, "n 13 rows cols"]
+    change: Float32[Tensor, "n 1 h w"]
+
+
+@dataclass(frozen=True)
+class _Start:
+    """Start images as planes: colours, coverage by each hand, pixels that show objects."""
+
+    rgb: Float32[np.ndarray, "b 3 h w"]
+    hands: Float32[np.ndarray, "b 2 h w"]
+    hits: BoxHits
+    hand_colours: Float32[np.ndarray, "b 2 points 3"]
+
+
+@dataclass(frozen=True)
+class _SeenObjects:
+    """Pixels that show objects, the start each image belongs to, and where it shows the same."""
+
+    hits: BoxHits
+    owner: Int64[np.ndarray, " n"]
+    at_start: Float64[np.ndarray, "hits 2"]
+
+
+def drawing_inputs(
+    scenes: Scenes, states: SceneStates, owner: Int64[np.ndarray, " n"], config: RendererConfig
+) -> DrawingInputs:
+    """Inputs for drawing each state from the scene whose number is in `owner`."""
+    shape_px = scenes.images.shape[1], scenes.images.shape[2]
+    K, boxes_m = scenes.K_head[owner], scenes.boxes_m[owner]
+    before = Bodies.seen(scenes.states, scenes.boxes_m, scenes.K_head)
+    now = Bodies.seen(states, boxes_m, K)
+    motion = CameraMotion.between(K, scenes.states.Ts_world_camera[owner], states.Ts_world_camera)
+    present = scenes.states.object_present[owner] & states.object_present
+    start = _start(scenes, before)
+    points = project_hands(now.hands_world, K, states.Ts_world_camera)
+    hands = splat_hands(points, start.hand_colours[owner], shape_px)
+    hits = cast_boxes(now.Ts_camera_box, boxes_m[..., 3:], present, K, shape_px)
+
+    positions = motion.image_positions(shape_px)
+    warped, marks, outside = _warped(start, owner, positions, config)
+    at_start = positions_at_start(hits, before.Ts_camera_box[owner], boxes_m[..., 3:], K)
+    seen = _SeenObjects(hits, owner, at_start)
+    objects = _objects(seen, start)
+    fine = [warped, objects[:, :3], hands.colour, hands.coverage, objects[:, 3:], marks, outside]
+    change = _camera_change(positions)
+    if not config.redraws_table or change.min() < 1.0:
+        moved = motion_shares(before, now, owner, motion)
+        moved[:, 2:] *= present
+        body = _body_change(_Stirred(start, owner, positions, moved), hands.coverage, hits, outside)
+        change = np.maximum(body, change) if config.redraws_table else body
+    return DrawingInputs(
+        torch.from_numpy(np.concatenate(fine, axis=1)),
+        torch.from_numpy(_coarse(seen, start, states, boxes_m, hands.nearness)),
+        torch.from_numpy(np.broadcast_to(change, (len(owner), 1, *shape_px)).astype(np.float32)),
+    )
+
+
+def _start(scenes: Scenes, before: Bodies) -> _Start:
+    shape_px = scenes.images.shape[1], scenes.images.shape[2]
+    rgb = np.ascontiguousarray(np.moveaxis(scenes.images, -1, 1), dtype=np.float32) / 255.0
+    K, cameras = scenes.K_head, scenes.states.Ts_world_camera
+    points = project_hands(before.hands_world, K, cameras)
+    colours = colours_at(rgb, project_hands(before.hands_world, K, cameras, middle_only=True))
+    present = scenes.states.object_present
+    hits = cast_boxes(before.Ts_camera_box, scenes.boxes_m[..., 3:], present, K, shape_px)
+    return _Start(rgb, splat_hands(points, colours, shape_px).coverage, hits, colours)
+
+
+def _plane(hits: BoxHits, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Values of hits [hits, c] on images [n, c, h, w], zero elsewhere."""
+    num_images, height, width = shape
+    flat = np.zeros((num_images * height * width, values.shape[1]), dtype=np.float32)
+    flat[hits.place] = values
+    return np.moveaxis(flat.reshape(num_images, height, width, -1), -1, 1)
+
+
+def _warped(
+    start: _Start, owner: np.ndarray, positions: np.ndarray, config: RendererConfig
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The start image after the camera's motion, its hands and objects, and what it lacks."""
+    num_starts, _, height, width = start.rgb.shape
+    hit = _plane(start.hits, np.ones((len(start.hits.place), 1)), (num_starts, height, width))
+    layers = np.concatenate([start.rgb, start.hands.max(axis=1, keepdims=True), hit], axis=1)
+    # Outside the start image its border is repeated.
+    sampled = sample_images(
+        torch.from_numpy(layers)[torch.from_numpy(owner)],
+        torch.from_numpy(positions),
+        interpolation=config.interpolation,
+    ).clamp_(0.0, 1.0)
+    planes: np.ndarray = sampled.numpy()
+    outside = ~is_inside(positions, (height, width))
+    return planes[:, :3], planes[:, 3:], outside[:, None].astype(np.float32)
+
+
+def _objects(seen: _SeenObjects, start: _Start) -> Float32[np.ndarray, "n 4 h w"]:
+    """Objects in the start image's colours, and where they are."""
+    hits = seen.hits
+    texture = colours_at_positions(start.rgb, seen.owner[hits.image], seen.at_start)
+    values = np.concatenate([texture, np.ones((len(texture), 1))], axis=1)
+    return _plane(hits, values, (len(seen.owner), *start.rgb.shape[2:]))
+
+
+def _coarse(
+    seen: _SeenObjects,
+    start: _Start,
+    states: SceneStates,
+    boxes_m: np.ndarray,
+    hands_nearness: np.ndarray,
+) -> Float32[np.ndarray, "n 13 rows cols"]:
+    """Hands' nearness, and what an object's pixels are told of it, at every second pixel."""
+    _, _, height, width = start.rgb.shape
+    hits, owner = seen.hits, seen.owner
+    v, u = np.divmod(hits.place % (height * width), width)
+    kept = np.flatnonzero((u % 2 == 0) & (v % 2 == 0))
+    image, slot = hits.image[kept], hits.slot[kept]
+    hidden = start.hands.max(axis=1, keepdims=True)
+    upwards = object_transforms(states.object_poses[image, slot])[..., 2, :3]
+    values = [
+        colours_at_positions(hidden, owner[image], seen.at_start[kept]),
+        hits.thickness_m[kept, None] * _PER_M,
+        _NEARNESS_M / hits.depth_m[kept, None],
+        hits.local[kept],
+        boxes_m[image, slot, 3:] * _PER_M,
+        upwards,
+    ]
+    planes = np.zeros((len(owner), COARSE_CHANNELS, height // 2, width // 2), dtype=np.float32)
+    planes[:, :1] = hands_nearness[..., ::2, ::2] * _NEARNESS_M
+    planes[image, 1:, v[kept] // 2, u[kept] // 2] = np.concatenate(values, axis=1)
+    return planes
+
+
+@dataclass(frozen=True)
+class _Stirred:
+    """Bodies that moved, as they were in the start image."""
+
+    start: _Start
+    owner: Int64[np.ndarray, " n"]
+    positions: Float32[np.ndarray, "n h w 2"]
+    moved: Float64[np.ndarray, "n bodies"]
+
+    def warped(self) -> Float32[np.ndarray, "n 1 h w"]:
+        """Shares of motion of what each pixel showed, after the camera's motion."""
+        num_starts, _, height, width = self.start.rgb.shape
+        slots = self.start.hits.slot[:, None] + 1
+        shown = _plane(self.start.hits, slots, (num_starts, height, width))[self.owner, 0]
+        table = np.concatenate([np.zeros((len(self.owner), 1)), self.moved[:, 2:]], axis=1)
+        boxes = table[np.arange(len(self.owner))[:, None, None], shown.astype(np.int64)]
+        hands = (self.start.hands[self.owner] > _COVERED) * self.moved[:, :2, None, None]
+        stirred = np.maximum(hands.max(axis=1), boxes).astype(np.float32)[:, None]
+        sampled = sample_images(
+            torch.from_numpy(stirred), torch.from_numpy(self.positions), interpolation="bilinear"
+        )
+        return np.asarray(sampled.numpy())
+
+
+def _body_change(
+    stirred: _Stirred, cover: np.ndarray, hits: BoxHits, outside: np.ndarray
+) -> Float32[np.ndarray, "n 1 h w"]:
+    """Where something moved: around bodies that did, then and now; and unseen places."""
+    moved = stirred.moved
+    shape = (len(cover), *cover.shape[2:])
+    hands = ((cover > _COVERED) * moved[:, :2, None, None]).max(axis=1, keepdims=True)
+    objects = _plane(hits, moved[hits.image, 2 + hits.slot][:, None], shape)
+    change = np.maximum(np.maximum(hands, objects), np.maximum(stirred.warped(), outside))
+    reach = functional.max_pool2d(
+        torch.from_numpy(change.astype(np.float32)), 2 * _REACH_PX + 1, 1, _REACH_PX
+    )
+    return np.asarray(reach.numpy())
+
+
+def _camera_change(positions: Float32[np.ndarray, "n h w 2"]) -> Float64[np.ndarray, "n 1 1 1"]:
+    """From 0 to 1 by how far the image's corners moved."""
+    _, height, width, _ = positions.shape
+    home = pixel_centres(height, width).reshape(height, width, 2)
+    corners = (positions - home)[:, :: height - 1, :: width - 1]
+    farthest = np.abs(corners).max(axis=(1, 2, 3))
+    return np.asarray((farthest / _CAMERA_MOVED_PX).clip(0, 1)[:, None, None, None])

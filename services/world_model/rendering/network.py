@@ -1,0 +1,91 @@
+"""The renderer's network: a small U-Net at half the image's size that mixes what it is given.
+
+Each pixel becomes a mixture of the warped start image, the objects' texture and the hands'
+colours, plus what the network adds; where nothing changed it is the warped start itself.
+"""
+
+from itertools import pairwise
+
+import torch
+from jaxtyping import Float, Float32
+from torch import Tensor, nn
+from torch.nn import functional
+
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.inputs import (
+    COARSE_CHANNELS,
+    FINE_CHANNELS,
+    DrawingInputs,
+)
+
+# Weights of the three given colours, then what is added to their mixture.
+_OUTPUTS = 6
+_WARPED_LOGIT = 2.0
+
+
+class ResidualBlock(nn.Module):
+    """Two 3×3 convolutions around which the input passes by."""
+
+    def __init__(self, width: int) -> None:
+        super().__init__()
+        self.first = nn.Conv2d(width, width, 3, padding=1)
+        self.second = nn.Conv2d(width, width, 3, padding=1)
+        nn.init.zeros_(self.second.weight)
+
+    def forward(self, x: Float[Tensor, "n width h w"]) -> Float[Tensor, "n width h w"]:
+        """The input and what the block adds to it."""
+        added: Tensor = self.second(functional.relu(self.first(functional.relu(x))))
+        return x + added
+
+
+class RendererNetwork(nn.Module):
+    """Mixes drawn and warped images; fully convolutional and without any normalization."""
+
+    def __init__(self, config: RendererConfig) -> None:
+        super().__init__()
+        self.config = config
+        widths, depths = config.widths, config.depths
+        inputs = 4 * FINE_CHANNELS + COARSE_CHANNELS
+        self.stem = nn.Conv2d(inputs, widths[0], config.stem_px, padding=config.stem_px // 2)
+        self.encoder = nn.ModuleList(
+            nn.Sequential(*[ResidualBlock(width) for _ in range(depth)])
+            for width, depth in zip(widths, depths, strict=True)
+        )
+        steps = list(pairwise(widths))
+        self.down = nn.ModuleList(nn.Conv2d(a, b, 2, stride=2) for a, b in steps)
+        self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in steps)
+        self.decoder = nn.ModuleList(ResidualBlock(a) for a, _ in steps)
+        self.head = nn.Conv2d(widths[0], 4 * _OUTPUTS, 3, padding=1)
+        # At first an image is mostly the warped start, and nothing is added.
+        nn.init.zeros_(self.head.weight)
+        bias = torch.zeros(4 * _OUTPUTS)
+        bias[:4] = _WARPED_LOGIT
+        self.head.bias = nn.Parameter(bias)
+
+    def forward(self, inputs: DrawingInputs) -> Float32[Tensor, "n 3 h w"]:
+        """Images in 0 … 1."""
+        x = torch.cat([functional.pixel_unshuffle(inputs.fine, 2), inputs.coarse], dim=1)
+        dtype = self.stem.weight.dtype
+        drawn = self._unet(x.to(dtype, memory_format=torch.channels_last)).float()
+        drawn = functional.pixel_shuffle(drawn, 2)
+        warped, objects, hands = (inputs.fine[:, 3 * i : 3 * i + 3] for i in range(3))
+        weights = drawn[:, :3].softmax(dim=1)
+        hit, is_hand = inputs.fine[:, 11:12], inputs.fine[:, 9:11].amax(dim=1, keepdim=True)
+        # Colours exist only where something is hit: elsewhere the weights count for nothing.
+        mixed = weights[:, 1:2] * hit * (objects - warped)
+        mixed = mixed + weights[:, 2:] * is_hand * (hands - warped) + drawn[:, 3:].tanh()
+        return warped + inputs.change * mixed
+
+    def _unet(self, x: Tensor) -> Tensor:
+        x = self.stem(x)
+        passed = []
+        for level, blocks in enumerate(self.encoder):
+            x = blocks(x)
+            if level < len(self.down):
+                passed.append(x)
+                x = self.down[level](x)
+        for level in reversed(range(len(self.down))):
+            x = functional.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
+            x = self.decoder[level](x + passed[level])
+        out: Tensor = self.head(functional.relu(x))
+        return out

@@ -1,0 +1,115 @@
+"""The renderer: asked images of a future whose states are known, from one start image."""
+
+import copy
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from jaxtyping import Float32, UInt8
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.inputs import DrawingInputs, Scenes, drawing_inputs
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.precision import has_fast_bfloat16
+from services.world_model.rendering.scene_states import SceneState, SceneStates
+
+
+class Renderer:
+    """Draws head images of states; the same input always gives the same bytes.
+
+    Args:
+        network: trained weights; they are copied.
+        uses_bfloat16: whether convolutions run in bfloat16; by default where the processor has
+            instructions for it.
+    """
+
+    def __init__(self, network: RendererNetwork, *, uses_bfloat16: bool | None = None) -> None:
+        fast = has_fast_bfloat16() if uses_bfloat16 is None else uses_bfloat16
+        dtype = torch.bfloat16 if fast else torch.float32
+        self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
+        self._network.to(dtype)
+
+    @property
+    def config(self) -> RendererConfig:
+        """Shape of the network."""
+        return self._network.config
+
+    def draw(
+        self,
+        start_image: np.ndarray,
+        K_head: np.ndarray,
+        start: SceneState,
+        states: Sequence[SceneState],
+        boxes_m: np.ndarray,
+    ) -> UInt8[np.ndarray, "n h w 3"]:
+        """Images of states that follow a start, or precede it.
+
+        A state in which the camera and everything else is where it was at the start gives exactly
+        the start image.
+
+        Args:
+            start_image: uint8 [h, w, 3], what the head camera saw at the start.
+            K_head: its matrix [3, 3] in pixels; a lens's distortion is not modelled.
+            start: where everything was then.
+            states: at least one; of which images are asked.
+            boxes_m: [k, 6], per object slot centre and half sizes (x y z, x y z) of its bounding
+                box in its own frame.
+
+        Raises:
+            ShapeError: arrays of another shape, no state, or states of other slots than boxes.
+            InvalidInputError: an image whose sides the network does not fit.
+            NonFiniteError: NaN or infinity.
+        """
+        scenes = self._scene(start_image, K_head, start, boxes_m)
+        stacked = SceneStates.stack(states)
+        if stacked.object_present.shape[1] != len(boxes_m):
+            raise ShapeError(
+                f"renderer: states have {stacked.object_present.shape[1]} object slots but there "
+                f"are {len(boxes_m)} boxes; expected as many"
+            )
+        owner = np.zeros(len(states), dtype=np.int64)
+        with torch.inference_mode():
+            images = self._drawn(drawing_inputs(scenes, stacked, owner, self.config))
+            rounded = (images * 255.0).round_().clamp_(0, 255).to(torch.uint8)
+            return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
+
+    def _drawn(self, inputs: DrawingInputs) -> Float32[Tensor, "n 3 h w"]:
+        """Images in 0 … 1; where nothing changed the network has no say, so it is not asked."""
+        asked = inputs.change.flatten(1).amax(dim=1) > 0
+        if bool(asked.all()):
+            return self._network(inputs)
+        images = inputs.fine[:, :3].clone()
+        if bool(asked.any()):
+            some = DrawingInputs(inputs.fine[asked], inputs.coarse[asked], inputs.change[asked])
+            images[asked] = self._network(some)
+        return images
+
+    def _scene(
+        self,
+        start_image: np.ndarray,
+        K_head: np.ndarray,
+        start: SceneState,
+        boxes_m: np.ndarray,
+    ) -> Scenes:
+        if start_image.ndim != 3 or start_image.shape[2] != 3 or start_image.dtype != np.uint8:
+            raise ShapeError(
+                f"renderer: got a start image {start_image.dtype} {start_image.shape}, expected "
+                "uint8 [h, w, 3]"
+            )
+        multiple = self.config.pixel_multiple
+        if any(side % multiple or side == 0 for side in start_image.shape[:2]):
+            raise InvalidInputError(
+                f"renderer: got a start image of {start_image.shape[:2]} px, expected sides that "
+                f"are multiples of {multiple}"
+            )
+        K, boxes = np.asarray(K_head, dtype=np.float64), np.asarray(boxes_m, dtype=np.float64)
+        if K.shape != (3, 3) or boxes.shape != (len(start.object_present), 6):
+            raise ShapeError(
+                f"renderer: got K_head {K.shape} and boxes {boxes.shape}, expected (3, 3) and "
+                f"({len(start.object_present)}, 6) for the start's object slots"
+            )
+        if not (np.isfinite(K).all() and np.isfinite(boxes).all()):
+            raise NonFiniteError("renderer: K_head or boxes hold NaN or infinity")
+        return Scenes(start_image[None], K[None], SceneStates.stack([start]), boxes[None])

@@ -1,0 +1,89 @@
+"""States that a renderer draws: the head camera, both hands and every object at one step."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from dextouch.errors import NonFiniteError, ShapeError
+
+MAX_OBJECTS = 4
+
+
+@dataclass(frozen=True)
+class SceneState:
+    """Where everything is at one step; slots of objects that are absent hold anything finite."""
+
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    Ts_world_wrist: Float64[np.ndarray, "2 4 4"]
+    joints_rad: Float64[np.ndarray, "2 20"]
+    object_poses: Float64[np.ndarray, "k 7"]
+    object_present: Bool[np.ndarray, " k"]
+
+
+@dataclass(frozen=True)
+class SceneStates:
+    """Many states as arrays; poses are x y z (m), then the quaternion w x y z, in the world."""
+
+    Ts_world_camera: Float64[np.ndarray, "n 4 4"]
+    Ts_world_wrist: Float64[np.ndarray, "n 2 4 4"]
+    joints_rad: Float64[np.ndarray, "n 2 20"]
+    object_poses: Float64[np.ndarray, "n k 7"]
+    object_present: Bool[np.ndarray, "n k"]
+
+    @classmethod
+    def stack(cls, states: Sequence[SceneState]) -> "SceneStates":
+        """One or more states of one number of object slots.
+
+        Raises:
+            ShapeError: no state, arrays of another shape, or more than four slots.
+            NonFiniteError: NaN or infinity.
+        """
+        if not states:
+            raise ShapeError("scene states: got none, expected at least one to draw")
+        shapes = {(np.shape(s.object_poses), np.shape(s.object_present)) for s in states}
+        num_slots = len(states[0].object_present)
+        if shapes != {((num_slots, 7), (num_slots,))} or num_slots > MAX_OBJECTS:
+            raise ShapeError(
+                f"scene states: got object poses and presences of shapes {sorted(shapes)}, "
+                f"expected [K, 7] and [K] with one K ≤ {MAX_OBJECTS} in all of them"
+            )
+        made = cls(
+            np.stack([np.asarray(s.T_world_camera, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.Ts_world_wrist, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.joints_rad, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.object_poses, dtype=np.float64) for s in states]),
+            np.stack([np.asarray(s.object_present, dtype=np.bool_) for s in states]),
+        )
+        made._check()
+        return made
+
+    def __len__(self) -> int:
+        return len(self.Ts_world_camera)
+
+    def take(self, rows: Int64[np.ndarray, " m"]) -> "SceneStates":
+        """Some of the states, in the order of `rows`."""
+        return SceneStates(
+            self.Ts_world_camera[rows],
+            self.Ts_world_wrist[rows],
+            self.joints_rad[rows],
+            self.object_poses[rows],
+            self.object_present[rows],
+        )
+
+    def _check(self) -> None:
+        expected = {
+            "T_world_camera": (self.Ts_world_camera, (4, 4)),
+            "Ts_world_wrist": (self.Ts_world_wrist, (2, 4, 4)),
+            "joints_rad": (self.joints_rad, (2, 20)),
+            "object_poses": (self.object_poses, self.object_poses.shape[1:]),
+        }
+        for name, (array, shape) in expected.items():
+            if array.shape[1:] != shape:
+                raise ShapeError(f"scene state: {name} is {array.shape[1:]}, expected {shape}")
+            bad = np.flatnonzero(~np.isfinite(array).all(axis=tuple(range(1, array.ndim))))
+            if len(bad):
+                raise NonFiniteError(
+                    f"scene state {bad[0]}: {name} holds NaN or infinity; expected finite numbers"
+                )

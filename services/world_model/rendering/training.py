@@ -1,0 +1,228 @@
+"""Training of the renderer on true states, some of them shaken as imagined ones will be."""
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from services.world_model.rendering.box_raster import object_transforms
+from services.world_model.rendering.clips import SceneClip, gather
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.inputs import DrawingInputs, drawing_inputs
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.precision import has_fast_bfloat16
+from services.world_model.rendering.scene_states import SceneStates
+
+LOG_EVERY_STEPS = 50
+MIN_LEARNING_RATE_SHARE = 0.01
+
+
+class RendererTraining(BaseModel):
+    """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    cpu_budget_s: float = Field(default=540.0, gt=0)
+    max_steps: int | None = Field(default=None, ge=1)
+    batch: int = Field(default=24, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    warmup_steps: int = Field(default=50, ge=1)
+    weight_decay: float = Field(default=0.01, ge=0)
+    ema_decay: float = Field(default=0.995, ge=0, lt=1)
+    max_gradient_norm: float = Field(default=1.0, gt=0)
+    gradient_weight: float = Field(default=0.5, ge=0, description="of neighbours' differences")
+    late_start_fraction: float = Field(
+        default=0.5, ge=0, le=1, description="of pairs that start at any image, not the first"
+    )
+    shaken_fraction: float = Field(default=0.5, ge=0, le=1, description="of pairs with wrong poses")
+    shake_m: float = Field(default=0.003, ge=0, description="deviation of a wrong place, per axis")
+    shake_rad: float = Field(default=0.05, ge=0, description="deviation of a wrong turn, per axis")
+    uses_bfloat16: bool = Field(
+        default=True, description="where the processor multiplies it faster than float32"
+    )
+
+
+@dataclass(frozen=True)
+class RendererProgress:
+    """Where a run stands."""
+
+    step: int
+    share: float
+    loss: float
+
+
+@dataclass(frozen=True)
+class TrainedRenderer:
+    """The averaged network and how it got there."""
+
+    network: RendererNetwork
+    steps: int
+    cpu_s: float
+    log: list[RendererProgress] = field(default_factory=list)
+
+
+def train_renderer(
+    clips: Sequence[SceneClip],
+    config: RendererConfig,
+    settings: RendererTraining,
+    *,
+    rng: np.random.Generator,
+    on_progress: Callable[[RendererProgress], None] | None = None,
+) -> TrainedRenderer:
+    """Train on pairs of images of one clip: a start and a later one.
+
+    Args:
+        clips: at least one, all of images of one size.
+        config: shape of the network.
+        settings: how to train.
+        rng: decides initial weights, pairs and what is shaken.
+        on_progress: is told every few steps.
+
+    Raises:
+        InvalidInputError: no clips, or images of sides that the network does not fit.
+    """
+    run = RendererRun(clips, config, settings, rng=rng)
+    log: list[RendererProgress] = []
+    begin_s = time.process_time()
+    cpu_s = 0.0
+    while (share := run.share(cpu_s)) < 1.0:
+        loss = run.learn(share)
+        cpu_s = time.process_time() - begin_s
+        if run.step % LOG_EVERY_STEPS == 0:
+            log.append(RendererProgress(run.step, min(run.share(cpu_s), 1.0), loss))
+            if on_progress is not None:
+                on_progress(log[-1])
+    return TrainedRenderer(run.averaged, run.step, cpu_s, log)
+
+
+class RendererRun:
+    """One run: network, its running average, optimizer and what is random."""
+
+    def __init__(
+        self,
+        clips: Sequence[SceneClip],
+        config: RendererConfig,
+        settings: RendererTraining,
+        *,
+        rng: np.random.Generator,
+    ) -> None:
+        check_clips(clips, config)
+        self.step = 0
+        self._clips = clips
+        self._settings = settings
+        self._rng = rng
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(int(rng.integers(2**31)))
+            self.network = RendererNetwork(config)
+        self.averaged = RendererNetwork(config).eval().requires_grad_(requires_grad=False)
+        self.averaged.load_state_dict(self.network.state_dict())
+        self._bfloat16 = settings.uses_bfloat16 and has_fast_bfloat16()
+        self._optimizer = torch.optim.AdamW(
+            self.network.parameters(),
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+            betas=(0.9, 0.95),
+            fused=True,
+        )
+
+    def share(self, cpu_s: float) -> float:
+        """Share of the run that is done, by the tighter of its two limits."""
+        by_time = cpu_s / self._settings.cpu_budget_s
+        limit = self._settings.max_steps
+        return by_time if limit is None else max(by_time, self.step / limit)
+
+    def learn(self, share: float) -> float:
+        """One step of the optimizer on a fresh batch; its loss."""
+        inputs, true = self.batch()
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self._bfloat16):
+            drawn = self.network(inputs)
+        loss = drawing_loss(drawn, true, gradient_weight=self._settings.gradient_weight)
+        for group in self._optimizer.param_groups:
+            group["lr"] = self._learning_rate(share)
+        self._optimizer.zero_grad()
+        torch.autograd.backward(loss)
+        torch.nn.utils.clip_grad_norm_(
+            self.network.parameters(), self._settings.max_gradient_norm, error_if_nonfinite=True
+        )
+        self._optimizer.step()
+        self._average()
+        self.step += 1
+        return loss.item()
+
+    def batch(self) -> tuple[DrawingInputs, Float32[Tensor, "n 3 h w"]]:
+        """Inputs of random pairs and the true later images in 0 … 1."""
+        starts, laters = self._pairs()
+        scenes, _ = gather(self._clips, starts)
+        later, images = gather(self._clips, laters)
+        scenes = replace(scenes, states=self._shaken(scenes.states))
+        states = self._shaken(later.states)
+        owner = np.arange(len(starts))
+        inputs = drawing_inputs(scenes, states, owner, self.network.config)
+        true = torch.from_numpy(np.ascontiguousarray(np.moveaxis(images, -1, 1))).float() / 255.0
+        return inputs, true
+
+    def _pairs(self) -> tuple[np.ndarray, np.ndarray]:
+        starts, laters = [], []
+        for _ in range(self._settings.batch):
+            clip = int(self._rng.integers(len(self._clips)))
+            length = len(self._clips[clip])
+            is_late = self._rng.random() < self._settings.late_start_fraction
+            start = int(self._rng.integers(length - 1)) if is_late else 0
+            starts.append((clip, start))
+            laters.append((clip, int(self._rng.integers(start + 1, length))))
+        return np.array(starts), np.array(laters)
+
+    def _shaken(self, states: SceneStates) -> SceneStates:
+        """Objects a little off, in some of the states; always as many random numbers."""
+        settings, shape = self._settings, states.object_present.shape
+        is_shaken = self._rng.random(len(states)) < settings.shaken_fraction
+        shift = self._rng.normal(size=(*shape, 3)) * settings.shake_m
+        turn = self._rng.normal(size=(*shape, 3)) * settings.shake_rad
+        poses = states.object_poses.copy()
+        poses[..., :3] += shift * is_shaken[:, None, None]
+        R = rotation_from_vector(turn * is_shaken[:, None, None])
+        Ts = object_transforms(states.object_poses)
+        poses[..., 3:] = quaternion_from_rotation(R @ Ts[..., :3, :3])
+        return replace(states, object_poses=poses)
+
+    def _learning_rate(self, share: float) -> float:
+        warmup = min(1.0, (self.step + 1) / self._settings.warmup_steps)
+        cosine = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
+        return self._settings.learning_rate * warmup * max(cosine, MIN_LEARNING_RATE_SHARE)
+
+    @torch.no_grad()
+    def _average(self) -> None:
+        # Early weights are forgotten faster, so that short runs are not held back by the start.
+        decay = min(self._settings.ema_decay, (1 + self.step) / (10 + self.step))
+        pairs = zip(self.averaged.parameters(), self.network.parameters(), strict=True)
+        for mean, weight in pairs:
+            mean.lerp_(weight, 1.0 - decay)
+
+
+def drawing_loss(
+    drawn: Float32[Tensor, "n 3 h w"], true: Float32[Tensor, "n 3 h w"], *, gradient_weight: float
+) -> Float32[Tensor, ""]:
+    """Mean absolute error of colours, and of differences of neighbours, which keeps edges sharp."""
+    error = drawn - true
+    across = (error[..., 1:] - error[..., :-1]).abs().mean()
+    down = (error[..., 1:, :] - error[..., :-1, :]).abs().mean()
+    return error.abs().mean() + gradient_weight * (across + down)
+
+
+def check_clips(clips: Sequence[SceneClip], config: RendererConfig) -> None:
+    """Refuse clips that the network cannot learn from."""
+    sizes = {clip.images.shape[1:3] for clip in clips}
+    multiple = config.pixel_multiple
+    if len(sizes) != 1 or any(side % multiple for size in sizes for side in size):
+        raise InvalidInputError(
+            f"renderer training: got {len(clips)} clips of image sizes {sorted(sizes)}, expected "
+            f"at least one clip and one size whose sides are multiples of {multiple}"
+        )

@@ -1,0 +1,30 @@
+"""Constants and motions of a scene by hand: a camera above the table that looks straight down."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dextouch.geometry.cameras import pinhole_matrix
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import transform
+from services.world_model.rendering.scene_states import SceneState
+
+# Looks straight down: x of the image is x of the world, y of the image is -y.
+DOWN = np.diag([1.0, -1.0, -1.0])
+K = pinhole_matrix(width_px=64, height_px=64, fovy_rad=np.deg2rad(46.0))
+BOXES_M = np.array([[0.0, 0.0, 0.01, 0.03, 0.02, 0.01], [0.0, 0.0, 0.0, 0.02, 0.02, 0.02]])
+
+
+def shifted(state: SceneState, *, camera_m=(0.0, 0.0, 0.0), objects_m=(0.0, 0.0, 0.0)):
+    """The same scene after the camera and the objects moved in the world."""
+    T = state.T_world_camera.copy()
+    T[:3, 3] += camera_m
+    poses = state.object_poses.copy()
+    poses[:, :3] += objects_m
+    return replace(state, T_world_camera=T, object_poses=poses)
+
+
+def turned(state: SceneState, vector_rad) -> SceneState:
+    """The same scene after the camera turned in its own frame."""
+    R = rotation_from_vector(np.asarray(vector_rad, dtype=float))
+    return replace(state, T_world_camera=state.T_world_camera @ transform(R, np.zeros(3)))

@@ -1,0 +1,147 @@
+"""Renderers draw what moved, leave the rest alone, and do not care what else is drawn."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import transform
+from services.world_model.rendering.camera_motion import CameraMotion, sample_images
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.renderer import Renderer
+from services.world_model.rendering.scene_states import SceneState, SceneStates
+from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, DOWN, K, shifted, turned
+
+
+def network(config: RendererConfig) -> RendererNetwork:
+    """Weights that draw something everywhere."""
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        made = RendererNetwork(config)
+        for weight in made.parameters():
+            torch.nn.init.normal_(weight, std=0.08)
+    return made
+
+
+@pytest.fixture
+def renderer(small) -> Renderer:
+    return Renderer(network(small))
+
+
+def test_nothing_that_moves_gives_the_start_image(renderer, image, still):
+    drawn = renderer.draw(image, K, still, [still, still], BOXES_M)
+    assert (drawn == image).all()
+
+
+def test_skipping_the_network_changes_no_bit(small, image, still):
+    states = [still, shifted(still, objects_m=(0.03, 0.0, 0.0)), still]
+    renderer = Renderer(network(small))
+    skipped = renderer.draw(image, K, still, states, BOXES_M)
+    renderer._drawn = renderer._network
+    np.testing.assert_array_equal(renderer.draw(image, K, still, states, BOXES_M), skipped)
+
+
+def test_far_from_what_moved_the_image_is_the_start(renderer, image, still):
+    poses = still.object_poses.copy()
+    poses[0, 0] += 0.03
+    drawn = renderer.draw(image, K, still, [replace(still, object_poses=poses)], BOXES_M)[0]
+    changed = np.argwhere((drawn != image).any(axis=-1))
+    # The box lies at x 2 … 11 cm and y 6 … 10 cm, 58 cm away, before or after; 4 px around it.
+    focal = K[0, 0] / 0.58
+    assert len(changed) > 100
+    assert (changed[:, 1] >= 32 + 0.02 * focal - 6).all()
+    assert (changed[:, 1] <= 32 + 0.11 * focal + 6).all()
+    assert (changed[:, 0] >= 32 - 0.10 * focal - 6).all()
+    assert (changed[:, 0] <= 32 - 0.06 * focal + 6).all()
+
+
+def test_without_redrawing_the_table_only_bodies_change_under_a_moving_camera(image, still):
+    config = RendererConfig(widths=(8, 16), depths=(1, 1), redraws_table=False)
+    bare = replace(still, object_present=np.array([False, False]))
+    hidden = transform(DOWN, np.array([0.0, 0.0, 5.0]))
+    bare = replace(bare, Ts_world_wrist=np.stack([hidden, hidden]))
+    moved = shifted(bare, camera_m=(0.004, 0.0, 0.0))
+    drawn = Renderer(network(config)).draw(image, K, bare, [moved], BOXES_M)[0]
+    positions = CameraMotion.between(
+        K[None], bare.T_world_camera[None], moved.T_world_camera[None]
+    ).image_positions((64, 64))
+    planes = torch.from_numpy(image).permute(2, 0, 1)[None].float() / 255.0
+    warped = sample_images(planes, torch.from_numpy(positions), interpolation="bicubic")
+    expected = (warped[0].permute(1, 2, 0).clamp(0, 1) * 255).round().numpy()
+    # The right edge shows what the start image lacks, and is the network's.
+    np.testing.assert_array_equal(drawn[:, :55], expected[:, :55].astype(np.uint8))
+
+
+@pytest.mark.parametrize("uses_bfloat16", [False, True])
+def test_alone_or_in_company_an_image_is_the_same(small, image, still, uses_bfloat16):
+    rng = np.random.default_rng(0)
+    states = [
+        turned(shifted(still, objects_m=rng.normal(size=3) * 0.02), rng.normal(size=3) * 0.03)
+        for _ in range(9)
+    ]
+    renderer = Renderer(network(small), uses_bfloat16=uses_bfloat16)
+    together = renderer.draw(image, K, still, states, BOXES_M).astype(int)
+    alone = [renderer.draw(image, K, still, [state], BOXES_M)[0] for state in states]
+    assert np.abs(together - np.stack(alone)).max() <= 1
+    again = renderer.draw(image, K, still, states, BOXES_M)
+    np.testing.assert_array_equal(again, together)
+
+
+def test_an_empty_slot_changes_nothing(renderer, image, still):
+    moved = shifted(still, objects_m=(0.03, 0.01, 0.0))
+
+    def with_slot(state: SceneState) -> SceneState:
+        poses = np.concatenate([state.object_poses, [[9.0, 9, 9, 0, 0, 0, 0]]])
+        return replace(state, object_poses=poses, object_present=np.array([True, True, False]))
+
+    boxes = np.concatenate([BOXES_M, np.zeros((1, 6))])
+    np.testing.assert_array_equal(
+        renderer.draw(image, K, with_slot(still), [with_slot(moved)], boxes),
+        renderer.draw(image, K, still, [moved], BOXES_M),
+    )
+
+
+def test_a_scene_without_slots_is_drawn(renderer, image, still):
+    bare = replace(still, object_poses=np.zeros((0, 7)), object_present=np.zeros(0, dtype=bool))
+    drawn = renderer.draw(image, K, bare, [turned(bare, (0, 0, 0.1))], np.zeros((0, 6)))
+    assert drawn.shape == (1, 64, 64, 3)
+
+
+@pytest.mark.parametrize("place", [[0, 0, 0.0], [0, 0, -1.0], [1e5, -1e5, 1e5], [0.05, 0.08, 0.0]])
+@pytest.mark.parametrize("flip", [0.0, np.pi / 2, np.pi])
+def test_wherever_the_camera_is_images_are_drawn(renderer, image, still, place, flip):
+    R = rotation_from_vector(np.array([flip, 0.0, 0.0])) @ DOWN
+    lost = replace(still, T_world_camera=transform(R, np.array(place, dtype=float)))
+    with np.errstate(all="raise", under="ignore"):
+        renderer.draw(image, K, still, [lost, still], BOXES_M)
+        renderer.draw(image, K, lost, [still, lost], BOXES_M)
+    inputs = np.isfinite(renderer.draw(image, K, lost, [still], BOXES_M * 0.0))
+    assert inputs.all()
+
+
+def test_what_cannot_be_drawn_is_refused(renderer, image, still):
+    with pytest.raises(ShapeError, match="got none"):
+        renderer.draw(image, K, still, [], BOXES_M)
+    with pytest.raises(ShapeError, match="boxes"):
+        renderer.draw(image, K, still, [still], BOXES_M[:1])
+    with pytest.raises(ShapeError, match="uint8"):
+        renderer.draw(image[..., :2], K, still, [still], BOXES_M)
+    with pytest.raises(InvalidInputError, match="multiples of 4"):
+        renderer.draw(image[:62], K, still, [still], BOXES_M)
+    lost = replace(still, joints_rad=np.full((2, 20), np.nan))
+    with pytest.raises(NonFiniteError, match="joints_rad"):
+        renderer.draw(image, K, still, [lost], BOXES_M)
+    with pytest.raises(NonFiniteError, match="boxes"):
+        renderer.draw(image, K, still, [still], np.full((2, 6), np.nan))
+    fewer = replace(still, object_poses=still.object_poses[:1], object_present=np.array([True]))
+    with pytest.raises(ShapeError, match="slots"):
+        renderer.draw(image, K, still, [fewer], BOXES_M)
+
+
+def test_states_are_taken_by_row(still):
+    states = SceneStates.stack([still, shifted(still, objects_m=(1.0, 0, 0))])
+    assert states.take(np.array([1, 0])).object_poses[0, 0, 0] == states.object_poses[1, 0, 0]
