@@ -73,13 +73,14 @@ class TwinWorld:
         self._stages: dict[str, Stage] = {}
         self._description = self._describe()
 
-    def _stage(self, task: str) -> Stage:
+    def stage(self, task: str) -> Stage:
+        """The task set up with robot hands; one for all rollouts, where the last call left it."""
         if task not in self._stages:
             self._stages[get_task(task).name] = Stage(task, "robot", self._settings)
         return self._stages[task]
 
     def _describe(self) -> WorldDescription:
-        scenes = [self._stage(task).simulation.scene.xml for task in TASK_NAMES]
+        scenes = [self.stage(task).simulation.scene.xml for task in TASK_NAMES]
         facts = [version("mujoco-core"), self._settings.model_dump(mode="json"), scenes]
         return WorldDescription(
             name="twin",
@@ -106,7 +107,7 @@ class TwinWorld:
             raise InvalidInputError(
                 "world twin: got a start with an observation; it begins from task and seed only"
             )
-        stage = self._stage(start.task)
+        stage = self.stage(start.task)
         anchor = stage.start(stage.plan(start.seed))
         log = _StepLog(stage, self._settings.cameras)
         log.step()
@@ -128,7 +129,7 @@ class TwinWorld:
         del seed
         checked = check_actions(actions, where="world twin: actions")
         commands = poses_from_actions(checked, state.anchor)
-        stage = self._stage(state.task)
+        stage = self.stage(state.task)
         stage.simulation.set_state(state.physics, step_index=state.step * STEPS_PER_GRID)
         log = _StepLog(stage, tuple(filter(selector.wants, self._settings.cameras)))
         for row in range(len(checked)):
@@ -175,7 +176,7 @@ class TwinWorld:
         if not (isinstance(task, str) and isinstance(seed, int) and isinstance(step, int)):
             raise InvalidInputError("world twin: the snapshot's task, seed or step is damaged")
         physics, anchor = arrays["physics"], arrays["anchor"]
-        size = self._stage(task).simulation.state_size
+        size = self.stage(task).simulation.state_size
         if physics.shape != (size,) or anchor.shape != (3, 4, 4) or step < 0:
             raise InvalidInputError(
                 f"world twin: got a snapshot of shapes {physics.shape} and {anchor.shape} at step "

@@ -72,6 +72,18 @@ STAGES = {
         "`dextouch train world-model --streaming` alone, and both together. Ends with how many "
         "times faster windows are read than learned from.",
     ),
+    "evaluator": StageEntry(
+        "services.cli.bench.evaluator.stage",
+        "compare success that a world model imagines with that in the twin",
+        "Rolls out a dense ladder of scripts, policies that cannot succeed (holding still, "
+        "retreating, another scene's actions) and cloned policies in closed loop, in the twin and "
+        "in the world model from the same first observations, on starts that nothing was trained "
+        "on. The judge tells imagined success from the imagined ending alone. Reports the judge on "
+        "true endings, imagined against real success for each rollout and for the policies, "
+        "calibration, chained touch beside a copy and chained images beside the warped start, with "
+        "intervals over the starts. Everything is kept in --keep when it is computed, so a run "
+        "that was broken off goes on where it stood.",
+    ),
     "clocks": StageEntry(
         "services.cli.bench.clocks.stage",
         "date the samples of devices: ours, arrival stamps, regressions",

@@ -1,0 +1,1 @@
+"""Stage `evaluator`: whether success that a world model imagines can be believed."""

@@ -1,0 +1,131 @@
+"""How near an imagined rollout is to the true one: contact of taxels and images, chunk by chunk."""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Bool, Float64, UInt8
+
+from dextouch.geometry.transforms import apply, invert, transform_from_pose
+from dextouch.hands.actions import AnchorPoses, poses_from_actions
+from dextouch.metrics.image import PEAK, decibels
+from dextouch.tactile.contact import in_contact
+from services.cli.bench.evaluator.plan import CHUNK_STEPS
+from services.cli.bench.evaluator.playing import ImaginedRollout, TrueRollout
+
+# Pixels about an object's box that belong to its region too.
+_MARGIN_PX: Final = 1
+Row = dict[str, list[list[float]]]
+
+
+def chunk_figures(
+    real: TrueRollout,
+    imagined: ImaginedRollout,
+    anchor: AnchorPoses,
+    K_head: np.ndarray,
+    first_image: np.ndarray,
+    boxes_m: np.ndarray,
+) -> Row:
+    """Per chunk: contact counts of the imagined touch and of the copied one, and PSNR at its end.
+
+    Counts are taxels in contact [in both, imagined, true]. The copy is the true touch at the
+    chunk's start, so it looks at the truth where the world has to remember. PSNR is
+    [imagined, warped] of the whole image and of the region where objects are or were; warped is
+    the rollout's first image, moved by the known motion of the camera over the table.
+    """
+    cameras = poses_from_actions(real.actions, anchor).Ts_world_camera_head
+    found: Row = {"contact": [], "contact_of_copy": [], "psnr": [], "psnr_of_objects": []}
+    for index, image in enumerate(real.images_of_chunks):
+        steps = slice(1 + index * CHUNK_STEPS, 1 + (index + 1) * CHUNK_STEPS)
+        truth = real.tactile_kpa[steps]
+        copied = np.broadcast_to(real.tactile_kpa[steps.start - 1], truth.shape)
+        found["contact"].append(contact_counts(imagined.tactile_kpa[steps], truth))
+        found["contact_of_copy"].append(contact_counts(copied, truth))
+        T_world_now = cameras[steps.stop - 2]
+        warped = warp_over_table(first_image, K_head, anchor.T_world_camera_head, T_world_now)
+        region = object_region(
+            np.concatenate([real.object_poses[0], real.object_poses[index + 1]]),
+            np.concatenate([boxes_m, boxes_m]),
+            K_head,
+            T_world_now,
+            image.shape[:2],
+        )
+        pair = (imagined.images_of_chunks[index], warped)
+        everywhere = np.ones_like(region)
+        found["psnr"].append([psnr_within(one, image, everywhere) for one in pair])
+        if region.any():
+            found["psnr_of_objects"].append([psnr_within(one, image, region) for one in pair])
+    return found
+
+
+def contact_counts(predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> list[float]:
+    """Taxels in contact: in both, predicted, true. F1 is 2·both / (predicted + true)."""
+    told, came = in_contact(predicted_kpa), in_contact(true_kpa)
+    return [float((told & came).sum()), float(told.sum()), float(came.sum())]
+
+
+def psnr_within(predicted: np.ndarray, true: np.ndarray, region: np.ndarray) -> float:
+    """PSNR in dB over the pixels of a region."""
+    error = predicted[region].astype(np.float64) - true[region].astype(np.float64)
+    return float(decibels(np.mean(error**2), peak=PEAK))
+
+
+def object_region(
+    object_poses: np.ndarray,
+    boxes_m: np.ndarray,
+    K: np.ndarray,
+    T_world_camera: np.ndarray,
+    shape_px: tuple[int, int],
+) -> Bool[np.ndarray, "h w"]:
+    """Pixels within the rectangle about each object's box, [objects, 7] and [objects, 6]."""
+    region = np.zeros(shape_px, dtype=bool)
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    for pose, box in zip(object_poses, boxes_m, strict=True):
+        corners = apply(transform_from_pose(pose), box[:3] + signs * box[3:])
+        seen = apply(invert(T_world_camera), corners)
+        if (seen[:, 2] <= 0).any():
+            continue
+        pixels = (seen / seen[:, 2:]) @ K.T
+        low = np.floor(pixels[:, :2].min(axis=0) - _MARGIN_PX).astype(int).clip(0)
+        high = np.ceil(pixels[:, :2].max(axis=0) + _MARGIN_PX).astype(int).clip(0)
+        region[low[1] : high[1], low[0] : high[0]] = True
+    return region
+
+
+def warp_over_table(
+    image: UInt8[np.ndarray, "h w 3"],
+    K: np.ndarray,
+    T_world_then: np.ndarray,
+    T_world_now: np.ndarray,
+) -> UInt8[np.ndarray, "h w 3"]:
+    """What a camera sees now if all that it saw then lies on the table, the plane z = 0.
+
+    Bilinear; beyond the image its edge is repeated. Rays that miss the table are taken as
+    infinitely far.
+    """
+    height, width = image.shape[:2]
+    u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([u, v, np.ones_like(u)], axis=-1).reshape(-1, 3)
+    rays = pixels @ np.linalg.inv(K).T @ T_world_now[:3, :3].T
+    down = rays[:, 2] < -1e-9
+    far = np.where(down, -T_world_now[2, 3] / np.where(down, rays[:, 2], 1.0), 1e6)
+    points = T_world_now[:3, 3] + far[:, None] * rays
+    then = apply(invert(T_world_then), points)
+    depth = np.where(np.abs(then[:, 2:]) > 1e-9, then[:, 2:], 1e-9)
+    at = (then / depth) @ K.T - 0.5
+    return _bilinear(image, at[:, :2]).reshape(height, width, 3)
+
+
+def _bilinear(image: np.ndarray, at_px: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
+    height, width = image.shape[:2]
+    x = np.clip(at_px[:, 0], 0, width - 1)
+    y = np.clip(at_px[:, 1], 0, height - 1)
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    fx, fy = (x - left)[:, None], (y - top)[:, None]
+    values: Float64[np.ndarray, "n 3"] = (
+        image[top, left] * (1 - fx) * (1 - fy)
+        + image[top, right] * fx * (1 - fy)
+        + image[bottom, left] * (1 - fx) * fy
+        + image[bottom, right] * fx * fy
+    )
+    return np.round(values).astype(np.uint8)

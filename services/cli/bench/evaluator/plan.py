@@ -1,0 +1,84 @@
+"""What the stage `evaluator` rolls out: tasks, starts, and policies by name."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from dextouch.errors import InvalidInputError
+
+CAMERA: Final = "camera_head"
+# 5 1/3 s at 15 steps a second, in chunks as policies send them.
+NUM_STEPS: Final = 80
+CHUNK_STEPS: Final = 16
+FIRST_SEED: Final = 30_000
+# Where the scripts of "another scene" come from: the same task, objects elsewhere.
+OTHER_SCENE: Final = 5_000
+LEVELS_MM: Final = (0.0, 2.5, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0)
+HOLD, RETREAT, ELSEWHERE = "hold", "retreat", "another scene's actions"
+# What cannot succeed, and what a judge that looks at motion would call a success.
+IDLE: Final = (HOLD, RETREAT, ELSEWHERE)
+
+
+@dataclass(frozen=True)
+class ClonedPolicy:
+    """A checkpoint of a cloned policy, known by its name and its content."""
+
+    name: str
+    path: Path
+
+    @classmethod
+    def parse(cls, text: str) -> "ClonedPolicy":
+        """A policy from NAME=PATH.
+
+        Raises:
+            InvalidInputError: other text, or no such file.
+        """
+        name, _, path = text.partition("=")
+        if not name or not Path(path).is_file():
+            raise InvalidInputError(f"--cloned: got {text!r}, expected NAME=PATH of a checkpoint")
+        return cls(name, Path(path))
+
+    @property
+    def key(self) -> str:
+        """Its name in results; another checkpoint of the same name has another one."""
+        return f"{self.name}@{hashlib.sha256(self.path.read_bytes()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Everything that one run of the stage is about.
+
+    `world` is a checkpoint of the world model (None: the one that comes with the package), `probe`
+    one of the judge; `keep` is the folder of results and arrays.
+    """
+
+    keep: Path
+    world: Path | None
+    probe: Path
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    levels_mm: tuple[float, ...] = LEVELS_MM
+    cloned: tuple[ClonedPolicy, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.tasks or not self.seeds or not self.levels_mm:
+            raise InvalidInputError(
+                f"evaluator: got {len(self.tasks)} tasks, {len(self.seeds)} starts and "
+                f"{len(self.levels_mm)} levels, expected at least one of each"
+            )
+
+    @property
+    def scripts(self) -> tuple[str, ...]:
+        """Names of the scripted policies, from exact to far off."""
+        return tuple(script_name(level_mm) for level_mm in self.levels_mm)
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names of all policies."""
+        return (*self.scripts, *IDLE, *(cloned.key for cloned in self.cloned))
+
+
+def script_name(level_mm: float) -> str:
+    """The name of the script that reads places wrongly by so much."""
+    return f"script {level_mm:g} mm"

@@ -1,0 +1,201 @@
+"""One policy in the twin, and in an imagined world from the same first observation."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.geometry.transforms import transform
+from dextouch.hands.actions import (
+    AnchorPoses,
+    HandTrajectory,
+    actions_from_poses,
+    poses_from_actions,
+)
+from dextouch.worlds.world import (
+    Observation,
+    ReturnSelector,
+    RolloutStart,
+    StartedRollout,
+    State,
+    World,
+)
+from services.cli.bench.evaluator.plan import (
+    CAMERA,
+    CHUNK_STEPS,
+    ELSEWHERE,
+    HOLD,
+    NUM_STEPS,
+    OTHER_SCENE,
+    RETREAT,
+    script_name,
+)
+from services.evaluation.endings import NUM_SEEN_STEPS
+from services.evaluation.policies.asking import action_chunk, ask
+from services.twin.stage import Stage
+from services.twin.world import TwinState, TwinWorld
+
+_NO_IMAGES = ReturnSelector(cameras=())
+_LAST_IMAGE = ReturnSelector(steps="last")
+_RETREAT_M = np.array([0.0, -0.10, 0.12])
+_RETREAT_STEPS = 24
+Actions = Float64[np.ndarray, "80 67"]
+
+
+@dataclass(frozen=True)
+class TrueRollout:
+    """What the twin made of a policy.
+
+    Chunk ends are steps 16, 32 … 80. `actions` are what was sent, relative to step 0;
+    `object_poses` T_world_object at step 0 and the chunk ends.
+    """
+
+    success: bool
+    actions: Actions
+    tactile_kpa: Float32[np.ndarray, "81 2 320"]
+    images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
+    last_images: UInt8[np.ndarray, "3 h w 3"]
+    object_poses: Float64[np.ndarray, "ends objects 7"]
+
+
+@dataclass(frozen=True)
+class ImaginedRollout:
+    """What a world imagined of the same policy; `doubted` is why it does not trust itself."""
+
+    tactile_kpa: Float32[np.ndarray, "81 2 320"]
+    images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
+    last_images: UInt8[np.ndarray, "3 h w 3"]
+    object_poses: Float32[np.ndarray, "3 objects 7"] | None
+    doubted: str | None
+
+
+def scripted_actions(stage: Stage, seed: int, policy: str, levels_mm: tuple[float, ...]) -> Actions:
+    """Commands of a policy that does not look, steps 1 … 80, relative to the start's poses."""
+    noise_m = {script_name(level): level / 1000 for level in levels_mm}.get(policy, 0.0)
+    plan = stage.plan(seed + OTHER_SCENE * (policy == ELSEWHERE), noise_m=noise_m)
+    anchor = stage.start(plan)
+    actions = actions_from_poses(plan.commands, anchor)
+    if policy == HOLD:
+        actions[1:] = actions[0]
+    if policy == RETREAT:
+        actions = _retreat(actions[0], anchor)
+    return actions[1:]
+
+
+def _retreat(row: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "81 67"]:
+    """Both hands back and up, and still from then on."""
+    still = poses_from_actions(np.repeat(row[None], NUM_STEPS + 1, axis=0), anchor)
+    way = np.minimum(np.arange(NUM_STEPS + 1) / _RETREAT_STEPS, 1.0)
+    offset = transform(np.eye(3), (way * way * (3 - 2 * way))[:, None] * _RETREAT_M)
+    moved = HandTrajectory(
+        offset @ still.Ts_world_wrist_left,
+        offset @ still.Ts_world_wrist_right,
+        still.joints_left_rad,
+        still.joints_right_rad,
+        still.Ts_world_camera_head,
+    )
+    return actions_from_poses(moved, anchor)
+
+
+def play_in_twin(
+    twin: TwinWorld,
+    started: StartedRollout[TwinState],
+    policy: Policy | Actions,
+    start: PolicyStart,
+) -> TrueRollout:
+    """Let a policy act in the twin from its start."""
+    stage, state = twin.stage(start.task), started.state
+    touch, sent = [started.observation.tactile_kpa], []
+    poses, images = [stage_poses(twin, state)], []
+    seen = started.observation
+    looks = not isinstance(policy, np.ndarray)
+    if looks:
+        ask(policy.reset, start, where="policy: reset")  # type: ignore[union-attr]
+    for first in range(0, NUM_STEPS, CHUNK_STEPS):
+        chunk = _chunk(policy, seen, first, twin)
+        is_last = first + CHUNK_STEPS == NUM_STEPS
+        head = CHUNK_STEPS - 4 if is_last else CHUNK_STEPS
+        # Images are slow, so only those that somebody looks at are made.
+        selector = ReturnSelector() if looks else _NO_IMAGES
+        step = twin.step(state, chunk[:head], seed=start.seed, selector=selector)
+        parts = [step]
+        if is_last:
+            parts.append(twin.step(step.state, chunk[head:], seed=start.seed))
+        touch.extend(part.observation.tactile_kpa for part in parts)
+        state, seen = parts[-1].state, parts[-1].observation
+        images.append(stage.rig.image(stage.simulation, CAMERA))
+        poses.append(stage.simulation.object_poses())
+        sent.append(chunk)
+    return TrueRollout(
+        bool(seen.success),
+        np.concatenate(sent),
+        np.concatenate(touch),
+        np.stack(images),
+        seen.images[CAMERA][-NUM_SEEN_STEPS:],
+        np.stack(poses),
+    )
+
+
+def stage_poses(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 7"]:
+    """Where the objects of a state are."""
+    simulation = twin.stage(state.task).simulation
+    simulation.set_state(state.physics, step_index=0)
+    return simulation.object_poses()
+
+
+def play_in_imagination(
+    world: World[State], first: RolloutStart, policy: Policy | Actions, start: PolicyStart
+) -> ImaginedRollout:
+    """Let a policy act in an imagined world; a policy that looks sees what is imagined."""
+    started = world.reset(first)
+    state, seen = started.state, started.observation
+    touch, images = [seen.tactile_kpa], []
+    looks = not isinstance(policy, np.ndarray)
+    if looks:
+        ask(policy.reset, start, where="policy: reset")  # type: ignore[union-attr]
+    doubted: str | None = None
+    for at in range(0, NUM_STEPS, CHUNK_STEPS):
+        chunk = _chunk(policy, seen, at, world)
+        if looks or at + CHUNK_STEPS == NUM_STEPS:
+            step = world.step(state, chunk, seed=start.seed + at)
+            images.append(step.observation.images[CAMERA][-1])
+        else:
+            # A world is a function: asking twice gives touch of all steps and the last image.
+            step = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
+            last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
+            images.append(last.observation.images[CAMERA][-1])
+        state, seen = step.state, step.observation
+        touch.append(seen.tactile_kpa)
+        if seen.doubt is not None and seen.doubt.outside:
+            doubted = doubted or seen.doubt.reason
+    poses = seen.object_poses
+    return ImaginedRollout(
+        np.concatenate(touch),
+        np.stack(images),
+        seen.images[CAMERA][-NUM_SEEN_STEPS:],
+        None if poses is None else poses[-NUM_SEEN_STEPS:],
+        doubted,
+    )
+
+
+def _chunk(
+    policy: Policy | Actions, seen: Observation, first: int, world: World[State]
+) -> Float64[np.ndarray, "16 67"]:
+    if isinstance(policy, np.ndarray):
+        return policy[first : first + CHUNK_STEPS]
+    where = f"policy, step {first}: act"
+    answer = ask(policy.act, seen, where=where)
+    return action_chunk(answer, world.description, where=where)[:CHUNK_STEPS]
+
+
+def start_in_twin(
+    twin: TwinWorld, task: str, seed: int, instruction: str
+) -> tuple[StartedRollout[TwinState], RolloutStart, PolicyStart]:
+    """How the twin begins, and the same start for an imagined world and for a policy."""
+    asked = RolloutStart(task=task, seed=seed, instruction=instruction)
+    started = twin.reset(asked)
+    imagined = replace(
+        asked, observation=started.observation, anchor=started.anchor, K_head=started.K_head
+    )
+    return started, imagined, PolicyStart(task, instruction, seed, started.anchor, started.K_head)

@@ -1,0 +1,191 @@
+"""The stage `evaluator`: policies in the twin and in imagination, and how far the two agree."""
+
+import argparse
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from dextouch.errors import InvalidInputError
+from services.cli.bench.evaluator.keeping import KeptRows, Row
+from services.cli.bench.evaluator.lines import Line, Rolled, TaskFigures
+from services.cli.bench.evaluator.page import cell, write_page
+from services.cli.bench.evaluator.plan import FIRST_SEED, LEVELS_MM, ClonedPolicy, StudyPlan
+from services.cli.bench.evaluator.work import Study, open_study, unit_rows
+from services.cli.bench.machine import describe_machine
+from services.cli.bench.report import ResultTable, StageReport
+from services.cli.bench.stages import Bar
+from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
+from services.twin.tasks import TASK_NAMES
+
+PACKAGES = ("numpy", "torch", "mujoco")
+_USUAL_STARTS, _QUICK_STARTS = 20, 2
+_QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this stage."""
+    parser.add_argument("--world", type=Path, help="checkpoint of the world model (committed one)")
+    parser.add_argument("--probe", type=Path, default=DEFAULT_PROBE, help="checkpoint of the judge")
+    parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
+    parser.add_argument(
+        "--starts", type=int, help=f"starts a task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
+    )
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="%(default)s")
+    parser.add_argument(
+        "--cloned",
+        action="append",
+        metavar="NAME=PATH",
+        help="cloned policy to roll out in closed loop; may be repeated (the committed one)",
+    )
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        default=Path("runs/evaluator"),
+        help="folder of results; what is there is not computed again (%(default)s)",
+    )
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="%(default)s")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Roll out what is not kept yet, and make the table of everything.
+
+    Raises:
+        InvalidInputError: options that do not fit.
+    """
+    del folder
+    plan = _plan(options)
+    study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")
+    units = [
+        (task, seed, tuple(missing))
+        for seed in plan.seeds
+        for task in study.tasks
+        if (missing := study.missing(kept, task, seed))
+    ]
+    with bar("rolling out", len(units)) as step:
+        for rows, name in _results(plan, units, options.jobs):
+            kept.add(rows)
+            step(name)
+    figures, failed = figures_of_tasks(study, kept)
+    lines = [line for each in figures for line in each.lines()]
+    policies = [row for each in figures for row in each.policy_rows()]
+    chunks = [row for each in figures for row in each.chunk_rows()]
+    notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
+             if task not in study.tasks]  # fmt: skip
+    if failed:
+        notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
+    write_page(plan.keep / "evaluator.html", study.about, lines, (policies, chunks), notes)
+    content = {
+        "about": study.about,
+        "lines": [asdict(line) for line in lines],
+        "policies": policies,
+        "chunks": chunks,
+        "notes": notes,
+    }
+    text = json.dumps(content, indent=1, allow_nan=False)
+    (plan.keep / "evaluator.json").write_text(text + "\n", encoding="utf-8")
+    return StageReport(
+        stage="evaluator",
+        machine=describe_machine(PACKAGES),
+        options={"tasks": study.tasks, "starts": len(plan.seeds), "policies": plan.policies},
+        tables=[
+            interval_table(lines),
+            row_table("Success rates", policies),
+            row_table("Chunks of scripts, each figure beside its rival", chunks),
+        ],
+        panels=[],
+        requirements=[line.requirement() for line in lines],
+        data={name: content[name] for name in ("about", "lines", "policies", "chunks")},
+        notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
+    )
+
+
+def figures_of_tasks(study: Study, kept: KeptRows) -> tuple[list[TaskFigures], int]:
+    """Figures of every task from what is kept, and how many rollouts failed or are missing."""
+    figures: list[TaskFigures] = []
+    failed = 0
+    for task in study.tasks:
+        rolled: list[Rolled] = []
+        for seed in study.plan.seeds:
+            for policy in study.policies(task):
+                keys = study.keys(task, seed, policy)
+                found = {name: kept.get(**key) for name, key in keys.items()}
+                rows = {name: row for name, row in found.items() if row and "error" not in row}
+                if len(rows) == len(keys):
+                    rolled.append(_rolled(policy, seed, rows))
+                else:
+                    failed += 1
+        if rolled:
+            figures.append(TaskFigures(task, rolled, study.plan.scripts))
+    return figures, failed
+
+
+def _rolled(policy: str, seed: int, rows: dict[str, Row]) -> Rolled:
+    return Rolled(
+        policy,
+        seed,
+        bool(rows["real"]["success"]),
+        rows["true verdict"],
+        rows["imagined verdict"],
+        rows["imagined"],
+    )
+
+
+def interval_table(lines: Sequence[Line]) -> ResultTable:
+    """Figures with their intervals."""
+    rows = [
+        (
+            f"{line.task}: {line.what}",
+            "undefined" if line.value is None else f"{line.value:.3f}",
+            "" if line.interval is None else f"{line.interval[0]:.3f} to {line.interval[1]:.3f}",
+            str(line.num),
+        )
+        for line in lines
+    ]
+    columns = ("", "figure", "95 % over starts", "rollouts or policies")
+    return ResultTable("Imagined and real", columns, rows)
+
+
+def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:
+    """Rows of one kind as a table."""
+    columns = tuple(dict.fromkeys(name for row in rows for name in row))
+    return ResultTable(title, columns, [tuple(cell(row.get(n)) for n in columns) for row in rows])
+
+
+def _results(
+    plan: StudyPlan, units: Sequence[tuple[str, int, tuple[str, ...]]], num_jobs: int
+) -> Iterator[tuple[list[Row], str]]:
+    """Rows of every unit, as soon as it is done."""
+    if num_jobs == 1 or len(units) < 2:
+        for task, seed, policies in units:
+            yield unit_rows(plan, task, seed, policies), f"{task} {seed}"
+        return
+    # A fresh interpreter: a forked one would share the threads of torch.
+    with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(unit_rows, plan, *unit): unit for unit in units}
+        for done in as_completed(running):
+            task, seed, _ = running[done]
+            yield done.result(), f"{task} {seed}"
+
+
+def _plan(options: argparse.Namespace) -> StudyPlan:
+    default = _QUICK_STARTS if options.quick else _USUAL_STARTS
+    num_starts = default if options.starts is None else options.starts
+    if num_starts < 1 or options.jobs < 1:
+        raise InvalidInputError(
+            f"evaluator: got {num_starts} starts and {options.jobs} jobs, expected at least one"
+        )
+    cloned = options.cloned or [f"cloned={DEFAULT_POLICY}"]
+    return StudyPlan(
+        keep=options.keep,
+        world=options.world,
+        probe=options.probe,
+        tasks=tuple(options.tasks),
+        seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
+        levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,
+        cloned=tuple(ClonedPolicy.parse(text) for text in cloned),
+    )

@@ -1,0 +1,189 @@
+"""Stage `evaluator`: what is kept is not computed again, and its figures by hand."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+
+from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.geometry.transforms import transform
+from services.cli.bench.evaluator import work
+from services.cli.bench.evaluator.keeping import KeptRows, array_path, read_arrays, write_arrays
+from services.cli.bench.evaluator.lines import Rolled, TaskFigures, f1
+from services.cli.bench.evaluator.measuring import (
+    contact_counts,
+    object_region,
+    psnr_within,
+    warp_over_table,
+)
+from services.cli.bench.evaluator.page import write_page
+from services.cli.bench.evaluator.plan import IDLE, ClonedPolicy, StudyPlan
+from services.cli.bench.evaluator.stage import figures_of_tasks
+from services.evaluation.settings import DEFAULT_PROBE
+
+K = np.array([[50.0, 0, 16], [0, 50.0, 16], [0, 0, 1]])
+# One metre above the table, looking straight down: x right, y away from world y.
+DOWN = np.diag([1.0, -1.0, -1.0])
+
+
+def _row(seed: int, **more: object) -> dict:
+    return {"kind": "real", "twin": "t", "task": "a", "seed": seed, "policy": "p", **more}
+
+
+def test_rows_are_kept_and_found_again(tmp_path):
+    path = tmp_path / "kept" / "rows.jsonl"
+    KeptRows(path).add([_row(1, success=True), _row(2, success=False)])
+    again = KeptRows(path)
+    assert again.get(**_row(1))["success"] is True
+    assert again.get(**_row(3)) is None
+    assert again.get(**{**_row(1), "twin": "another"}) is None
+    again.add([_row(1, success=False)])
+    assert KeptRows(path).get(**_row(1))["success"] is True
+
+
+def test_a_line_that_was_cut_off_is_skipped(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    KeptRows(path).add([_row(1, success=True)])
+    with path.open("a", encoding="utf-8") as file:
+        file.write('{"kind": "real", "twin": "t", "ta')
+    cut = KeptRows(path)
+    assert len(cut) == 1
+    cut.add([_row(2, success=True)])
+    lines = path.read_text(encoding="utf-8").splitlines()
+    assert len(KeptRows(path)) == 2
+    assert json.loads(lines[-1])["seed"] == 2
+
+
+def test_arrays_come_back_or_are_refused(tmp_path):
+    path = array_path(tmp_path, **_row(1), world="0123456789abcdef")
+    write_arrays(path, {"touch": np.arange(3.0)})
+    assert read_arrays(path)["touch"].tolist() == [0, 1, 2]
+    path.write_bytes(b"no arrays")
+    with pytest.raises(CorruptDataError, match="remove the file"):
+        read_arrays(path)
+
+
+@pytest.fixture(scope="module")
+def plan(tmp_path_factory):
+    torch.set_num_threads(1)
+    keep = tmp_path_factory.mktemp("kept")
+    return StudyPlan(keep, None, DEFAULT_PROBE, ("stand_bottle",), (77,), levels_mm=(0.0,))
+
+
+def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
+    study, path = work.Study(plan), plan.keep / "rollouts.jsonl"
+    missing = study.missing(KeptRows(path), "stand_bottle", 77)
+    assert missing == ["script 0 mm", *IDLE]
+    # Killed in the first policy, after its two rollouts and before its verdicts.
+    rows = study.rows("stand_bottle", 77, ["script 0 mm"])
+    KeptRows(path).add([next(rows), next(rows)])
+    assert study.missing(KeptRows(path), "stand_bottle", 77) == missing
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("rolled out again")
+
+    for name in ("play_in_twin", "play_in_imagination"):
+        monkeypatch.setattr(work, name, refuse)
+    kept = KeptRows(path)
+    kept.add(study.rows("stand_bottle", 77, ["script 0 mm"]))
+    assert study.missing(KeptRows(path), "stand_bottle", 77) == list(IDLE)
+    figures, failed = figures_of_tasks(study, kept)
+    assert failed == len(IDLE)
+    assert [row["real"] for row in figures[0].policy_rows()] == [1.0]
+    chunks = figures[0].chunk_rows()
+    assert [row["chunk"] for row in chunks] == [1, 2, 3, 4, 5]
+    # The camera's motion over a table is known: the warped start is no wild guess.
+    assert all(row["psnr_of_warped_start"] > 15 for row in chunks)
+
+
+def test_contact_f1_by_hand():
+    told, true = np.zeros((2, 2, 320), np.float32), np.zeros((2, 2, 320), np.float32)
+    told[0, 0, :4], true[0, 0, 2:8] = 5.0, 5.0
+    assert contact_counts(told, true) == [2, 4, 6]
+    assert f1(np.array([2.0, 4.0, 6.0])) == pytest.approx(0.4)
+    assert f1(np.zeros(3)) == 1.0
+
+
+def test_a_still_camera_warps_nothing():
+    image = np.random.default_rng(0).integers(0, 256, (32, 32, 3)).astype(np.uint8)
+    T = transform(DOWN, np.array([0.0, 0.0, 1.0]))
+    np.testing.assert_array_equal(warp_over_table(image, K, T, T), image)
+
+
+def test_a_camera_that_moves_over_the_table_by_hand():
+    # From 1 m above, 40 mm along world x are 50 px/m · 0.04 m = 2 px to the right.
+    image = np.random.default_rng(1).integers(0, 256, (32, 32, 3)).astype(np.uint8)
+    then = transform(DOWN, np.array([0.0, 0.0, 1.0]))
+    now = transform(DOWN, np.array([0.04, 0.0, 1.0]))
+    warped = warp_over_table(image, K, then, now)
+    np.testing.assert_array_equal(warped[:, :-2], image[:, 2:])
+
+
+def test_the_region_of_an_object_by_hand():
+    # A cube of 80 mm on the axis: its top, 0.96 m away, spans 0.04 / 0.96 · 50 = 2.08 px each way.
+    pose = np.array([[0, 0, 0, 1.0, 0, 0, 0]])
+    box = np.array([[0, 0, 0, 0.04, 0.04, 0.04]])
+    T = transform(DOWN, np.array([0.0, 0.0, 1.0]))
+    region = object_region(pose, box, K, T, (32, 32))
+    rows, columns = np.flatnonzero(region.any(axis=1)), np.flatnonzero(region.any(axis=0))
+    assert (rows[0], rows[-1]) == (columns[0], columns[-1]) == (12, 19)
+    image = np.zeros((32, 32, 3), np.uint8)
+    other = image.copy()
+    other[~region] = 255
+    assert psnr_within(other, image, region) == 100.0
+
+
+def _rolled(policy: str, seed: int, *, real: bool, told: float) -> Rolled:
+    verdict = {"probability": told, "likely_success": told >= 0.5, "decision": "success"}
+    truth = {"probability": float(real), "likely_success": real, "decision": "success"}
+    contact = [[[2.0, 4.0, 6.0]] * 5, [[3.0, 6.0, 6.0]] * 5]
+    chunks = {
+        "contact": contact[0],
+        "contact_of_copy": contact[1],
+        "psnr": [[25.0, 20.0 + chunk] for chunk in range(5)],
+        "psnr_of_objects": [[18.0, 19.0]] * 5,
+    }
+    return Rolled(policy, seed, real, truth, verdict, chunks)
+
+
+def test_lines_by_hand(tmp_path):
+    rolled = [
+        _rolled("script 0 mm", 1, real=True, told=0.9),
+        _rolled("script 0 mm", 2, real=True, told=0.4),
+        _rolled("script 9 mm", 1, real=False, told=0.4),
+        _rolled("script 9 mm", 2, real=False, told=0.1),
+        _rolled("hold", 1, real=False, told=0.8),
+        _rolled("hold", 2, real=False, told=0.2),
+    ]
+    figures = TaskFigures("a", rolled, ("script 0 mm", "script 9 mm"))
+    lines = {line.what: line for line in figures.lines()}
+    # Wins 0.9 and 0.4 against losses 0.4 and 0.1: three pairs right, one tied.
+    assert lines["imagined against real, each rollout, AUC"].value == pytest.approx(3.5 / 4)
+    balanced = lines["imagined against real, each rollout, balanced accuracy"]
+    assert balanced.value == pytest.approx(0.75)
+    assert lines["judge on true endings, AUC"].value == 1.0
+    assert lines["policies (scripts), Pearson"].value == pytest.approx(1.0)
+    # Real 1, 0, 0 and imagined 0.5, 0, 0.5: the first is not above the last in imagination.
+    worst = lines["policies (all), MMRV with ties"]
+    assert worst.value == pytest.approx((1 + 0 + 0) / 3)
+    assert worst.requirement().is_met is False
+    assert lines["imagined success of hold"].value == 0.5
+    assert lines["imagined success of retreat"].value is None
+    contact = lines["chained contact F1 less copy, worst of chunks 1 to 4"]
+    assert contact.value == pytest.approx(0.4 - 0.5)
+    assert lines["chained image less warped start, worst of chunks 2 to 5"].value == 1.0
+    assert lines["the same where objects are or were"].value == -1.0
+    page = tmp_path / "page.html"
+    write_page(page, {"twin": "0" * 64}, list(lines.values()), [figures.policy_rows()], ["<note>"])
+    text = page.read_text(encoding="utf-8")
+    assert "&lt;note&gt;" in text
+    assert 'class="missed"' in text
+    assert 'class="met"' in text
+
+
+def test_plans_without_anything_are_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match="0 starts"):
+        StudyPlan(tmp_path, None, DEFAULT_PROBE, ("stand_bottle",), ())
+    with pytest.raises(InvalidInputError, match="NAME=PATH"):
+        ClonedPolicy.parse("no-path")
