@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
-STAGE ?= store loader acquisition clocks calibration retargeting twin world-model
+STAGE ?= store loader acquisition clocks calibration retargeting twin world-model evaluator
 export OMP_NUM_THREADS ?= 1
 
 .PHONY: demo test check slow vm fuzz mutants fix clean bench bench-lerobot check-lerobot-export

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.errors import CorruptDataError, InvalidInputError
+from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from dextouch.geometry.transforms import transform
 from services.cli.bench.evaluator import work
 from services.cli.bench.evaluator.keeping import KeptRows, array_path, read_arrays, write_arrays
@@ -95,6 +95,15 @@ def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
     assert [row["chunk"] for row in chunks] == [1, 2, 3, 4, 5]
     # The camera's motion over a table is known: the warped start is no wild guess.
     assert all(row["psnr_of_warped_start"] > 15 for row in chunks)
+
+
+def test_starts_of_the_training_are_refused(plan):
+    study = work.Study(plan)
+    first = work.start_in_twin(study.twin, "stand_bottle", 77, "")[0].observation
+    digest = work.first_digest(first)
+    study.probe.metadata = study.probe.metadata.model_copy(update={"training_starts": (digest,)})
+    with pytest.raises(ConflictError, match="trained on by the success probe"):
+        next(study.rows("stand_bottle", 77, ["hold"]))
 
 
 def test_contact_f1_by_hand():

@@ -30,8 +30,10 @@ from services.cli.bench.evaluator.playing import (
     scripted_actions,
     start_in_twin,
 )
+from services.evaluation.closed_loop import first_digest
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.starts import refuse_training_starts
 from services.evaluation.success_probe import SuccessProbe
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.settings import TwinSettings
@@ -91,7 +93,12 @@ class Study:
         ]
 
     def rows(self, task: str, seed: int, policies: list[str]) -> Iterator[Row]:
-        """Roll out and judge; rollouts whose arrays are kept are not made again."""
+        """Roll out and judge; rollouts whose arrays are kept are not made again.
+
+        Raises:
+            ConflictError: judge or cloned policy were trained on this start.
+        """
+        self._refuse_training_start(task, seed)
         for policy in policies:
             keys = self.keys(task, seed, policy)
             try:
@@ -101,6 +108,15 @@ class Study:
                     {**key, "error": type(error).__name__, "message": error.message}
                     for key in keys.values()
                 )
+
+    def _refuse_training_start(self, task: str, seed: int) -> None:
+        instruction = self.twin.stage(task).task.instruction
+        first = start_in_twin(self.twin, task, seed, instruction)[0].observation
+        digest = first_digest(first)
+        trained = {"the success probe": self.probe.metadata.training_starts}
+        trained |= {name: one.metadata.training_starts for name, one in self.cloned.items()}
+        for what, starts in trained.items():
+            refuse_training_starts([digest], trained_on=starts, what=what)
 
     def actor(self, task: str, seed: int, policy: str) -> Policy | Actions:
         """A policy that looks, or the actions of one that does not."""
