@@ -47,7 +47,8 @@ def read_demonstration(reader: EpisodeReader) -> Demonstration:
     """One robot episode with a known outcome as arrays.
 
     Raises:
-        InvalidInputError: the episode does not say whether it succeeded, or has no seed.
+        InvalidInputError: the episode does not say whether it succeeded, has no seed, or not an
+            image for every step.
     """
     attributes = reader.attributes
     if attributes.success is None or attributes.seed is None:
@@ -55,6 +56,7 @@ def read_demonstration(reader: EpisodeReader) -> Demonstration:
             f"episode {attributes.episode_id!r}: success {attributes.success}, seed "
             f"{attributes.seed}; expected both known, as in episodes of the twin"
         )
+    reader.require_images(CAMERA)
     measured = reader.window(0, num_steps=reader.num_steps, cameras=(CAMERA,))
     return Demonstration(
         attributes.episode_id,

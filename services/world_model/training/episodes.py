@@ -19,7 +19,8 @@ def load_episodes(url: str) -> list[EpisodeArrays]:
     """All episodes of a store, read once into memory.
 
     Raises:
-        InvalidInputError: a store without episodes, or one of another rate than the others.
+        InvalidInputError: a store without episodes, one of another rate than the others, or one
+            without an image for every step.
         UnknownNameError: an episode without the head camera.
     """
     store = EpisodeStore(url)
@@ -43,7 +44,13 @@ def check_rates(rates_hz: set[float], url: str) -> None:
 
 
 def read_episode(reader: EpisodeReader) -> EpisodeArrays:
-    """One whole episode as a single window for each kind of action it holds."""
+    """One whole episode as a single window for each kind of action it holds.
+
+    Raises:
+        InvalidInputError: there is not an image for every step.
+        UnknownNameError: an episode without the head camera.
+    """
+    reader.require_images(CAMERA)
     measured = reader.window(0, reader.num_steps, cameras=(CAMERA,))
     actions: dict[ActionKind, Float64[np.ndarray, "steps 67"]] = {"measured": measured.actions}
     if "action_commanded" in reader.streams:

@@ -15,7 +15,6 @@ import structlog
 from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.episodes.window import nearest_indices
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.geometry.interpolation import interpolate_poses
 from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
@@ -24,8 +23,6 @@ from dextouch.schemas.rollouts import ActionKind
 
 CAMERA = "camera_head"
 TWIN_ONLY: tuple[Origin, ...] = ("twin",)
-# An image or a pose belongs to a grid step if it is this near, as a share of a step.
-_SAME_STEP = 0.25
 _FROM_STEP = "_from_step"
 logger = structlog.get_logger(__name__)
 
@@ -159,7 +156,7 @@ def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> Sc
     kind: ActionKind = "commanded" if "action_commanded" in reader.streams else "measured"
     if kind == "commanded":
         actions = reader.read("action_commanded").values.astype(np.float64)
-    images, image_steps = _images(reader, window.t_ref_ns) if with_images else _no_images()
+    images, image_steps = _images(reader) if with_images else _no_images()
     boxes = np.array(attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
     return SceneEpisode(
         episode_id=attributes.episode_id,
@@ -204,18 +201,12 @@ def _no_images() -> tuple[np.ndarray, np.ndarray]:
     return np.zeros((0, 0, 0, 3), dtype=np.uint8), np.zeros(0, dtype=np.int64)
 
 
-def _step_ns(grid_ns: np.ndarray) -> int:
-    return int(grid_ns[1] - grid_ns[0]) if len(grid_ns) > 1 else 1
-
-
-def _images(reader: EpisodeReader, grid_ns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Images nearest to the grid steps that they show, and these steps."""
+def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
+    """Images of the steps that have one of their own, and these steps."""
     if CAMERA not in reader.streams or not reader.num_samples(CAMERA):
         return _no_images()
-    stamps = reader.stamps_ns(CAMERA)
-    nearest = nearest_indices(stamps, grid_ns)
-    shows = np.abs(stamps[nearest] - grid_ns) <= _SAME_STEP * _step_ns(grid_ns)
-    return reader.images(CAMERA)[nearest[shows]], np.flatnonzero(shows).astype(np.int64)
+    steps, images = reader.shown_steps(CAMERA)
+    return reader.images(CAMERA)[images], steps
 
 
 def _object_poses(

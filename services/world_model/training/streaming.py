@@ -96,7 +96,8 @@ def index_episodes(url: str) -> list[StoredEpisode]:
     """All episodes of a store; each is read once, for the hash of its content, and let go.
 
     Raises:
-        InvalidInputError: a store without episodes, or one of another rate than the others.
+        InvalidInputError: a store without episodes, one of another rate than the others, or one
+            without an image for every step.
         UnknownNameError: an episode without the head camera.
     """
     # An id may hold something else than when it was last read.

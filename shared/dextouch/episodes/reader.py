@@ -3,6 +3,7 @@
 from typing import Literal, overload
 
 import numpy as np
+from jaxtyping import Int64
 
 from dextouch.episodes.camera_threads import each_camera
 from dextouch.episodes.format import STAMPS
@@ -25,6 +26,10 @@ from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS
 
 SIDES = ("left", "right")
+# Half a step, as with a camera of the model's rate that runs on its own, and a little jitter.
+OWN_IMAGE_SHARE = 0.6
+# A camera may drop this share of its images now and then; images of every second step lack more.
+MAX_UNSHOWN_SHARE = 0.05
 ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
 
 
@@ -217,6 +222,41 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
             anchor=self._anchor(start),
             K_head=self.attributes.K_head_matrix(),
         )
+
+    def shown_steps(
+        self, camera: str
+    ) -> tuple[Int64[np.ndarray, " shown"], Int64[np.ndarray, " shown"]]:
+        """Steps with an image of their own, at most 0.6 steps away, and which image that is.
+
+        Raises:
+            UnknownNameError: no such camera.
+        """
+        self._check_cameras((camera,))
+        stamps, grid_ns = self.stamps_ns(camera), self._column("action_t_ref_ns")
+        if not len(stamps):
+            return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
+        nearest = nearest_indices(stamps, grid_ns)
+        reach_ns = OWN_IMAGE_SHARE * 1e9 / self.attributes.model_rate_hz
+        steps = np.flatnonzero(np.abs(stamps[nearest] - grid_ns) <= reach_ns)
+        return steps.astype(np.int64), nearest[steps]
+
+    def require_images(self, camera: str) -> None:
+        """Refuse an episode whose images do not show its steps, some dropped ones apart.
+
+        `window` gives the nearest image whatever its time: where only every N-th step was drawn,
+        that is the image of another step.
+
+        Raises:
+            InvalidInputError: more than a twentieth of the steps have no image of their own.
+            UnknownNameError: no such camera.
+        """
+        num_missing = self.num_steps - len(self.shown_steps(camera)[0])
+        if num_missing > MAX_UNSHOWN_SHARE * self.num_steps:
+            raise InvalidInputError(
+                f"{self._what}: {num_missing} of {self.num_steps} steps have no image of "
+                f"{camera!r} within {OWN_IMAGE_SHARE} steps, expected one a step; record it with "
+                "images of every step (`dextouch train data --images 1`)"
+            )
 
     def _nearest(self, camera: str, t_ns: np.ndarray) -> np.ndarray:
         stamps = self.stamps_ns(camera)

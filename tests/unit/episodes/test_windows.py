@@ -40,6 +40,56 @@ def test_window_equals_the_plain_way(made, store, start):
     assert len(window) == 17
 
 
+def shown_by(make_episode, store, keep, *, late_ns=0):
+    """A reader of 41 steps whose 81 images at 30 Hz are those of `keep`, each so late."""
+    made = make_episode(41)
+    made.values["camera_head"] = made.values["camera_head"][keep]
+    made.stamps_ns["camera_head"] = made.stamps_ns["camera_head"][keep] + late_ns
+    return made.write(store)
+
+
+@pytest.mark.parametrize(("every", "shown"), [(1, 41), (2, 41), (4, 21), (8, 11)])
+def test_a_step_has_its_own_image_or_none(make_episode, store, every, shown):
+    reader = shown_by(make_episode, store, slice(None, None, every))
+    steps, images = reader.shown_steps("camera_head")
+    assert len(steps) == shown
+    # 30 Hz: image 2n is that of step n; `every` of them lie between two that were kept.
+    np.testing.assert_array_equal(images * every, 2 * steps)
+    if shown == 41:
+        reader.require_images("camera_head")
+        return
+    with pytest.raises(InvalidInputError, match=f"{41 - shown} of 41 steps have no image"):
+        reader.require_images("camera_head")
+
+
+def test_a_camera_may_run_on_its_own_and_drop_an_image_or_two(make_episode, store):
+    late = shown_by(make_episode, store, slice(None, None, 2), late_ns=33_000_000)
+    late.require_images("camera_head")
+    assert len(late.shown_steps("camera_head")[0]) == 41
+    # 60 ms late, the image of the step before is the nearer one, but for step 0.
+    later = make_episode(41, seed=4)
+    later.stamps_ns["camera_head"] = later.stamps_ns["camera_head"][::2] + 60_000_000
+    later.values["camera_head"] = later.values["camera_head"][::2]
+    reader = later.write(store, episode_id="later")
+    steps, images = reader.shown_steps("camera_head")
+    np.testing.assert_array_equal(steps, np.arange(1, 41))
+    np.testing.assert_array_equal(images, steps - 1)
+    dropping = make_episode(41, seed=5)
+    keep = np.delete(np.arange(0, 81, 2), [7, 30])
+    dropping.stamps_ns["camera_head"] = dropping.stamps_ns["camera_head"][keep]
+    dropping.values["camera_head"] = dropping.values["camera_head"][keep]
+    reader = dropping.write(store, episode_id="dropping")
+    assert sorted(set(range(41)) - set(reader.shown_steps("camera_head")[0])) == [7, 30]
+    reader.require_images("camera_head")
+
+
+def test_unknown_cameras_show_nothing(made, store):
+    reader = made.write(store)
+    for ask in (reader.shown_steps, reader.require_images):
+        with pytest.raises(UnknownNameError, match="camera_head"):
+            ask("tactile_left")
+
+
 def test_commanded_actions_refer_to_the_measured_pose(made, store):
     window = made.write(store).window(3, 5, action_kind="commanded")
     poses = act.poses_from_actions(made.values["action_commanded"], made.trajectory.anchor(0))

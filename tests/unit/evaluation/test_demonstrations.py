@@ -1,6 +1,7 @@
 """Episodes of a store as arrays and pictures, and what is refused."""
 
 import json
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_ro
 from dextouch.streams.descriptors import StreamDescriptor
 from services.evaluation.__main__ import main
 from services.evaluation.demonstrations import instructions_of, read_demonstrations
+from services.evaluation.endings import read_ending_episodes
 from services.evaluation.reporting import action_picture, episode_picture
 from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.success_probe import SuccessProbe
@@ -19,8 +21,14 @@ from tests.unit.evaluation import toy
 GRID_NS = np.round(np.arange(toy.STEPS) * 1e9 / 15).astype(np.int64)
 
 
-def write(store: EpisodeStore, item: toy.Demonstration, **changed: object) -> None:
-    """A toy demonstration as an episode of the store."""
+def write(
+    store: EpisodeStore,
+    item: toy.Demonstration,
+    *,
+    shown: Sequence[int] = range(toy.STEPS),
+    **changed: object,
+) -> None:
+    """A toy demonstration as an episode of the store, with images of some steps."""
     attributes = {
         "episode_id": item.episode_id, "task": item.task, "instruction": item.instruction,
         "domain": "robot", "origin": "twin", "seed": item.seed, "success": item.success,
@@ -42,7 +50,8 @@ def write(store: EpisodeStore, item: toy.Demonstration, **changed: object) -> No
     with store.writer(kind="episode", attributes=built) as writer:
         for name, (values, fields) in streams.items():
             writer.add_stream(StreamDescriptor(name=name, nominal_rate_hz=15, **fields))
-            writer.append(name, values=values, t_ref_ns=GRID_NS)
+            steps = list(shown) if fields["kind"] == "image" else slice(None)
+            writer.append(name, values=values[steps], t_ref_ns=GRID_NS[steps])
 
 
 @pytest.fixture(scope="module")
@@ -91,6 +100,30 @@ def test_an_unknown_outcome_is_refused(tmp_path):
     write(store, toy.demonstration("reach", 1, name="who-knows"), success=None)
     with pytest.raises(InvalidInputError, match="who-knows"):
         read_demonstrations(store)
+
+
+# What `dextouch train data --images 4` draws.
+SPARSE = [*range(0, 77, 4), 78, 79, 80]
+
+
+def test_images_of_every_fourth_step_are_not_taken_for_those_of_all(tmp_path):
+    store = EpisodeStore(tmp_path)
+    write(store, toy.demonstration("reach", 1), shown=SPARSE)
+    with pytest.raises(InvalidInputError, match=r"reach-1-0.*: 58 of 81 steps .*--images 1"):
+        read_demonstrations(store)
+
+
+def test_the_last_three_steps_of_sparse_images_are_enough_for_the_probe(tmp_path):
+    store = EpisodeStore(tmp_path)
+    item = toy.demonstration("reach", 2)
+    write(store, item, shown=SPARSE)
+    (episode,) = read_ending_episodes(store)
+    np.testing.assert_array_equal(episode.final.images, item.images[[78, 79, 80]])
+    assert episode.start_digest == item.start_digest
+    # Steps that were not drawn are judged by touch, never by the images of others.
+    for step in (episode.early_step, episode.middle_step, 79):
+        assert episode.endings[step].images is None
+        assert episode.endings[step].tactile_kpa.shape == (3, 2, 320)
 
 
 def test_pictures_of_an_episode(url):

@@ -138,8 +138,8 @@ def _touch(trajectory, box_m):
     return touch
 
 
-def write_episode(store, episode):
-    """The toy episode in a real store: every stream at the model rate."""
+def write_episode(store, episode, image_every=1):
+    """The toy episode in a real store: every stream at the model rate, images if asked sparser."""
     stamps = (np.arange(len(episode)) * 1_000_000_000) // 15
     streams = {
         "tactile_left": ("tactile", episode.tactile_kpa[:, 0], "kPa"),
@@ -167,7 +167,8 @@ def write_episode(store, episode):
                     unit=unit, nominal_rate_hz=15.0,
                 )
             )  # fmt: skip
-            writer.append(name, values=values, t_ref_ns=stamps)
+            every = image_every if kind == "image" else 1
+            writer.append(name, values=values[::every], t_ref_ns=stamps[::every])
 
 
 @pytest.fixture

@@ -12,6 +12,7 @@ from services.twin.motions import Motion
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.take_options import TakeOptions
+from services.world_model.training.episodes import read_episode
 from services.world_model.training.scene_episodes import (
     load_scene_episodes,
     refuse_shared_scenes,
@@ -112,6 +113,16 @@ def test_streams_at_their_own_rates_are_brought_to_the_grid(truths, loaded):
     # Step 1 is at 66.67 ms, two thirds of the way from sample 6 to sample 7.
     np.testing.assert_allclose(
         got.object_poses[1, :, :3], poses[6, :, :3] / 3 + poses[7, :, :3] * 2 / 3, atol=1e-6
+    )
+
+
+def test_sparse_takes_are_refused_where_every_step_has_to_be_seen(truths, url):
+    reader = EpisodeStore(url).open(truths["push"].attributes.episode_id)
+    with pytest.raises(InvalidInputError, match="58 of 81 steps have no image"):
+        read_episode(reader)
+    whole = EpisodeStore(url).open(truths["whole"].attributes.episode_id)
+    np.testing.assert_array_equal(
+        read_episode(whole).images, truths["whole"].streams["camera_head"].values[::2]
     )
 
 

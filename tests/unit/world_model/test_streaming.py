@@ -179,6 +179,14 @@ def test_what_does_not_exist_is_refused(stored, tmp_path):
         index_episodes(str(tmp_path / "empty"))
 
 
+def test_images_of_every_second_step_are_not_taken_for_those_of_all(tmp_path, toy_episode):
+    store = EpisodeStore(tmp_path / "sparse")
+    write_episode(store, toy_episode(0), image_every=2)
+    for read in (index_episodes, load_episodes):
+        with pytest.raises(InvalidInputError, match=r"toy-0.*: 20 of 41 steps .*--images 1"):
+            read(str(store.root))
+
+
 def test_streamed_training_gives_the_weights_of_training_in_memory(
     stored, in_memory, train_settings
 ):
