@@ -4,13 +4,15 @@ from typing import Final
 
 from dextouch.errors import UnknownNameError
 from services.twin.tasks.insert_peg import InsertPeg
+from services.twin.tasks.place_phone import PlacePhone
 from services.twin.tasks.place_shoes import PlaceShoes
 from services.twin.tasks.stack_bowls import StackBowls
 from services.twin.tasks.stand_bottle import StandBottle
 from services.twin.tasks.task import Task
 
 _TASKS: Final[dict[str, Task]] = {
-    task.name: task for task in (StandBottle(), StackBowls(), InsertPeg(), PlaceShoes())
+    task.name: task
+    for task in (StandBottle(), StackBowls(), InsertPeg(), PlaceShoes(), PlacePhone())
 }
 TASK_NAMES: Final = tuple(_TASKS)
 
