@@ -4,6 +4,7 @@ from typing import Final
 
 from dextouch.errors import UnknownNameError
 from services.twin.tasks.insert_peg import InsertPeg
+from services.twin.tasks.open_drawer import OpenDrawer
 from services.twin.tasks.place_phone import PlacePhone
 from services.twin.tasks.place_shoes import PlaceShoes
 from services.twin.tasks.stack_bowls import StackBowls
@@ -12,7 +13,7 @@ from services.twin.tasks.task import Task
 
 _TASKS: Final[dict[str, Task]] = {
     task.name: task
-    for task in (StandBottle(), StackBowls(), InsertPeg(), PlaceShoes(), PlacePhone())
+    for task in (StandBottle(), StackBowls(), InsertPeg(), PlaceShoes(), PlacePhone(), OpenDrawer())
 }
 TASK_NAMES: Final = tuple(_TASKS)
 
