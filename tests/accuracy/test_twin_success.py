@@ -1,16 +1,25 @@
 """Scripted demonstrators succeed without noise and fail with much of it."""
 
 import sys
+from functools import cache
 
 import pytest
 
+from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
-from services.twin.stage import Stage
+from services.twin.stage import Stage, command_row
 from services.twin.tasks import TASK_NAMES
 
 SEEDS = range(100, 104)
 LADDER_M = (0.0, 0.05)
+# Scenes and errors of the figures in docs/twin_tasks.md.
+FIRST_SEED = 40_000
+NUM_SCENES_EXACT, NUM_SCENES = 40, {"robot": 16, "human": 8}
+FINE_LADDER_MM = (0, 2.5, 5, 7.5, 10, 15, 20, 30, 40)
+LEAST_EXACT = 0.9
+
+cached_stage = cache(Stage)
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
@@ -28,3 +37,30 @@ def test_success_falls_with_noise(task, domain, capsys):
         sys.stdout.write(f"\n{task} {domain}: success at noise {steps}\n")
     assert rates[0] >= 0.75
     assert rates[-1] <= 0.5
+
+
+def demonstration_succeeds(stage, seed, noise_m):
+    plan = stage.plan(seed, noise_m=noise_m)
+    stage.start(plan)
+    for row in range(1, NUM_GRID_STEPS):
+        for _ in stage.simulation.advance(command_row(plan.commands, row)):
+            pass
+    return stage.task.succeeded(stage.simulation)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_mm", FINE_LADDER_MM)
+@pytest.mark.parametrize("domain", ["robot", "human"])
+@pytest.mark.parametrize("task", TASK_NAMES)
+def test_the_fine_ladder(task, domain, noise_mm, capsys):
+    stage = cached_stage(task, domain, TwinSettings())
+    num_scenes = NUM_SCENES[domain] if noise_mm else NUM_SCENES_EXACT
+    seeds = range(FIRST_SEED, FIRST_SEED + num_scenes)
+    won = sum(demonstration_succeeds(stage, seed, 0.001 * noise_mm) for seed in seeds)
+    with capsys.disabled():
+        sys.stdout.write(f"\n{task} {domain}: error {noise_mm} mm, success {won} of {num_scenes}")
+        sys.stdout.flush()
+    if noise_mm == 0:
+        assert won >= LEAST_EXACT * num_scenes
+    if noise_mm == FINE_LADDER_MM[-1]:
+        assert won <= 0.5 * num_scenes
