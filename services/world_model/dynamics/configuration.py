@@ -1,0 +1,42 @@
+"""Shape of the start reader and the recurrent core; stored in every checkpoint that has them."""
+
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+# Objects a task may have; unused slots are masked.
+MAX_OBJECTS: Final = 3
+# The core runs once every four steps of the model grid, the clock of video latents.
+STEPS_PER_LATENT: Final = 4
+
+
+class DynamicsConfig(BaseModel):
+    """Everything that fixes the shape of a dynamics model.
+
+    `tasks` and the number of objects of each are the vocabulary: a task's index selects its
+    embedding, its objects fill the first slots in the order of the episode's `object_names`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    tasks: tuple[str, ...] = Field(min_length=1)
+    num_objects: tuple[int, ...]
+    image_px: int = Field(default=64, ge=16, le=256)
+    reader_channels: int = Field(default=32, ge=8, le=256)
+    reader_keypoints: int = Field(default=40, ge=4, le=256)
+    width: int = Field(default=192, ge=8, le=1024)
+    num_layers: int = Field(default=2, ge=1, le=8)
+    touch_channels: int = Field(default=48, ge=4, le=320)
+
+    @model_validator(mode="after")
+    def _objects_fit(self) -> "DynamicsConfig":
+        if len(self.num_objects) != len(self.tasks) or len(set(self.tasks)) != len(self.tasks):
+            raise ValueError(
+                f"got {len(self.tasks)} tasks and {len(self.num_objects)} numbers of objects, "
+                "expected one number for every task and no task twice"
+            )
+        if any(not 1 <= count <= MAX_OBJECTS for count in self.num_objects):
+            raise ValueError(
+                f"num_objects: got {self.num_objects}, expected 1 … {MAX_OBJECTS} for every task"
+            )
+        return self

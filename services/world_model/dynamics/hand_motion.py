@@ -1,0 +1,74 @@
+"""Where palms and fingertips are in the world for given actions: what the core is fed with."""
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32, Float64
+
+from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.tactile.layout import SIDES
+
+# The wrist and five fingertips of each hand.
+NUM_POINTS: Final = 6
+
+
+@dataclass(frozen=True)
+class HandMotion:
+    """Both hands over n steps in the world frame, left before right.
+
+    `points_m` are the wrist and thumb … little fingertip; `axes` the first two columns of
+    R_world_wrist; `Ts_world_camera` the head camera's poses.
+    """
+
+    points_m: Float32[np.ndarray, "n 2 6 3"]
+    axes: Float32[np.ndarray, "n 2 6"]
+    joints_rad: Float32[np.ndarray, "n 2 20"]
+    Ts_world_camera: Float64[np.ndarray, "n 4 4"]
+
+    def __len__(self) -> int:
+        return len(self.points_m)
+
+    def __getitem__(self, steps: slice | np.ndarray) -> "HandMotion":
+        """Some of the steps."""
+        return HandMotion(
+            self.points_m[steps],
+            self.axes[steps],
+            self.joints_rad[steps],
+            self.Ts_world_camera[steps],
+        )
+
+
+@cache
+def _hand(side: str) -> RobotHand:
+    return RobotHand(side)
+
+
+def hand_motion(actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses) -> HandMotion:
+    """Both hands where actions put them.
+
+    Args:
+        actions: relative to `anchor`.
+        anchor: T_world poses that the actions refer to.
+
+    Raises:
+        DegenerateRotationError: actions that describe no rotation.
+    """
+    poses = poses_from_actions(actions, anchor)
+    Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)
+    joints = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
+    tips = np.stack(
+        [_hand(side).fingertips_m(joints[:, index]) for index, side in enumerate(SIDES)], axis=1
+    )
+    R = Ts[..., :3, :3]
+    points = np.concatenate([np.zeros_like(tips[:, :, :1]), tips], axis=2)
+    points = points @ np.swapaxes(R, -1, -2) + Ts[:, :, None, :3, 3]
+    axes = np.concatenate([R[..., 0], R[..., 1]], axis=-1)
+    return HandMotion(
+        points.astype(np.float32),
+        axes.astype(np.float32),
+        joints.astype(np.float32),
+        poses.Ts_world_camera_head,
+    )

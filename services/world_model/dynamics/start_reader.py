@@ -1,0 +1,133 @@
+"""Start reader: where a task's objects are, from one head image, the touch and the hands.
+
+Feature points of a small convolutional network (spatial soft-argmax, Levine et al. 2016) give a
+pixel and a height for every object; the position is where the pixel's ray meets that height, so
+that the known camera pose is used exactly and not learned.
+"""
+
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32, Int64, UInt8
+from torch import Tensor, nn
+
+from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.core import NUM_PADS
+from services.world_model.dynamics.features import compressed
+from services.world_model.dynamics.hand_motion import NUM_POINTS
+from services.world_model.dynamics.objects import MAX_DISTANCE_M, ObjectPoses
+
+TASK_WIDTH = 16
+_POINT_SIZE = 2 * NUM_POINTS * 3
+_CAMERA_SIZE = 7
+# Rays flatter than this never meet the table within reach.
+_FLATTEST = -0.15
+
+
+@dataclass(frozen=True)
+class FirstStep:
+    """One observed step; everything in the world frame, metres and kPa."""
+
+    image: UInt8[Tensor, "batch px px 3"]
+    K_head: Float32[Tensor, "batch 3 3"]
+    T_world_camera: Float32[Tensor, "batch 4 4"]
+    points_m: Float32[Tensor, "batch 2 6 3"]
+    pads_kpa: Float32[Tensor, "batch 12"]
+    task: Int64[Tensor, " batch"]
+
+
+class StartReader(nn.Module):
+    """First step to object poses with a probability that each is there.
+
+    Args:
+        config: of the dynamics model.
+    """
+
+    height_mean: Tensor
+
+    def __init__(self, config: DynamicsConfig) -> None:
+        super().__init__()
+        self.config = config
+        channels, points = config.reader_channels, config.reader_keypoints
+        self.register_buffer("height_mean", torch.zeros(len(config.tasks), MAX_OBJECTS))
+        self.eye = nn.Sequential(
+            nn.Conv2d(3, channels, 5, stride=2, padding=2),
+            nn.GELU(),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(channels, channels, 3, padding=1),
+            nn.GELU(),
+            nn.Conv2d(channels, points, 1),
+        )
+        self.sharpness = nn.Parameter(torch.ones(points))
+        self.task = nn.Embedding(len(config.tasks), TASK_WIDTH)
+        known = 3 * points + TASK_WIDTH + _POINT_SIZE + NUM_PADS + _CAMERA_SIZE
+        self.head = nn.Sequential(
+            nn.Linear(known, 192), nn.GELU(), nn.Linear(192, 192), nn.GELU(),
+            nn.Linear(192, MAX_OBJECTS * 10),
+        )  # fmt: skip
+
+    def forward(self, first: FirstStep) -> ObjectPoses:
+        """Objects of every entry; `present` are probabilities, 0 in slots the task has not."""
+        image = first.image.permute(0, 3, 1, 2).float() / 255 - 0.5
+        return self.read(image, first)
+
+    def read(
+        self, image: Float32[Tensor, "batch 3 px px"], first: FirstStep, maps=None
+    ) -> ObjectPoses:
+        """`forward` with an image in −0.5 … 0.5 in place of the bytes."""
+        told = self.head(self._known(image, first, maps)).unflatten(1, (MAX_OBJECTS, 10))
+        pixel = (told[..., :2] * 0.5 + 0.5) * self.config.image_px
+        height_m = self.height_mean[first.task] + 0.05 * told[..., 2]
+        counts = torch.tensor(self.config.num_objects)[first.task]
+        used = torch.arange(MAX_OBJECTS) < counts[:, None]
+        present = told[..., 9].sigmoid() * used
+        position = ray_at_height(pixel, height_m, first.K_head, first.T_world_camera)
+        return ObjectPoses(position, told[..., 3:9].unflatten(-1, (2, 3)), present)
+
+    def _known(
+        self, image: Float32[Tensor, "batch 3 px px"], first: FirstStep, maps=None
+    ) -> Float32[Tensor, "batch known"]:
+        maps = self.eye(image) if maps is None else maps
+        weight = (maps.flatten(2) * self.sharpness.exp()[:, None]).softmax(-1).view(maps.shape)
+        places = torch.linspace(-1, 1, maps.shape[-1])
+        columns = (weight.sum(2) * places).sum(-1)
+        rows = (weight.sum(3) * places).sum(-1)
+        strength = (weight * maps).sum((2, 3))
+        eye_m = first.T_world_camera[:, :3, 3]
+        camera = torch.cat(
+            [eye_m, first.T_world_camera[:, :2, 2], first.T_world_camera[:, :2, 0]], dim=1
+        )
+        return torch.cat(
+            [
+                3 * columns,
+                3 * rows,
+                strength.tanh(),
+                self.task(first.task),
+                compressed(first.points_m).flatten(1),
+                compressed(first.pads_kpa * 1e-2),
+                5.0 * camera,
+            ],
+            dim=1,
+        )
+
+
+def ray_at_height(
+    pixel: Float32[Tensor, "batch objects 2"],
+    height_m: Float32[Tensor, "batch objects"],
+    K_head: Float32[Tensor, "batch 3 3"],
+    T_world_camera: Float32[Tensor, "batch 4 4"],
+) -> Float32[Tensor, "batch objects 3"]:
+    """World point (m) where a pixel's ray is at a height; within `MAX_DISTANCE_M` of the origin.
+
+    Rays that look up or almost along the horizon are bent down to meet the height far away.
+    """
+    focal = torch.stack([K_head[:, 0, 0], K_head[:, 1, 1]], dim=-1)[:, None]
+    centre = K_head[:, None, :2, 2]
+    flat = (pixel - centre) / focal
+    ray = torch.cat([flat, torch.ones_like(flat[..., :1])], dim=-1)
+    ray = ray @ T_world_camera[:, :3, :3].transpose(1, 2)
+    eye_m = T_world_camera[:, None, :3, 3]
+    reach = (height_m - eye_m[..., 2]) / ray[..., 2].clamp_max(_FLATTEST)
+    point = eye_m[..., :2] + reach[..., None] * ray[..., :2]
+    return torch.cat([point, height_m[..., None]], dim=-1).clamp(-MAX_DISTANCE_M, MAX_DISTANCE_M)

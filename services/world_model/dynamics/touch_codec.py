@@ -1,0 +1,51 @@
+"""Linear codec of both hands' taxels for the core: principal axes of the root of pressure."""
+
+import torch
+from jaxtyping import Float32
+from torch import Tensor, nn
+
+from dextouch.tactile.layout import NUM_TAXELS
+from services.world_model.network.principal_axes import principal_axes
+from services.world_model.network.tactile_tokenizer import root_pressure
+
+# A pad at rest: below this peak pressure it counts as free when contact is learned.
+FREE_KPA = 2.0
+
+
+class TouchCodec(nn.Module):
+    """Frozen encoder and decoder of one hand's taxels (left and right alike).
+
+    Latents are in units of the strongest axis' amplitude, so that their squared error is that of
+    the roots of pressure up to one factor. Decoded pressure is bounded by `peak_kpa`, the highest
+    that was seen in training.
+    """
+
+    basis: Tensor
+    scale: Tensor
+    peak_kpa: Tensor
+
+    def __init__(self, num_channels: int) -> None:
+        super().__init__()
+        self.register_buffer("basis", torch.eye(NUM_TAXELS, num_channels))
+        self.register_buffer("scale", torch.ones(()))
+        self.register_buffer("peak_kpa", torch.full((), 1e3))
+
+    @torch.no_grad()
+    def fit(self, tactile_kpa: Float32[Tensor, "n 320"]) -> None:
+        """Take axes, scale and peak from training touch of single hands."""
+        roots = root_pressure(tactile_kpa).double()
+        # Not centred: the mean of touch is no touch that ever happens.
+        basis, rms = principal_axes(roots.T @ roots / len(roots), self.basis.shape[1])
+        self.basis.copy_(basis)
+        self.scale.copy_(rms[0].clamp_min(1e-3))
+        self.peak_kpa.copy_(tactile_kpa.max().clamp_min(FREE_KPA))
+
+    def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
+        """Latents; pressures below zero count as zero, those above the peak as the peak."""
+        bounded = torch.minimum(tactile_kpa, self.peak_kpa)
+        return (root_pressure(bounded) @ self.basis) / self.scale
+
+    def decode(self, latents: Float32[Tensor, "*b channels"]) -> Float32[Tensor, "*b 320"]:
+        """Pressures in kPa between zero and the peak."""
+        roots = ((latents * self.scale) @ self.basis.T).clamp_min(0.0)
+        return torch.minimum(roots.square(), self.peak_kpa)
