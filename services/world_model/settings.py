@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import torch
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_settings import BaseSettings, CliImplicitFlag
 
@@ -9,6 +10,11 @@ from dextouch.serving.settings import service_config
 from dextouch.worlds.serve import WorldServiceSettings
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
+
+
+def has_bfloat16() -> bool:
+    """Whether this processor multiplies bfloat16 itself, which halves the time of training."""
+    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
 
 
 class OptimizerSettings(BaseModel):
@@ -63,6 +69,48 @@ class TrainSettings(BaseModel):
     network: NetworkConfig = NetworkConfig()
     optimizer: OptimizerSettings = OptimizerSettings()
     windows: WindowSettings = WindowSettings()
+
+
+class ReaderSettings(BaseModel):
+    """How start readers are trained."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    num_steps: int = Field(default=6000, ge=1)
+    batch: int = Field(default=32, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    ema_decay: float = Field(default=0.995, ge=0, lt=1)
+    first_fraction: float = Field(default=0.6, ge=0, le=1, description="of first steps")
+    bfloat16: bool = Field(default_factory=has_bfloat16, description="convolve in bfloat16")
+
+
+class CoreLossWeights(BaseModel):
+    """Weights of a core's training targets; 0 leaves one out."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    objects: float = Field(default=1.0, ge=0)
+    touch: float = Field(default=6.0, ge=0)
+    contact: float = Field(default=0.5, ge=0)
+    success: float = Field(default=1.0, ge=0)
+
+
+class CoreSettings(BaseModel):
+    """How recurrent cores are trained."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    num_steps: int = Field(default=4000, ge=1)
+    batch: int = Field(default=64, ge=1)
+    learning_rate: float = Field(default=2e-3, gt=0)
+    weight_decay: float = Field(default=0.05, ge=0)
+    ema_decay: float = Field(default=0.99, ge=0, lt=1)
+    first_fraction: float = Field(default=0.6, ge=0, le=1, description="of whole episodes")
+    measured_fraction: float = Field(default=0.15, ge=0, le=1, description="of measured actions")
+    held_fraction: float = Field(default=0.04, ge=0, le=1, description="of hands held still")
+    pose_noise_m: float = Field(default=0.0025, ge=0, description="of the true start poses")
+    weights: CoreLossWeights = CoreLossWeights()
+    bfloat16: bool = Field(default_factory=has_bfloat16, description="train in bfloat16")
 
 
 class TrainCommand(BaseSettings, TrainSettings):

@@ -73,10 +73,16 @@ class StartReader(nn.Module):
         return self.read(image, first)
 
     def read(
-        self, image: Float32[Tensor, "batch 3 px px"], first: FirstStep, maps=None
+        self,
+        image: Float32[Tensor, "batch 3 px px"],
+        first: FirstStep,
+        *,
+        bfloat16: bool = False,
     ) -> ObjectPoses:
-        """`forward` with an image in −0.5 … 0.5 in place of the bytes."""
-        told = self.head(self._known(image, first, maps)).unflatten(1, (MAX_OBJECTS, 10))
+        """`forward` with an image in −0.5 … 0.5 in place of the bytes; convolved in bfloat16."""
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
+            maps = self.eye(image)
+        told = self.head(self._known(maps.float(), first)).unflatten(1, (MAX_OBJECTS, 10))
         pixel = (told[..., :2] * 0.5 + 0.5) * self.config.image_px
         height_m = self.height_mean[first.task] + 0.05 * told[..., 2]
         counts = torch.tensor(self.config.num_objects)[first.task]
@@ -86,9 +92,8 @@ class StartReader(nn.Module):
         return ObjectPoses(position, told[..., 3:9].unflatten(-1, (2, 3)), present)
 
     def _known(
-        self, image: Float32[Tensor, "batch 3 px px"], first: FirstStep, maps=None
+        self, maps: Float32[Tensor, "batch points rows columns"], first: FirstStep
     ) -> Float32[Tensor, "batch known"]:
-        maps = self.eye(image) if maps is None else maps
         weight = (maps.flatten(2) * self.sharpness.exp()[:, None]).softmax(-1).view(maps.shape)
         places = torch.linspace(-1, 1, maps.shape[-1])
         columns = (weight.sum(2) * places).sum(-1)

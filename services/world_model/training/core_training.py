@@ -1,0 +1,239 @@
+"""Training of a recurrent core on whole episodes: where objects go, and how that feels."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float32, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.core import RecurrentCore, SceneFuture, SceneStart
+from services.world_model.dynamics.features import command_features
+from services.world_model.dynamics.model import Commands
+from services.world_model.dynamics.objects import ObjectPoses
+from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.settings import CoreSettings
+from services.world_model.training.averaging import WeightAverage, cosine_rate
+from services.world_model.training.scene_table import SceneTable
+
+_UNIT_M = 0.05
+_FIT_EPISODES = 400
+OnStep = Callable[[int, float], None]
+
+
+@dataclass(frozen=True)
+class CoreData:
+    """What cores are trained on: episodes, their touch as latents, and what readers saw.
+
+    `readings` are a reader's objects by start step; the core learns from them and from true
+    poses with errors of the same size, so that it neither trusts its start too much nor too little.
+    """
+
+    table: SceneTable
+    touch: Float32[Tensor, "episodes steps 2 channels"]
+    readings: Mapping[int, ObjectPoses]
+
+
+@dataclass(frozen=True)
+class _Batch:
+    rows: Int64[Tensor, " batch"]
+    start_step: int
+    start: SceneStart
+    commands: Commands
+    is_held: Bool[Tensor, " batch"]
+
+
+def train_core(
+    data: CoreData,
+    config: DynamicsConfig,
+    settings: CoreSettings,
+    *,
+    seed: int,
+    on_step: OnStep | None = None,
+) -> RecurrentCore:
+    """A core that follows scenes from any start step to the end.
+
+    Args:
+        data: training episodes.
+        config: of the dynamics model.
+        settings: number of steps, weights of the losses and the like.
+        seed: of weights and of everything that is drawn.
+        on_step: called with the step and its loss.
+    """
+    generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        core = RecurrentCore(config)
+        fit_features(core, data.table)
+        optimizer = torch.optim.AdamW(
+            core.parameters(),
+            lr=settings.learning_rate,
+            weight_decay=settings.weight_decay,
+            fused=True,
+        )
+        average = WeightAverage(core, settings.ema_decay)
+        for step in range(settings.num_steps):
+            batch = _draw(data, settings, generator, rng)
+            loss = core_loss(core, data, batch, settings)
+            for group in optimizer.param_groups:
+                group["lr"] = cosine_rate(settings.learning_rate, step, settings.num_steps)
+            optimizer.zero_grad()
+            loss.backward()  # type: ignore[no-untyped-call]
+            nn.utils.clip_grad_norm_(core.parameters(), 1.0, error_if_nonfinite=True)
+            optimizer.step()
+            average.update(core)
+            if on_step is not None:
+                on_step(step + 1, float(loss.detach()))
+    average.copy_to(core)
+    return core.eval()
+
+
+@torch.no_grad()
+def fit_features(core: RecurrentCore, table: SceneTable) -> None:
+    """Mean and deviation of command features over the training episodes."""
+    rows = torch.arange(0, len(table), max(1, len(table) // _FIT_EPISODES))
+    commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
+    objects = table.objects_at(rows, 0)
+    features = command_features(
+        commands.points_m, commands.axes, commands.joints_rad, objects
+    ).flatten(0, 1)
+    core.feature_mean.copy_(features.mean(0))
+    core.feature_std.copy_(features.std(0) + 0.05)
+
+
+def _draw(
+    data: CoreData, settings: CoreSettings, generator: torch.Generator, rng: np.random.Generator
+) -> _Batch:
+    table = data.table
+    is_first = rng.random() < settings.first_fraction
+    later = [step for step in data.readings if step > 0]
+    start_step = 0 if is_first or not later else int(rng.choice(later))
+    rows = torch.randint(len(table), (settings.batch,), generator=generator)
+
+    def chance(fraction: float) -> Bool[Tensor, " batch"]:
+        return torch.rand(len(rows), generator=generator) < fraction
+
+    measured = chance(settings.measured_fraction) | ~table.commanded[rows]
+    commands = table.commands(rows, start_step, measured)
+    free = ~table.in_contact[rows, start_step].any(-1)
+    held = chance(settings.held_fraction) & free & (start_step == 0)
+    objects = _start_objects(data, rows, start_step, settings, generator)
+    return _Batch(
+        rows=rows,
+        start_step=start_step,
+        start=SceneStart(
+            objects,
+            data.touch[rows, start_step].float(),
+            table.pads_kpa[rows, start_step],
+            table.task[rows],
+            (~measured).float(),
+        ),
+        commands=_held_still(commands, held),
+        is_held=held,
+    )
+
+
+def _start_objects(
+    data: CoreData,
+    rows: Tensor,
+    start_step: int,
+    settings: CoreSettings,
+    generator: torch.Generator,
+) -> ObjectPoses:
+    """A reader's objects, or true ones with an error, half and half."""
+    true, read = data.table.objects_at(rows, start_step), data.readings[start_step][rows]
+    size = settings.pose_noise_m * 2 * torch.rand((len(rows), 1, 1), generator=generator)
+    shift = torch.randn(true.position_m.shape, generator=generator) * size
+    shift[..., 2] *= 0.3
+    turn = torch.randn(true.axes.shape, generator=generator) * size[..., None] * 5.0
+    use_read = torch.rand((len(rows), 1), generator=generator) < 0.5
+    return ObjectPoses(
+        torch.where(use_read[..., None], read.position_m, true.position_m + shift),
+        torch.where(use_read[..., None, None], read.axes, true.axes + turn),
+        torch.where(use_read, read.present, true.present),
+    )
+
+
+def _held_still(commands: Commands, held: Bool[Tensor, " batch"]) -> Commands:
+    def still(values: Tensor) -> Tensor:
+        chosen = held.view(-1, *[1] * (values.ndim - 1))
+        return torch.where(chosen, values[:, :1].expand_as(values), values)
+
+    return Commands(
+        still(commands.points_m), still(commands.axes), still(commands.joints_rad)
+    )
+
+
+def core_loss(
+    core: RecurrentCore, data: CoreData, batch: _Batch, settings: CoreSettings
+) -> Float32[Tensor, ""]:
+    """Weighted sum of the errors in objects, touch, contact and final success.
+
+    Where hands are held still in the air, nothing moves and nothing is felt beyond the start.
+    """
+    commands, start = batch.commands, batch.start
+    features = command_features(
+        commands.points_m, commands.axes, commands.joints_rad, start.objects
+    )
+    with torch.autocast("cpu", dtype=torch.bfloat16, enabled=settings.bfloat16):
+        future, _ = core(features, start, core.first_state(start))
+    future = _in_float32(future)
+    table, rows = data.table, batch.rows
+    true = _stand(table.objects_of_latents(rows, batch.start_step), batch.is_held)
+    steps = table.steps_after(batch.start_step)
+    moves = ~batch.is_held
+    touch = data.touch[rows][:, steps].float()
+    at_start = start.touch[:, None, None].expand_as(touch)
+    touch = torch.where(moves.view(-1, 1, 1, 1, 1), touch, at_start)
+    contact = table.in_contact[rows][:, steps] & moves.view(-1, 1, 1, 1)
+    success = table.success[rows] * moves
+    weights = settings.weights
+    return (
+        weights.objects * _object_error(future.objects, true, start.objects.present)
+        + weights.touch * (future.touch[:, 1:] - touch).square().sum(-1).mean()
+        + weights.contact
+        * functional.binary_cross_entropy_with_logits(future.contact[:, 1:], contact.float())
+        + weights.success
+        * functional.binary_cross_entropy_with_logits(future.success[:, -1], success)
+    )
+
+
+def _in_float32(future: SceneFuture) -> SceneFuture:
+    objects = future.objects
+    return SceneFuture(
+        ObjectPoses(objects.position_m.float(), objects.axes.float(), objects.present.float()),
+        future.touch.float(),
+        future.contact.float(),
+        future.success.float(),
+    )
+
+
+def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:
+    def still(values: Tensor) -> Tensor:
+        chosen = held.view(-1, *[1] * (values.ndim - 1))
+        return torch.where(chosen, values[:, :1].expand_as(values), values)
+
+    return replace(
+        objects, position_m=still(objects.position_m), axes=still(objects.axes)
+    )
+
+
+def _object_error(
+    told: ObjectPoses, true: ObjectPoses, seen: Float32[Tensor, "batch objects"]
+) -> Float32[Tensor, ""]:
+    """Errors of position (twice) and axes, of objects that are there and were seen at the start."""
+    weight = true.present * (seen > 0.5)[:, None]
+    position = functional.smooth_l1_loss(
+        told.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.2, reduction="none"
+    ).sum(-1)
+    axes = (told.axes - true.axes).square().sum((-1, -2))
+    return ((2.0 * position + axes) * weight).sum() / weight.sum().clamp_min(1.0)
+
+
+@torch.no_grad()
+def touch_latents(codec: TouchCodec, table: SceneTable) -> Tensor:
+    """Latents of all touch of a table, as float16 to save memory."""
+    return torch.stack([codec.encode(touch.float()).half() for touch in table.tactile_kpa])

@@ -1,0 +1,153 @@
+"""Training of a start reader on steps whose object poses are known."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Float32, Int64
+from torch import Tensor, nn
+from torch.nn import functional
+
+from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.objects import ObjectPoses
+from services.world_model.dynamics.start_reader import StartReader
+from services.world_model.settings import ReaderSettings
+from services.world_model.training.averaging import WeightAverage, cosine_rate
+from services.world_model.training.scene_table import SceneTable
+
+# Errors of positions are measured in this unit.
+_UNIT_M = 0.05
+_BATCH_OF_READING = 128
+OnStep = Callable[[int, float], None]
+
+
+@dataclass(frozen=True)
+class ReaderError:
+    """Errors on held-out steps, of objects that are there: medians and 90 % quantiles in mm."""
+
+    lateral_mm: float
+    lateral_90_mm: float
+    height_mm: float
+    axis_deg: float
+    presence: float
+
+
+def train_reader(
+    table: SceneTable,
+    config: DynamicsConfig,
+    settings: ReaderSettings,
+    *,
+    seed: int,
+    on_step: OnStep | None = None,
+) -> StartReader:
+    """A reader of objects from single steps: half of them first ones, half from amid episodes.
+
+    Args:
+        table: training episodes.
+        config: of the dynamics model.
+        settings: number of steps and the like.
+        seed: of weights and of everything that is drawn.
+        on_step: called with the step and its loss.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        reader = StartReader(config)
+    _fit_heights(reader, table, config)
+    optimizer = torch.optim.AdamW(
+        reader.parameters(), lr=settings.learning_rate, weight_decay=1e-3, fused=True
+    )
+    average = WeightAverage(reader, settings.ema_decay)
+    later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
+    for step in range(settings.num_steps):
+        rows = torch.randint(len(table), (settings.batch,), generator=generator)
+        amid = torch.tensor(later)[torch.randint(len(later), rows.shape, generator=generator)]
+        is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
+        steps = torch.where(is_first, 0, amid)
+        loss = _loss(reader, (table, rows, steps), generator, bfloat16=settings.bfloat16)
+        for group in optimizer.param_groups:
+            group["lr"] = cosine_rate(settings.learning_rate, step, settings.num_steps)
+        optimizer.zero_grad()
+        loss.backward()  # type: ignore[no-untyped-call]
+        nn.utils.clip_grad_norm_(reader.parameters(), 1.0, error_if_nonfinite=True)
+        optimizer.step()
+        average.update(reader)
+        if on_step is not None:
+            on_step(step + 1, float(loss.detach()))
+    average.copy_to(reader)
+    return reader.eval()
+
+
+def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:
+    """Resting heights: medians over the first steps of each task's episodes."""
+    for task, count in enumerate(config.num_objects):
+        for slot in range(count):
+            first = table.objects.position_m[:, 0, slot, 2]
+            there = (table.task == task) & (table.objects.present[:, 0, slot] > 0)
+            if there.any():
+                reader.height_mean[task, slot] = first[there].median()
+
+
+def _loss(
+    reader: StartReader,
+    places: tuple[SceneTable, Int64[Tensor, " batch"], Int64[Tensor, " batch"]],
+    generator: torch.Generator,
+    *,
+    bfloat16: bool,
+) -> Float32[Tensor, ""]:
+    table, rows, steps = places
+    first, true = table.first_steps(rows, steps), table.objects_at(rows, steps)
+    image = first.image.permute(0, 3, 1, 2).float() / 255 - 0.5
+    brightness = torch.randn((len(rows), 1, 1, 1), generator=generator) * 0.03
+    image = image + brightness + torch.randn(image.shape, generator=generator) * 0.01
+    told = reader.read(image, first, bfloat16=bfloat16)
+    there = true.present
+    used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
+    position = functional.smooth_l1_loss(
+        told.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.1, reduction="none"
+    ).sum(-1)
+    axes = (told.axes - true.axes).square().sum((-1, -2))
+    presence = functional.binary_cross_entropy(
+        told.present.clamp(1e-4, 1 - 1e-4), there, reduction="none"
+    )
+    return ((position + axes) * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
+        presence * used
+    ).sum() / used.sum()
+
+
+@torch.no_grad()
+def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPoses:
+    """What a reader makes of one step of every episode."""
+    parts = []
+    for rows in torch.arange(len(table)).split(_BATCH_OF_READING):
+        parts.append(reader(table.first_steps(rows, torch.full_like(rows, step))))
+    return ObjectPoses(
+        torch.cat([part.position_m for part in parts]),
+        torch.cat([part.axes for part in parts]),
+        torch.cat([part.present for part in parts]),
+    )
+
+
+def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str, ReaderError]:
+    """Errors by task at one step of held-out episodes; tasks without objects there are left out."""
+    told, errors = read_objects(reader, table, step), {}
+    rows = torch.arange(len(table))
+    true = table.objects_at(rows, step)
+    for index, task in enumerate(reader.config.tasks):
+        of_task = table.task == index
+        there = (true.present > 0) & of_task[:, None]
+        if not there.any():
+            continue
+        off_mm = 1e3 * (told.position_m - true.position_m)[there]
+        lateral = off_mm[:, :2].norm(dim=-1)
+        cosine = (functional.normalize(told.axes[there][:, 0], dim=-1) * true.axes[there][:, 0])
+        used = (torch.arange(MAX_OBJECTS) < reader.config.num_objects[index]) & of_task[:, None]
+        right = (told.present > 0.5) == (true.present > 0)
+        errors[task] = ReaderError(
+            lateral_mm=float(lateral.median()),
+            lateral_90_mm=float(lateral.quantile(0.9)),
+            height_mm=float(off_mm[:, 2].abs().median()),
+            axis_deg=float(torch.rad2deg(cosine.sum(-1).clamp(-1, 1).acos()).median()),
+            presence=float(right[used].float().mean()),
+        )
+    return errors

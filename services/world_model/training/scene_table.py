@@ -1,0 +1,237 @@
+"""Episodes as tensors for training start readers and recurrent cores on whole episodes."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from jaxtyping import Bool, Float16, Float32, Int64, UInt8
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import AnchorPoses
+from dextouch.tactile.layout import split_pads
+from services.world_model.dynamics.configuration import (
+    MAX_OBJECTS,
+    STEPS_PER_LATENT,
+    DynamicsConfig,
+)
+from services.world_model.dynamics.core import NUM_PADS
+from services.world_model.dynamics.features import LOOKS
+from services.world_model.dynamics.hand_motion import HandMotion, hand_motion
+from services.world_model.dynamics.model import Commands, pad_means_kpa
+from services.world_model.dynamics.objects import ObjectPoses, objects_from_poses
+from services.world_model.dynamics.start_reader import FirstStep
+from services.world_model.dynamics.touch_codec import FREE_KPA
+from services.world_model.training.scene_episodes import SceneEpisode
+
+
+@dataclass(frozen=True)
+class HandTable:
+    """Hands of every step of every episode, in the world."""
+
+    points_m: Float32[Tensor, "episodes steps 2 6 3"]
+    axes: Float32[Tensor, "episodes steps 2 6"]
+    joints_rad: Float32[Tensor, "episodes steps 2 20"]
+
+    @classmethod
+    def of(cls, motions: Sequence[HandMotion]) -> "HandTable":
+        """Motions of one length."""
+        return cls(
+            torch.from_numpy(np.stack([motion.points_m for motion in motions])),
+            torch.from_numpy(np.stack([motion.axes for motion in motions])),
+            torch.from_numpy(np.stack([motion.joints_rad for motion in motions])),
+        )
+
+
+@dataclass(frozen=True)
+class SceneTable:
+    """Episodes of one length on the model grid.
+
+    `images` are of the steps `image_steps`; `in_contact` says which pads touch something;
+    `sent` are commanded hands where an episode has them, measured ones elsewhere, and `commanded`
+    says which.
+    """
+
+    sent: HandTable
+    measured: HandTable
+    commanded: Bool[Tensor, " episodes"]
+    Ts_world_camera: Float32[Tensor, "episodes steps 4 4"]
+    objects: ObjectPoses
+    tactile_kpa: Float16[Tensor, "episodes steps 2 320"]
+    pads_kpa: Float32[Tensor, "episodes steps 12"]
+    in_contact: Bool[Tensor, "episodes steps 12"]
+    images: UInt8[Tensor, "episodes images px px 3"]
+    image_steps: tuple[int, ...]
+    K_head: Float32[Tensor, "episodes 3 3"]
+    success: Float32[Tensor, " episodes"]
+    task: Int64[Tensor, " episodes"]
+
+    def __len__(self) -> int:
+        return len(self.success)
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of every episode, the first one included."""
+        return self.tactile_kpa.shape[1]
+
+    def first_steps(
+        self, rows: Int64[Tensor, " batch"], steps: Int64[Tensor, " batch"]
+    ) -> FirstStep:
+        """What a start reader sees of some steps, each of which has an image."""
+        places = torch.tensor([self.image_steps.index(int(step)) for step in steps])
+        return FirstStep(
+            self.images[rows, places],
+            self.K_head[rows],
+            self.Ts_world_camera[rows, steps],
+            self.measured.points_m[rows, steps],
+            self.pads_kpa[rows, steps],
+            self.task[rows],
+        )
+
+    def objects_at(self, rows: Tensor, steps: Tensor | int) -> ObjectPoses:
+        """True objects at one step of each episode."""
+        objects = self.objects
+        return ObjectPoses(
+            objects.position_m[rows, steps], objects.axes[rows, steps], objects.present[rows, steps]
+        )
+
+    def objects_of_latents(self, rows: Tensor, start: int) -> ObjectPoses:
+        """True objects at the start and at every latent step after it."""
+        steps = torch.arange(start, self.num_steps, STEPS_PER_LATENT)
+        objects = self.objects
+        return ObjectPoses(
+            objects.position_m[rows][:, steps],
+            objects.axes[rows][:, steps],
+            objects.present[rows][:, steps],
+        )
+
+    def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
+        """Standing where measured at `start`, then as sent (or measured) until the end."""
+        latents = torch.arange(start, self.num_steps - 1, STEPS_PER_LATENT)
+        looks = latents[:, None] + torch.tensor(LOOKS)
+        ends = looks[:, -1]
+
+        def chosen(name: str, steps: Tensor) -> Tensor:
+            sent: Tensor = getattr(self.sent, name)[rows][:, steps]
+            measured: Tensor = getattr(self.measured, name)[rows][:, steps]
+            return torch.where(use_measured.view(-1, *[1] * (sent.ndim - 1)), measured, sent)
+
+        here = self.measured
+        standing = here.points_m[rows, start][:, None, None].expand(-1, 1, len(LOOKS), -1, -1, -1)
+        return Commands(
+            torch.cat([standing, chosen("points_m", looks)], dim=1),
+            torch.cat([here.axes[rows, start][:, None], chosen("axes", ends)], dim=1),
+            torch.cat([here.joints_rad[rows, start][:, None], chosen("joints_rad", ends)], dim=1),
+        )
+
+    def steps_after(self, start: int) -> Int64[Tensor, "latents 4"]:
+        """The four model steps of every latent after `start`."""
+        latents = torch.arange(start, self.num_steps - 1, STEPS_PER_LATENT)
+        return latents[:, None] + torch.arange(1, STEPS_PER_LATENT + 1)
+
+    def select(self, rows: Int64[Tensor, " some"]) -> "SceneTable":
+        """Some of the episodes."""
+        return SceneTable(
+            HandTable(*(getattr(self.sent, n)[rows] for n in ("points_m", "axes", "joints_rad"))),
+            HandTable(
+                *(getattr(self.measured, n)[rows] for n in ("points_m", "axes", "joints_rad"))
+            ),
+            self.commanded[rows],
+            self.Ts_world_camera[rows],
+            self.objects[rows],
+            self.tactile_kpa[rows],
+            self.pads_kpa[rows],
+            self.in_contact[rows],
+            self.images[rows],
+            self.image_steps,
+            self.K_head[rows],
+            self.success[rows],
+            self.task[rows],
+        )
+
+
+def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Tasks in alphabetical order with the number of objects of each.
+
+    Raises:
+        InvalidInputError: no episodes, or a task whose episodes differ in their objects.
+    """
+    counts: dict[str, set[int]] = {}
+    for episode in episodes:
+        counts.setdefault(episode.task, set()).add(episode.object_poses.shape[1])
+    uneven = {task: sorted(found) for task, found in counts.items() if len(found) > 1}
+    if not counts or uneven:
+        raise InvalidInputError(
+            f"training episodes: got {len(episodes)} episodes, tasks with several numbers of "
+            f"objects {uneven}; expected at least one episode and one number for every task"
+        )
+    tasks = tuple(sorted(counts))
+    return tasks, tuple(counts[task].pop() for task in tasks)
+
+
+def scene_table(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> SceneTable:
+    """Tensors of episodes.
+
+    Raises:
+        InvalidInputError: lengths or image steps differ, a length is not 1 + 4k, or a task or an
+            image size is not the configuration's.
+    """
+    _check(episodes, config)
+    sent, measured = [], []
+    for episode in episodes:
+        anchor = AnchorPoses(*episode.anchor)
+        measured.append(hand_motion(episode.measured_actions, anchor))
+        sent.append(hand_motion(episode.actions, anchor))
+    tactile = np.stack([episode.tactile_kpa for episode in episodes])
+    objects = [objects_from_poses(episode.object_poses) for episode in episodes]
+    return SceneTable(
+        sent=HandTable.of(sent),
+        measured=HandTable.of(measured),
+        commanded=torch.tensor([e.action_kind == "commanded" for e in episodes]),
+        Ts_world_camera=torch.from_numpy(np.stack([m.Ts_world_camera for m in measured])).float(),
+        objects=ObjectPoses(
+            torch.stack([each.position_m for each in objects]),
+            torch.stack([each.axes for each in objects]),
+            torch.stack([each.present for each in objects]),
+        ),
+        tactile_kpa=torch.from_numpy(tactile.astype(np.float16)),
+        pads_kpa=torch.from_numpy(pad_means_kpa(tactile.astype(np.float32))),
+        in_contact=torch.from_numpy(_pad_peaks_kpa(tactile) >= FREE_KPA),
+        images=torch.from_numpy(np.stack([episode.images for episode in episodes])),
+        image_steps=tuple(int(step) for step in episodes[0].image_steps),
+        K_head=torch.from_numpy(np.stack([e.K_head for e in episodes]).astype(np.float32)),
+        success=torch.tensor([float(episode.success) for episode in episodes]),
+        task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
+    )
+
+
+def _pad_peaks_kpa(tactile_kpa: np.ndarray) -> np.ndarray:
+    tips, palm = split_pads(tactile_kpa)
+    peaks = np.concatenate([tips.max((-1, -2)), palm.max((-1, -2))[..., None]], axis=-1)
+    return peaks.reshape(*peaks.shape[:-2], NUM_PADS)
+
+
+def _check(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> None:
+    if not episodes:
+        raise InvalidInputError("training episodes: got none, expected at least one")
+    first = episodes[0]
+    num_steps, size = len(first.tactile_kpa), (config.image_px, config.image_px, 3)
+    for episode in episodes:
+        if episode.task not in config.tasks or episode.object_poses.shape[1] > MAX_OBJECTS:
+            raise InvalidInputError(
+                f"episode {episode.episode_id}: task {episode.task!r} with "
+                f"{episode.object_poses.shape[1]} objects, expected one of {config.tasks} with at "
+                f"most {MAX_OBJECTS}"
+            )
+        if len(episode.tactile_kpa) != num_steps or num_steps % STEPS_PER_LATENT != 1:
+            raise InvalidInputError(
+                f"episode {episode.episode_id}: got {len(episode.tactile_kpa)} steps, expected "
+                f"1 + 4k and as many as {first.episode_id} ({num_steps})"
+            )
+        if episode.images.shape[1:] != size or list(episode.image_steps) != list(first.image_steps):
+            raise InvalidInputError(
+                f"episode {episode.episode_id}: images {episode.images.shape[1:]} of steps "
+                f"{list(episode.image_steps)[:4]} …, expected {size} and the steps of "
+                f"{first.episode_id}; record all with one --images setting"
+            )
