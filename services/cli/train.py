@@ -8,15 +8,17 @@ from collections.abc import Sequence
 TRAINERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "data": ("services.cli.training_data", ()),
     "world-model": ("services.world_model.__main__", ("train",)),
+    "state": ("services.world_model.__main__", ("train-state",)),
     "imagined": ("services.cli.imagined_data", ()),
     "policy": ("services.evaluation.__main__", ("train-policy",)),
     "probe": ("services.evaluation.__main__", ("train-probe",)),
 }
 
-USAGE = """usage: dextouch train data|world-model|imagined|policy|probe [options]
+USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe [options]
 
   data         record the mixed twin episodes that everything is trained on
   world-model  the joint visuo-tactile flow-matching model
+  state        the state model: start readers and recurrent cores on whole episodes
   imagined     those episodes as the world model imagines them
   policy       a closed-loop policy that imitates the demonstrations
   probe        the judge of imagined success; give it data made with --ladder

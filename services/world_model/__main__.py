@@ -14,15 +14,21 @@ from dextouch.errors import InvalidInputError
 from dextouch.serving.settings import load_settings
 from dextouch.worlds.serve import serve_worlds
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint
-from services.world_model.settings import ShowCommand, TrainCommand, WorldModelSettings
+from services.world_model.settings import (
+    ShowCommand,
+    TrainCommand,
+    TrainStateCommand,
+    WorldModelSettings,
+)
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
-USAGE = """usage: world_model train|serve|show [flags]
+USAGE = """usage: world_model train|train-state|serve|show [flags]
 
-  train   learn from the episodes of a store and write a measured checkpoint
-  serve   serve a checkpoint's rollouts over HTTP
-  show    say where a checkpoint comes from and how good it is
+  train         learn from the episodes of a store and write a measured checkpoint
+  train-state   the same for a state model: start readers and recurrent cores
+  serve         serve a checkpoint's rollouts over HTTP
+  show          say where a checkpoint comes from and how good it is
 
 Flags: world_model COMMAND --help"""
 EXIT_USAGE = 2
@@ -34,6 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str]], int]] = {
         "train": run_train,
+        "train-state": run_train_state,
         "serve": run_serve,
         "show": run_show,
     }
@@ -71,6 +78,24 @@ def run_train(arguments: list[str]) -> int:
 
         report = train(settings, on_progress)
     print(_table(report))
+    if settings.json_path is not None:
+        written = {**asdict(report), "checkpoint": str(report.checkpoint)}
+        settings.json_path.write_text(json.dumps(written, indent=2))
+    return 0
+
+
+def run_train_state(arguments: list[str]) -> int:
+    """Train a state model; figures go to the terminal and, if asked, to a file."""
+    from services.world_model.training.state_trainer import train_state
+
+    settings = _parse(TrainStateCommand, arguments)
+    report = train_state(settings)
+    print(
+        f"{report.checkpoint}: {report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s, "
+        f"{report.num_training_episodes} episodes, {report.num_heldout_episodes} held out"
+    )
+    for name, value in report.metrics.items():
+        print(f"{name:<36} {value:.3f}")
     if settings.json_path is not None:
         written = {**asdict(report), "checkpoint": str(report.checkpoint)}
         settings.json_path.write_text(json.dumps(written, indent=2))

@@ -14,7 +14,8 @@ from services.world_model.network.configuration import NetworkConfig
 
 def has_bfloat16() -> bool:
     """Whether this processor multiplies bfloat16 itself, which halves the time of training."""
-    return bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
+    supported = torch.ops.mkldnn._is_mkldnn_bf16_supported  # noqa: SLF001 - no public name
+    return bool(supported())
 
 
 class OptimizerSettings(BaseModel):
@@ -111,6 +112,32 @@ class CoreSettings(BaseModel):
     pose_noise_m: float = Field(default=0.0025, ge=0, description="of the true start poses")
     weights: CoreLossWeights = CoreLossWeights()
     bfloat16: bool = Field(default_factory=has_bfloat16, description="train in bfloat16")
+
+
+class StateTrainSettings(BaseModel):
+    """Training of a state model: an ensemble of start readers and recurrent cores."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
+    output: Path = Path("runs/world_model/state.safetensors")
+    name: str = "state"
+    seed: int = Field(default=0, ge=0)
+    num_members: int = Field(default=3, ge=1, le=16, description="of the ensemble")
+    heldout_share: float = Field(default=0.08, gt=0, lt=1, description="of scenes, to measure on")
+    jobs: int = Field(default=2, ge=1, le=64, description="members trained at the same time")
+    width: int = Field(default=192, ge=8, le=1024, description="of the recurrent cores")
+    reader: ReaderSettings = ReaderSettings()
+    core: CoreSettings = CoreSettings()
+
+
+class TrainStateCommand(BaseSettings, StateTrainSettings):
+    """`train-state` on the command line; figures are also written to `json_path`, if given."""
+
+    model_config = service_config("world_model_train_state")
+
+    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
 
 
 class TrainCommand(BaseSettings, TrainSettings):

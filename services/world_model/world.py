@@ -37,8 +37,10 @@ from services.world_model.checkpoints import Checkpoint, default_checkpoint, rea
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Precision, Prediction, stack_noise
 from services.world_model.network.visual_codec import to_uint8
+from services.world_model.starts import CAMERA, complete_start
+from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.state_world import StateWorld
 
-CAMERA = "camera_head"
 MAX_SNAPSHOT_BYTES = 4 * 2**20
 _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head")
 
@@ -106,7 +108,7 @@ class ModelWorld:
         """
         if start.task not in self._description.tasks:
             raise UnknownNameError("task", start.task, list(self._description.tasks))
-        observation, anchor, K_head = _complete(start)
+        observation, anchor, K_head = complete_start(start)
         reached = observation.action_reached[-1].copy()
         for part in POSE_SLICES:
             reached[part] = IDENTITY_POSE_9D
@@ -257,25 +259,28 @@ def open_world(
     *,
     sampling_steps: int | None = None,
     precision: Precision = "float32",
-) -> ModelWorld:
-    """The world of a checkpoint file; without one, of that which comes with the package."""
-    checkpoint = read_checkpoint(path if path is not None else default_checkpoint())
-    return ModelWorld(checkpoint, sampling_steps=sampling_steps, precision=precision)
+) -> ModelWorld | StateWorld:
+    """The world of a checkpoint file, of either form; without one, of the package's own.
 
+    Args:
+        path: of a safetensors file; None for the one that comes with the package.
+        sampling_steps: Euler steps of the paper's form; a state model has none.
+        precision: of the paper's form.
 
-def _complete(
-    start: RolloutStart,
-) -> tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]:
-    if start.observation is None or start.anchor is None or start.K_head is None:
-        raise InvalidInputError(
-            "start: this world begins from an observation; send one step of images, touch and "
-            "reached action together with the anchor poses and K_head"
+    Raises:
+        InvalidInputError: sampling steps for a state model.
+    """
+    file = path if path is not None else default_checkpoint()
+    if not is_state_checkpoint(file):
+        return ModelWorld(
+            read_checkpoint(file), sampling_steps=sampling_steps, precision=precision
         )
-    if CAMERA not in start.observation.images:
-        raise UnknownNameError("camera of the start", "none of them", [CAMERA])
-    if len(start.observation) != 1:
-        raise ShapeError(f"start: got {len(start.observation)} observed steps, expected one")
-    return start.observation, start.anchor, start.K_head
+    if sampling_steps is not None:
+        raise InvalidInputError(
+            f"state model {file.name}: got {sampling_steps} sampling steps, expected none: it "
+            "predicts without sampling"
+        )
+    return StateWorld(read_state_checkpoint(file))
 
 
 def _request(state: ModelState, chunk: np.ndarray) -> PredictionRequest:

@@ -1,1 +1,1 @@
-"""State of a scene that lasts: objects found at the start, then moved and felt by a recurrent core."""
+"""Lasting state of a scene: objects found at the start, then moved by a recurrent core."""

@@ -186,6 +186,10 @@ class DynamicsModel(nn.Module):
         )
         return following, imagined
 
+    def readers(self) -> list[StartReader]:
+        """The start reader of every member."""
+        return [member.reader for member in self._members()]
+
     def _members(self) -> list[DynamicsMember]:
         return [member for member in self.members if isinstance(member, DynamicsMember)]
 
@@ -211,7 +215,7 @@ class DynamicsModel(nn.Module):
         contact: Float32[Tensor, "*batch 12"],
     ) -> Float32[Tensor, "*batch 2 320"]:
         """Pressures in kPa; pads that are more likely free than in contact feel nothing."""
-        pads = (contact > 0).unflatten(-1, (2, NUM_PADS // 2))
+        pads = (contact > 0).reshape(*contact.shape[:-1], 2, NUM_PADS // 2)
         tips = pads[..., :5].repeat_interleave(NUM_TIP_TAXELS // 5, dim=-1)
         palm = pads[..., 5:].expand(*pads.shape[:-1], NUM_TAXELS - NUM_TIP_TAXELS)
         return self.codec.decode(touch) * torch.cat([tips, palm], dim=-1)

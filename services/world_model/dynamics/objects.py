@@ -28,7 +28,7 @@ class ObjectPoses:
     axes: Float32[Tensor, "*batch objects 2 3"]
     present: Float32[Tensor, "*batch objects"]
 
-    def __getitem__(self, index: Tensor | int | slice) -> "ObjectPoses":
+    def __getitem__(self, index: Tensor | int | slice | tuple[slice, int]) -> "ObjectPoses":
         """Some entries of the batch."""
         return ObjectPoses(self.position_m[index], self.axes[index], self.present[index])
 

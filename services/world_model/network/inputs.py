@@ -144,6 +144,17 @@ def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.nd
         )
     for part in POSE_SLICES:
         actions[0, part] = IDENTITY_POSE_9D
+    check_reach(actions)
+    return actions.round(DECIMALS) + 0.0
+
+
+def check_reach(actions: Float64[np.ndarray, "time 67"]) -> None:
+    """Refuse poses and angles outside what a body can do.
+
+    Raises:
+        InvalidInputError: more than 2 m from the anchor, or more than a full turn of a joint.
+    """
+    for part in POSE_SLICES:
         reach_m = float(np.abs(actions[:, part][:, :3]).max())
         if reach_m > MAX_TRANSLATION_M:
             raise InvalidInputError(
@@ -159,7 +170,6 @@ def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.nd
                 f"{MAX_JOINT_RAD:.3g}; angles are in radians",
                 got=angle_rad,
             )
-    return actions.round(DECIMALS) + 0.0
 
 
 def _checked_anchor(anchor: AnchorPoses) -> np.ndarray:

@@ -162,9 +162,7 @@ def _held_still(commands: Commands, held: Bool[Tensor, " batch"]) -> Commands:
         chosen = held.view(-1, *[1] * (values.ndim - 1))
         return torch.where(chosen, values[:, :1].expand_as(values), values)
 
-    return Commands(
-        still(commands.points_m), still(commands.axes), still(commands.joints_rad)
-    )
+    return Commands(still(commands.points_m), still(commands.axes), still(commands.joints_rad))
 
 
 def core_loss(
@@ -216,9 +214,7 @@ def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:
         chosen = held.view(-1, *[1] * (values.ndim - 1))
         return torch.where(chosen, values[:, :1].expand_as(values), values)
 
-    return replace(
-        objects, position_m=still(objects.position_m), axes=still(objects.axes)
-    )
+    return replace(objects, position_m=still(objects.position_m), axes=still(objects.axes))
 
 
 def _object_error(

@@ -118,9 +118,10 @@ def _loss(
 @torch.no_grad()
 def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPoses:
     """What a reader makes of one step of every episode."""
-    parts = []
-    for rows in torch.arange(len(table)).split(_BATCH_OF_READING):
-        parts.append(reader(table.first_steps(rows, torch.full_like(rows, step))))
+    parts: list[ObjectPoses] = [
+        reader(table.first_steps(rows, torch.full_like(rows, step)))
+        for rows in torch.split(torch.arange(len(table)), _BATCH_OF_READING)
+    ]
     return ObjectPoses(
         torch.cat([part.position_m for part in parts]),
         torch.cat([part.axes for part in parts]),
@@ -140,7 +141,7 @@ def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str
             continue
         off_mm = 1e3 * (told.position_m - true.position_m)[there]
         lateral = off_mm[:, :2].norm(dim=-1)
-        cosine = (functional.normalize(told.axes[there][:, 0], dim=-1) * true.axes[there][:, 0])
+        cosine = functional.normalize(told.axes[there][:, 0], dim=-1) * true.axes[there][:, 0]
         used = (torch.arange(MAX_OBJECTS) < reader.config.num_objects[index]) & of_task[:, None]
         right = (told.present > 0.5) == (true.present > 0)
         errors[task] = ReaderError(

@@ -1,7 +1,7 @@
 """Episodes as tensors for training start readers and recurrent cores on whole episodes."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 import torch
@@ -130,24 +130,39 @@ class SceneTable:
         latents = torch.arange(start, self.num_steps - 1, STEPS_PER_LATENT)
         return latents[:, None] + torch.arange(1, STEPS_PER_LATENT + 1)
 
-    def select(self, rows: Int64[Tensor, " some"]) -> "SceneTable":
-        """Some of the episodes."""
-        return SceneTable(
-            HandTable(*(getattr(self.sent, n)[rows] for n in ("points_m", "axes", "joints_rad"))),
-            HandTable(
-                *(getattr(self.measured, n)[rows] for n in ("points_m", "axes", "joints_rad"))
-            ),
-            self.commanded[rows],
-            self.Ts_world_camera[rows],
-            self.objects[rows],
-            self.tactile_kpa[rows],
-            self.pads_kpa[rows],
-            self.in_contact[rows],
-            self.images[rows],
-            self.image_steps,
-            self.K_head[rows],
-            self.success[rows],
-            self.task[rows],
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything as named tensors, for a file that other processes read."""
+        flat = {"image_steps": torch.tensor(self.image_steps)}
+        for name in (one.name for one in fields(self) if one.name != "image_steps"):
+            part = getattr(self, name)
+            if isinstance(part, Tensor):
+                flat[name] = part.contiguous()
+            else:
+                for inner in fields(part):
+                    flat[f"{name}.{inner.name}"] = getattr(part, inner.name).contiguous()
+        return flat
+
+    @classmethod
+    def from_tensors(cls, flat: dict[str, Tensor]) -> "SceneTable":
+        """Inverse of `tensors`."""
+
+        def group(name: str) -> dict[str, Tensor]:
+            prefix = f"{name}."
+            return {
+                key.removeprefix(prefix): value
+                for key, value in flat.items()
+                if key.startswith(prefix)
+            }
+
+        whole = {
+            key: value for key, value in flat.items() if "." not in key and key != "image_steps"
+        }
+        return cls(
+            sent=HandTable(**group("sent")),
+            measured=HandTable(**group("measured")),
+            objects=ObjectPoses(**group("objects")),
+            image_steps=tuple(flat["image_steps"].tolist()),
+            **whole,
         )
 
 

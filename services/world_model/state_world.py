@@ -1,0 +1,362 @@
+"""World of a state model: rollouts whose imagined scene lasts from the first chunk to the last."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.errors import EndedError, InvalidInputError, ShapeError, UnknownNameError
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
+from dextouch.schemas.rollouts import Doubt
+from dextouch.streams.packing import pack, unpack
+from dextouch.worlds.world import (
+    EVERYTHING,
+    ActionKind,
+    Observation,
+    ReturnSelector,
+    RolloutStart,
+    StartedRollout,
+    SteppedRollout,
+    WorldDescription,
+)
+from services.world_model.dynamics.configuration import STEPS_PER_LATENT
+from services.world_model.dynamics.hand_motion import HandMotion, hand_motion
+from services.world_model.dynamics.memory import (
+    memory_arrays,
+    memory_from_arrays,
+    memory_of,
+    stack_memories,
+)
+from services.world_model.dynamics.model import (
+    PRESENCE_THRESHOLD,
+    STILL_M,
+    Commands,
+    ImaginedSteps,
+    SceneMemory,
+    pad_means_kpa,
+)
+from services.world_model.dynamics.objects import ObjectPoses, poses_from_objects
+from services.world_model.dynamics.start_reader import FirstStep
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.inputs import (
+    ACTION_KINDS,
+    PredictionRequest,
+    build_inputs,
+    check_reach,
+)
+from services.world_model.starts import CAMERA, complete_start
+from services.world_model.state_checkpoints import StateCheckpoint
+
+MAX_CHUNK_STEPS = 64
+MAX_SNAPSHOT_BYTES = 2**20
+# An object believed absent is shown here, under the table, where no task leaves one.
+ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
+# A rollout is doubted once its hands have moved half as long again as an episode of training, and
+# ends at four times that length: so far no state was ever trained.
+DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
+
+
+@dataclass(frozen=True)
+class StateRollout:
+    """Where a rollout stands: its start, and the memory of its scene.
+
+    `first_reached` and `reached` are relative to `anchor`, the poses of step 0; `num_moving` counts
+    the latent steps in which hands moved.
+    """
+
+    task: str
+    action_kind: ActionKind
+    image: UInt8[np.ndarray, "h w 3"]
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+    first_reached: Float64[np.ndarray, "67"]
+    memory: SceneMemory
+    step: int = 0
+    num_moving: int = 0
+
+
+class StateWorld:
+    """Implements `dextouch.worlds.world.BatchWorld` with a state model.
+
+    It is deterministic: seeds of chunks change nothing.
+
+    Args:
+        checkpoint: loaded, from `read_state_checkpoint`.
+    """
+
+    def __init__(self, checkpoint: StateCheckpoint) -> None:
+        self._dynamics = checkpoint.dynamics
+        self._metadata, self._digest = checkpoint.metadata, checkpoint.digest
+        config = self._metadata.dynamics
+        self._description = WorldDescription(
+            name=self._metadata.name,
+            kind="model",
+            digest=checkpoint.digest,
+            tasks=config.tasks,
+            cameras=(),
+            image_height_px=config.image_px,
+            image_width_px=config.image_px,
+            model_rate_hz=self._metadata.model_rate_hz,
+            action_kinds=ACTION_KINDS,
+            starts_from=("observation",),
+            chunk_multiple=STEPS_PER_LATENT,
+            max_chunk_steps=MAX_CHUNK_STEPS,
+            object_names=self._metadata.object_names,
+        )
+
+    @property
+    def description(self) -> WorldDescription:
+        """What this world is and accepts."""
+        return self._description
+
+    def reset(self, start: RolloutStart) -> StartedRollout[StateRollout]:
+        """Find the objects of one observed step, and remember them.
+
+        Raises:
+            UnknownNameError: a task or action kind that the model was not trained on.
+            InvalidInputError: no observation, anchor or K_head, or ones that do not fit.
+        """
+        if start.task not in self._description.tasks:
+            raise UnknownNameError("task", start.task, list(self._description.tasks))
+        observation, anchor, K_head = complete_start(start)
+        reached = observation.action_reached[-1].copy()
+        for part in POSE_SLICES:
+            reached[part] = IDENTITY_POSE_9D
+        image, tactile_kpa = observation.images[CAMERA][-1], observation.tactile_kpa[-1]
+        self._check_start(start, reached)
+        tactile_kpa = np.maximum(tactile_kpa, 0.0)
+        motion = hand_motion(reached[None], anchor)
+        first = FirstStep(
+            torch.from_numpy(image.copy())[None],
+            torch.from_numpy(K_head).float()[None],
+            torch.from_numpy(motion.Ts_world_camera).float(),
+            torch.from_numpy(motion.points_m),
+            torch.from_numpy(pad_means_kpa(tactile_kpa))[None],
+            torch.tensor([self._description.tasks.index(start.task)]),
+        )
+        memory = self._dynamics.begin(
+            first,
+            torch.from_numpy(tactile_kpa)[None],
+            Commands.standing([motion]),
+            torch.tensor([float(start.action_kind == "commanded")]),
+        )
+        rollout = StateRollout(
+            start.task, start.action_kind, image, anchor, K_head, reached, memory
+        )
+        seen = Observation(
+            first_step=0,
+            images={},
+            tactile_kpa=tactile_kpa[None],
+            action_reached=reached[None],
+            reached_is_measured=True,
+            object_poses=self._poses(memory.poses, start.task),
+        )
+        return StartedRollout(rollout, seen, anchor, K_head)
+
+    def _check_start(self, start: RolloutStart, reached: np.ndarray) -> None:
+        """The checks of every other model, so that a start that one takes the other takes too."""
+        observation, anchor, K_head = complete_start(start)
+        request = PredictionRequest(
+            first_image=observation.images[CAMERA][-1],
+            first_tactile_kpa=observation.tactile_kpa[-1],
+            actions=np.repeat(reached[None], 1 + STEPS_PER_LATENT, axis=0),
+            action_kind=start.action_kind,
+            instruction=start.instruction,
+            anchor=anchor,
+            K_head=K_head,
+        )
+        build_inputs([request], NetworkConfig(image_px=self._metadata.dynamics.image_px))
+
+    def step(
+        self,
+        state: StateRollout,
+        actions: Float64[np.ndarray, "steps 67"],
+        *,
+        seed: int,
+        selector: ReturnSelector = EVERYTHING,
+    ) -> SteppedRollout[StateRollout]:
+        """Imagine one action chunk of 4k ≤ 64 steps.
+
+        Raises:
+            ShapeError: a chunk of another length.
+            InvalidInputError: actions that no hand can follow.
+            EndedError: the hands have moved four times as long as any episode of training.
+        """
+        chunks = np.asarray(actions)[None]
+        return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
+
+    def step_batch(
+        self,
+        states: Sequence[StateRollout],
+        actions: Float64[np.ndarray, "batch steps 67"],
+        *,
+        seeds: Sequence[int],
+        selectors: Sequence[ReturnSelector] | None = None,
+    ) -> list[SteppedRollout[StateRollout]]:
+        """`step` for each entry at once; answers differ from single ones by rounding only."""
+        asked = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+        counts = (len(states), len(actions), len(seeds), len(asked))
+        if len(set(counts)) != 1 or len(states) == 0:
+            raise ShapeError(
+                f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
+                f"{counts[3]} selectors, expected one of each for every rollout"
+            )
+        for state in states:
+            self._refuse_ended(state)
+        chunks = [self._checked_chunk(chunk) for chunk in actions]
+        motions = [hand_motion(chunk, s.anchor) for chunk, s in zip(chunks, states, strict=True)]
+        memory = stack_memories([state.memory for state in states])
+        following, imagined = self._dynamics.advance(memory, Commands.of(motions))
+        moving = num_moving(memory, motions)
+        return [
+            self._answer(
+                replace(
+                    state,
+                    memory=memory_of(following, index),
+                    step=state.step + len(chunks[index]),
+                    num_moving=state.num_moving + moving[index],
+                ),
+                chunks[index],
+                (imagined, index),
+                asked[index],
+            )
+            for index, state in enumerate(states)
+        ]
+
+    def _refuse_ended(self, state: StateRollout) -> None:
+        limit = LAST_HORIZONS * self._metadata.bounds.horizon_latents
+        if state.num_moving >= limit:
+            seconds = limit * STEPS_PER_LATENT / self._metadata.model_rate_hz
+            reason = (
+                f"hands moved for {seconds:.0f} s, four times as long as any episode this model "
+                "was trained on"
+            )
+            raise EndedError(f"world {self._metadata.name}: {reason}", reason=reason)
+
+    def _checked_chunk(self, actions: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
+        chunk = check_actions(actions, where="action chunk")
+        if len(chunk) % STEPS_PER_LATENT or len(chunk) > MAX_CHUNK_STEPS:
+            raise ShapeError(
+                f"action chunk: got {len(chunk)} rows, expected a multiple of {STEPS_PER_LATENT} "
+                f"up to {MAX_CHUNK_STEPS}"
+            )
+        check_reach(chunk)
+        return chunk
+
+    def _answer(
+        self,
+        state: StateRollout,
+        chunk: np.ndarray,
+        imagined: tuple[ImaginedSteps, int],
+        selector: ReturnSelector,
+    ) -> SteppedRollout[StateRollout]:
+        steps, index = imagined
+        one = ObjectPoses(
+            steps.poses.position_m[index], steps.poses.axes[index], steps.poses.present[index]
+        )
+        observation = Observation(
+            first_step=state.step - len(chunk) + 1,
+            images={},
+            tactile_kpa=steps.tactile_kpa[index].numpy(),
+            action_reached=chunk,
+            reached_is_measured=False,
+            object_poses=self._poses(one, state.task),
+            doubt=self._doubt(state, steps, index),
+        )
+        return SteppedRollout(state, observation.selected(selector))
+
+    def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
+        bounds = self._metadata.bounds
+        disagreement_m = float(steps.disagreement_m[index])
+        distance = float(steps.distance[index])
+        reason = None
+        if state.num_moving > DOUBTED_HORIZONS * bounds.horizon_latents:
+            reason = "hands moved longer than in any episode of training"
+        elif disagreement_m > bounds.disagreement_m:
+            reason = (
+                f"members disagree by {1e3 * disagreement_m:.0f} mm about an object, more than "
+                f"{1e3 * bounds.disagreement_m:.0f} mm"
+            )
+        elif distance > bounds.distance:
+            reason = (
+                f"hands are {distance / bounds.distance:.1f} times as far from training as allowed"
+            )
+        return Doubt(
+            disagreement=disagreement_m,
+            distance=distance,
+            outside=reason is not None,
+            reason=reason,
+        )
+
+    def _poses(self, objects: ObjectPoses, task: str) -> Float32[np.ndarray, "n objects 7"]:
+        """Poses of the task's objects; absent ones lie below the table."""
+        count = len(self._metadata.object_names[task])
+        poses = poses_from_objects(objects).astype(np.float32)[..., :count, :]
+        there = objects.present.numpy()[..., :count] > PRESENCE_THRESHOLD
+        return np.where(there[..., None], poses, ABSENT_POSE)
+
+    def snapshot(self, state: StateRollout) -> bytes:
+        """The state as bytes that `restore` of the same checkpoint accepts."""
+        fields = {
+            "digest": self._digest,
+            "task": state.task,
+            "action_kind": state.action_kind,
+            "step": state.step,
+            "num_moving": state.num_moving,
+        }
+        arrays = {
+            "image": state.image,
+            "anchor": np.stack(state.anchor.as_tuple()),
+            "K_head": state.K_head,
+            "first_reached": state.first_reached,
+        }
+        return pack(fields, {**arrays, **memory_arrays(state.memory)})
+
+    def restore(self, data: bytes) -> StateRollout:
+        """The state of a snapshot.
+
+        Raises:
+            InvalidInputError: bytes that are no snapshot of this checkpoint.
+        """
+        fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
+        if fields.get("digest") != self._digest:
+            raise InvalidInputError(
+                f"snapshot: of world {str(fields.get('digest'))[:12]!r}, expected "
+                f"{self._digest[:12]!r}; restore it in the world that made it"
+            )
+        config, name = self._metadata.dynamics, fields.get("task")
+        step, moving = fields.get("step"), fields.get("num_moving")
+        size = (config.image_px, config.image_px, 3)
+        shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
+        if (
+            name not in config.tasks
+            or fields.get("action_kind") not in ACTION_KINDS
+            or not isinstance(step, int)
+            or not isinstance(moving, int)
+            or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
+        ):
+            raise InvalidInputError(
+                f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
+                "this world's own snapshot writes"
+            )
+        return StateRollout(
+            task=name,
+            action_kind=fields["action_kind"],
+            image=arrays["image"],
+            anchor=AnchorPoses(*np.array(arrays["anchor"])),
+            K_head=np.array(arrays["K_head"]),
+            first_reached=check_actions(arrays["first_reached"][None], where="snapshot")[0],
+            memory=memory_from_arrays(arrays, config, self._metadata.num_members),
+            step=step,
+            num_moving=moving,
+        )
+
+
+def num_moving(memory: SceneMemory, motions: Sequence[HandMotion]) -> list[int]:
+    """In how many latent steps of a chunk the hands of each rollout move."""
+    ends = np.stack([m.points_m[STEPS_PER_LATENT - 1 :: STEPS_PER_LATENT] for m in motions])
+    path = np.concatenate([memory.points_m[:, None].numpy(), ends], axis=1)
+    moved_m = np.linalg.norm(np.diff(path, axis=1), axis=-1).max(axis=(-1, -2))
+    return [int(count) for count in (moved_m >= STILL_M).sum(axis=1)]

@@ -1,0 +1,244 @@
+"""Training of a state model: episodes of stores to a measured checkpoint, member by member.
+
+Members are trained in processes of their own and kept as soon as they are finished, so that an
+interrupted run goes on with those that are missing.
+"""
+
+import hashlib
+import multiprocessing
+import time
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from pathlib import Path
+
+import structlog
+import torch
+from safetensors.torch import load_file, save_file
+from torch import Tensor
+
+from dextouch.errors import InvalidInputError
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
+from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.settings import StateTrainSettings
+from services.world_model.state_checkpoints import (
+    StateBounds,
+    StateMetadata,
+    write_state_checkpoint,
+)
+from services.world_model.training.core_training import CoreData, touch_latents, train_core
+from services.world_model.training.reader_training import read_objects, train_reader
+from services.world_model.training.scene_episodes import (
+    SceneEpisode,
+    load_scene_episodes,
+    refuse_shared_scenes,
+    split_by_scene,
+)
+from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
+from services.world_model.training.state_evaluation import evaluate_dynamics
+
+# Cores learn to begin at these steps beside the first.
+LATER_STARTS = tuple(range(8, 64, 8))
+_LOG_EVERY = 500
+_SEED_STRIDE = 1000
+logger = structlog.get_logger(__name__)
+
+
+@dataclass(frozen=True)
+class StateReport:
+    """What a run made and how good it is on held-out scenes."""
+
+    checkpoint: Path
+    digest: str
+    num_parameters: int
+    cpu_s: float
+    num_training_episodes: int
+    num_heldout_episodes: int
+    metrics: dict[str, float]
+
+
+def train_state(settings: StateTrainSettings) -> StateReport:
+    """Train every member, measure the ensemble, write it.
+
+    Raises:
+        InvalidInputError: no episodes, or ones that do not fit each other.
+    """
+    torch.set_num_threads(1)
+    episodes = [
+        episode
+        for url in settings.episodes
+        for episode in load_scene_episodes(url, tasks=settings.tasks or None)
+    ]
+    training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
+    refuse_shared_scenes(training, heldout)
+    config = _config(episodes, settings)
+    parts = settings.output.with_suffix(".parts")
+    parts.mkdir(parents=True, exist_ok=True)
+    data_hash = _data_hash(training)
+    table = scene_table(training, config)
+    codec = TouchCodec(config.touch_channels)
+    codec.fit(table.tactile_kpa[:, ::4].float().flatten(0, 2))
+    table_file = parts / "table.safetensors"
+    save_file({**table.tensors(), **_prefixed(codec)}, table_file)
+    del table
+    work = _Work(settings, config, parts, _key(settings, data_hash))
+    cpu_s = _train_members(work)
+    dynamics = _assembled(work, codec)
+    measured = evaluate_dynamics(dynamics, scene_table(heldout, config))
+    metadata = StateMetadata(
+        name=settings.name,
+        dynamics=config,
+        num_members=settings.num_members,
+        object_names={e.task: e.object_names for e in episodes},
+        object_boxes_m={
+            e.task: tuple(tuple(map(float, row)) for row in e.object_boxes_m) for e in episodes
+        },
+        bounds=StateBounds(
+            disagreement_m=measured.disagreement_m,
+            distance=measured.distance,
+            horizon_latents=measured.num_latents,
+        ),
+        command=_command(settings),
+        seed=settings.seed,
+        training_cpu_s=round(cpu_s, 1),
+        num_training_episodes=len(training),
+        training_seeds=_seed_ranges(training),
+        data_hash=data_hash,
+        metrics=measured.figures,
+    )
+    digest = write_state_checkpoint(settings.output, dynamics, metadata)
+    table_file.unlink()
+    return StateReport(
+        settings.output,
+        digest,
+        sum(p.numel() for p in dynamics.parameters()),
+        cpu_s,
+        len(training),
+        len(heldout),
+        measured.figures,
+    )
+
+
+@dataclass(frozen=True)
+class _Work:
+    """What every member's process is given."""
+
+    settings: StateTrainSettings
+    config: DynamicsConfig
+    parts: Path
+    key: str
+
+    def file_of(self, member: int) -> Path:
+        """Where a finished member is kept; other settings or data have other names."""
+        return self.parts / f"member-{self.key}-{member}.safetensors"
+
+
+def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> DynamicsConfig:
+    tasks, num_objects = vocabulary(episodes)
+    sides = {episode.images.shape[1] for episode in episodes}
+    if len(sides) != 1 or 0 in sides:
+        raise InvalidInputError(
+            f"state model: got episodes with images of {sorted(sides)} px, expected one size "
+            "(and images in all of them)"
+        )
+    return DynamicsConfig(
+        tasks=tasks, num_objects=num_objects, image_px=sides.pop(), width=settings.width
+    )
+
+
+def _key(settings: StateTrainSettings, data_hash: str) -> str:
+    chosen = settings.model_dump_json(exclude={"output", "jobs", "num_members", "name"})
+    return hashlib.sha256((chosen + data_hash).encode()).hexdigest()[:16]
+
+
+def _data_hash(episodes: list[SceneEpisode]) -> str:
+    digests = sorted(episode.content_sha256 for episode in episodes)
+    return hashlib.sha256("\n".join(digests).encode()).hexdigest()
+
+
+def _seed_ranges(episodes: list[SceneEpisode]) -> dict[str, tuple[int, int]]:
+    """First and last seed of every task."""
+    seeds: dict[str, list[int]] = {}
+    for episode in episodes:
+        seeds.setdefault(episode.task, []).append(episode.seed)
+    return {task: (min(found), max(found)) for task, found in sorted(seeds.items())}
+
+
+def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
+    return {f"codec/{name}": value for name, value in codec.state_dict().items()}
+
+
+def _train_members(work: _Work) -> float:
+    """Train the members that are not there yet; the CPU seconds that took."""
+    missing = [m for m in range(work.settings.num_members) if not work.file_of(m).exists()]
+    spawned = multiprocessing.get_context("spawn")
+    total_s = 0.0
+    with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
+        for done in as_completed([pool.submit(_train_member, work, m) for m in missing]):
+            total_s += done.result()
+    return total_s
+
+
+def _train_member(work: _Work, member: int) -> float:
+    torch.set_num_threads(1)
+    started_s = time.process_time()
+    flat = load_file(work.parts / "table.safetensors")
+    codec = TouchCodec(work.config.touch_channels)
+    codec.load_state_dict(
+        {k.removeprefix("codec/"): flat.pop(k) for k in list(flat) if k.startswith("codec/")}
+    )
+    table = SceneTable.from_tensors(flat)
+    seed = work.settings.seed * _SEED_STRIDE + member
+    made = DynamicsMember(work.config)
+    log = _Log(member)
+    made.reader = train_reader(
+        table, work.config, work.settings.reader, seed=seed, on_step=log.reader
+    )
+    starts = [step for step in (0, *LATER_STARTS) if step in table.image_steps]
+    readings = {step: read_objects(made.reader, table, step) for step in starts}
+    data = CoreData(table, touch_latents(codec, table), readings)
+    made.core = train_core(data, work.config, work.settings.core, seed=seed, on_step=log.core)
+    partial = work.file_of(member).with_suffix(".partial")
+    save_file({k: v.contiguous() for k, v in made.state_dict().items()}, partial)
+    partial.replace(work.file_of(member))
+    return time.process_time() - started_s
+
+
+class _Log:
+    """Says now and then where a member's training stands."""
+
+    def __init__(self, member: int) -> None:
+        self._member = member
+
+    def reader(self, step: int, loss: float) -> None:
+        """One step of the reader."""
+        self._say("reader", step, loss)
+
+    def core(self, step: int, loss: float) -> None:
+        """One step of the core."""
+        self._say("core", step, loss)
+
+    def _say(self, part: str, step: int, loss: float) -> None:
+        if step % _LOG_EVERY == 0:
+            logger.info(
+                "training_state", member=self._member, part=part, step=step, loss=round(loss, 4)
+            )
+
+
+def _assembled(work: _Work, codec: TouchCodec) -> DynamicsModel:
+    dynamics = DynamicsModel(work.config, work.settings.num_members)
+    dynamics.codec.load_state_dict(codec.state_dict())
+    for index, member in enumerate(dynamics.members):
+        member.load_state_dict(load_file(work.file_of(index)))
+    return dynamics.eval().requires_grad_(requires_grad=False)
+
+
+def _command(settings: StateTrainSettings) -> str:
+    """The command that repeats a run; stores go by their last name, since folders do not travel."""
+    given = settings.model_dump(mode="json", exclude_defaults=True, exclude={"output", "episodes"})
+    stores = [url.rstrip("/").rsplit("/", 1)[-1] for url in settings.episodes]
+    flags = [f"--episodes={','.join(stores)}"]
+    for name, value in given.items():
+        items = value.items() if isinstance(value, dict) else [("", value)]
+        flags += [f"--{name}{'.' if inner else ''}{inner}={one}" for inner, one in items]
+    return " ".join(["dextouch train state", *flags])
