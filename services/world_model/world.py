@@ -272,9 +272,7 @@ def open_world(
     """
     file = path if path is not None else default_checkpoint()
     if not is_state_checkpoint(file):
-        return ModelWorld(
-            read_checkpoint(file), sampling_steps=sampling_steps, precision=precision
-        )
+        return ModelWorld(read_checkpoint(file), sampling_steps=sampling_steps, precision=precision)
     if sampling_steps is not None:
         raise InvalidInputError(
             f"state model {file.name}: got {sampling_steps} sampling steps, expected none: it "

@@ -43,7 +43,9 @@ class _Imagined:
 
 def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
     """Imagine every episode from its first step and compare."""
-    parts = [_imagine(dynamics, table, rows) for rows in torch.split(torch.arange(len(table)), _BATCH)]
+    parts = [
+        _imagine(dynamics, table, rows) for rows in torch.split(torch.arange(len(table)), _BATCH)
+    ]
     tactile = torch.cat([part.tactile_kpa for part in parts]).numpy()
     true = table.tactile_kpa.float().numpy()
     figures: dict[str, float] = {}

@@ -1,0 +1,318 @@
+"""Parts of the dynamics model against hand calculations, projections and other libraries."""
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial.transform import Rotation
+
+from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.geometry.cameras import pinhole_matrix, project
+from dextouch.geometry.transforms import apply, invert, transform
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
+from services.world_model.dynamics.core import RecurrentCore, SceneStart
+from services.world_model.dynamics.features import NUM_FEATURES, command_features, compressed
+from services.world_model.dynamics.hand_motion import hand_motion
+from services.world_model.dynamics.memory import (
+    memory_arrays,
+    memory_from_arrays,
+    memory_of,
+    stack_memories,
+)
+from services.world_model.dynamics.model import REST_LATENTS, Commands, DynamicsModel
+from services.world_model.dynamics.objects import (
+    ObjectPoses,
+    objects_from_poses,
+    poses_from_objects,
+)
+from services.world_model.dynamics.start_reader import FirstStep, ray_at_height
+from services.world_model.dynamics.touch_codec import TouchCodec
+
+CONFIG = DynamicsConfig(tasks=("one", "two"), num_objects=(1, 2), image_px=32, width=16)
+
+
+def anchor_at(*translations_m, turn=None):
+    R = np.eye(3) if turn is None else Rotation.from_rotvec(turn).as_matrix()
+    return AnchorPoses(*(transform(R, np.array(t)) for t in translations_m))
+
+
+def still_actions(num_steps):
+    actions = np.zeros((num_steps, 67))
+    for part in POSE_SLICES:
+        actions[:, part] = IDENTITY_POSE_9D
+    return actions
+
+
+def objects(batch=1, **changed):
+    parts = {
+        "position_m": torch.zeros(batch, MAX_OBJECTS, 3),
+        "axes": torch.tensor([[0.0, 0, 1], [1, 0, 0]]).expand(batch, MAX_OBJECTS, 2, 3).clone(),
+        "present": torch.ones(batch, MAX_OBJECTS),
+    }
+    return ObjectPoses(**{**parts, **changed})
+
+
+def test_hands_stand_where_the_anchor_is_and_turn_with_it():
+    straight = hand_motion(still_actions(3), anchor_at((0.1, 0, 0), (0, 0.2, 0), (0, 0, 1)))
+    np.testing.assert_allclose(straight.points_m[:, 0, 0], [[0.1, 0, 0]] * 3)
+    np.testing.assert_allclose(straight.points_m[:, 1, 0], [[0, 0.2, 0]] * 3)
+    quarter = [0, 0, np.pi / 2]
+    turned = hand_motion(
+        still_actions(3), anchor_at((0.1, 0, 0), (0, 0.2, 0), (0, 0, 1), turn=quarter)
+    )
+    fingers = straight.points_m[0, 1, 1:] - straight.points_m[0, 1, 0]
+    expected = np.stack([-fingers[:, 1], fingers[:, 0], fingers[:, 2]], axis=1)
+    np.testing.assert_allclose(
+        turned.points_m[0, 1, 1:] - turned.points_m[0, 1, 0], expected, atol=1e-6
+    )
+
+
+def test_a_pixel_at_a_height_is_the_point_that_projects_there():
+    K = pinhole_matrix(width_px=64, height_px=64, fovy_rad=0.8)
+    R = Rotation.from_euler("xyz", [-2.4, 0.1, 0.2]).as_matrix()
+    T_world_camera = transform(R, np.array([0.02, -0.5, 0.55]))
+    points = np.array([[0.05, 0.02, 0.03], [-0.1, 0.1, 0.0], [0.0, 0.0, 0.15]])
+    pixels, in_front = project(K, apply(invert(T_world_camera), points))
+    assert in_front.all()
+    found = ray_at_height(
+        torch.tensor(pixels, dtype=torch.float32)[None],
+        torch.tensor(points[:, 2], dtype=torch.float32)[None],
+        torch.tensor(K, dtype=torch.float32)[None],
+        torch.tensor(T_world_camera, dtype=torch.float32)[None],
+    )
+    np.testing.assert_allclose(found[0].numpy(), points, atol=2e-5)
+
+
+def test_pixels_of_the_sky_stay_within_reach():
+    T = torch.as_tensor(transform(Rotation.from_euler("x", 90, degrees=True).as_matrix(),
+        np.array([0.0, 0.0, 0.5]))).float()[None]  # fmt: skip
+    K = torch.tensor(pinhole_matrix(width_px=64, height_px=64, fovy_rad=0.8)).float()[None]
+    found = ray_at_height(torch.tensor([[[32.0, 60.0], [32.0, 2.0]]]), torch.zeros(1, 2), K, T)
+    assert torch.isfinite(found).all()
+    assert found.abs().max() <= 1.0
+
+
+def test_features_hold_a_millimetre_near_an_object():
+    points = torch.zeros(1, 1, 2, 2, 6, 3)
+    axes, joints = torch.zeros(1, 1, 2, 6), torch.zeros(1, 1, 2, 20)
+    here = command_features(points, axes, joints, objects())
+    assert here.shape == (1, 1, NUM_FEATURES)
+    moved = points.clone()
+    moved[0, 0, 1, 1, 3, 0] = 0.001
+    change = command_features(moved, axes, joints, objects()) - here
+    # Its offset along x in world axes, and along the object's x: asinh(0.1) / 2 each.
+    changed = change[change.abs() > 1e-6]
+    assert len(changed) == 2 * MAX_OBJECTS
+    np.testing.assert_allclose(changed.abs(), np.arcsinh(0.1) / 2, rtol=1e-5)
+
+
+def test_features_of_empty_slots_are_zero_and_of_moved_scenes_the_same():
+    generator = torch.Generator().manual_seed(0)
+    points = 0.1 * torch.randn(1, 3, 2, 2, 6, 3, generator=generator)
+    axes, joints = torch.zeros(1, 3, 2, 6), torch.zeros(1, 3, 2, 20)
+    none = objects(present=torch.zeros(1, MAX_OBJECTS))
+    assert command_features(points, axes, joints, none).count_nonzero() == 2 * 2 * 6 * 3
+    shift = torch.tensor([0.3, -0.2, 0.0])
+    one = command_features(points, axes, joints, objects())
+    other = command_features(
+        points + shift, axes, joints, objects(position_m=shift.expand(1, MAX_OBJECTS, 3))
+    )
+    torch.testing.assert_close(one, other, atol=1e-4, rtol=0)
+
+
+def test_distances_are_compressed_as_written():
+    assert float(compressed(torch.tensor(0.0))) == 0.0
+    np.testing.assert_allclose(float(compressed(torch.tensor(0.01))), np.log(1 + np.sqrt(2)) / 2)
+
+
+def test_poses_go_through_position_and_axes_and_back():
+    rotations = Rotation.random(20, random_state=1)
+    poses = np.concatenate(
+        [np.linspace(-0.3, 0.3, 60).reshape(20, 3), rotations.as_quat(scalar_first=True)], axis=1
+    )[:, None]
+    slots = objects_from_poses(poses)
+    assert slots.present.tolist() == [[1.0, 0.0, 0.0]] * 20
+    back = poses_from_objects(slots)[:, 0]
+    np.testing.assert_allclose(back[:, :3], poses[:, 0, :3], atol=1e-6)
+    turned = Rotation.from_quat(back[:, 3:], scalar_first=True) * rotations.inv()
+    assert turned.magnitude().max() < 1e-5
+
+
+def test_an_axis_nobody_knows_still_gives_a_rigid_pose():
+    axes = torch.tensor([[[[0.0, 0.0, 0.5], [0, 0, 0]]], [[[0.0, 0, 0], [0, 0, 0]]]])
+    poses = poses_from_objects(ObjectPoses(torch.zeros(2, 1, 3), axes, torch.ones(2, 1)))
+    np.testing.assert_allclose(np.linalg.norm(poses[..., 3:], axis=-1), 1.0)
+    z = Rotation.from_quat(poses[:, 0, 3:], scalar_first=True).apply([0, 0, 1])
+    np.testing.assert_allclose(z, [[0, 0, 1]] * 2, atol=1e-9)
+
+
+def test_what_left_the_table_is_not_there():
+    poses = np.tile([0.0, -3.0, 0, 1, 0, 0, 0], (1, 1))
+    assert objects_from_poses(poses).present.sum() == 0
+
+
+def test_touch_latents_are_the_best_linear_ones():
+    rng = np.random.default_rng(0)
+    touch = np.maximum(rng.normal(size=(400, 6)) @ rng.normal(size=(6, 320)), 0) ** 2
+    codec = TouchCodec(12)
+    codec.fit(torch.tensor(touch, dtype=torch.float32))
+    roots = np.sqrt(touch)
+    _, _, directions = np.linalg.svd(roots, full_matrices=False)
+    best = roots @ directions[:12].T @ directions[:12]
+    ours = (codec.encode(torch.tensor(touch, dtype=torch.float32)) * codec.scale) @ codec.basis.T
+    np.testing.assert_allclose(ours.numpy(), best, atol=2e-3)
+
+
+def test_saturated_touch_stays_bounded_and_no_touch_is_none():
+    codec = TouchCodec(8)
+    codec.fit(40 * torch.rand(100, 320, generator=torch.Generator().manual_seed(0)))
+    loud = codec.decode(codec.encode(torch.full((1, 320), 650.0)))
+    assert loud.max() <= codec.peak_kpa
+    assert codec.decode(codec.encode(torch.zeros(1, 320))).count_nonzero() == 0
+
+
+def start(batch=2, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return SceneStart(
+        objects(batch, position_m=0.1 * torch.randn(batch, MAX_OBJECTS, 3, generator=generator)),
+        torch.randn(batch, 2, CONFIG.touch_channels, generator=generator),
+        torch.rand(batch, 12, generator=generator),
+        torch.arange(batch) % 2,
+        torch.ones(batch),
+    )
+
+
+@pytest.fixture
+def core():
+    torch.manual_seed(0)
+    return RecurrentCore(CONFIG).eval()
+
+
+@torch.no_grad()
+def test_chunks_one_after_another_are_the_whole(core):
+    features = torch.randn(2, 20, NUM_FEATURES, generator=torch.Generator().manual_seed(1))
+    whole, end = core(features, start(), core.first_state(start()))
+    state, parts = core.first_state(start()), []
+    for chunk in features.split(4, dim=1):
+        future, state = core(chunk, start(), state)
+        parts.append(future.objects.position_m)
+    torch.testing.assert_close(torch.cat(parts, dim=1), whole.objects.position_m)
+    torch.testing.assert_close(state, end)
+
+
+@torch.no_grad()
+def test_a_state_is_bounded_whatever_comes(core):
+    wild = 1e6 * torch.randn(2, 1000, NUM_FEATURES, generator=torch.Generator().manual_seed(1))
+    future, state = core(wild, start(), core.first_state(start()))
+    assert state.abs().max() <= 1.0
+    assert torch.isfinite(future.touch).all()
+
+
+@torch.no_grad()
+def test_one_at_a_time_is_as_a_batch(core):
+    features = torch.randn(2, 5, NUM_FEATURES, generator=torch.Generator().manual_seed(2))
+    both = start()
+    together, _ = core(features, both, core.first_state(both))
+    one = SceneStart(
+        both.objects[:1], both.touch[:1], both.pads_kpa[:1], both.task[:1], both.commanded[:1]
+    )
+    alone, _ = core(features[:1], one, core.first_state(one))
+    torch.testing.assert_close(alone.touch, together.touch[:1], atol=1e-5, rtol=1e-5)
+
+
+@pytest.fixture
+def model():
+    torch.manual_seed(0)
+    return DynamicsModel(CONFIG, num_members=2).eval()
+
+
+ANCHOR = anchor_at((-0.1, 0, 0.1), (0.1, 0, 0.1), (0, -0.5, 0.5))
+
+
+def begun(model, tasks=(0, 1)):
+    motion = hand_motion(still_actions(1), ANCHOR)
+    batch = len(tasks)
+    first = FirstStep(
+        torch.randint(0, 255, (batch, 32, 32, 3), dtype=torch.uint8,
+            generator=torch.Generator().manual_seed(0)),
+        torch.tensor(pinhole_matrix(width_px=32, height_px=32, fovy_rad=0.8)).float().expand(
+            batch, 3, 3),
+        torch.tensor(motion.Ts_world_camera).float().expand(batch, 4, 4),
+        torch.tensor(motion.points_m).expand(batch, 2, 6, 3),
+        torch.zeros(batch, 12),
+        torch.tensor(tasks),
+    )  # fmt: skip
+    touch = 5 * torch.rand(batch, 2, 320, generator=torch.Generator().manual_seed(3))
+    return model.begin(first, touch, Commands.standing([motion] * batch), torch.ones(batch))
+
+
+def lifted(num_steps):
+    actions = still_actions(num_steps)
+    actions[:, 2] = np.linspace(0.001, 0.05, num_steps)
+    return hand_motion(actions, ANCHOR)
+
+
+def test_slots_a_task_has_not_are_empty(model):
+    memory = begun(model)
+    assert memory.poses.present[0, 1:].sum() == 0
+    assert memory.poses.present[1, 2:].sum() == 0
+
+
+def test_steps_lie_on_the_line_between_latents(model):
+    memory = begun(model)
+    _, imagined = model.advance(memory, Commands.of([lifted(8)] * 2))
+    position = imagined.poses.position_m
+    assert position.shape == (2, 8, MAX_OBJECTS, 3)
+    before = torch.cat([memory.poses.position_m[:, None], position[:, 3:4]], dim=1)
+    for index in range(2):
+        ends = before[:, index], position[:, 4 * index + 3]
+        quarter = ends[0] + 0.25 * (ends[1] - ends[0])
+        torch.testing.assert_close(position[:, 4 * index], quarter, atol=1e-6, rtol=0)
+
+
+def test_hands_that_stand_for_two_seconds_bring_everything_to_rest(model):
+    memory = begun(model)
+    still = Commands.of([hand_motion(still_actions(16), ANCHOR)] * 2)
+    for _ in range(REST_LATENTS // 4):
+        memory, _ = model.advance(memory, still)
+    rested, imagined = model.advance(memory, still)
+    torch.testing.assert_close(rested.hidden, memory.hidden, atol=0, rtol=0)
+    assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
+    for _ in range(60):
+        rested, imagined = model.advance(rested, still)
+    assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
+    moving, _ = model.advance(rested, Commands.of([lifted(16)] * 2))
+    assert (moving.hidden != rested.hidden).any()
+
+
+def test_members_that_agree_do_not_disagree(model):
+    model.members[1].load_state_dict(model.members[0].state_dict())
+    _, imagined = model.advance(begun(model), Commands.of([lifted(8)] * 2))
+    torch.testing.assert_close(imagined.disagreement_m, torch.zeros(2), atol=1e-6, rtol=0)
+
+
+def test_a_memory_survives_its_arrays(model):
+    memory = begun(model)
+    one = memory_of(memory, 1)
+    arrays = memory_arrays(one)
+    back = memory_from_arrays(arrays, CONFIG, 2)
+    command = Commands.of([lifted(4)])
+    expected, got = model.advance(one, command)[1], model.advance(back, command)[1]
+    assert (expected.tactile_kpa == got.tactile_kpa).all()
+    both = stack_memories([memory_of(memory, 0), one])
+    assert (both.hidden == memory.hidden).all()
+
+
+@pytest.mark.parametrize("damage", ["missing", "shape", "nan", "task"])
+def test_damaged_memories_are_refused(model, damage):
+    arrays = memory_arrays(memory_of(begun(model), 0))
+    if damage == "missing":
+        del arrays["hidden"]
+    elif damage == "shape":
+        arrays["axes"] = arrays["axes"][:1]
+    elif damage == "nan":
+        arrays["position_m"] = arrays["position_m"] * np.float32(np.nan)
+    else:
+        arrays["task"] = np.array([7])
+    with pytest.raises((InvalidInputError, NonFiniteError)):
+        memory_from_arrays(arrays, CONFIG, 2)
