@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import torch
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_settings import BaseSettings, CliImplicitFlag
 
@@ -10,12 +9,9 @@ from dextouch.serving.settings import service_config
 from dextouch.worlds.serve import WorldServiceSettings
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
-
-
-def has_bfloat16() -> bool:
-    """Whether this processor multiplies bfloat16 itself, which halves the time of training."""
-    supported = torch.ops.mkldnn._is_mkldnn_bf16_supported  # noqa: SLF001 - no public name
-    return bool(supported())
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.precision import has_fast_bfloat16
+from services.world_model.rendering.training import RendererTraining
 
 
 class OptimizerSettings(BaseModel):
@@ -82,7 +78,7 @@ class ReaderSettings(BaseModel):
     learning_rate: float = Field(default=2e-3, gt=0)
     ema_decay: float = Field(default=0.995, ge=0, lt=1)
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="of first steps")
-    bfloat16: bool = Field(default_factory=has_bfloat16, description="convolve in bfloat16")
+    bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="convolve in bfloat16")
 
 
 class CoreLossWeights(BaseModel):
@@ -111,7 +107,7 @@ class CoreSettings(BaseModel):
     held_fraction: float = Field(default=0.04, ge=0, le=1, description="of hands held still")
     pose_noise_m: float = Field(default=0.0025, ge=0, description="of the true start poses")
     weights: CoreLossWeights = CoreLossWeights()
-    bfloat16: bool = Field(default_factory=has_bfloat16, description="train in bfloat16")
+    bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="train in bfloat16")
 
 
 class StateTrainSettings(BaseModel):
@@ -130,6 +126,8 @@ class StateTrainSettings(BaseModel):
     width: int = Field(default=192, ge=8, le=1024, description="of the recurrent cores")
     reader: ReaderSettings = ReaderSettings()
     core: CoreSettings = CoreSettings()
+    renderer: RendererConfig = RendererConfig()
+    drawing: RendererTraining = RendererTraining()
 
 
 class TrainStateCommand(BaseSettings, StateTrainSettings):

@@ -20,10 +20,14 @@ from dextouch.errors import (
 )
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.rendering.checkpoints import renderer_from_tensors, renderer_tensors
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
 
 FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_state_model"
 MAX_CHECKPOINT_BYTES = 64 * 2**20
+_DYNAMICS, _RENDERER = "dynamics.", "renderer."
 
 
 class StateBounds(BaseModel):
@@ -49,6 +53,7 @@ class StateMetadata(BaseModel):
     name: str
     dynamics: DynamicsConfig
     num_members: int
+    renderer: RendererConfig
     object_names: dict[str, tuple[str, ...]]
     object_boxes_m: dict[str, tuple[tuple[float, ...], ...]]
     model_rate_hz: float = 15.0
@@ -67,6 +72,7 @@ class StateCheckpoint:
     """A loaded state model, its history and the digest of its file."""
 
     dynamics: DynamicsModel
+    renderer: RendererNetwork
     metadata: StateMetadata
     digest: str
 
@@ -80,17 +86,20 @@ def is_state_checkpoint(path: Path) -> bool:
         return False
 
 
-def write_state_checkpoint(path: Path, dynamics: DynamicsModel, metadata: StateMetadata) -> str:
+def write_state_checkpoint(
+    path: Path, dynamics: DynamicsModel, renderer: RendererNetwork, metadata: StateMetadata
+) -> str:
     """Write the file in one move and return its digest.
 
     Learned weights are stored as float16, statistics as float32.
     """
     learned = {name for name, _ in dynamics.named_parameters()}
     tensors = {
-        f"dynamics.{name}": (tensor.half() if name in learned else tensor).contiguous()
+        f"{_DYNAMICS}{name}": (tensor.half() if name in learned else tensor).contiguous()
         for name, tensor in dynamics.state_dict().items()
     }
     _refuse_non_finite(tensors, "state model to be written")
+    tensors |= renderer_tensors(renderer, prefix=_RENDERER)
     data = save(tensors, {METADATA_KEY: metadata.model_dump_json()})
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(path.suffix + ".partial")
@@ -124,9 +133,14 @@ def read_state_checkpoint(path: Path) -> StateCheckpoint:
         raise CorruptDataError(f"state model {path.name}: no safetensors file ({error})") from error
     metadata = _metadata(notes.get(METADATA_KEY), path.name)
     dynamics = DynamicsModel(metadata.dynamics, metadata.num_members)
-    _load_strictly(dynamics, tensors, path.name)
+    drawing = {name: t for name, t in tensors.items() if name.startswith(_RENDERER)}
+    _load_strictly(dynamics, {n: t for n, t in tensors.items() if n not in drawing}, path.name)
+    renderer = renderer_from_tensors(
+        drawing, metadata.renderer, prefix=_RENDERER, where=f"state model {path.name}"
+    )
     digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return StateCheckpoint(dynamics.eval().requires_grad_(requires_grad=False), metadata, digest)
+    dynamics.eval().requires_grad_(requires_grad=False)
+    return StateCheckpoint(dynamics, renderer, metadata, digest)
 
 
 def _metadata(text: str | None, name: str) -> StateMetadata:
@@ -147,7 +161,7 @@ def _metadata(text: str | None, name: str) -> StateMetadata:
 
 
 def _load_strictly(dynamics: DynamicsModel, tensors: dict[str, Tensor], name: str) -> None:
-    expected = {f"dynamics.{key}": value for key, value in dynamics.state_dict().items()}
+    expected = {f"{_DYNAMICS}{key}": value for key, value in dynamics.state_dict().items()}
     missing = sorted(expected.keys() - tensors.keys())
     foreign = sorted(tensors.keys() - expected.keys())
     if missing or foreign:
@@ -163,7 +177,7 @@ def _load_strictly(dynamics: DynamicsModel, tensors: dict[str, Tensor], name: st
             )
     _refuse_non_finite(tensors, f"state model {name}")
     dynamics.load_state_dict(
-        {key.removeprefix("dynamics."): tensor.float() for key, tensor in tensors.items()}
+        {key.removeprefix(_DYNAMICS): tensor.float() for key, tensor in tensors.items()}
     )
 
 

@@ -8,7 +8,15 @@ import torch
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import EndedError, InvalidInputError, ShapeError, UnknownNameError
-from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
+from dextouch.hands.actions import (
+    IDENTITY_POSE_9D,
+    JOINTS_LEFT,
+    JOINTS_RIGHT,
+    POSE_SLICES,
+    AnchorPoses,
+    check_actions,
+    poses_from_actions,
+)
 from dextouch.schemas.rollouts import Doubt
 from dextouch.streams.packing import pack, unpack
 from dextouch.worlds.world import (
@@ -35,6 +43,7 @@ from services.world_model.dynamics.model import (
     Commands,
     ImaginedSteps,
     SceneMemory,
+    mean_start,
     pad_means_kpa,
 )
 from services.world_model.dynamics.objects import ObjectPoses, poses_from_objects
@@ -46,6 +55,8 @@ from services.world_model.network.inputs import (
     build_inputs,
     check_reach,
 )
+from services.world_model.rendering.renderer import Renderer
+from services.world_model.rendering.scene_states import SceneState
 from services.world_model.starts import CAMERA, complete_start
 from services.world_model.state_checkpoints import StateCheckpoint
 
@@ -88,6 +99,7 @@ class StateWorld:
 
     def __init__(self, checkpoint: StateCheckpoint) -> None:
         self._dynamics = checkpoint.dynamics
+        self._renderer = Renderer(checkpoint.renderer)
         self._metadata, self._digest = checkpoint.metadata, checkpoint.digest
         config = self._metadata.dynamics
         self._description = WorldDescription(
@@ -95,7 +107,7 @@ class StateWorld:
             kind="model",
             digest=checkpoint.digest,
             tasks=config.tasks,
-            cameras=(),
+            cameras=(CAMERA,),
             image_height_px=config.image_px,
             image_width_px=config.image_px,
             model_rate_hz=self._metadata.model_rate_hz,
@@ -147,7 +159,7 @@ class StateWorld:
         )
         seen = Observation(
             first_step=0,
-            images={},
+            images={CAMERA: image[None]},
             tactile_kpa=tactile_kpa[None],
             action_reached=reached[None],
             reached_is_measured=True,
@@ -256,16 +268,34 @@ class StateWorld:
         one = ObjectPoses(
             steps.poses.position_m[index], steps.poses.axes[index], steps.poses.present[index]
         )
+        poses = self._poses(one, state.task)
         observation = Observation(
             first_step=state.step - len(chunk) + 1,
             images={},
             tactile_kpa=steps.tactile_kpa[index].numpy(),
             action_reached=chunk,
             reached_is_measured=False,
-            object_poses=self._poses(one, state.task),
+            object_poses=poses,
             doubt=self._doubt(state, steps, index),
-        )
-        return SteppedRollout(state, observation.selected(selector))
+        ).selected(selector)
+        if selector.wants(CAMERA):
+            shown = slice(len(chunk) - len(observation), None)
+            images = self._drawn(state, chunk[shown], poses[shown])
+            observation = replace(observation, images={CAMERA: images})
+        return SteppedRollout(state, observation)
+
+    def _drawn(
+        self,
+        state: StateRollout,
+        actions: Float64[np.ndarray, "n 67"],
+        poses: Float32[np.ndarray, "n objects 7"],
+    ) -> UInt8[np.ndarray, "n h w 3"]:
+        """Images of steps with hands and objects where they are said to be."""
+        start_poses = self._poses(mean_start(state.memory), state.task)
+        boxes_m = np.array(self._metadata.object_boxes_m[state.task])
+        start = _scene_states(state.first_reached[None], state.anchor, start_poses)[0]
+        states = _scene_states(actions, state.anchor, poses)
+        return self._renderer.draw(state.image, state.K_head, start, states, boxes_m)
 
     def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
         bounds = self._metadata.bounds
@@ -352,6 +382,27 @@ class StateWorld:
             step=step,
             num_moving=moving,
         )
+
+
+def _scene_states(
+    actions: Float64[np.ndarray, "n 67"],
+    anchor: AnchorPoses,
+    poses: Float32[np.ndarray, "n objects 7"],
+) -> list[SceneState]:
+    hands = poses_from_actions(actions, anchor)
+    Ts_world_wrist = np.stack([hands.Ts_world_wrist_left, hands.Ts_world_wrist_right], axis=1)
+    joints_rad = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
+    there = poses[..., 2] > ABSENT_POSE[2]
+    return [
+        SceneState(
+            hands.Ts_world_camera_head[index],
+            Ts_world_wrist[index],
+            joints_rad[index],
+            poses[index].astype(np.float64),
+            there[index],
+        )
+        for index in range(len(actions))
+    ]
 
 
 def num_moving(memory: SceneMemory, motions: Sequence[HandMotion]) -> list[int]:

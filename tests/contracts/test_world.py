@@ -25,8 +25,19 @@ from services.world_model.checkpoints import (
     read_checkpoint,
     write_checkpoint,
 )
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.state_checkpoints import (
+    StateCheckpoint,
+    StateMetadata,
+    read_state_checkpoint,
+    write_state_checkpoint,
+)
+from services.world_model.state_world import StateWorld
 from services.world_model.world import ModelWorld
 from tests.unit.worlds.fakes import K_HEAD, BatchSumWorld, anchor, observation
 
@@ -96,10 +107,42 @@ def untrained_checkpoint() -> Checkpoint:
         return read_checkpoint(path)
 
 
+@functools.cache
+def untrained_state_checkpoint() -> StateCheckpoint:
+    """A small state model of random weights."""
+    torch.manual_seed(0)
+    torch.set_num_threads(1)
+    config = DynamicsConfig(tasks=("stand_bottle",), num_objects=(1,), image_px=32, width=16)
+    dynamics = DynamicsModel(config, num_members=2)
+    dynamics.codec.fit(10 * torch.rand(272, 320))
+    shape = RendererConfig(widths=(8, 8), depths=(1, 1))
+    metadata = StateMetadata(
+        name="untrained",
+        dynamics=config,
+        num_members=2,
+        renderer=shape,
+        object_names={"stand_bottle": ("bottle",)},
+        object_boxes_m={"stand_bottle": ((0.0, 0.0, 0.0, 0.03, 0.03, 0.1),)},
+        command="test",
+        seed=0,
+        training_cpu_s=0.0,
+        num_training_episodes=0,
+        training_seeds={},
+        data_hash="0",
+    )
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "untrained.safetensors"
+        write_state_checkpoint(path, dynamics, RendererNetwork(shape), metadata)
+        return read_state_checkpoint(path)
+
+
 CANDIDATES = {
     "twin": Candidate(twin, from_seed),
     "world-model": Candidate(
         lambda: ModelWorld(untrained_checkpoint()), from_observation, batch_tolerance=1e-2
+    ),
+    "state-model": Candidate(
+        lambda: StateWorld(untrained_state_checkpoint()), from_observation, batch_tolerance=1e-2
     ),
     "sum": Candidate(BatchSumWorld, from_seed),
     "copy-first": Candidate(lambda: CopyFirstWorld(tasks=("stand_bottle",)), from_observation),

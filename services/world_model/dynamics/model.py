@@ -239,6 +239,11 @@ def _mean(poses: list[ObjectPoses]) -> ObjectPoses:
     )
 
 
+def mean_start(memory: SceneMemory) -> ObjectPoses:
+    """Where the members together saw the objects of the start."""
+    return _mean([start.objects for start in memory.start])
+
+
 def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
     """Poses of every step of the model grid, linear between latent steps."""
     weight = torch.arange(1, STEPS_PER_LATENT + 1) / STEPS_PER_LATENT

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Float64
+from jaxtyping import Float32, Float64, Shaped
 from torch import Tensor
 
 from dextouch.geometry.transforms import pose_from_transform, transform, transform_from_pose
@@ -33,7 +33,7 @@ class ObjectPoses:
         return ObjectPoses(self.position_m[index], self.axes[index], self.present[index])
 
 
-def objects_from_poses(poses: Float64[np.ndarray, "*batch objects 7"]) -> ObjectPoses:
+def objects_from_poses(poses: Shaped[np.ndarray, "*batch objects 7"]) -> ObjectPoses:
     """True poses (x y z in metres, qw qx qy qz) as filled slots; further slots are empty."""
     T = transform_from_pose(np.asarray(poses, dtype=np.float64))
     batch, count = T.shape[:-3], T.shape[-3]

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int64
+from jaxtyping import Bool, Float16, Float32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -33,7 +33,7 @@ class CoreData:
     """
 
     table: SceneTable
-    touch: Float32[Tensor, "episodes steps 2 channels"]
+    touch: Float16[Tensor, "episodes steps 2 channels"]
     readings: Mapping[int, ObjectPoses]
 
 

@@ -11,6 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import structlog
 import torch
 from safetensors.torch import load_file, save_file
@@ -20,6 +21,9 @@ from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
 from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.rendering.checkpoints import renderer_from_tensors, renderer_tensors
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.training import RendererProgress, train_renderer
 from services.world_model.settings import StateTrainSettings
 from services.world_model.state_checkpoints import (
     StateBounds,
@@ -28,6 +32,7 @@ from services.world_model.state_checkpoints import (
 )
 from services.world_model.training.core_training import CoreData, touch_latents, train_core
 from services.world_model.training.reader_training import read_objects, train_reader
+from services.world_model.training.scene_clips import scene_clips
 from services.world_model.training.scene_episodes import (
     SceneEpisode,
     load_scene_episodes,
@@ -39,6 +44,8 @@ from services.world_model.training.state_evaluation import evaluate_dynamics
 
 # Cores learn to begin at these steps beside the first.
 LATER_STARTS = tuple(range(8, 64, 8))
+# The renderer learns from this many episodes at most: it sees few of their images anyway.
+MAX_CLIPS = 1500
 _LOG_EVERY = 500
 _SEED_STRIDE = 1000
 logger = structlog.get_logger(__name__)
@@ -64,11 +71,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         InvalidInputError: no episodes, or ones that do not fit each other.
     """
     torch.set_num_threads(1)
-    episodes = [
-        episode
-        for url in settings.episodes
-        for episode in load_scene_episodes(url, tasks=settings.tasks or None)
-    ]
+    episodes = _episodes(settings)
     training, heldout = split_by_scene(episodes, held_out_share=settings.heldout_share)
     refuse_shared_scenes(training, heldout)
     config = _config(episodes, settings)
@@ -82,13 +85,15 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
     work = _Work(settings, config, parts, _key(settings, data_hash))
-    cpu_s = _train_members(work)
+    cpu_s = _train_parts(work)
     dynamics = _assembled(work, codec)
+    renderer = _trained_renderer(work)
     measured = evaluate_dynamics(dynamics, scene_table(heldout, config))
     metadata = StateMetadata(
         name=settings.name,
         dynamics=config,
         num_members=settings.num_members,
+        renderer=settings.renderer,
         object_names={e.task: e.object_names for e in episodes},
         object_boxes_m={
             e.task: tuple(tuple(map(float, row)) for row in e.object_boxes_m) for e in episodes
@@ -106,12 +111,12 @@ def train_state(settings: StateTrainSettings) -> StateReport:
         data_hash=data_hash,
         metrics=measured.figures,
     )
-    digest = write_state_checkpoint(settings.output, dynamics, metadata)
+    digest = write_state_checkpoint(settings.output, dynamics, renderer, metadata)
     table_file.unlink()
     return StateReport(
         settings.output,
         digest,
-        sum(p.numel() for p in dynamics.parameters()),
+        sum(p.numel() for p in (*dynamics.parameters(), *renderer.parameters())),
         cpu_s,
         len(training),
         len(heldout),
@@ -131,6 +136,19 @@ class _Work:
     def file_of(self, member: int) -> Path:
         """Where a finished member is kept; other settings or data have other names."""
         return self.parts / f"member-{self.key}-{member}.safetensors"
+
+    @property
+    def renderer_file(self) -> Path:
+        """Where the finished renderer is kept."""
+        return self.parts / f"renderer-{self.key}.safetensors"
+
+
+def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
+    return [
+        episode
+        for url in settings.episodes
+        for episode in load_scene_episodes(url, tasks=settings.tasks or None)
+    ]
 
 
 def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> DynamicsConfig:
@@ -168,15 +186,48 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
     return {f"codec/{name}": value for name, value in codec.state_dict().items()}
 
 
-def _train_members(work: _Work) -> float:
-    """Train the members that are not there yet; the CPU seconds that took."""
+def _train_parts(work: _Work) -> float:
+    """Train the parts that are not there yet, several at a time; the CPU seconds that took."""
     missing = [m for m in range(work.settings.num_members) if not work.file_of(m).exists()]
     spawned = multiprocessing.get_context("spawn")
     total_s = 0.0
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
-        for done in as_completed([pool.submit(_train_member, work, m) for m in missing]):
+        orders = [pool.submit(_train_member, work, member) for member in missing]
+        if not work.renderer_file.exists():
+            orders.append(pool.submit(_train_renderer, work))
+        for done in as_completed(orders):
             total_s += done.result()
     return total_s
+
+
+def _train_renderer(work: _Work) -> float:
+    torch.set_num_threads(1)
+    settings = work.settings
+    episodes, _ = split_by_scene(_episodes(settings), held_out_share=settings.heldout_share)
+    rng = np.random.default_rng(settings.seed)
+    chosen = rng.permutation(len(episodes))[:MAX_CLIPS]
+    clips = scene_clips([episodes[index] for index in sorted(chosen)])
+    trained = train_renderer(
+        clips, settings.renderer, settings.drawing, rng=rng, on_progress=_say_drawing
+    )
+    partial = work.renderer_file.with_suffix(".partial")
+    save_file(renderer_tensors(trained.network), partial)
+    partial.replace(work.renderer_file)
+    return trained.cpu_s
+
+
+def _say_drawing(now: RendererProgress) -> None:
+    if now.step % _LOG_EVERY == 0:
+        logger.info(
+            "training_state", part="renderer", step=now.step, share=round(now.share, 2),
+            loss=round(now.loss, 4),
+        )  # fmt: skip
+
+
+def _trained_renderer(work: _Work) -> RendererNetwork:
+    tensors = load_file(work.renderer_file)
+    where = f"renderer {work.renderer_file.name}"
+    return renderer_from_tensors(tensors, work.settings.renderer, where=where)
 
 
 def _train_member(work: _Work, member: int) -> float:

@@ -1,0 +1,180 @@
+"""Start readers and cores learn a toy scene: a bright block that a descending hand presses."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.cameras import pinhole_matrix, project
+from dextouch.geometry.transforms import apply, invert, transform
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.settings import CoreSettings, ReaderSettings
+from services.world_model.state_checkpoints import StateBounds
+from services.world_model.training.core_training import CoreData, touch_latents, train_core
+from services.world_model.training.reader_training import (
+    read_objects,
+    reader_errors,
+    train_reader,
+)
+from services.world_model.training.scene_episodes import SceneEpisode
+from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
+from services.world_model.training.state_evaluation import evaluate_dynamics
+
+PX, NUM_STEPS = 32, 17
+K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))
+CAMERA = transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
+BLOCK_HEIGHT_M = 0.03
+
+
+def episode(seed):
+    """The right hand comes down at its own place; it presses only if the block is under it."""
+    rng = np.random.default_rng(seed)
+    block_m = np.array([*rng.uniform(-0.1, 0.1, 2), BLOCK_HEIGHT_M])
+    hits = seed % 2 == 0
+    hand_m = block_m + ([0.0, 0.0, 0.2] if hits else [0.12, 0.12, 0.2])
+    left_m = np.array([-0.3, 0.0, 0.2])
+    anchor = np.stack([transform(np.eye(3), left_m), transform(np.eye(3), hand_m), CAMERA])
+    actions = np.zeros((NUM_STEPS, 67))
+    for part in POSE_SLICES:
+        actions[:, part] = IDENTITY_POSE_9D
+    down = np.clip(np.arange(NUM_STEPS) / 10, 0, 1)
+    actions[:, 11] = -0.2 * down
+    tactile = np.zeros((NUM_STEPS, 2, 320), dtype=np.float16)
+    tactile[down >= 0.8, 1, 80:] = 20.0 if hits else 0.0
+    poses = np.zeros((NUM_STEPS, 1, 7), dtype=np.float32)
+    poses[:, 0, :3], poses[:, 0, 3] = block_m, 1.0
+    steps = np.arange(0, NUM_STEPS, 4)
+    return SceneEpisode(
+        episode_id=f"toy-{seed}", task="press", instruction="press the block", domain="robot",
+        seed=seed, motion="script", noise_m=0.0, success=hits, event_times_s={},
+        object_names=("block",), object_boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
+        action_kind="commanded", actions=actions, measured_actions=actions, anchor=anchor,
+        K_head=K_HEAD, tactile_kpa=tactile, object_poses=poses,
+        images=np.repeat(picture(block_m)[None], len(steps), axis=0), image_steps=steps,
+        content_sha256=f"{seed:064x}",
+    )  # fmt: skip
+
+
+def picture(block_m):
+    pixels, _ = project(K_HEAD, apply(invert(CAMERA), block_m[None]))
+    rows, columns = np.mgrid[0:PX, 0:PX] + 0.5
+    near = np.hypot(columns - pixels[0, 0], rows - pixels[0, 1]) < 2.5
+    image = np.full((PX, PX, 3), 90, dtype=np.uint8)
+    image[near] = (240, 60, 40)
+    return image
+
+
+@pytest.fixture(scope="module")
+def config():
+    return DynamicsConfig(
+        tasks=("press",), num_objects=(1,), image_px=PX, width=32, reader_channels=16,
+        reader_keypoints=8, touch_channels=8,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def table(config):
+    return scene_table([episode(seed) for seed in range(48)], config)
+
+
+@pytest.fixture(scope="module")
+def held_out(config):
+    return scene_table([episode(seed) for seed in range(1000, 1016)], config)
+
+
+@pytest.fixture(scope="module")
+def reader(table, config):
+    torch.set_num_threads(1)
+    settings = ReaderSettings(num_steps=250, batch=16, bfloat16=False)
+    return train_reader(table, config, settings, seed=0)
+
+
+def test_a_reader_finds_held_out_blocks(reader, held_out):
+    error = reader_errors(reader, held_out, 0)["press"]
+    # The mean place of all blocks is about 75 mm off.
+    assert error.lateral_mm < 20
+    assert error.height_mm < 5
+    assert error.presence == 1.0
+
+
+def test_the_same_seed_gives_the_same_reader(table, config):
+    settings = ReaderSettings(num_steps=3, batch=4, bfloat16=False)
+    one = train_reader(table, config, settings, seed=5).state_dict()
+    other = train_reader(table, config, settings, seed=5).state_dict()
+    assert all((one[name] == other[name]).all() for name in one)
+
+
+def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_out, config):
+    dynamics = DynamicsModel(config)
+    dynamics.codec.fit(table.tactile_kpa.float().flatten(0, 2))
+    readings = {step: read_objects(reader, table, step) for step in (0, 4)}
+    data = CoreData(table, touch_latents(dynamics.codec, table), readings)
+    settings = CoreSettings(num_steps=250, batch=16, bfloat16=False)
+    member = dynamics.members[0]
+    member.reader = reader
+    member.core = train_core(data, config, settings, seed=0)
+    measured = evaluate_dynamics(dynamics.eval(), held_out)
+    assert measured.figures["contact_f1_chunk_1"] > 0.8
+    assert measured.figures["contact_f1_chunk_1_of_copy"] == 0.0
+    assert measured.figures["final_object_mm_press"] < 25
+    assert measured.disagreement_m == 0.0
+    assert StateBounds(distance=measured.distance).distance > 0
+
+
+def test_a_table_survives_its_tensors(table):
+    back = SceneTable.from_tensors(table.tensors())
+    assert back.image_steps == table.image_steps
+    for name, tensor in table.tensors().items():
+        assert (back.tensors()[name] == tensor).all()
+
+
+def test_commands_begin_where_hands_are_measured(config):
+    one = episode(0)
+    lagging = one.measured_actions.copy()
+    lagging[:, 9] += 0.01
+    late = scene_table([dataclasses.replace(one, measured_actions=lagging)], config)
+    rows = torch.tensor([0])
+    sent = late.commands(rows, 4, torch.tensor([False]))
+    reached = late.commands(rows, 4, torch.tensor([True]))
+    torch.testing.assert_close(sent.points_m[:, 0], reached.points_m[:, 0])
+    shift = reached.points_m[:, 1:, :, 1, :, 0] - sent.points_m[:, 1:, :, 1, :, 0]
+    torch.testing.assert_close(shift, torch.full_like(shift, 0.01), atol=1e-6, rtol=0)
+    assert len(sent) == 1 + (NUM_STEPS - 1 - 4) // 4
+
+
+@pytest.mark.parametrize("fault", ["length", "size", "steps", "task"])
+def test_episodes_that_do_not_fit_each_other_are_refused(config, fault):
+    wrong = episode(1)
+    if fault == "length":
+        wrong = dataclasses.replace(
+            wrong,
+            actions=wrong.actions[:-4],
+            measured_actions=wrong.measured_actions[:-4],
+            tactile_kpa=wrong.tactile_kpa[:-4],
+            object_poses=wrong.object_poses[:-4],
+        )
+    elif fault == "size":
+        wrong = dataclasses.replace(wrong, images=wrong.images[:, :16])
+    elif fault == "steps":
+        wrong = dataclasses.replace(wrong, image_steps=wrong.image_steps + 1)
+    else:
+        wrong = dataclasses.replace(wrong, task="juggle")
+    with pytest.raises(InvalidInputError, match="toy-1"):
+        scene_table([episode(0), wrong], config)
+
+
+def test_a_task_has_one_number_of_objects():
+    one = episode(1)
+    two = dataclasses.replace(
+        one,
+        object_names=("block", "lid"),
+        object_poses=np.repeat(one.object_poses, 2, axis=1),
+        object_boxes_m=np.repeat(one.object_boxes_m, 2, axis=0),
+    )
+    with pytest.raises(InvalidInputError, match="press"):
+        vocabulary([episode(0), two])
+    assert vocabulary([episode(0), episode(2)]) == (("press",), (1,))
