@@ -12,6 +12,7 @@ import torch
 
 from dextouch.clients.policy import Policy
 from dextouch.errors import DexTouchError
+from dextouch.worlds.world import BatchWorld
 from services.cli.bench.evaluator.keeping import (
     KeptRows,
     Row,
@@ -38,7 +39,7 @@ from services.evaluation.success_probe import SuccessProbe
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
-from services.world_model.world import ModelWorld, open_world
+from services.world_model.world import open_world
 
 
 class Study:
@@ -48,7 +49,7 @@ class Study:
         torch.set_num_threads(1)
         self.plan = plan
         self.twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
-        self.world: ModelWorld = open_world(plan.world)
+        self.world: BatchWorld[Any] = open_world(plan.world)
         self.probe = SuccessProbe.load(plan.probe)
         self.cloned = {one.key: BehaviourCloningPolicy.load(one.path) for one in plan.cloned}
         self.about = {
