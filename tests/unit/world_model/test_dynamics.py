@@ -285,6 +285,16 @@ def test_hands_that_stand_for_two_seconds_bring_everything_to_rest(model):
     assert (moving.hidden != rested.hidden).any()
 
 
+def test_chunks_in_turn_imagine_what_one_long_chunk_does(model):
+    memory = begun(model)
+    _, whole = model.advance(memory, Commands.of([lifted(16)] * 2))
+    halves = []
+    for steps in (slice(0, 8), slice(8, 16)):
+        memory, imagined = model.advance(memory, Commands.of([lifted(16)[steps]] * 2))
+        halves.append(imagined.poses.position_m)
+    torch.testing.assert_close(torch.cat(halves, dim=1), whole.poses.position_m)
+
+
 def test_members_that_agree_do_not_disagree(model):
     model.members[1].load_state_dict(model.members[0].state_dict())
     _, imagined = model.advance(begun(model), Commands.of([lifted(8)] * 2))
