@@ -4,10 +4,11 @@ import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from operator import not_
 from pathlib import Path
 
 import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
@@ -30,7 +31,12 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 
 
 class CheckpointMetadata(BaseModel):
-    """Where a checkpoint comes from and how good it was measured to be, inside its file."""
+    """Where a checkpoint comes from and how good it was measured to be, inside its file.
+
+    `initialized_from` is the digest of the checkpoint whose weights training began with; what that
+    one was trained on counts as trained on here, too. Where it is None it is not written, so that
+    older releases read the file.
+    """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -46,6 +52,7 @@ class CheckpointMetadata(BaseModel):
     train_fingerprints: tuple[str, ...]
     data_hash: str
     heldout_episode_ids: tuple[str, ...] = ()
+    initialized_from: str | None = Field(default=None, exclude_if=not_)
     metrics: dict[str, float] = {}
 
 

@@ -63,6 +63,17 @@ class TrainSettings(BaseModel):
     loader_workers: int = Field(
         default=0, ge=0, le=64, description="processes that read for --streaming; 0: none besides"
     )
+    init: Path | None = Field(
+        default=None,
+        description="checkpoint whose weights and codecs to start from; same network settings",
+    )
+    resume: CliImplicitFlag[bool] = Field(
+        default=False,
+        description="go on with what a run of this output left when it was killed, if anything",
+    )
+    state_every_cpu_s: float = Field(
+        default=60.0, ge=0, description="CPU seconds between states kept for --resume"
+    )
     network: NetworkConfig = NetworkConfig()
     optimizer: OptimizerSettings = OptimizerSettings()
     windows: WindowSettings = WindowSettings()
@@ -171,11 +182,23 @@ def command_line(settings: TrainSettings) -> str:
     Stores go by their last name: checkpoints travel, folders do not.
     """
     given = settings.model_dump(
-        mode="json", exclude_defaults=True, exclude={"output", "json_path", "episodes", "heldout"}
+        mode="json",
+        exclude_defaults=True,
+        exclude={
+            "output",
+            "json_path",
+            "episodes",
+            "heldout",
+            "init",
+            "resume",
+            "state_every_cpu_s",
+        },
     )
     flags = [f"--episodes={_last_name(settings.episodes)}"]
     if settings.heldout is not None:
         flags.append(f"--heldout={_last_name(settings.heldout)}")
+    if settings.init is not None:
+        flags.append(f"--init={settings.init.name}")
     for name, value in given.items():
         if isinstance(value, bool):
             flags.append(f"--{name}" if value else f"--no-{name}")

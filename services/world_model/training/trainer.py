@@ -1,16 +1,21 @@
 """Training settings in, a measured checkpoint and a report out."""
 
+import json
 import math
 import time
+from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from dextouch.errors import InvalidInputError
+from dextouch.errors import ConflictError
 from services.world_model.checkpoints import (
+    Checkpoint,
     CheckpointMetadata,
     read_checkpoint,
     write_checkpoint,
@@ -26,10 +31,21 @@ from services.world_model.training.dataset import (
     WindowSampler,
     combined_hash,
 )
-from services.world_model.training.episodes import load_episodes, split_by_hash
 from services.world_model.training.evaluation import evaluate_prediction
 from services.world_model.training.objective import losses
-from services.world_model.training.streaming import index_episodes, read_batches
+from services.world_model.training.splits import check_disjoint, check_not_learned, load_split
+from services.world_model.training.streaming import read_batches
+from services.world_model.training.training_state import (
+    RunFacts,
+    TrainingState,
+    identity_of,
+    optimizer_tensors,
+    part_of,
+    read_state,
+    restore_optimizer,
+    state_path,
+    write_state,
+)
 
 LOG_EVERY_STEPS = 20
 MIN_LEARNING_RATE_SHARE = 0.01
@@ -61,6 +77,7 @@ class TrainingReport:
 
 
 OnProgress = Callable[[TrainingProgress], None]
+OnState = Callable[["TrainingRun"], None]
 
 
 def train(settings: TrainSettings, on_progress: OnProgress | None = None) -> TrainingReport:
@@ -73,28 +90,6 @@ def train(settings: TrainSettings, on_progress: OnProgress | None = None) -> Tra
     return train_on(trained, heldout, settings, on_progress)
 
 
-def load_split(
-    settings: TrainSettings,
-) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    """Training and held-out episodes of the settings' stores; the latter always in memory."""
-    if settings.streaming:
-        return _stream_split(settings)
-    episodes = load_episodes(settings.episodes)
-    if settings.heldout is None:
-        return split_by_hash(episodes, heldout_percent=settings.heldout_percent)
-    return episodes, load_episodes(settings.heldout)
-
-
-def _stream_split(
-    settings: TrainSettings,
-) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    episodes = index_episodes(settings.episodes)
-    if settings.heldout is not None:
-        return episodes, load_episodes(settings.heldout)
-    trained, heldout = split_by_hash(episodes, heldout_percent=settings.heldout_percent)
-    return trained, [episode.load() for episode in heldout]
-
-
 def train_on(
     trained: Sequence[TrainingEpisode],
     heldout: Sequence[EpisodeArrays],
@@ -104,10 +99,16 @@ def train_on(
     """`train` with episodes that are already split."""
     check_disjoint(trained, heldout)
     torch.set_num_threads(settings.num_threads)
+    ancestor = None if settings.init is None else read_checkpoint(settings.init)
+    prints = {episode.content_hash() for episode in trained}
+    names = {episode.episode_id for episode in trained}
+    if ancestor is not None:
+        # What the ancestor was trained on is no test either.
+        check_not_learned(heldout, ancestor)
+        prints |= set(ancestor.metadata.train_fingerprints)
+        names |= set(ancestor.metadata.train_episode_ids)
     run = TrainingRun(trained, settings)
-    run.fit_codecs()
-    log = run.run(on_progress)
-    prints = sorted(episode.content_hash() for episode in trained)
+    log = _run_or_resume(run, ancestor, on_progress)
     metadata = CheckpointMetadata(
         name=settings.name,
         network=settings.network,
@@ -116,22 +117,24 @@ def train_on(
         seed=settings.seed,
         training_steps=run.step,
         training_cpu_s=round(run.cpu_s, 1),
-        train_episode_ids=tuple(sorted(episode.episode_id for episode in trained)),
-        train_fingerprints=tuple(prints),
-        data_hash=combined_hash(prints),
+        train_episode_ids=tuple(sorted(names)),
+        train_fingerprints=tuple(sorted(prints)),
+        data_hash=combined_hash(sorted(prints)),
         heldout_episode_ids=tuple(sorted(episode.episode_id for episode in heldout)),
+        initialized_from=None if ancestor is None else ancestor.digest,
     )
     write_checkpoint(settings.output, run.averaged, metadata)
     # Measured on the weights as stored, then stored again with the figures.
     stored = read_checkpoint(settings.output).model
     metrics = {
         **evaluate_prediction(
-            stored, heldout, train_fingerprints=prints, stride=settings.evaluation_stride
+            stored, heldout, train_fingerprints=sorted(prints), stride=settings.evaluation_stride
         )
     }
     digest = write_checkpoint(
         settings.output, stored, metadata.model_copy(update={"metrics": metrics})
     )
+    state_path(settings.output).unlink(missing_ok=True)
     return TrainingReport(
         checkpoint=settings.output,
         digest=digest,
@@ -145,21 +148,33 @@ def train_on(
     )
 
 
-def check_disjoint(trained: Sequence[TrainingEpisode], heldout: Sequence[TrainingEpisode]) -> None:
-    """Raise if a held-out episode, or a seed of its task, is also trained on."""
-    prints = {episode.content_hash() for episode in trained}
-    seeds = {(e.task, e.seed) for e in trained if e.seed is not None}
-    both = [
-        episode.episode_id
-        for episode in heldout
-        if episode.content_hash() in prints or (episode.task, episode.seed) in seeds
-    ]
-    if both:
-        raise InvalidInputError(
-            f"training: {len(both)} held-out episodes are also trained on {both[:3]} (same content "
-            "or same task and seed); expected disjoint sets",
-            episodes=both,
-        )
+def _run_or_resume(
+    run: "TrainingRun", ancestor: Checkpoint | None, on_progress: OnProgress | None
+) -> list[TrainingProgress]:
+    """The whole run, or what a process that died left of it; its state is kept on the way."""
+    settings = run.settings
+    path = state_path(settings.output)
+    identity = identity_of(
+        settings,
+        data_hash=combined_hash([episode.content_hash() for episode in run.episodes]),
+        init_digest=None if ancestor is None else ancestor.digest,
+    )
+    if settings.resume and path.exists():
+        run.restore(read_state(path, identity))
+    elif ancestor is not None:
+        run.start_from(ancestor)
+    else:
+        run.fit_codecs()
+    kept_cpu_s = run.cpu_s
+
+    def keep(now: TrainingRun) -> None:
+        nonlocal kept_cpu_s
+        if now.cpu_s - kept_cpu_s >= settings.state_every_cpu_s:
+            tensors, facts = now.state()
+            write_state(path, TrainingState(tensors, RunFacts(identity=identity, **facts)))
+            kept_cpu_s = now.cpu_s
+
+    return run.run(on_progress, keep)
 
 
 class TrainingRun:
@@ -170,15 +185,19 @@ class TrainingRun:
 
     def __init__(self, episodes: Sequence[TrainingEpisode], settings: TrainSettings) -> None:
         self.settings = settings
-        self._episodes = episodes
+        self.episodes = episodes
         self.step = 0
         self.cpu_s = 0.0
+        self.log: list[TrainingProgress] = []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
             self.model = JointWorldModel(settings.network)
         self.averaged = JointWorldModel(settings.network).eval()
         self._generator = torch.Generator().manual_seed(settings.seed + 1)
         self._rng = np.random.default_rng(settings.seed + 2)
+        # Its state after the windows that were learned from, and after those that wait.
+        self._window_numbers = json.dumps(self._rng.bit_generator.state)
+        self._drawn: deque[str] = deque()
         windows = settings.windows
         self._sampler = WindowSampler(
             episodes,
@@ -208,24 +227,75 @@ class TrainingRun:
         model.tactile_residual_std.copy_(residuals.tactile[:, 1:].std().clamp_min(1e-3))
         self.averaged.load_state_dict(model.state_dict())
 
-    def run(self, on_progress: OnProgress | None = None) -> list[TrainingProgress]:
-        """Train until the budget or the number of steps is used up; returns the loss log."""
-        log: list[TrainingProgress] = []
-        start_s = time.process_time()
+    def start_from(self, checkpoint: Checkpoint) -> None:
+        """Take over weights and codecs, as `fit_codecs` and training left them.
+
+        Raises:
+            ConflictError: a checkpoint of other network settings; they are named.
+        """
+        asked = self.settings.network.model_dump()
+        there = checkpoint.metadata.network.model_dump()
+        others = {name: (there[name], asked[name]) for name in asked if there[name] != asked[name]}
+        if others:
+            raise ConflictError(
+                "training: the checkpoint to start from has other network settings (its own, "
+                f"asked for): {others}; ask for its own"
+            )
+        self.model.load_state_dict(checkpoint.model.state_dict())
+        self.averaged.load_state_dict(checkpoint.model.state_dict())
+
+    def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
+        """Tensors and other facts that the next steps depend on."""
+        tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
+        tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
+        tensors |= optimizer_tensors(self._optimizer)
+        tensors["generator"] = self._generator.get_state()
+        facts = {
+            "step": self.step,
+            "cpu_s": self.cpu_s,
+            "window_numbers": self._window_numbers,
+            "log": tuple(astuple(entry) for entry in self.log),
+        }
+        return tensors, facts
+
+    def restore(self, state: TrainingState) -> None:
+        """Go on where `state` was taken."""
+        self.model.load_state_dict(part_of(state.tensors, "model."))
+        self.averaged.load_state_dict(part_of(state.tensors, "averaged."))
+        restore_optimizer(self._optimizer, state.tensors)
+        self._generator.set_state(state.tensors["generator"])
+        self._window_numbers = state.facts.window_numbers
+        self._rng.bit_generator.state = json.loads(self._window_numbers)
+        self.step, self.cpu_s = state.facts.step, state.facts.cpu_s
+        self.log = [TrainingProgress(*row) for row in state.facts.log]
+
+    def run(
+        self, on_progress: OnProgress | None = None, on_step: OnState | None = None
+    ) -> list[TrainingProgress]:
+        """Train until the budget or the number of steps is used up; returns the loss log.
+
+        Args:
+            on_progress: gets every entry of the log.
+            on_step: gets the run after every step.
+        """
+        start_s = time.process_time() - self.cpu_s
         self.model.train()
         batches = self._batches()
         while self.share() < 1.0:
             loss_video, loss_tactile = self.learn(next(batches))
+            self._window_numbers = self._drawn.popleft()
             self.step += 1
             self.cpu_s = time.process_time() - start_s
             if self.step % LOG_EVERY_STEPS == 0 or self.share() >= 1.0:
                 progress = TrainingProgress(
                     self.step, min(self.share(), 1.0), loss_video, loss_tactile
                 )
-                log.append(progress)
+                self.log.append(progress)
                 if on_progress is not None:
                     on_progress(progress)
-        return log
+            if on_step is not None:
+                on_step(self)
+        return self.log
 
     def share(self) -> float:
         """Share of the run that is done, by the tighter of its two limits."""
@@ -259,8 +329,14 @@ class TrainingRun:
         """The windows of each step, for ever."""
         if self.settings.streaming:
             workers = self.settings.loader_workers
-            return read_batches(self._episodes, self.places(), num_workers=workers)
-        return map(self._sampler.cut, self.places())
+            return read_batches(self.episodes, self._noted_places(), num_workers=workers)
+        return map(self._sampler.cut, self._noted_places())
+
+    def _noted_places(self) -> Iterator[list[Place]]:
+        """`places`, noting the random numbers after each: readers ask for some ahead."""
+        for places in self.places():
+            self._drawn.append(json.dumps(self._rng.bit_generator.state))
+            yield places
 
     def places(self) -> Iterator[list[Place]]:
         """Where the windows of each step lie, for ever."""

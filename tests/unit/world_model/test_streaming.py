@@ -19,12 +19,13 @@ from services.world_model.training.dataset import (
     stack_windows,
 )
 from services.world_model.training.episodes import load_episodes
+from services.world_model.training.splits import load_split
 from services.world_model.training.streaming import (
     WindowDataset,
     index_episodes,
     read_batches,
 )
-from services.world_model.training.trainer import TrainingRun, load_split, train
+from services.world_model.training.trainer import TrainingRun, train
 from tests.unit.world_model.conftest import write_episode
 
 PLACES = [

@@ -1,0 +1,138 @@
+"""State of a training run beside its output, so that a run whose process died can go on.
+
+One safetensors file holds the weights, their running average, the optimizer and the state of the
+random numbers; its metadata holds the counters as JSON. The file is replaced in one move, so that
+a kill at any moment leaves the last complete state. It is removed when the run has ended.
+"""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Final
+
+import torch
+from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from dextouch.errors import ConflictError, CorruptDataError
+from services.world_model.settings import TrainSettings
+
+METADATA_KEY: Final = "dextouch_training_state"
+SUFFIX: Final = ".resume"
+# Settings that may be others when a run goes on.
+_FREE_SETTINGS: Final = {
+    "episodes", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
+    "streaming", "loader_workers", "num_threads",
+}  # fmt: skip
+
+
+class RunFacts(BaseModel):
+    """What a state holds beside its tensors.
+
+    `identity` are the settings and data that the run began with, `window_numbers` is the state of
+    the generator that draws windows, as JSON, after the last step that was learned from. `log` has
+    rows of step, share of the run, and the losses of sight and touch.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    identity: dict[str, JsonValue]
+    step: int
+    cpu_s: float
+    window_numbers: str
+    log: tuple[tuple[int, float, float, float], ...]
+
+
+@dataclass(frozen=True)
+class TrainingState:
+    """Everything that the next steps of a run depend on.
+
+    Names of tensors begin with `model.`, `averaged.`, `optimizer.` (then the number of the
+    parameter and the name of its moment) or are `generator`.
+    """
+
+    tensors: dict[str, Tensor]
+    facts: RunFacts
+
+
+def state_path(output: Path) -> Path:
+    """Where the state of a run with this output lies."""
+    return output.with_name(output.name + SUFFIX)
+
+
+def identity_of(
+    settings: TrainSettings, *, data_hash: str, init_digest: str | None
+) -> dict[str, JsonValue]:
+    """What has to be the same when a run goes on."""
+    kept: dict[str, JsonValue] = settings.model_dump(mode="json", exclude=_FREE_SETTINGS)
+    return {**kept, "data_hash": data_hash, "init_digest": init_digest}
+
+
+def write_state(path: Path, state: TrainingState) -> None:
+    """Replace the state of a run in one move."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    tensors = {name: tensor.detach().contiguous() for name, tensor in state.tensors.items()}
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write(save(tensors, {METADATA_KEY: state.facts.model_dump_json()}))
+        file.flush()
+        os.fsync(file.fileno())
+    partial.replace(path)
+
+
+def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
+    """The state of a run that went on with these settings and data.
+
+    Raises:
+        ConflictError: it is of other settings or data; they are named.
+        CorruptDataError: no state of ours, or a damaged one.
+    """
+    try:
+        with safe_open(path, framework="pt") as file:
+            notes = file.metadata() or {}
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        facts = RunFacts.model_validate_json(notes.get(METADATA_KEY, ""))
+    except (SafetensorError, ValidationError) as error:
+        raise CorruptDataError(
+            f"training state {path.name}: unreadable ({error}); remove it to start afresh"
+        ) from error
+    expected = json.loads(json.dumps(dict(identity)))
+    names = facts.identity.keys() | expected.keys()
+    others = sorted(n for n in names if facts.identity.get(n) != expected.get(n))
+    if others:
+        was = {name: facts.identity.get(name) for name in others}
+        now = {name: expected.get(name) for name in others}
+        raise ConflictError(
+            f"training state {path.name}: of a run with {was}, got {now}; go on with the settings "
+            "and episodes that it began with, or leave --resume away to start afresh"
+        )
+    return TrainingState(tensors, facts)
+
+
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
+    """The moments of every parameter by name."""
+    kept: dict[int, dict[str, Tensor]] = optimizer.state_dict()["state"]
+    return {
+        f"optimizer.{number}.{name}": moment
+        for number, moments in kept.items()
+        for name, moment in moments.items()
+    }
+
+
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
+    """Bring back what `optimizer_tensors` gave."""
+    moments: dict[int, dict[str, Any]] = {}
+    for name, tensor in part_of(tensors, "optimizer.").items():
+        number, moment = name.split(".", 1)
+        moments.setdefault(int(number), {})[moment] = tensor
+    groups = optimizer.state_dict()["param_groups"]
+    optimizer.load_state_dict({"state": moments, "param_groups": groups})
+
+
+def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Those whose names begin with a prefix, without it."""
+    return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
