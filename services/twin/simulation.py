@@ -106,14 +106,13 @@ class Simulation:
         parts = STEPS_PER_GRID // STEPS_PER_COMMAND
         weight = np.arange(1, parts + 1) / parts
         before = transform_from_pose(self.commanded_poses())
-        left = np.zeros(parts, dtype=np.int64)
-        Ts = [
-            interpolate_poses(np.stack(pair), left, weight)
-            for pair in zip(before, target.Ts_world_x, strict=True)
-        ]
+        # All three bodies in one call: start and end of each, one after the other.
+        ends = np.stack([before, target.Ts_world_x], axis=1).reshape(-1, 4, 4)
+        left = np.repeat(np.arange(0, len(ends), 2), parts)
+        Ts = interpolate_poses(ends, left, np.tile(weight, len(before)))
         joints_before = self.commanded_joints_rad()
         joints = joints_before + weight[:, None, None] * (target.joints_rad - joints_before)
-        return pose_from_transform(np.stack(Ts, axis=1)), joints
+        return pose_from_transform(Ts.reshape(-1, parts, 4, 4).swapaxes(0, 1)), joints
 
     def _sense(self) -> None:
         """Make every derived quantity belong to the present state, and read the skin."""

@@ -8,11 +8,14 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
+from dextouch.geometry.interpolation import interpolate_poses
+from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
 from dextouch.hands.actions import IDENTITY_POSE_9D
 from services.twin import __main__ as command_line
 from services.twin.episodes import record, write_episode
 from services.twin.motions import MOTION_KINDS, Motion
 from services.twin.settings import TwinSettings
+from services.twin.simulation import Simulation
 from services.twin.stage import Stage
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id
 
@@ -85,6 +88,27 @@ def test_the_same_seed_gives_the_same_bytes_on_a_fresh_stage(robot_take):
     again = record(Stage("stand_bottle", "robot", TwinSettings()), 3, HEAD_ONLY)
     assert digest(again) == digest(robot_take)
     assert again.attributes == robot_take.attributes
+
+
+def _interpolated_one_by_one(self, target):
+    """How a simulation interpolates commands, a body at a time."""
+    weight = np.arange(1, 9) / 8
+    before = transform_from_pose(self.commanded_poses())
+    Ts = [
+        interpolate_poses(np.stack(pair), np.zeros(8, dtype=np.int64), weight)
+        for pair in zip(before, target.Ts_world_x, strict=True)
+    ]
+    q = self.commanded_joints_rad()
+    joints = q + weight[:, None, None] * (target.joints_rad - q)
+    return pose_from_transform(np.stack(Ts, axis=1)), joints
+
+
+def test_bodies_interpolated_together_give_the_bytes_of_each_by_itself(
+    bottle_stage, bowls_stage, robot_take, human_take, monkeypatch
+):
+    monkeypatch.setattr(Simulation, "_interpolated", _interpolated_one_by_one)
+    assert digest(record(bottle_stage, 3, HEAD_ONLY)) == digest(robot_take)
+    assert digest(record(bowls_stage, 3, HEAD_ONLY)) == digest(human_take)
 
 
 def test_another_seed_gives_another_take(bottle_stage, robot_take):
