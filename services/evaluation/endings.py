@@ -159,7 +159,10 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
         start_digest(first.images[CAMERA][0], first.tactile_kpa[0]),
         last,
         {},
-        _event_times(about.event_times_s, success=about.success),
+        _event_times(
+            about.event_times_s,
+            unknown_if_empty=about.success or about.origin == "imagined",
+        ),
         1 / about.model_rate_hz,
     )
     steps = (episode.early_step, episode.middle_step, last - 1, last)
@@ -167,9 +170,11 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
     return EndingEpisode(**{**vars(episode), "endings": endings})
 
 
-def _event_times(times: Mapping[str, float], *, success: bool) -> Mapping[str, float] | None:
-    """Nothing noted in a failure may mean that nothing was reached; in a success it cannot."""
-    return times if times or not success else None
+def _event_times(
+    times: Mapping[str, float], *, unknown_if_empty: bool
+) -> Mapping[str, float] | None:
+    """Nothing noted in a true failure means that nothing was reached; elsewhere it says nothing."""
+    return times if times or not unknown_if_empty else None
 
 
 def _read_ending(reader: EpisodeReader, end: int) -> Ending:

@@ -16,7 +16,7 @@ from dextouch.tactile.layout import SIDES
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
 NS_PER_S: Final = 1_000_000_000
-Kind = Literal["tactile", "image", "robot_state"]
+Kind = Literal["tactile", "image", "robot_state", "pose"]
 
 
 def imagine_episode(
@@ -26,7 +26,8 @@ def imagine_episode(
 
     The imagined episode starts from the source's first observation. Its `success` is the
     *source's*: what these actions really led to, which is what a judge of imagined endings has to
-    learn. Its lineage names the source and the world's digest.
+    learn. Its lineage names the source and the world's digest. Where the world gives object poses,
+    they are the stream `object_poses`, from step 1 on.
 
     Args:
         source: a robot episode with head camera, touch and commanded actions.
@@ -119,6 +120,11 @@ def _write(
     ]
     for index, side in enumerate(SIDES):
         streams.append((f"tactile_{side}", "tactile", "kPa", tactile[:, index]))
+    poses = [one.object_poses for one in seen[1:] if one.object_poses is not None]
+    if poses and len(poses) == len(seen) - 1:
+        # The first observation is a real one: nobody knows where its objects are.
+        values = np.concatenate(poses).astype(np.float64)
+        streams.append(("object_poses", "pose", "pose_m_wxyz", values))
     with store.writer(kind="episode", attributes=attributes) as writer:
         for name, kind, unit, values in streams:
             writer.add_stream(
@@ -130,7 +136,8 @@ def _write(
                         "dtype": values.dtype.name,
                         "unit": unit,
                         "nominal_rate_hz": rate_hz,
+                        "frame": "world" if kind == "pose" else None,
                     }
                 )
             )
-            writer.append(name, values=values, t_ref_ns=t_ref_ns)
+            writer.append(name, values=values, t_ref_ns=t_ref_ns[-len(values) :])

@@ -1,5 +1,7 @@
 """Imagined episodes: what a world showed, with the outcome and the lineage of their source."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,9 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.worlds.baseline import CopyFirstWorld
 from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds.world import EVERYTHING, SteppedRollout
 from services.cli.demo.background import served
+from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
 from services.twin.episodes import demonstrate, write_episode
 
@@ -48,6 +52,50 @@ def test_an_imagined_episode_shows_what_the_world_showed(sources, client, tmp_pa
     )
     np.testing.assert_array_equal(window.tactile_kpa[40], truth.tactile_kpa[0])
     np.testing.assert_allclose(window.actions, truth.actions, atol=1e-9)
+
+
+class _PoseWorld(CopyFirstWorld):
+    """Repeats the first image, and says that one bowl rises by a millimetre a step."""
+
+    @property
+    def description(self):
+        names = {"stack_bowls": ("bowl_a", "bowl_b")}
+        return super().description.model_copy(update={"object_names": names})
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        stepped = super().step(state, actions, seed=seed)
+        steps = state.first_step + 1 + np.arange(len(actions))
+        poses = np.zeros((len(actions), 2, 7), np.float32)
+        poses[:, :, 3], poses[:, 1, 2] = 1.0, 0.001 * steps
+        seen = replace(stepped.observation, object_poses=poses)
+        return SteppedRollout(stepped.state, seen.selected(selector))
+
+
+def test_imagined_poses_are_kept_for_the_judge(sources, tmp_path):
+    app = create_world_app({"poses": _PoseWorld(tasks=("stack_bowls",))}, WorldServiceSettings())
+    store = EpisodeStore(tmp_path)
+    with served({"worlds": app}) as urls, RolloutClient(urls["worlds"]) as client:
+        name = imagine_episode(sources[0], client, "poses", store)
+    reader = store.open(name)
+    kept = reader.read("object_poses")
+    assert len(kept) == reader.num_steps - 1
+    ending = read_ending_episode(reader).final
+    assert ending.imagined
+    np.testing.assert_allclose(ending.object_poses[:, 1, 2], [0.078, 0.079, 0.080], atol=1e-6)
+
+
+def test_endings_of_a_true_episode_are_those_of_the_twin(sources):
+    source = sources[0]
+    episode = read_ending_episode(source)
+    assert not episode.final.imagined
+    assert episode.event_times_s == source.attributes.event_times_s
+    assert episode.success == source.attributes.success
+    window = source.window(78, 3)
+    np.testing.assert_array_equal(episode.final.images, window.images["camera_head"])
+    np.testing.assert_array_equal(episode.final.tactile_kpa, window.tactile_kpa)
+    # The twin notes poses 100 times a second: the last ones are those of the last step.
+    truth = source.read("object_poses").values[-1]
+    np.testing.assert_allclose(episode.final.object_poses[-1], truth, atol=1e-6)
 
 
 def test_an_episode_without_commands_is_refused(sources, client, tmp_path):
