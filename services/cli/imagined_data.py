@@ -1,13 +1,14 @@
 """Robot episodes of a store as the world model imagines them: `dextouch train imagined`.
 
-Their outcome is that of the same actions in the twin. Measure the success probe on them to see
-how far imagined endings can be trusted. It should not be trained on them: where the model
-imagined another outcome, it would learn not to believe what it sees.
+Their outcome is that of the same actions in the twin. The success probe is trained on them beside
+true episodes, so that its probabilities hold for what is imagined, and measured on those of other
+seeds to see how far imagined endings can be trusted.
 """
 
 import argparse
 import json
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -18,30 +19,63 @@ from dextouch.episodes import EpisodeStore
 from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
 from services.generation.demonstrations import imagine_episode
-from services.world_model.checkpoints import default_checkpoint, read_checkpoint
-from services.world_model.world import ModelWorld
+from services.world_model.checkpoints import default_checkpoint
+from services.world_model.world import open_world
 
 WORLD = "world_model"
 
 
-def imagine_all(episodes: str, output: str, checkpoint: Path) -> dict[str, int]:
-    """Imagine every robot episode of a store; those that are there are kept.
+@dataclass(frozen=True)
+class Choice:
+    """Which episodes of a store are imagined: of these tasks and seeds; None takes all."""
+
+    tasks: tuple[str, ...] | None = None
+    seeds: range | None = None
+
+    def takes(self, task: str, seed: int | None) -> bool:
+        """Whether an episode of this task and seed is one of them."""
+        of_task = self.tasks is None or task in self.tasks
+        return of_task and (self.seeds is None or seed in self.seeds)
+
+
+EVERYTHING = Choice()
+
+
+def imagine_all(
+    episodes: str, output: str, checkpoint: Path, choice: Choice = EVERYTHING
+) -> dict[str, int]:
+    """Imagine robot episodes of a store; those that are there are kept.
 
     Args:
         episodes: store to read.
         output: store to write.
-        checkpoint: of the world model.
+        checkpoint: of a world model of either form.
+        choice: which of the episodes.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
-    world = ModelWorld(read_checkpoint(checkpoint))
+    world = open_world(checkpoint)
     app = create_world_app({WORLD: world}, WorldServiceSettings(), name="imagined")
     made = 0
     with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
         for episode_id in track(source.list(), description="imagined episodes"):
-            imagine_episode(source.open(episode_id), client, WORLD, target)
-            made += 1
+            reader = source.open(episode_id)
+            if choice.takes(reader.attributes.task, reader.attributes.seed):
+                imagine_episode(reader, client, WORLD, target)
+                made += 1
     return {"imagined": made}
+
+
+def seed_range(text: str) -> range:
+    """Seeds written as FIRST:LAST+1.
+
+    Raises:
+        ArgumentTypeError: anything else.
+    """
+    first, _, stop = text.partition(":")
+    if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop)):
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected FIRST:LAST+1 such as 0:100")
+    return range(int(first), int(stop))
 
 
 def main(argv: Sequence[str]) -> int:
@@ -52,9 +86,13 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--checkpoint", type=Path, default=default_checkpoint(), help="world model (committed one)"
     )
+    parser.add_argument("--tasks", help="with commas (all)")
+    parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (all)")
     parser.add_argument("--json", type=Path, help="write the counts here")
     arguments = parser.parse_args(list(argv))
-    counts = imagine_all(arguments.episodes, arguments.store, arguments.checkpoint)
+    tasks = tuple(arguments.tasks.split(",")) if arguments.tasks else None
+    choice = Choice(tasks, arguments.seeds)
+    counts = imagine_all(arguments.episodes, arguments.store, arguments.checkpoint, choice)
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
     if arguments.json:
         arguments.json.write_text(json.dumps(counts, indent=2), encoding="utf-8")
