@@ -48,6 +48,9 @@ COMMANDS = {
         "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
     ),
     "bench": Command("services.cli.bench", "time a stage against its error, beside its rivals"),
+    "stress": Command(
+        "services.cli.stress.command", "feed every stage what breaks numerical code; tell what held"
+    ),
 }
 
 # A second word that another module does.

@@ -1,0 +1,1 @@
+"""`dextouch stress`: every stage under every numerical hazard, as checks that also are tests."""

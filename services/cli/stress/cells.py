@@ -1,0 +1,204 @@
+"""Cells of the stress matrix: one stage under one numerical hazard, checked against the real code.
+
+A stage is a module with a `STAGE`; each hazard of `HAZARDS` is there either a function that checks
+or a reason why the hazard cannot occur. The command and the tests run the same functions.
+"""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final, Literal
+
+import numpy as np
+
+from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
+
+HAZARDS: Final[Mapping[str, str]] = {
+    "rotations": "near-singular rotations: angles of 0 and π, parallel columns, lost quaternions",
+    "one_axis": "motion about one axis only, or none",
+    "clock": "clock steps, wraps, pauses and stamps that go back",
+    "non_finite": "NaN, infinity, denormal and huge numbers",
+    "touch": "zero and saturated touch",
+    "ends": "t = 0 and t = 1: ends of intervals, flow time, rates of none and all",
+    "precision": "bfloat16 and float16 numbers",
+    "device": "weights or inputs on another device",
+    "long_run": "1000 steps: drift over 63 chunks of 16",
+    "batch": "one against many: a batch of 1 and of N",
+}
+
+Verdict = Literal["held", "failed", "does not apply", "not run"]
+
+
+class Check:
+    """What one cell finds: every statement is noted, and those that do not hold fail the cell."""
+
+    def __init__(self) -> None:
+        self._told: list[str] = []
+        self._broken: list[str] = []
+        self._refusals: dict[str, list[str]] = {}
+        self._bounds: dict[str, tuple[float, str]] = {}
+        self.figures: dict[str, float] = {}
+
+    @property
+    def held(self) -> bool:
+        """Whether something was checked and all of it holds."""
+        has_checked = self._told or self._refusals or self._bounds
+        return bool(has_checked) and not self._broken
+
+    @property
+    def came_out(self) -> str:
+        """What came out, in words; what does not hold stands first."""
+        figures = [
+            f"{what} {self.figures[what]:.2g} {unit}".rstrip() + f" (≤ {bound:g})"
+            for what, (bound, unit) in self._bounds.items()
+        ]
+        refusals = [f"{kind}: {', '.join(what)}" for kind, what in self._refusals.items()]
+        broken = [f"NOT {text}" for text in self._broken]
+        return "; ".join([*broken, *figures, *self._told, *refusals])
+
+    def true(self, text: str, holds: object) -> None:
+        """A statement that must be true."""
+        found = self._told if bool(holds) else self._broken
+        if text not in found:
+            found.append(text)
+
+    def at_most(
+        self, what: str, value: float | int | np.number[Any], bound: float | int, unit: str = ""
+    ) -> None:
+        """A figure that must be finite and not above its bound; of several the largest is told."""
+        figure = float(value)
+        if not figure <= bound:
+            self._broken.append(f"{what} {figure:.3g} {unit}".rstrip() + f" (≤ {bound:g})")
+        if what not in self.figures or not figure <= self.figures[what]:
+            self.figures[what] = figure
+        if self.figures[what] <= bound:
+            self._bounds[what] = (bound, unit)
+        else:
+            self._bounds.pop(what, None)
+
+    def finite(self, what: str, values: np.ndarray) -> None:
+        """Numbers that must all be finite."""
+        self.true(f"{what} finite", np.isfinite(np.asarray(values, dtype=np.float64)).all())
+
+    def equal(self, what: str, got: np.ndarray, expected: np.ndarray) -> None:
+        """Arrays that must be the same to the last bit; NaN equals NaN."""
+        a, b = np.asarray(got), np.asarray(expected)
+        same = a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
+        self.true(f"{what} equal to the bit", same)
+
+    def refused(
+        self, what: str, call: Callable[[], object], kind: type[DexTouchError] = InvalidInputError
+    ) -> None:
+        """A call that must end in an error of ours of this kind."""
+        try:
+            call()
+        except DexTouchError as error:
+            if isinstance(error, kind):
+                self._refusals.setdefault(type(error).__name__, []).append(what)
+            else:
+                self._broken.append(
+                    f"{what}: {type(error).__name__}, expected {kind.__name__} ({error.message})"
+                )
+        else:
+            self._broken.append(f"{what}: accepted, expected {kind.__name__}")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One check: what is fed, whether it takes long, and the function that does it."""
+
+    stage: str
+    hazard: str
+    fed: str
+    slow: bool
+    run: Callable[[Check], None]
+
+
+@dataclass(frozen=True)
+class Exemption:
+    """A cell that does not apply, and why."""
+
+    stage: str
+    hazard: str
+    reason: str
+
+
+@dataclass
+class StageCells:
+    """The row of one stage: a cell or an exemption for every hazard."""
+
+    name: str
+    cells: dict[str, Cell] = field(default_factory=dict)
+    exemptions: dict[str, Exemption] = field(default_factory=dict)
+
+    def cell(
+        self, hazard: str, fed: str, *, slow: bool = False
+    ) -> Callable[[Callable[[Check], None]], Callable[[Check], None]]:
+        """Decorator: this function checks the stage under this hazard."""
+        self._free(hazard)
+
+        def add(run: Callable[[Check], None]) -> Callable[[Check], None]:
+            self.cells[hazard] = Cell(self.name, hazard, fed, slow, run)
+            return run
+
+        return add
+
+    def does_not_apply(self, **reasons: str) -> None:
+        """Hazards that cannot occur in the stage, each with its reason."""
+        for hazard, reason in reasons.items():
+            self._free(hazard)
+            self.exemptions[hazard] = Exemption(self.name, hazard, reason)
+
+    def row(self) -> list[Cell | Exemption]:
+        """Every hazard in the order of the matrix.
+
+        Raises:
+            UnknownNameError: a hazard of the matrix has neither a check nor a reason.
+        """
+        known: dict[str, Cell | Exemption] = {**self.exemptions, **self.cells}
+        missing = [hazard for hazard in HAZARDS if hazard not in known]
+        if missing:
+            raise UnknownNameError(f"cell of stage {self.name}", missing[0], list(known))
+        return [known[hazard] for hazard in HAZARDS]
+
+    def _free(self, hazard: str) -> None:
+        if hazard not in HAZARDS:
+            raise UnknownNameError("hazard", hazard, list(HAZARDS))
+        if hazard in self.cells or hazard in self.exemptions:
+            raise InvalidInputError(f"stress: {self.name}, {hazard} is given twice")
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What came of one cell."""
+
+    stage: str
+    hazard: str
+    fed: str
+    came_out: str
+    verdict: Verdict
+    figures: dict[str, float]
+    time_s: float
+
+
+def run_cell(cell: Cell | Exemption) -> Finding:
+    """Run one cell; whatever the code under test raises unasked fails it."""
+    if isinstance(cell, Exemption):
+        return Finding(cell.stage, cell.hazard, "", cell.reason, "does not apply", {}, 0.0)
+    check = Check()
+    begin_s = time.perf_counter()
+    try:
+        cell.run(check)
+    except Exception as error:  # noqa: BLE001 - an error that nobody expected is the finding
+        text = " ".join(str(error).split())
+        check.true(f"expected: {type(error).__name__}: {text[:200]}", holds=False)
+    verdict: Verdict = "held" if check.held else "failed"
+    elapsed_s = time.perf_counter() - begin_s
+    told = check.came_out or "nothing was checked"
+    return Finding(cell.stage, cell.hazard, cell.fed, told, verdict, check.figures, elapsed_s)
+
+
+def not_run(cell: Cell) -> Finding:
+    """A slow cell that a quick run leaves out."""
+    text = "slow; run without --quick"
+    return Finding(cell.stage, cell.hazard, cell.fed, text, "not run", {}, 0.0)

@@ -1,0 +1,171 @@
+"""Stress of clocks: counters that wrap while nobody looks, steps, huge stamps, long takes."""
+
+import numpy as np
+
+from dextouch.clocks import OnlineClock, TickCounter, find_lost_samples, fit_clock, unwrap_counter
+from dextouch.errors import ClockFitError, ShapeError
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from services.cli.stress.cells import Check, StageCells
+
+STAGE = StageCells("clocks")
+_PERIOD_NS = 16_666_667
+# Shares of a full turn of a counter for which a device was silent.
+_PAUSES = (0.3, 0.5, 0.9, 1.0, 1.5, 3.7, 1000.25)
+
+
+@STAGE.cell("clock", "16- and 32-bit counters silent for 0.3 … 1000 wraps; a clock that is stepped")
+def _clock(check: Check) -> None:
+    worst = {"tick counter": 0, "stamps offline": 0, "stamps online": 0}
+    for bits, tick_ns in ((16, 1_000), (32, 1_000)):
+        turn_ns = 2**bits * tick_ns
+        for share in _PAUSES:
+            device_ns = np.arange(40, dtype=np.int64) * _PERIOD_NS
+            device_ns[20:] += round(share * turn_ns)
+            device_ns -= device_ns % tick_ns
+            host_ns = device_ns + 5_000_000 + 300_000 * (np.arange(40) % 3)
+            counts = device_ns // tick_ns % 2**bits
+            counter = TickCounter(bits, 10**9 // tick_ns)
+            ticked = [counter.to_ns(int(c), int(t)) for c, t in zip(counts, host_ns, strict=True)]
+            worst["tick counter"] = max(worst["tick counter"], _off(np.array(ticked), device_ns))
+            straight = unwrap_counter(counts, modulus=2**bits, hint=host_ns // tick_ns) * tick_ns
+            worst["stamps offline"] = max(worst["stamps offline"], _off(straight, device_ns))
+            online = OnlineClock(_descriptor(bits, tick_ns))
+            dated = [
+                online.update(t_host_ns=int(t), t_device_ns=int(c * tick_ns))
+                for c, t in zip(counts, host_ns, strict=True)
+            ]
+            late = np.array(dated) - device_ns
+            worst["stamps online"] = max(worst["stamps online"], _off(late, late * 0 + 5_000_000))
+    for what, bound in (("tick counter", 0), ("stamps offline", 0), ("stamps online", 700_000)):
+        check.at_most(f"{what} off after a pause", worst[what], bound, "ns")
+    report = find_lost_samples(np.array([65534, 65535, 0, 3]), bits=16)
+    check.true("a wrap of numbers is no loss, 2 lost after it", report.num_missing == 2)
+    device, host = _take(3000, 20.0)
+    stepped = device.copy()
+    stepped[1500:] += 3_000_000_000
+    model = fit_clock(stepped, host)
+    check.true("a step of 3 s found once", model.num_steps == 1)
+    off_ns = np.abs(model.to_host_ns(stepped, host) - _truth(device, 20.0)).max()
+    check.at_most("dates beside the step off", off_ns, 200_000, "ns")
+    back = device.copy()
+    back[1500:] -= 10_000_000_000
+    model = fit_clock(back, host)
+    check.true("a step back is found and ambiguous", model.num_steps == 1 and model.is_ambiguous)
+    check.refused("dates without arrivals", lambda: model.to_host_ns(back))
+
+
+@STAGE.cell(
+    "non_finite", "float stamps with NaN; counts outside the counter; arrivals that go back"
+)
+def _non_finite(check: Check) -> None:
+    device, host = _take(100, 0.0)
+    broken = device.astype(np.float64)
+    broken[50] = np.nan
+    check.refused("NaN stamps", lambda: fit_clock(broken, host), ClockFitError)
+    check.refused("NaN counts", lambda: unwrap_counter(broken, modulus=2**32), ShapeError)
+    check.refused(
+        "count past the modulus", lambda: unwrap_counter(np.array([70_000]), modulus=2**16)
+    )
+    check.refused("count past the counter", lambda: TickCounter(16, 1000).to_ns(65_536, 0))
+    check.refused("arrivals go back", lambda: fit_clock(device, host[::-1]), ClockFitError)
+    check.refused("a clock that stands", lambda: fit_clock(device * 0, host), ClockFitError)
+    clock = OnlineClock(None)
+    clock.update(t_host_ns=0, t_device_ns=0)
+    check.refused("a stamp that is missing", lambda: clock.update(t_host_ns=1))
+
+
+@STAGE.cell("ends", "10 samples, the fewest; dates before the first and after the last sample")
+def _ends(check: Check) -> None:
+    device, host = _take(10, 0.0)
+    model = fit_clock(device, host)
+    outside = np.array([device[0] - 10**9, device[-1] + 10**9])
+    check.at_most(
+        "dates a second outside off",
+        np.abs(model.to_host_ns(outside) - outside - 1_000_000).max(),
+        700_000,
+        "ns",
+    )
+    check.refused("9 samples", lambda: fit_clock(device[:9], host[:9]), ClockFitError)
+    check.refused("no sample", lambda: fit_clock(device[:0], host[:0]), ClockFitError)
+
+
+@STAGE.cell("precision", "stamps near 2^62 ns, where float64 knows only every 512th nanosecond")
+def _precision(check: Check) -> None:
+    device, host = _take(2000, 35.0)
+    shift = 2**62 + 12_345
+    near, far = fit_clock(device, host), fit_clock(device + shift, host + shift)
+    apart = far.to_host_ns(device + shift) - shift - near.to_host_ns(device)
+    check.at_most("dates change by", np.abs(apart).max(), 0, "ns")
+    online = [OnlineClock(None), OnlineClock(None)]
+    dated = [
+        [
+            one.update(t_host_ns=int(h) + off, t_device_ns=int(d) + off)
+            for d, h in zip(device[:500], host[:500], strict=True)
+        ]
+        for one, off in zip(online, (0, shift), strict=True)
+    ]
+    moved = [b - a - shift for a, b in zip(*dated, strict=True)]
+    check.at_most("live dates change by", max(map(abs, moved)), 0, "ns")
+
+
+@STAGE.cell("long_run", "60 000 samples (1000 s), 30 ppm fast, live and offline")
+def _long_run(check: Check) -> None:
+    device, host = _take(60_000, 30.0)
+    true_ns = _truth(device, 30.0)
+    off_ns = np.abs(fit_clock(device, host).to_host_ns(device) - true_ns)
+    check.at_most("offline off", off_ns.max(), 50_000, "ns")
+    clock = OnlineClock(None)
+    live = [
+        clock.update(t_host_ns=int(h), t_device_ns=int(d))
+        for d, h in zip(device[::6], host[::6], strict=True)
+    ]
+    late = np.abs(np.array(live) - true_ns[::6])[600:]
+    check.at_most("live off after a minute", late.max(), 200_000, "ns")
+    check.true("live dates rise", (np.diff(live) > 0).all())
+
+
+@STAGE.cell("batch", "dates of 2000 stamps at once and one by one")
+def _batch(check: Check) -> None:
+    device, host = _take(2000, -50.0)
+    model = fit_clock(device, host)
+    alone = np.concatenate([model.to_host_ns(device[k : k + 1]) for k in range(len(device))])
+    check.equal("dates", model.to_host_ns(device), alone)
+
+
+STAGE.does_not_apply(
+    rotations="no rotations",
+    one_axis="no motion",
+    touch="no touch",
+    device="whole numbers in the host's memory",
+)
+
+
+def _take(num_samples: int, skew_ppm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Device stamps at 60 Hz and their arrivals, 1 ms later or a little more."""
+    device = np.arange(num_samples, dtype=np.int64) * _PERIOD_NS
+    delay_ns = np.random.default_rng(num_samples).exponential(300_000, num_samples)
+    delay_ns[::7] = 0.0
+    host = _truth(device, skew_ppm) + delay_ns.astype(np.int64)
+    return device, np.maximum.accumulate(host)
+
+
+def _truth(device: np.ndarray, skew_ppm: float) -> np.ndarray:
+    """Arrivals of samples that nothing delays."""
+    return np.rint(device * (1 + skew_ppm * 1e-6)).astype(np.int64) + 1_000_000
+
+
+def _descriptor(bits: int, tick_ns: int) -> StreamDescriptor:
+    return StreamDescriptor(
+        name="stress",
+        kind="scalar",
+        shape=(1,),
+        dtype="float32",
+        unit="N",
+        nominal_rate_hz=60.0,
+        capabilities=ClockCapabilities(device_time=True, device_time_bits=bits, tick_ns=tick_ns),
+    )
+
+
+def _off(got: np.ndarray, expected: np.ndarray) -> int:
+    """Largest difference, both counted from their first."""
+    return int(np.abs((got - got[0]) - (expected - expected[0])).max())

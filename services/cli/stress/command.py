@@ -1,0 +1,99 @@
+"""The command `dextouch stress`: runs cells of the matrix and prints what each one found."""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from rich.console import Console
+from rich.table import Table
+
+from dextouch.errors import UnknownNameError
+from services.cli.stress.cells import HAZARDS, Cell, Exemption, Finding, not_run, run_cell
+from services.cli.stress.report import summary, to_json, to_markdown, to_table
+from services.cli.stress.stages import STAGES, load_stage
+
+EXIT_FAILED = 1
+WIDTH = 200
+DESCRIPTION = (
+    "Feed every stage what breaks numerical code (near-singular rotations, clock steps, NaN, "
+    "saturated touch, 1000 steps, …) and tell what came out: a named refusal, a bounded answer or "
+    "a figure against its bound. Ends with status 1 where a cell fails."
+)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run the matrix, or the stages that are named.
+
+    Returns:
+        0, or 1 where a cell fails.
+    """
+    options = _parser().parse_args(list(argv))
+    for name in options.stage:
+        if name not in STAGES:
+            raise UnknownNameError("stage", name, list(STAGES))
+    for name in options.hazard or ():
+        if name not in HAZARDS:
+            raise UnknownNameError("hazard", name, list(HAZARDS))
+    cells = _chosen(options.stage or list(STAGES), options.hazard or list(HAZARDS))
+    console = _console()
+    if options.list:
+        console.print(_listing(cells))
+        return 0
+    findings = _run(cells, console, quick=options.quick)
+    console.print(to_table(findings))
+    console.print(summary(findings), highlight=False)
+    for path, write in ((options.json, to_json), (options.markdown, to_markdown)):
+        if path is not None:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(write(findings) + "\n", encoding="utf-8")
+    return EXIT_FAILED if any(one.verdict == "failed" for one in findings) else 0
+
+
+def _console() -> Console:
+    """As wide as the terminal; where there is none, wide enough for a table."""
+    console = Console()
+    return console if console.is_terminal else Console(width=WIDTH)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="dextouch stress",
+        description=DESCRIPTION,
+        epilog=f"Stages: {', '.join(STAGES)}. Start with: dextouch stress --quick",
+    )
+    parser.add_argument("stage", nargs="*", metavar="STAGE", help="only these (default: all)")
+    parser.add_argument(
+        "--hazard", action="append", metavar="NAME", help=f"only these: {', '.join(HAZARDS)}"
+    )
+    parser.add_argument("--quick", action="store_true", help="leave out what takes long")
+    parser.add_argument("--list", action="store_true", help="say what would be run, run nothing")
+    parser.add_argument("--json", type=Path, metavar="PATH", help="write every finding here")
+    parser.add_argument("--markdown", type=Path, metavar="PATH", help="write the matrix here")
+    return parser
+
+
+def _chosen(stages: Sequence[str], hazards: Sequence[str]) -> list[Cell | Exemption]:
+    rows = [load_stage(name).row() for name in STAGES if name in stages]
+    return [cell for row in rows for cell in row if cell.hazard in hazards]
+
+
+def _run(cells: Sequence[Cell | Exemption], console: Console, *, quick: bool) -> list[Finding]:
+    findings = []
+    with console.status("stress") as status:
+        for cell in cells:
+            status.update(f"{cell.stage}, {cell.hazard}")
+            if quick and isinstance(cell, Cell) and cell.slow:
+                findings.append(not_run(cell))
+            else:
+                findings.append(run_cell(cell))
+    return findings
+
+
+def _listing(cells: Sequence[Cell | Exemption]) -> Table:
+    table = Table("stage", "hazard", "fed, or why it does not apply", "takes", header_style="bold")
+    for cell in cells:
+        if isinstance(cell, Exemption):
+            table.add_row(cell.stage, cell.hazard, f"[dim]{cell.reason}[/]", "")
+        else:
+            table.add_row(cell.stage, cell.hazard, cell.fed, "long" if cell.slow else "")
+    return table

@@ -1,0 +1,30 @@
+"""The stages of the stress matrix, by name; their modules are loaded when asked for."""
+
+import importlib
+from typing import Final
+
+from dextouch.errors import UnknownNameError
+from services.cli.stress.cells import StageCells
+
+STAGES: Final = {
+    "geometry": "services.cli.stress.geometry",
+    "clocks": "services.cli.stress.clocks",
+    "hand-eye": "services.cli.stress.hand_eye",
+    "retargeting": "services.cli.stress.retargeting",
+    "tactile-calibration": "services.cli.stress.tactile_calibration",
+    "resampling": "services.cli.stress.resampling",
+}
+
+
+def load_stage(name: str) -> StageCells:
+    """The cells of a stage.
+
+    Raises:
+        UnknownNameError: no such stage.
+    """
+    if name not in STAGES:
+        raise UnknownNameError("stage", name, list(STAGES))
+    stage = importlib.import_module(STAGES[name]).STAGE
+    if not isinstance(stage, StageCells):
+        raise UnknownNameError("stage", name, list(STAGES))
+    return stage
