@@ -2,7 +2,8 @@
 
 Their outcome is that of the same actions in the twin. The success probe is trained on them beside
 true episodes, so that its probabilities hold for what is imagined, and measured on those of other
-seeds to see how far imagined endings can be trusted.
+seeds to see how far imagined endings can be trusted. A state model draws only the images that the
+probe looks at.
 """
 
 import argparse
@@ -15,11 +16,13 @@ import torch
 from rich.progress import track
 
 from dextouch.clients.rollouts import RolloutClient
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
+from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import imagine_episode
 from services.world_model.checkpoints import default_checkpoint
+from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
 
 WORLD = "world_model"
@@ -61,9 +64,17 @@ def imagine_all(
         for episode_id in track(source.list(), description="imagined episodes"):
             reader = source.open(episode_id)
             if choice.takes(reader.attributes.task, reader.attributes.seed):
-                imagine_episode(reader, client, WORLD, target)
+                steps = judged_steps(reader) if isinstance(world, StateWorld) else None
+                imagine_episode(reader, client, WORLD, target, image_steps=steps)
                 made += 1
     return {"imagined": made}
+
+
+def judged_steps(episode: EpisodeReader) -> set[int]:
+    """The steps of an episode whose images a judge of success looks at."""
+    seed, last = episode.attributes.seed or 0, episode.num_steps - 1
+    ends = (early_step(seed), middle_step(seed), last - 1, last)
+    return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 
 
 def seed_range(text: str) -> range:
@@ -84,7 +95,10 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument("--episodes", required=True, help="folder of the store to imagine")
     parser.add_argument("--store", required=True, help="folder of the store for the result")
     parser.add_argument(
-        "--checkpoint", type=Path, default=default_checkpoint(), help="world model (committed one)"
+        "--checkpoint",
+        type=Path,
+        default=default_checkpoint(),
+        help="of either form (the package's)",
     )
     parser.add_argument("--tasks", help="with commas (all)")
     parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (all)")

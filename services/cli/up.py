@@ -202,7 +202,7 @@ def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
 
     settings = WorldModelSettings()
     world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
-    return create_world_app({world.description.name: world}, settings, name="world_model")
+    return create_world_app({settings.world_name: world}, settings, name="world_model")
 
 
 def _dashboard(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:

@@ -22,6 +22,16 @@ EARLY_ENDS: Final = (2, 8, 14)
 MIDDLE_ENDS: Final = (32, 48, 64)
 
 
+def early_step(seed: int) -> int:
+    """The one of `EARLY_ENDS` that an episode of this seed is shown at."""
+    return EARLY_ENDS[seed % len(EARLY_ENDS)]
+
+
+def middle_step(seed: int) -> int:
+    """The one of `MIDDLE_ENDS` that an episode of this seed is shown at."""
+    return MIDDLE_ENDS[seed // len(EARLY_ENDS) % len(MIDDLE_ENDS)]
+
+
 @dataclass(frozen=True)
 class Ending:
     """The last three steps of a rollout: head images, taxels in kPa, and where objects are.
@@ -96,12 +106,12 @@ class EndingEpisode:
     @property
     def early_step(self) -> int:
         """The one of `EARLY_ENDS` that this episode is shown at."""
-        return EARLY_ENDS[self.seed % len(EARLY_ENDS)]
+        return early_step(self.seed)
 
     @property
     def middle_step(self) -> int:
         """The one of `MIDDLE_ENDS` that this episode is shown at."""
-        return MIDDLE_ENDS[self.seed // len(EARLY_ENDS) % len(MIDDLE_ENDS)]
+        return middle_step(self.seed)
 
     def reached(self, milestones: Sequence[str], step: int) -> list[bool] | None:
         """Whether each milestone was reached by a step; None where nobody noted it."""

@@ -1,6 +1,7 @@
 """A robot episode and a served imagined world in; the same actions as that world sees them, out."""
 
 import hashlib
+from collections.abc import Collection
 from typing import Final, Literal
 
 import numpy as np
@@ -9,18 +10,24 @@ from dextouch.clients.rollouts import RolloutClient
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas.rollouts import Observation, ReturnSelector
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.tactile.layout import SIDES
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
+SHORT_CHUNK_STEPS: Final = 4
 NS_PER_S: Final = 1_000_000_000
 Kind = Literal["tactile", "image", "robot_state", "pose"]
 
 
 def imagine_episode(
-    source: EpisodeReader, client: RolloutClient, world: str, store: EpisodeStore
+    source: EpisodeReader,
+    client: RolloutClient,
+    world: str,
+    store: EpisodeStore,
+    *,
+    image_steps: Collection[int] | None = None,
 ) -> str:
     """Play an episode's commanded actions in an imagined world and keep what it showed.
 
@@ -34,6 +41,9 @@ def imagine_episode(
         client: of the service that has the world.
         world: its name there.
         store: where the imagined episode goes.
+        image_steps: steps whose images somebody will look at; None for all of them. Images are
+            then kept of the chunks of four steps that hold one of these. It is meant for worlds
+            whose state does not depend on where chunks end, since chunks are shorter then.
 
     Returns:
         Its id; the same source and world give the same id, and one that is there is kept.
@@ -69,8 +79,11 @@ def imagine_episode(
         init=(first, window.anchor, window.K_head),
     ) as rollout:
         seen.extend(
-            rollout.step(commanded[begin : begin + CHUNK_STEPS])
-            for begin in range(1, len(commanded), CHUNK_STEPS)
+            rollout.step(
+                commanded[begin:end],
+                selector=None if shown else ReturnSelector(cameras=()),
+            )
+            for begin, end, shown in _chunks(len(commanded), image_steps)
         )
     lineage = (
         *attributes.lineage,
@@ -93,6 +106,22 @@ def imagine_episode(
     return name
 
 
+def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:
+    """First step, step after the last, and whether images are asked for, of every chunk."""
+    if image_steps is None:
+        firsts = range(1, num_steps, CHUNK_STEPS)
+        return [(first, min(first + CHUNK_STEPS, num_steps), True) for first in firsts]
+    chunks: list[tuple[int, int, bool]] = []
+    for first in range(1, num_steps, SHORT_CHUNK_STEPS):
+        end = min(first + SHORT_CHUNK_STEPS, num_steps)
+        shown = any(first <= step < end for step in image_steps)
+        if chunks and not shown and not chunks[-1][2] and end - chunks[-1][0] <= CHUNK_STEPS:
+            chunks[-1] = (chunks[-1][0], end, False)
+        else:
+            chunks.append((first, end, shown))
+    return chunks
+
+
 def imagined_id(episode_id: str, world_digest: str) -> str:
     """The id of an imagined episode: its source and, in short, the world that imagined it."""
     return f"imagined-{world_digest[:8]}-{episode_id}"
@@ -110,7 +139,9 @@ def _write(
 ) -> None:
     rate_hz = attributes.model_rate_hz
     tactile = np.concatenate([observation.tactile_kpa for observation in seen])
-    images = np.concatenate([observation.images[CAMERA] for observation in seen])
+    shown = [observation for observation in seen if CAMERA in observation.images]
+    images = np.concatenate([observation.images[CAMERA] for observation in shown])
+    shown_steps = np.concatenate([one.first_step + np.arange(len(one)) for one in shown])
     reached = np.concatenate([observation.action_reached for observation in seen])
     t_ref_ns = np.round(np.arange(len(tactile)) * NS_PER_S / rate_hz).astype(np.int64)
     streams: list[tuple[str, Kind, str, np.ndarray]] = [
@@ -140,4 +171,5 @@ def _write(
                     }
                 )
             )
-            writer.append(name, values=values, t_ref_ns=t_ref_ns[-len(values) :])
+            stamps_ns = t_ref_ns[shown_steps] if name == CAMERA else t_ref_ns[-len(values) :]
+            writer.append(name, values=values, t_ref_ns=stamps_ns)

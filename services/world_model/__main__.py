@@ -4,7 +4,8 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 from pydantic import ValidationError
 from pydantic_settings import BaseSettings, CliApp
@@ -20,6 +21,7 @@ from services.world_model.settings import (
     TrainStateCommand,
     WorldModelSettings,
 )
+from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
@@ -109,7 +111,7 @@ def run_serve(arguments: list[str]) -> int:
     settings = load_settings(WorldModelSettings, arguments)
     torch.set_num_threads(settings.num_threads)
     world = open_world(settings.checkpoint, sampling_steps=settings.sampling_steps)
-    serve_worlds({world.description.name: world}, settings, name="world_model")
+    serve_worlds({settings.world_name: world}, settings, name="world_model")
     return 0
 
 
@@ -117,15 +119,22 @@ def run_show(arguments: list[str]) -> int:
     """Print the history of one checkpoint, or of every one in a folder."""
     settings = _parse(ShowCommand, arguments)
     path = settings.checkpoint
-    found = []
-    for file in list_checkpoints(path) if path.is_dir() else [path]:
-        checkpoint = read_checkpoint(file)
-        history = checkpoint.metadata.model_dump(mode="json", exclude={"train_fingerprints"})
-        found.append({"file": file.name, "digest": checkpoint.digest, **history})
+    found = [_history(file) for file in (list_checkpoints(path) if path.is_dir() else [path])]
     print(json.dumps(found, indent=2))
     if settings.json_path is not None:
         settings.json_path.write_text(json.dumps(found, indent=2))
     return 0
+
+
+def _history(file: Path) -> dict[str, Any]:
+    """What a checkpoint of either form says about itself."""
+    if is_state_checkpoint(file):
+        state = read_state_checkpoint(file)
+        history = {"form": "state model", **state.metadata.model_dump(mode="json")}
+        return {"file": file.name, "digest": state.digest, **history}
+    checkpoint = read_checkpoint(file)
+    history = checkpoint.metadata.model_dump(mode="json", exclude={"train_fingerprints"})
+    return {"file": file.name, "digest": checkpoint.digest, "form": "paper's form", **history}
 
 
 def _parse(kind: type[SettingsT], arguments: list[str]) -> SettingsT:

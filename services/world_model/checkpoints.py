@@ -28,6 +28,7 @@ FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_world_model"
 MAX_CHECKPOINT_BYTES = 64 * 2**20
 PRETRAINED = Path(__file__).parent / "pretrained"
+STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
 
 class CheckpointMetadata(BaseModel):
@@ -143,8 +144,14 @@ def list_checkpoints(folder: Path) -> dict[Path, str]:
 
 
 def default_checkpoint() -> Path:
-    """The checkpoint that comes with the package."""
-    return PRETRAINED / "tiny.safetensors"
+    """The checkpoint that comes with the package: the state model, where it is there."""
+    state = PRETRAINED / STATE_MODEL
+    return state if state.is_file() else paper_form_checkpoint()
+
+
+def paper_form_checkpoint() -> Path:
+    """The checkpoint of the paper's form that comes with the package."""
+    return PRETRAINED / PAPER_FORM
 
 
 def _metadata(notes: Mapping[str, str], name: str) -> CheckpointMetadata:

@@ -171,8 +171,15 @@ class WorldModelSettings(WorldServiceSettings):
 
     model_config = service_config("world_model")
 
-    checkpoint: Path = default_checkpoint()
-    sampling_steps: int | None = Field(default=None, ge=1, le=64)
+    checkpoint: Path = Field(
+        default_factory=default_checkpoint, description="of either form (default: the package's)"
+    )
+    world_name: str = Field(
+        default="world_model", min_length=1, max_length=64, description="what clients call it"
+    )
+    sampling_steps: int | None = Field(
+        default=None, ge=1, le=64, description="Euler steps of the paper's form"
+    )
     num_threads: int = Field(default=1, ge=1)
 
 

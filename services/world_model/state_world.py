@@ -142,7 +142,7 @@ class StateWorld:
         motion = hand_motion(reached[None], anchor)
         first = FirstStep(
             torch.from_numpy(image.copy())[None],
-            torch.from_numpy(K_head).float()[None],
+            torch.tensor(K_head, dtype=torch.float32)[None],
             torch.from_numpy(motion.Ts_world_camera).float(),
             torch.from_numpy(motion.points_m),
             torch.from_numpy(pad_means_kpa(tactile_kpa))[None],

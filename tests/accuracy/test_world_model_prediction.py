@@ -1,4 +1,4 @@
-"""The shipped world model against simple rivals, on twin episodes recorded here and now."""
+"""The shipped model of the paper's form against simple rivals, on twin episodes made here."""
 
 import sys
 
@@ -11,7 +11,7 @@ from dextouch.tactile.layout import taxel_areas_m2
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
-from services.world_model.checkpoints import default_checkpoint, read_checkpoint
+from services.world_model.checkpoints import paper_form_checkpoint, read_checkpoint
 from services.world_model.training.dataset import EpisodeArrays, cut_window
 from services.world_model.training.episodes import load_episodes
 from services.world_model.training.evaluation import evaluate_prediction, predict_all
@@ -26,7 +26,7 @@ MAX_FALSE_ALARMS = 0.15
 @pytest.fixture(scope="module")
 def shipped():
     torch.set_num_threads(1)
-    return read_checkpoint(default_checkpoint())
+    return read_checkpoint(paper_form_checkpoint())
 
 
 def recorded(folder, *, miss: bool) -> list[EpisodeArrays]:
@@ -86,7 +86,7 @@ def test_false_actions_for_the_same_moment_are_seen_and_felt(figures, kind):
 
 
 def test_the_shipped_model_is_small_and_knows_its_history(shipped):
-    assert default_checkpoint().stat().st_size < 5e6
+    assert paper_form_checkpoint().stat().st_size < 5e6
     metadata = shipped.metadata
     assert metadata.command
     assert len(metadata.train_fingerprints) == len(metadata.train_episode_ids) > 0

@@ -17,7 +17,10 @@ from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.cli import main
 from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings
+from services.world_model.checkpoints import paper_form_checkpoint
+from services.world_model.state_world import StateWorld
 from services.world_model.world import open_world
+from tests.contracts.test_world import untrained_state_checkpoint
 from tests.unit.worlds.running import served
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -42,7 +45,7 @@ def table(text, first_header):
 @pytest.fixture(scope="module")
 def worlds():
     model = open_world()
-    return twin_worlds(TwinSettings()) | {model.description.name: model}
+    return twin_worlds(TwinSettings()) | {"world_model": model}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,7 @@ def services(worlds):
     settings = WorldServiceSettings()
     with (
         served(create_world_app(twin, settings)) as twin_url,
-        served(create_world_app({"tiny": worlds["tiny"]}, settings)) as model_url,
+        served(create_world_app({"world_model": worlds["world_model"]}, settings)) as model_url,
     ):
         yield {TWIN: twin_url, MODEL: model_url}
 
@@ -104,8 +107,12 @@ def test_six_numbers_of_a_rotation_are_the_first_two_columns():
 
 
 def test_worlds_say_what_the_table_says(worlds):
+    forms = {
+        "world_model, with a state model": StateWorld(untrained_state_checkpoint()),
+        "world_model, in the paper's form": open_world(paper_form_checkpoint()),
+    }
     for name, starts, cameras, longest, success, _ in table(ROLLOUT_API, "world"):
-        described = worlds[name.split(",")[0]].description
+        described = (forms.get(name) or worlds[name.split(",")[0]]).description
         assert described.starts_from == (starts,)
         if cameras.startswith("camera"):
             assert described.cameras == tuple(cameras.removesuffix(" (a setting)").split(", "))
@@ -146,6 +153,6 @@ def test_the_command_of_the_page_scores_the_policy(folder, services, capsys):
     assert main.main([*words, "--num_steps", "16", "--builtin", "[]"]) == 0
     report = json.loads((folder / "report.json").read_text())
     assert [row["policy"] for row in report["policies"]] == ["mine"]
-    assert report["imagined_world"] == "tiny"
+    assert report["imagined_world"] == "world_model"
     assert {"report.json", "report.jsonl", "report.html"} <= {p.name for p in folder.iterdir()}
     assert "mine" in capsys.readouterr().out

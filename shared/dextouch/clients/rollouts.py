@@ -161,7 +161,7 @@ class Rollout:
         """Its name at the service."""
         return self.info.id
 
-    def step(self, actions: np.ndarray) -> Observation:
+    def step(self, actions: np.ndarray, *, selector: ReturnSelector | None = None) -> Observation:
         """Advance by one action chunk.
 
         If this raises UnavailableError, the same call may be made again: a chunk that the service
@@ -170,18 +170,20 @@ class Rollout:
         Args:
             actions: [K, 67], K a multiple of the world's chunk; row i is the pose at step i+1 of
                 the chunk, relative to the rollout's step 0.
+            selector: of this chunk alone; None for the client's.
 
         Returns:
-            What was seen at the K steps (the last one if the client's selector says so).
+            What was seen at the K steps (the last one if the selector says so).
 
         Raises:
             EndedError: the world goes no further with this rollout, for the `reason` it names;
                 what was seen last stays in `observation`.
         """
         checked = check_actions(actions, where=f"rollout {self.id}")
+        query = self._query if selector is None else _query(selector)
         reply = self._link.request(
             "POST",
-            f"/v1/rollouts/{self.id}/chunks/{self.info.next_chunk}?{self._query}",
+            f"/v1/rollouts/{self.id}/chunks/{self.info.next_chunk}?{query}",
             body=checked.astype("<f8").tobytes(),
             content_type=ACTIONS_TYPE,
             accept=MSGPACK,

@@ -1,10 +1,74 @@
-"""Which episodes `dextouch train imagined` takes, and how their seeds are written."""
+"""Which episodes `dextouch train imagined` takes, and that it draws all that a judge looks at."""
 
 import argparse
+import json
 
+import numpy as np
 import pytest
 
-from services.cli.imagined_data import Choice, seed_range
+from dextouch.clients.rollouts import RolloutClient
+from dextouch.episodes import EpisodeStore
+from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from services.cli.demo.background import served
+from services.cli.imagined_data import WORLD, Choice, judged_steps, main, seed_range
+from services.evaluation.endings import read_ending_episode
+from services.generation.demonstrations import imagine_episode
+from services.twin.episodes import TakeOptions, record, write_episode
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.world_model.state_checkpoints import write_state_checkpoint
+from services.world_model.state_world import StateWorld
+from services.world_model.world import open_world
+from tests.contracts.test_world import untrained_state_checkpoint
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory):
+    """A store of one episode whose seed is shown to a judge at steps 8 and 48."""
+    store = EpisodeStore(tmp_path_factory.mktemp("truth"))
+    stage = Stage("stand_bottle", "robot", TwinSettings(image_height_px=32, image_width_px=32))
+    write_episode(store, record(stage, 4, TakeOptions(images=("camera_head",))))
+    return store
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    path = tmp_path_factory.mktemp("model") / "untrained.safetensors"
+    loaded = untrained_state_checkpoint()
+    write_state_checkpoint(path, loaded.dynamics, loaded.renderer, loaded.metadata)
+    return path
+
+
+def test_judged_steps_are_three_at_every_end(truth):
+    episode = truth.open(truth.list()[0])
+    assert judged_steps(episode) == {6, 7, 8, 46, 47, 48, 77, 78, 79, 80}
+
+
+def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, tmp_path):
+    report = tmp_path / "counts.json"
+    flags = ["--episodes", truth.root, "--store", tmp_path / "few", "--checkpoint", checkpoint]
+    assert main([*map(str, flags), "--json", str(report)]) == 0
+    assert json.loads(report.read_text()) == {"imagined": 1}
+    few, every = EpisodeStore(tmp_path / "few"), EpisodeStore(tmp_path / "every")
+    world = open_world(checkpoint)
+    assert isinstance(world, StateWorld)
+    app = create_world_app({WORLD: world}, WorldServiceSettings())
+    source = truth.open(truth.list()[0])
+    with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
+        name = imagine_episode(source, client, WORLD, every)
+    assert few.list() == every.list() == [name]
+    # Step 0, and the chunks of four that hold 6 … 8, 46 … 48 and 77 … 80.
+    shown = few.open(name).shown_steps("camera_head")[0]
+    assert shown.tolist() == [0, *range(5, 9), *range(45, 49), *range(77, 81)]
+    ours, theirs = (read_ending_episode(store.open(name)) for store in (few, every))
+    assert set(ours.endings) == set(theirs.endings) == {8, 48, 79, 80}
+    for step, ending in ours.endings.items():
+        wanted = theirs.endings[step]
+        # Stored images are compressed together, so they are alike but not the same.
+        difference = ending.images.astype(int) - wanted.images
+        assert np.abs(difference).mean() < 2.0
+        np.testing.assert_allclose(ending.tactile_kpa, wanted.tactile_kpa, atol=1e-3)
+        np.testing.assert_allclose(ending.object_poses, wanted.object_poses, atol=1e-5)
 
 
 def test_seeds_are_written_as_a_range():

@@ -66,6 +66,13 @@ def test_no_images_and_the_last_step_only(client):
         assert (seen.first_step, len(seen), seen.images) == (16, 1, {})
 
 
+def test_a_selector_of_one_chunk_alone(client):
+    with client.start(world="sum", **ASKED) as rollout:
+        assert rollout.step(actions(4), selector=ReturnSelector(cameras=())).images == {}
+        seen = rollout.step(actions(8))
+        assert (seen.first_step, set(seen.images)) == (5, set(CAMERAS))
+
+
 def test_an_ended_rollout_is_an_error_of_its_own(client):
     with client.start(world="sum", **ASKED) as rollout:
         before = rollout.step(actions(4))

@@ -17,12 +17,14 @@ from dextouch.errors import (
 from services.world_model import checkpoints
 from services.world_model.checkpoints import (
     METADATA_KEY,
+    default_checkpoint,
     find_checkpoint,
     list_checkpoints,
     read_checkpoint,
     to_bytes,
     write_checkpoint,
 )
+from services.world_model.settings import WorldModelSettings
 
 
 @pytest.fixture
@@ -138,3 +140,11 @@ def test_checkpoints_are_found_by_digest(tmp_path, tiny_model, metadata):
         find_checkpoint(tmp_path, "0" * 64)
     with pytest.raises(InvalidInputError, match="at least 8"):
         find_checkpoint(tmp_path, a[:4])
+
+
+def test_the_default_is_the_state_model_where_it_is_there(tmp_path, monkeypatch):
+    monkeypatch.setattr(checkpoints, "PRETRAINED", tmp_path)
+    (tmp_path / "tiny.safetensors").touch()
+    assert default_checkpoint() == WorldModelSettings().checkpoint == tmp_path / "tiny.safetensors"
+    (tmp_path / "state.safetensors").touch()
+    assert default_checkpoint() == WorldModelSettings().checkpoint == tmp_path / "state.safetensors"

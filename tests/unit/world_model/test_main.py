@@ -6,6 +6,9 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from services.world_model.__main__ import main
+from services.world_model.checkpoints import write_checkpoint
+from services.world_model.state_checkpoints import write_state_checkpoint
+from tests.contracts.test_world import untrained_state_checkpoint
 
 
 def test_train_then_show(toy_store, tmp_path, capsys):
@@ -40,3 +43,16 @@ def test_nonsense_is_refused(capsys, tmp_path):
         main(["train", "--episodes", str(tmp_path), "--seed", "-1"])
     with pytest.raises(SystemExit):
         main(["train", "--episodes", str(tmp_path), "--sed", "1"])
+
+
+def test_show_tells_both_forms_apart(tiny_model, metadata, tmp_path, capsys):
+    loaded = untrained_state_checkpoint()
+    write_state_checkpoint(
+        tmp_path / "b.safetensors", loaded.dynamics, loaded.renderer, loaded.metadata
+    )
+    write_checkpoint(tmp_path / "a.safetensors", tiny_model, metadata)
+    assert main(["show", "--checkpoint", str(tmp_path)]) == 0
+    paper, state = json.loads(capsys.readouterr().out)
+    assert (paper["form"], state["form"]) == ("paper's form", "state model")
+    assert state["digest"] == loaded.digest
+    assert state["object_names"] == {"stand_bottle": ["bottle"]}

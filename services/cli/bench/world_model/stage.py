@@ -54,7 +54,9 @@ TOGETHER: Final = (1, 4, 8)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    parser.add_argument("--checkpoint", type=Path, help="(default: the package's own)")
+    parser.add_argument(
+        "--checkpoint", type=Path, help="of the paper's form (default: the package's own)"
+    )
     parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 1)")
     parser.add_argument(
         "--seeds", type=int, help=f"episodes of each task ({USUAL['seeds']}; quick 1)"
@@ -67,12 +69,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
     """
-    from services.world_model.checkpoints import default_checkpoint, read_checkpoint
+    from services.world_model.checkpoints import paper_form_checkpoint, read_checkpoint
     from services.world_model.world import ModelWorld
 
     del folder
     plan = _plan(options)
-    checkpoint = read_checkpoint(options.checkpoint or default_checkpoint())
+    checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
     network = checkpoint.metadata.network
     variants = {
         variant_name(steps, precision): ModelWorld(
