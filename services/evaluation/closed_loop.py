@@ -9,14 +9,14 @@ failure, and the others go on.
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
+import numpy as np
 from jaxtyping import Float64
-from numpy import ndarray
 
 from dextouch.clients.policy import Policy, PolicyStart
 from dextouch.clients.rollouts import Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import Observation, ReturnSelector
+from dextouch.schemas.rollouts import Observation, ReturnSelector, WorldDescription
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.asking import action_chunk, ask
@@ -56,7 +56,7 @@ class MatchedStart:
     instruction: str
     observation: Observation
     anchor: AnchorPoses
-    K_head: Float64[ndarray, "3 3"]
+    K_head: Float64[np.ndarray, "3 3"]
 
     @property
     def digest(self) -> str:
@@ -246,10 +246,15 @@ class _Study:
         actor, description = self.policies[policy], self.worlds.descriptions[world]
         where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
         ask(actor.reset, start.for_policy(), where=f"{where}: reset")
+        looks = getattr(actor, "looks", True)
         while (left := self.plan.num_steps - rollout.info.last_step) > 0:
             acting = f"{where}, chunk {rollout.info.next_chunk}: act"
             answer = ask(actor.act, rollout.observation, where=acting)
-            rollout.step(action_chunk(answer, description, where=acting)[:left])
+            chunk = action_chunk(answer, description, where=acting)[:left]
+            if looks:
+                rollout.step(chunk)
+            else:
+                _step_unseen(rollout, chunk, left, description)
         last = rollout.observation
         if len(last) < NUM_SEEN_STEPS:
             raise InvalidInputError(
@@ -257,3 +262,23 @@ class _Study:
                 f"{NUM_SEEN_STEPS}; send longer chunks"
             )
         return Ending.of(last, start.task, imagined=world != REAL)
+
+
+def _step_unseen(
+    rollout: Rollout, chunk: np.ndarray, left: int, description: WorldDescription
+) -> None:
+    """Advance by a chunk of which only the rollout's ending is seen: images take most of the time.
+
+    Args:
+        rollout: whose policy does not look.
+        chunk: rows to carry out.
+        left: steps to the end of the rollout, those of the chunk included.
+        description: of the world; its chunks are whole multiples of something.
+    """
+    multiple = description.chunk_multiple
+    shown = -(-NUM_SEEN_STEPS // multiple) * multiple if len(chunk) == left else 0
+    unseen = max(len(chunk) - shown, 0)
+    if unseen:
+        rollout.step(chunk[:unseen], selector=ReturnSelector(cameras=()))
+    if unseen < len(chunk):
+        rollout.step(chunk[unseen:])

@@ -99,6 +99,9 @@ def test_demo_ends_well_and_keeps_its_promises(tmp_path):
     assert model["psnr"] > model["psnr_copy"]
     assert model["tactile_mse"] < min(model["tactile_mse_copy"], model["tactile_mse_zero"])
     assert {row["task"] for row in report["policies"]} == set(report["agreement"])
+    assert len(report["agreement"]) >= 2
+    assert all(found["num_policies"] >= 8 for found in report["agreement"].values())
+    assert all(len(row["imagined_interval"]) == 2 for row in report["policies"])
     for take in report["takes"].values():
         for device in take["devices"]:
             assert device["ledger_lost"] == device["counted_lost"]

@@ -1,4 +1,4 @@
-"""A store folder and a world model in; the applications of the services that the demo uses, out."""
+"""The applications of the services that the demo uses."""
 
 from pathlib import Path
 from typing import Any
@@ -14,11 +14,9 @@ from services.episode_store.app import create_app as create_store
 from services.episode_store.settings import EpisodeStoreSettings
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
-from services.world_model.checkpoints import Checkpoint
-from services.world_model.world import ModelWorld
 
 
-def build_apps(store: str, jobs_folder: Path, world_model: Checkpoint) -> dict[str, FastAPI]:
+def build_apps(store: str, jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
     """Store, alignment, the twin as the real world, and the imagined worlds.
 
     Args:
@@ -26,10 +24,9 @@ def build_apps(store: str, jobs_folder: Path, world_model: Checkpoint) -> dict[s
         jobs_folder: of the alignments.
         world_model: served beside the copy-first baseline.
     """
-    model = ModelWorld(world_model)
     imagined: dict[str, World[Any]] = {
-        "world_model": model,
-        "copy-first": CopyFirstWorld.beside(model.description),
+        "world_model": world_model,
+        "copy-first": CopyFirstWorld.beside(world_model.description),
     }
     return {
         "episode_store": create_store(EpisodeStoreSettings(store_url=store)),

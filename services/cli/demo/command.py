@@ -1,4 +1,4 @@
-"""The flags of `dextouch demo` in; a table, report.json and report.html out."""
+"""`dextouch demo`: all stages in order, a table, report.json and report.html."""
 
 import json
 import tempfile
@@ -10,9 +10,9 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dextouch import __version__
-from dextouch.clients.policy import Policy
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
+from dextouch.schemas.rollouts import WorldDescription
 from dextouch.serving.logs import configure_logging
 from services.cli.demo.apps import build_apps
 from services.cli.demo.background import served
@@ -32,7 +32,6 @@ from services.cli.demo.settings import DemoPlan, parse
 from services.cli.demo.stages import Stages
 from services.cli.demo.table import show
 from services.cli.demo.truth import Truth, make_truth
-from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.reporting import write_report
 
 # Errors that both takes have; the report's figure is the worse one.
@@ -85,7 +84,7 @@ class Demo:
         with served(apps) as urls:
             takes = self._record(truth, urls)
             prediction = self._predict(truth, models)
-            scores = self._judge(truth, urls, models)
+            scores = self._judge(urls, models)
         report = self._report(takes, prediction, scores, models)
         with self.stages.stage("report", "drawing the report"):
             write_report(
@@ -123,17 +122,14 @@ class Demo:
 
     def _predict(self, truth: Truth, models: Models) -> PredictionResult:
         with self.stages.stage("predict", "predicting held-out scenes with the world model"):
-            ids = [name for level in truth.demonstrations.values() for name in level]
-            return measure_prediction(models.world_model, EpisodeStore(self._truth_folder), ids)
-
-    def _judge(self, truth: Truth, urls: Mapping[str, str], models: Models) -> dict[str, Any]:
-        with self.stages.stage("judge", "scoring policies in the twin and in the world model"):
             store = EpisodeStore(self._truth_folder)
-            policies: dict[str, Policy] = {
-                **ladder(store, truth.demonstrations),
-                "behaviour cloning": models.policy,
-                "hold still": HoldPolicy(),
-            }
+            return measure_prediction(
+                models.world_model, store, truth.demonstrations, models.trained_on
+            )
+
+    def _judge(self, urls: Mapping[str, str], models: Models) -> dict[str, Any]:
+        with self.stages.stage("judge", "scoring policies in the twin and in the world model"):
+            policies = {**ladder(self.plan), "behaviour cloning": models.policy}
             return judge(urls, policies, models, self.plan)
 
     def _report(
@@ -146,7 +142,7 @@ class Demo:
         return {
             "about": {
                 "version": __version__,
-                "world model": models.world_model.digest[:12],
+                "world model": describe(models.world_model.description),
                 "held-out seeds": f"{self.plan.seeds[0]} … {self.plan.seeds[-1]}",
             },
             "success_probe": models.probe.metadata.metrics,
@@ -163,6 +159,12 @@ class Demo:
             "world_model": prediction.figures,
             **scores,
         }
+
+
+def describe(world: WorldDescription) -> str:
+    """A world model in a few words: its name, what it keeps, and its digest."""
+    form = "state model" if world.object_names else "paper's form"
+    return f"{world.name}, {form}, {world.digest[:12]}"
 
 
 def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:

@@ -1,30 +1,43 @@
-"""Served worlds and policies in; their scores in the real and the imagined world, out."""
+"""Policies of different quality, and their scores in the real and the imagined world."""
 
 from collections.abc import Mapping
 from typing import Any
 
 from dextouch.clients.policy import Policy
 from dextouch.clients.rollouts import RolloutClient
-from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError
+from services.cli.bench.evaluator.plan import ELSEWHERE, HOLD, RETREAT, script_name
+from services.cli.bench.evaluator.playing import scripted_actions
 from services.cli.demo.models import Models
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
-from services.evaluation.demonstrations import read_demonstration
 from services.evaluation.policies.replay import ReplayPolicy
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
 from services.twin.tasks import get_task
 
 MODEL = "world_model"
 BASELINE = "copy-first"
 
 
-def ladder(store: EpisodeStore, episode_ids: Mapping[float, list[str]]) -> dict[str, Policy]:
-    """The scripted demonstrator at each noise level, as policies that replay its commands."""
+def ladder(plan: DemoPlan) -> dict[str, Policy]:
+    """Policies that do not look, good and bad ones.
+
+    They are the scripted demonstrator with its errors, and three that should not succeed: holding
+    still, retreating, and the actions of another scene. Nothing is simulated for them: the twin
+    only plans what the demonstrator would command.
+    """
+    stages = {task: Stage(task, "robot", TwinSettings()) for task in TASKS}
+    names = (*(script_name(level) for level in plan.levels_mm), HOLD, RETREAT, ELSEWHERE)
     return {
-        f"scripted, {noise_m * 1e3:.0f} mm off": ReplayPolicy.of(
-            read_demonstration(store.open(episode_id)) for episode_id in ids
+        name: ReplayPolicy(
+            {
+                (task, seed): scripted_actions(stage, seed, name, plan.levels_mm)
+                for task, stage in stages.items()
+                for seed in plan.seeds
+            }
         )
-        for noise_m, ids in episode_ids.items()
+        for name in names
     }
 
 
@@ -45,6 +58,7 @@ def judge(
     Raises:
         DexTouchError: a rollout failed.
     """
+    models.trained_on.refuse(plan.seeds)
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
         instructions={task: get_task(task).instruction for task in TASKS},

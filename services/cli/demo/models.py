@@ -1,32 +1,76 @@
 """Committed or freshly trained networks, as the demo uses them."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import torch
 
+from dextouch.errors import ConflictError
+from dextouch.worlds.world import BatchWorld
 from services.cli import train
+from services.cli.demo.settings import TASKS
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
-from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
+from services.world_model.checkpoints import default_checkpoint, read_checkpoint
+from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.world import open_world
 
 DEMONSTRATIONS = ("--mix", "demonstrations")
 # Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
 EXACT_DATA = ("--first", "1000", "--count", "120", "--exact")
-# Endings near the border of success for the probe, and others to measure it on.
+# Endings near the border of success for world model and probe, and others to measure it on.
 ENDINGS = (
     "--ladder", "--first", "2000", "--count", "315",
     "--miss-fraction", "0.1", "--still-fraction", "0.1",
 )  # fmt: skip
 UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180")
+# A state model in small: one member, few steps.
+SMALL_STATE_MODEL = (
+    "--num_members=1", "--jobs=1", "--reader.num_steps=2500", "--core.num_steps=1500",
+    "--drawing.cpu_budget_s=300",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainedOn:
+    """What a world model was trained on: content of episodes, or ranges of seeds by task."""
+
+    fingerprints: tuple[str, ...] = ()
+    seeds: tuple[tuple[str, int, int], ...] = ()
+
+    @classmethod
+    def of(cls, checkpoint: Path) -> "TrainedOn":
+        """What a checkpoint of either form says."""
+        if not is_state_checkpoint(checkpoint):
+            return cls(fingerprints=read_checkpoint(checkpoint).metadata.train_fingerprints)
+        ranges = read_state_checkpoint(checkpoint).metadata.training_seeds
+        return cls(seeds=tuple((task, low, high) for task, (low, high) in ranges.items()))
+
+    def refuse(self, seeds: Iterable[int]) -> None:
+        """Let no scene be judged on whose seed is among those of training.
+
+        Raises:
+            ConflictError: the world model was trained on seeds about these.
+        """
+        wanted = list(seeds)
+        for task, low, high in self.seeds:
+            trained = [seed for seed in wanted if low <= seed <= high]
+            if trained:
+                raise ConflictError(
+                    f"world model: trained on {task!r} with seeds {low} … {high}, and the demo "
+                    f"judges on seed {trained[0]}; train it on seeds below 20000"
+                )
 
 
 @dataclass(frozen=True)
 class Models:
-    """World model, closed-loop policy and success probe."""
+    """World model of either form, closed-loop policy and success probe."""
 
-    world_model: Checkpoint
+    world_model: BatchWorld[Any]
+    trained_on: TrainedOn
     policy: BehaviourCloningPolicy
     probe: SuccessProbe
 
@@ -41,23 +85,29 @@ def committed_models() -> Models:
 
 
 def train_models(folder: Path) -> Models:
-    """Record training episodes and train all three, as the committed ones were trained.
+    """Record training episodes and train all three: a small state model, a policy and a judge.
+
+    The judge learns from true endings and from those that the state model imagines.
 
     Args:
         folder: where episodes and checkpoints go; episodes that are there are used again.
     """
-    episodes, exact, endings, unseen = (
-        str(folder / name) for name in ("episodes", "exact", "endings", "unseen")
+    episodes, exact, endings, unseen, imagined = (
+        str(folder / name) for name in ("episodes", "exact", "endings", "unseen", "imagined")
     )
-    world_model = folder / "world_model.safetensors"
+    world_model = folder / "state.safetensors"
     policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
     train.main(["data", "--store", episodes, *DEMONSTRATIONS])
     train.main(["data", "--store", exact, *EXACT_DATA])
-    train.main(["world-model", "--episodes", episodes, "--output", str(world_model)])
-    train.main(["policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)])
     train.main(["data", "--store", endings, *ENDINGS])
     train.main(["data", "--store", unseen, *UNSEEN_ENDINGS])
-    train.main(["probe", "--episodes", endings, "--held_out", unseen, "--output", str(probe)])
+    both = ["--episodes", episodes, "--episodes", endings, "--output", str(world_model)]
+    train.main(["state", *both, f"--tasks={','.join(TASKS)}", *SMALL_STATE_MODEL])
+    train.main(["policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)])
+    of_world = ["--checkpoint", str(world_model)]
+    train.main(["imagined", "--episodes", endings, "--store", imagined, *of_world])
+    true_and_imagined = ["--episodes", endings, "--episodes", imagined]
+    train.main(["probe", *true_and_imagined, "--held_out", unseen, "--output", str(probe)])
     return _load(world_model, policy, probe)
 
 
@@ -68,7 +118,8 @@ def use_one_thread() -> None:
 
 def _load(world_model: Path, policy: Path, probe: Path) -> Models:
     return Models(
-        read_checkpoint(world_model),
+        open_world(world_model),
+        TrainedOn.of(world_model),
         BehaviourCloningPolicy.load(policy),
         SuccessProbe.load(probe),
     )

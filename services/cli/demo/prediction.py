@@ -1,57 +1,249 @@
-"""Held-out episodes and a checkpoint in; how well images and touch are foreseen, out."""
+"""How well a world foresees images and touch of held-out episodes, beside simple rivals.
 
+Only the `World` interface is used, so every form of the world model is measured alike: over whole
+rollouts, from the first observed step to the last, with what was imagined before as the only past.
+"""
+
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError
+from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
+from dextouch.metrics import image as image_metrics
+from dextouch.metrics import tactile as tactile_metrics
+from dextouch.schemas.rollouts import Observation
+from dextouch.worlds.world import ReturnSelector, RolloutStart, World
+from services.cli.bench.evaluator.measuring import warp_over_table
+from services.cli.demo.models import TrainedOn
 from services.evaluation.reporting import PredictionPicture
-from services.world_model.checkpoints import Checkpoint
-from services.world_model.training.dataset import cut_window
 from services.world_model.training.episodes import read_episode
-from services.world_model.training.evaluation import evaluate_prediction, predict_all
+from services.world_model.training.evaluation import refuse_trained
 
-SHOWN_STEPS = (1, 4, 8, 12, 16)
-SHOWN_START = 16
+CAMERA: Final = "camera_head"
+CHUNK_STEPS: Final = 16
+_NO_IMAGE = ReturnSelector(cameras=())
+_LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
 
 
 @dataclass(frozen=True)
 class PredictionResult:
-    """Figures as `report.json` holds them, and one window a task to look at."""
+    """Figures as `report.json` holds them, and one rollout a task to look at."""
 
     figures: dict[str, Any]
     pictures: tuple[PredictionPicture, ...]
 
 
+@dataclass(frozen=True)
+class Future:
+    """Images at the ends of chunks, and the touch of every step after the first."""
+
+    images: UInt8[np.ndarray, "chunks h w 3"]
+    tactile_kpa: Float32[np.ndarray, "steps 2 320"]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An episode as it begins, what was commanded then, and what came of it."""
+
+    episode_id: str
+    start: RolloutStart
+    actions: Float64[np.ndarray, "steps 67"]
+    truth: Future
+    model_rate_hz: float
+
+
 def measure_prediction(
-    checkpoint: Checkpoint, store: EpisodeStore, episode_ids: list[str]
+    world: World[Any], store: EpisodeStore, episode_ids: Sequence[str], trained_on: TrainedOn
 ) -> PredictionResult:
-    """Errors over every stride-8 window of held-out episodes, with commanded actions.
+    """Errors over whole rollouts of held-out episodes with commanded actions.
 
     Args:
-        checkpoint: of the world model.
+        world: starts from observations.
         store: where the episodes are.
-        episode_ids: none of which was trained on (refused by content otherwise).
+        episode_ids: none of which was trained on.
+        trained_on: what the world was trained on.
+
+    Returns:
+        The figures of `measure_scenes`, and the first scene of every task as a picture.
+
+    Raises:
+        ConflictError, InvalidInputError: a scene that was trained on, or none at all.
     """
-    episodes = [read_episode(store.open(episode_id)) for episode_id in episode_ids]
-    figures = evaluate_prediction(
-        checkpoint.model, episodes, train_fingerprints=checkpoint.metadata.train_fingerprints
+    readers = [store.open(episode_id) for episode_id in episode_ids]
+    trained_on.refuse(reader.attributes.seed or 0 for reader in readers)
+    if trained_on.fingerprints:
+        refuse_trained([read_episode(reader) for reader in readers], trained_on.fingerprints)
+    return measure_scenes(world, [read_scene(reader) for reader in readers])
+
+
+def measure_scenes(world: World[Any], scenes: Sequence[Scene]) -> PredictionResult:
+    """Errors over whole rollouts of scenes.
+
+    Returns:
+        `psnr` (dB, mean over the images at the ends of chunks), `tactile_mse` (kPa²) and
+        `contact_f1`, each also for the rivals that an ending names, and `num_rollouts`.
+
+        - _copy repeats the first step; tactile_mse_zero feels nothing.
+        - psnr_warp is the first image, moved by the known motion of the camera over the table.
+        - _other_take is the world given the actions of another held-out scene of the same task.
+        - _hold is the world given actions in which nothing moves; in _hands_still the head does.
+
+    Raises:
+        InvalidInputError: no scene.
+    """
+    if not scenes:
+        raise InvalidInputError("prediction: got no scene, expected at least one")
+    imagined = [imagine(world, scene, scene.actions) for scene in scenes]
+    figures = _figures(imagined, scenes, "")
+    figures |= _figures([_copy(scene) for scene in scenes], scenes, "_copy")
+    for suffix, head_moves in (("_hold", False), ("_hands_still", True)):
+        still = [_still(scene.actions, head_moves=head_moves) for scene in scenes]
+        futures = [imagine(world, s, rows) for s, rows in zip(scenes, still, strict=True)]
+        figures |= _figures(futures, scenes, suffix)
+    others = [(scene, other) for scene in scenes if (other := _other(scene, scenes)) is not None]
+    if others:
+        wrong = [imagine(world, scene, other.actions) for scene, other in others]
+        figures |= _figures(wrong, [scene for scene, _ in others], "_other_take")
+    figures["psnr_warp"] = float(np.mean([_psnr(_warped(s), s.truth.images) for s in scenes]))
+    figures["tactile_mse_zero"] = _touch_error([_nothing(scene) for scene in scenes], scenes)
+    figures["num_rollouts"] = float(len(scenes))
+    return PredictionResult(figures, _pictures(scenes, imagined))
+
+
+def read_scene(reader: EpisodeReader) -> Scene:
+    """A stored robot episode as a start and its true future."""
+    about = reader.attributes
+    reader.require_images(CAMERA)
+    window = reader.window(0, reader.num_steps, cameras=(CAMERA,))
+    first = Observation(
+        first_step=0,
+        images={CAMERA: window.images[CAMERA][:1]},
+        tactile_kpa=window.tactile_kpa[:1],
+        action_reached=window.actions[:1],
+        reached_is_measured=True,
     )
-    pictures = []
-    for task in dict.fromkeys(episode.task for episode in episodes):
-        episode = next(episode for episode in episodes if episode.task == task)
-        window = cut_window(episode, SHOWN_START, 17, action_kind="commanded")
-        future = predict_all(checkpoint.model, [window.request], seed=0)
-        shown = np.array(SHOWN_STEPS)
-        pictures.append(
-            PredictionPicture(
-                title=f"{episode.instruction} One second ahead, from its first image and touch.",
-                times_s=shown / episode.model_rate_hz,
-                true_images=window.images[shown],
-                predicted_images=future.images[0][shown - 1],
-                true_tactile_kpa=window.tactile_kpa[shown],
-                predicted_tactile_kpa=future.tactile_kpa[0][shown - 1],
-            )
+    start = RolloutStart(
+        about.task,
+        about.seed or 0,
+        about.instruction,
+        observation=first,
+        anchor=window.anchor,
+        K_head=window.K_head,
+    )
+    num_steps = (reader.num_steps - 1) // CHUNK_STEPS * CHUNK_STEPS
+    actions = reader.read("action_commanded").values[1 : num_steps + 1]
+    truth = Future(
+        window.images[CAMERA][CHUNK_STEPS : num_steps + 1 : CHUNK_STEPS],
+        window.tactile_kpa[1 : num_steps + 1],
+    )
+    return Scene(about.episode_id, start, actions, truth, about.model_rate_hz)
+
+
+def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps 67"]) -> Future:
+    """What a world makes of actions that begin as a scene does."""
+    state = world.reset(scene.start).state
+    images, touch = [], []
+    for first in range(0, len(actions), CHUNK_STEPS):
+        chunk, seed = actions[first : first + CHUNK_STEPS], scene.start.seed + first
+        # A world is a function: asking twice gives touch of all steps and only the last image.
+        felt = world.step(state, chunk, seed=seed, selector=_NO_IMAGE)
+        seen = world.step(state, chunk, seed=seed, selector=_LAST_STEP)
+        images.append(seen.observation.images[CAMERA][-1])
+        touch.append(felt.observation.tactile_kpa)
+        state = felt.state
+    return Future(np.stack(images), np.concatenate(touch))
+
+
+def _other(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
+    """The next scene of the task that is another one."""
+    mine = [one for one in scenes if one.start.task == scene.start.task]
+    at = next(index for index, one in enumerate(mine) if one is scene)
+    turned = mine[at + 1 :] + mine[:at]
+    return next((one for one in turned if one.start.seed != scene.start.seed), None)
+
+
+def _still(actions: np.ndarray, *, head_moves: bool) -> Float64[np.ndarray, "steps 67"]:
+    rows = np.repeat(actions[:1], len(actions), axis=0)
+    if head_moves:
+        rows[:, CAMERA_HEAD] = actions[:, CAMERA_HEAD]
+    return rows
+
+
+def _first(scene: Scene) -> Observation:
+    if scene.start.observation is None:
+        raise InvalidInputError(f"scene {scene.episode_id!r}: begins without an observation")
+    return scene.start.observation
+
+
+def _copy(scene: Scene) -> Future:
+    first, truth = _first(scene), scene.truth
+    return Future(
+        np.repeat(first.images[CAMERA], len(truth.images), axis=0),
+        np.repeat(first.tactile_kpa, len(truth.tactile_kpa), axis=0),
+    )
+
+
+def _nothing(scene: Scene) -> Future:
+    return Future(scene.truth.images, np.zeros_like(scene.truth.tactile_kpa))
+
+
+def _warped(scene: Scene) -> UInt8[np.ndarray, "chunks h w 3"]:
+    anchor, K_head = scene.start.anchor, scene.start.K_head
+    if anchor is None or K_head is None:
+        raise InvalidInputError(f"scene {scene.episode_id!r}: begins without camera")
+    cameras = poses_from_actions(scene.actions, anchor).Ts_world_camera_head
+    image, then = _first(scene).images[CAMERA][0], anchor.T_world_camera_head
+    ends = cameras[CHUNK_STEPS - 1 :: CHUNK_STEPS]
+    return np.stack([warp_over_table(image, K_head, then, now) for now in ends])
+
+
+def _psnr(images: np.ndarray, truth: np.ndarray) -> float:
+    return float(image_metrics.psnr(predicted=images, true=truth))
+
+
+def _touch_error(futures: Sequence[Future], scenes: Sequence[Scene]) -> float:
+    return float(
+        tactile_metrics.mse(
+            predicted_kpa=np.stack([future.tactile_kpa for future in futures]),
+            true_kpa=np.stack([scene.truth.tactile_kpa for scene in scenes]),
         )
-    return PredictionResult(dict(figures), tuple(pictures))
+    )
+
+
+def _figures(futures: Sequence[Future], scenes: Sequence[Scene], suffix: str) -> dict[str, float]:
+    pairs = list(zip(futures, scenes, strict=True))
+    return {
+        f"psnr{suffix}": float(np.mean([_psnr(f.images, s.truth.images) for f, s in pairs])),
+        f"tactile_mse{suffix}": _touch_error(futures, scenes),
+        f"contact_f1{suffix}": float(
+            tactile_metrics.contact_f1(
+                predicted_kpa=np.stack([future.tactile_kpa for future in futures]),
+                true_kpa=np.stack([scene.truth.tactile_kpa for scene in scenes]),
+            )
+        ),
+    }
+
+
+def _pictures(scenes: Sequence[Scene], imagined: Sequence[Future]) -> tuple[PredictionPicture, ...]:
+    """The first scene of every task."""
+    firsts: dict[str, int] = {}
+    for index, scene in enumerate(scenes):
+        firsts.setdefault(scene.start.task, index)
+    return tuple(_picture(scenes[index], imagined[index]) for index in sorted(firsts.values()))
+
+
+def _picture(scene: Scene, imagined: Future) -> PredictionPicture:
+    ends = np.arange(CHUNK_STEPS, len(scene.actions) + 1, CHUNK_STEPS)
+    return PredictionPicture(
+        title=f"{scene.start.instruction} A whole rollout, from its first image and touch.",
+        times_s=ends / scene.model_rate_hz,
+        true_images=scene.truth.images,
+        predicted_images=imagined.images,
+        true_tactile_kpa=scene.truth.tactile_kpa[ends - 1],
+        predicted_tactile_kpa=imagined.tactile_kpa[ends - 1],
+    )

@@ -1,4 +1,4 @@
-"""The report of a run in, the table that ends it on the terminal out."""
+"""The tables that end a run on the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,10 +11,10 @@ PREDICTORS = (
     ("", "the model"),
     ("_hands_still", "the model, only the head moves"),
     ("_hold", "the model, nothing moves"),
-    ("_other_take", "the model, another take's actions"),
+    ("_other_take", "the model, another scene's actions"),
     ("_copy", "copy of the first step"),
+    ("_warp", "first image, moved as the camera"),
     ("_zero", "no touch at all"),
-    ("_codec", "codec alone (limit)"),
 )
 
 
@@ -70,7 +70,9 @@ def _errors(errors: Mapping[str, Any]) -> Table:
 
 
 def _world_model(figures: Mapping[str, Any]) -> Table:
-    table = _table("World model on held-out scenes", "", "images", "touch", "contact")
+    table = _table(
+        "World model, whole rollouts of held-out scenes", "", "images", "touch", "contact"
+    )
     table.add_row("", "PSNR (dB)", "MSE (kPa²)", "F1")
     for suffix, name in PREDICTORS:
         keys = (f"{measure}{suffix}" for measure in ("psnr", "tactile_mse", "contact_f1"))
@@ -79,10 +81,17 @@ def _world_model(figures: Mapping[str, Any]) -> Table:
 
 
 def _policies(rows: list[dict[str, Any]]) -> Table:
-    table = _table("Success of policies", "policy", "task", "real", "imagined")
+    table = _table("Success of policies, with 95 % intervals", "policy", "task", "real", "imagined")
     for row in rows:
-        table.add_row(row["policy"], row["task"], f"{row['real']:.2f}", f"{row['imagined']:.2f}")
+        table.add_row(row["policy"], row["task"], rate(row, "real"), rate(row, "imagined"))
     return table
+
+
+def rate(row: Mapping[str, Any], world: str) -> str:
+    """A success rate with its 95 % interval, where the report has one."""
+    interval = row.get(f"{world}_interval")
+    told = f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else ""
+    return f"{row[world]:.2f}{told}"
 
 
 def _agreement(agreement: Mapping[str, Mapping[str, Any]]) -> Table:

@@ -1,4 +1,4 @@
-"""A plan in; the truth episodes that a run records, predicts and judges with, in a store, out."""
+"""Truth episodes of a run: what it records through mock devices, and what it predicts."""
 
 import multiprocessing
 import os
@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from dextouch.episodes import EpisodeStore
-from services.cli.demo.settings import TASKS, DemoPlan
+from services.cli.demo.settings import FIRST_HELD_OUT_SEED, TASKS, DemoPlan
 from services.twin.cameras import CAMERAS
 from services.twin.episodes import TakeOptions, record, write_episode
 from services.twin.hands import Domain
@@ -22,10 +22,10 @@ MAX_PROCESSES = 4
 
 @dataclass(frozen=True)
 class Truth:
-    """Ids of the truth episodes: the two takes, and the demonstrations by noise level."""
+    """Ids of the truth episodes: the two takes, and demonstrations to predict."""
 
     takes: dict[str, str] = field(default_factory=dict)
-    demonstrations: dict[float, list[str]] = field(default_factory=dict)
+    demonstrations: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def make_truth(plan: DemoPlan, store_folder: Path, progress: Callable[[int, int]
     """Record the truth of a run in the twin, on all cores.
 
     Args:
-        plan: seeds and noise levels.
+        plan: seeds, and errors of the demonstrations.
         store_folder: where the episodes go.
         progress: told how many episodes are done, of how many.
     """
@@ -50,12 +50,14 @@ def make_truth(plan: DemoPlan, store_folder: Path, progress: Callable[[int, int]
         _Order(task, "human" if domain == "human" else "robot", (plan.take_seed,), TakeOptions())
         for domain, task in RECORDED.items()
     ]
-    ladder = [
-        _Order(task, "robot", tuple(plan.seeds), TakeOptions(noise_m, images=CAMERAS[:1]))
-        for noise_m in plan.noise_ladder_m
+    # Two scenes at least, so that another one's actions can be given.
+    scenes = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + plan.num_predicted)
+    demonstrations = [
+        _Order(task, "robot", tuple(scenes), TakeOptions(noise_m, images=CAMERAS[:1]))
+        for noise_m in plan.predicted_noise_m
         for task in TASKS
     ]
-    orders = takes + ladder
+    orders = takes + demonstrations
     made: list[list[str]] = []
     total = sum(len(order.seeds) for order in orders)
     processes = min(MAX_PROCESSES, os.cpu_count() or 1)
@@ -64,10 +66,8 @@ def make_truth(plan: DemoPlan, store_folder: Path, progress: Callable[[int, int]
         for ids in pool.map(_make, orders, [str(store_folder)] * len(orders)):
             made.append(ids)
             progress(sum(map(len, made)), total)
-    demonstrations: dict[float, list[str]] = {}
-    for order, ids in zip(ladder, made[len(takes) :], strict=True):
-        demonstrations.setdefault(order.options.noise_m, []).extend(ids)
-    return Truth(dict(zip(RECORDED, [ids[0] for ids in made], strict=False)), demonstrations)
+    predicted = tuple(episode_id for ids in made[len(takes) :] for episode_id in ids)
+    return Truth(dict(zip(RECORDED, [ids[0] for ids in made], strict=False)), predicted)
 
 
 def _make(order: _Order, store_folder: str) -> list[str]:

@@ -15,6 +15,8 @@ class HoldPolicy:
         chunk_steps: length of its chunks, a multiple of 4.
     """
 
+    looks = False
+
     def __init__(self, *, chunk_steps: int = 16) -> None:
         if chunk_steps < 4 or chunk_steps % 4:
             raise InvalidInputError(

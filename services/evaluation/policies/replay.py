@@ -21,6 +21,8 @@ class ReplayPolicy:
         chunk_steps: length of its chunks, a multiple of 4.
     """
 
+    looks = False
+
     def __init__(
         self, actions: Mapping[tuple[str, int], np.ndarray], *, chunk_steps: int = 16
     ) -> None:

@@ -27,7 +27,11 @@ class PolicyStart:
 
 @runtime_checkable
 class Policy(Protocol):
-    """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md)."""
+    """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md).
+
+    A policy with an attribute `looks` that is False gets no images after the first step, so that
+    worlds need not make them.
+    """
 
     def reset(self, start: PolicyStart) -> None:
         """Forget the last rollout and begin another."""

@@ -1,22 +1,27 @@
 """Parts of the demo that need no twin and no network weights."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import httpx
+import numpy as np
 import pytest
 from fastapi import FastAPI
 
+from dextouch.clients.policy import PolicyStart
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.log import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas.episodes import LineageEntry
 from services.cli.demo.background import served
 from services.cli.demo.command import worst_errors
+from services.cli.demo.judging import ladder
 from services.cli.demo.recording import forget_take
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.demo.stages import Stages
-from services.cli.demo.table import show
+from services.cli.demo.table import rate, show
 from tests.unit.bridges.takes import write_episode, write_recording
+from tests.unit.worlds.fakes import anchor, observation
 
 
 def test_a_take_of_an_earlier_run_is_replaced_with_its_episodes(tmp_path):
@@ -151,5 +156,31 @@ def test_the_table_shows_undefined_agreement(capsys):
         }
     )
     shown = capsys.readouterr().out
-    for words in ("undefined", "another take", "0.100", "0.000", "It flatters."):
+    for words in ("undefined", "another scene", "0.100", "0.000", "It flatters."):
         assert words in shown
+
+
+def test_policies_that_do_not_look_are_good_and_bad_ones():
+    plan = replace(parse(["--seeds", "1"]), levels_mm=(0.0, 30.0))
+    policies = ladder(plan)
+    assert list(policies) == [
+        "script 0 mm", "script 30 mm", "hold", "retreat", "another scene's actions",
+    ]  # fmt: skip
+    assert not any(policy.looks for policy in policies.values())
+    seed, task = plan.seeds[0], "stand_bottle"
+    start = PolicyStart(task, "", seed, anchor(), np.eye(3))
+    now = observation(seed=0)
+    chunks = {}
+    for name, policy in policies.items():
+        policy.reset(start)
+        chunks[name] = policy.act(now)
+        assert chunks[name].shape == (16, 67)
+    assert not np.array_equal(chunks["script 0 mm"], chunks["another scene's actions"])
+    np.testing.assert_array_equal(chunks["hold"], np.repeat(chunks["hold"][:1], 16, axis=0))
+    assert chunks["retreat"][-1, 11] != chunks["retreat"][0, 11]
+
+
+def test_the_table_shows_intervals():
+    row = {"real": 0.0, "real_interval": [0.0, 0.39], "imagined": 0.5}
+    assert rate(row, "real") == "0.00 (0.00 … 0.39)"
+    assert rate(row, "imagined") == "0.50"

@@ -235,6 +235,8 @@ def test_worlds_that_do_not_fit_are_refused_before_the_first_rollout(
 class Watching(HoldPolicy):
     """Notes what it is shown."""
 
+    looks = True
+
     def reset(self, start):
         super().reset(start)
         self.seen = getattr(self, "seen", [])
@@ -258,6 +260,28 @@ def test_cameras_are_those_that_every_world_has(client, probe):
     assert len(found.scores) == 3
     # 12 + 12 + 8 steps: the last chunk is cut, so that all policies act equally long.
     assert policy.seen == [(1, {"camera_head"}), (12, {"camera_head"}), (12, {"camera_head"})] * 3
+
+
+class NotLooking(Watching):
+    """The same, without eyes."""
+
+    looks = False
+
+
+@pytest.mark.parametrize("chunk_steps", [12, 16])
+def test_a_policy_that_does_not_look_ends_as_if_it_did(client, probe, chunk_steps):
+    """The judge sees the same endings, and the policy no image but the first."""
+    blind = NotLooking(chunk_steps=chunk_steps)
+    asked = {
+        "real": WorldAddress(client, "judge"),
+        "imagined": addresses(client, "dream"),
+        "plan": EvaluationPlan({"reach": ""}, [2000], num_steps=32),
+        "probe": probe,
+    }
+    found = evaluate(policies={"hold": blind}, **asked)
+    assert found == evaluate(policies={"hold": Watching(chunk_steps=chunk_steps)}, **asked)
+    assert found.failures == ()
+    assert [images for _, images in blind.seen][:2] == [{"camera_head"}, set()]
 
 
 class Fragile(HoldPolicy):

@@ -1,0 +1,91 @@
+"""How the demo measures a world: on scenes whose touch and images follow a known rule."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.geometry.cameras import pinhole_matrix
+from dextouch.geometry.transforms import transform
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
+from dextouch.schemas.rollouts import Observation
+from dextouch.worlds.baseline import CopyFirstWorld
+from dextouch.worlds.world import EVERYTHING, RolloutStart, SteppedRollout
+from services.cli.demo.models import TrainedOn
+from services.cli.demo.prediction import Future, Scene, measure_scenes
+
+PX, NUM_STEPS = 8, 32
+DOWN = np.diag([1.0, -1.0, -1.0])
+ANCHOR = AnchorPoses(
+    transform(np.eye(3), np.array([-0.2, 0.0, 0.2])),
+    transform(np.eye(3), np.array([0.2, 0.0, 0.2])),
+    transform(DOWN, np.array([0.0, 0.0, 0.5])),
+)
+
+
+def felt(actions):
+    """The toy's rule: 100 kPa on every taxel for each metre that the right hand goes down."""
+    return np.broadcast_to(-100.0 * actions[:, 11, None, None], (len(actions), 2, 320))
+
+
+class PressWorld(CopyFirstWorld):
+    """Feels by the toy's rule and goes on showing the first image."""
+
+    def step(self, state, actions, *, seed, selector=EVERYTHING):
+        stepped = super().step(state, actions, seed=seed)
+        seen = replace(stepped.observation, tactile_kpa=felt(actions).astype(np.float32))
+        return SteppedRollout(stepped.state, seen.selected(selector))
+
+
+def scene(seed, depth_m):
+    actions = np.zeros((NUM_STEPS, 67))
+    for part in POSE_SLICES:
+        actions[:, part] = IDENTITY_POSE_9D
+    first = Observation(
+        first_step=0,
+        images={"camera_head": np.full((1, PX, PX, 3), 100, np.uint8)},
+        tactile_kpa=np.zeros((1, 2, 320), np.float32),
+        action_reached=actions[:1].copy(),
+        reached_is_measured=True,
+    )
+    actions[:, 11] = -depth_m * np.arange(NUM_STEPS) / NUM_STEPS
+    K_head = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=1.0)
+    start = RolloutStart("press", seed, "press", observation=first, anchor=ANCHOR, K_head=K_head)
+    # Ten grey levels off everywhere: 20 log10(255 / 10) dB for a world that copies.
+    images = np.full((2, PX, PX, 3), 110, np.uint8)
+    return Scene(f"e{seed}", start, actions, Future(images, felt(actions).astype(np.float32)), 15.0)
+
+
+def test_figures_of_a_world_that_feels_and_does_not_see():
+    scenes = [scene(1, 0.2), scene(2, 0.1)]
+    found = measure_scenes(
+        PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX), scenes
+    )
+    figures, decibels = found.figures, 20 * np.log10(255 / 10)
+    for name in ("psnr", "psnr_copy", "psnr_warp", "psnr_hold"):
+        assert figures[name] == pytest.approx(decibels)
+    assert figures["tactile_mse"] == pytest.approx(0.0, abs=1e-9)
+    assert figures["contact_f1"] == pytest.approx(1.0)
+    # Row k is k/32 of 20 and of 10 kPa: their difference is k/32 of 10 kPa.
+    share = np.mean((np.arange(NUM_STEPS) / NUM_STEPS) ** 2)
+    assert figures["tactile_mse_other_take"] == pytest.approx(100 * share, rel=1e-5)
+    truth = (400 * share + 100 * share) / 2
+    for rival in ("copy", "zero", "hold", "hands_still"):
+        assert figures[f"tactile_mse_{rival}"] == pytest.approx(truth, rel=1e-5)
+    assert figures["num_rollouts"] == 2
+    assert [picture.true_images.shape[0] for picture in found.pictures] == [2]
+
+
+def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
+    world = CopyFirstWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
+    assert "psnr_other_take" not in measure_scenes(world, [scene(1, 0.1)]).figures
+    with pytest.raises(InvalidInputError, match="no scene"):
+        measure_scenes(world, [])
+
+
+def test_seeds_of_training_are_refused():
+    trained = TrainedOn(seeds=(("press", 0, 219),))
+    trained.refuse(range(220, 230))
+    with pytest.raises(ConflictError, match=r"'press' with seeds 0 … 219.*seed 219"):
+        trained.refuse(range(219, 222))
