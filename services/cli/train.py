@@ -24,7 +24,7 @@ USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe [o
   probe        the judge of imagined success; give it data made with --ladder
 
 Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`
-makes data and checkpoints as the committed ones were made; docs/evaluation.md has the commands."""
+trains a small state model, a policy and a probe; docs/evaluation.md has the commands."""
 
 
 def main(argv: Sequence[str]) -> int:

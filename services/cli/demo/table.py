@@ -30,8 +30,9 @@ def show(report: Mapping[str, Any]) -> None:
         f"Imagined success is judged by a small network, right on {accuracy:.0%} of the true"
     )
     console.print(
-        "endings it was measured on; endings that the model imagines wrongly mislead it.\n"
+        "endings it was measured on; endings that the model imagines wrongly mislead it. Endings"
     )
+    console.print("that the judge or the model itself doubts count by the likelier outcome.\n")
     console.print(_agreement(report["agreement"]))
     for task, comments in report["comments"].items():
         console.print(f"\n{task}", style="bold")
@@ -81,9 +82,17 @@ def _world_model(figures: Mapping[str, Any]) -> Table:
 
 
 def _policies(rows: list[dict[str, Any]]) -> Table:
-    table = _table("Success of policies, with 95 % intervals", "policy", "task", "real", "imagined")
+    table = _table(
+        "Success of policies, with 95 % intervals",
+        "policy",
+        "task",
+        "real",
+        "imagined",
+        "of these doubted",
+    )
     for row in rows:
-        table.add_row(row["policy"], row["task"], rate(row, "real"), rate(row, "imagined"))
+        doubted = str(row.get("imagined_undecided", ""))
+        table.add_row(row["policy"], row["task"], rate(row, "real"), rate(row, "imagined"), doubted)
     return table
 
 
