@@ -5,9 +5,11 @@ BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 STAGE ?= store loader acquisition clocks calibration retargeting twin world-model evaluator
+MADE := runs/reproduce
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz mutants fix clean bench bench-lerobot check-lerobot-export
+.PHONY: demo test check slow vm fuzz mutants fix clean bench bench-lerobot check-lerobot-export \
+	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
 $(VENV)/.runtime: pyproject.toml constraints.txt
@@ -50,6 +52,22 @@ bench: $(VENV)/.dev      ## time the stages against their errors, one after anot
 	@missed=; for stage in $(STAGE); do echo "== $$stage"; \
 	$(BIN)/dextouch bench $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
 	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
+
+# Every step goes on where it was broken off. The last one says which bounds are met.
+reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model and its judge anew, in runs/reproduce
+	$(BIN)/dextouch train data --store $(MADE)/train --tasks stand_bottle,stack_bowls --count 600 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --count 450 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 36 --images 4
+	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors
+	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:100 --store $(MADE)/imagined \
+		--checkpoint $(MADE)/state.safetensors
+	$(BIN)/dextouch train imagined --episodes $(MADE)/development --store $(MADE)/imagined_development \
+		--checkpoint $(MADE)/state.safetensors
+	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/imagined \
+		--development $(MADE)/development --development $(MADE)/imagined_development \
+		--output $(MADE)/success_probe.safetensors
+	$(BIN)/dextouch bench evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
+		--keep $(MADE)/evaluator --out $(MADE)/bench
 
 fix: $(VENV)/.dev        ## let the tools mend what they can
 	$(BIN)/ruff format .

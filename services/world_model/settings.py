@@ -84,7 +84,7 @@ class ReaderSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    num_steps: int = Field(default=6000, ge=1)
+    num_steps: int = Field(default=4000, ge=1)
     batch: int = Field(default=32, ge=1)
     learning_rate: float = Field(default=2e-3, gt=0)
     ema_decay: float = Field(default=0.995, ge=0, lt=1)
@@ -138,7 +138,7 @@ class StateTrainSettings(BaseModel):
     reader: ReaderSettings = ReaderSettings()
     core: CoreSettings = CoreSettings()
     renderer: RendererConfig = RendererConfig()
-    drawing: RendererTraining = RendererTraining()
+    drawing: RendererTraining = RendererTraining(cpu_budget_s=420.0)
 
 
 class TrainStateCommand(BaseSettings, StateTrainSettings):
