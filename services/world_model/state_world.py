@@ -7,7 +7,14 @@ import numpy as np
 import torch
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.errors import EndedError, InvalidInputError, ShapeError, UnknownNameError
+from dextouch.errors import (
+    EndedError,
+    InvalidInputError,
+    NonFiniteError,
+    ShapeError,
+    UnavailableError,
+    UnknownNameError,
+)
 from dextouch.hands.actions import (
     IDENTITY_POSE_9D,
     JOINTS_LEFT,
@@ -30,7 +37,7 @@ from dextouch.worlds.world import (
     WorldDescription,
 )
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
-from services.world_model.dynamics.hand_motion import HandMotion, hand_motion
+from services.world_model.dynamics.hand_motion import hand_motion
 from services.world_model.dynamics.memory import (
     memory_arrays,
     memory_from_arrays,
@@ -39,7 +46,6 @@ from services.world_model.dynamics.memory import (
 )
 from services.world_model.dynamics.model import (
     PRESENCE_THRESHOLD,
-    STILL_M,
     Commands,
     ImaginedSteps,
     SceneMemory,
@@ -62,6 +68,8 @@ from services.world_model.state_checkpoints import StateCheckpoint
 
 MAX_CHUNK_STEPS = 64
 MAX_SNAPSHOT_BYTES = 2**20
+# Of a start: farther poses and larger cameras are mistakes of units or frames.
+MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 # An object believed absent is shown here, under the table, where no task leaves one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is doubted once its hands have moved half as long again as an episode of training, and
@@ -136,12 +144,14 @@ class StateWorld:
         reached = observation.action_reached[-1].copy()
         for part in POSE_SLICES:
             reached[part] = IDENTITY_POSE_9D
-        image, tactile_kpa = observation.images[CAMERA][-1], observation.tactile_kpa[-1]
+        # Copies, so that what a caller does to its arrays later changes no rollout.
+        image, tactile_kpa = observation.images[CAMERA][-1].copy(), observation.tactile_kpa[-1]
+        K_head = np.array(K_head)
         self._check_start(start, reached)
         tactile_kpa = np.maximum(tactile_kpa, 0.0)
         motion = hand_motion(reached[None], anchor)
         first = FirstStep(
-            torch.from_numpy(image.copy())[None],
+            torch.from_numpy(image)[None],
             torch.tensor(K_head, dtype=torch.float32)[None],
             torch.from_numpy(motion.Ts_world_camera).float(),
             torch.from_numpy(motion.points_m),
@@ -159,17 +169,18 @@ class StateWorld:
         )
         seen = Observation(
             first_step=0,
-            images={CAMERA: image[None]},
-            tactile_kpa=tactile_kpa[None],
-            action_reached=reached[None],
+            images={CAMERA: image[None].copy()},
+            tactile_kpa=tactile_kpa[None].copy(),
+            action_reached=reached[None].copy(),
             reached_is_measured=True,
             object_poses=self._poses(memory.poses, start.task),
         )
         return StartedRollout(rollout, seen, anchor, K_head)
 
     def _check_start(self, start: RolloutStart, reached: np.ndarray) -> None:
-        """The checks of every other model, so that a start that one takes the other takes too."""
+        """The checks of every other model, and that hands and camera are within reach."""
         observation, anchor, K_head = complete_start(start)
+        _check_geometry(anchor, K_head)
         request = PredictionRequest(
             first_image=observation.images[CAMERA][-1],
             first_tactile_kpa=observation.tactile_kpa[-1],
@@ -221,14 +232,14 @@ class StateWorld:
         motions = [hand_motion(chunk, s.anchor) for chunk, s in zip(chunks, states, strict=True)]
         memory = stack_memories([state.memory for state in states])
         following, imagined = self._dynamics.advance(memory, Commands.of(motions))
-        moving = num_moving(memory, motions)
+        _refuse_non_finite(imagined)
         return [
             self._answer(
                 replace(
                     state,
                     memory=memory_of(following, index),
                     step=state.step + len(chunks[index]),
-                    num_moving=state.num_moving + moving[index],
+                    num_moving=state.num_moving + int(imagined.num_moving[index]),
                 ),
                 chunks[index],
                 (imagined, index),
@@ -272,7 +283,7 @@ class StateWorld:
         observation = Observation(
             first_step=state.step - len(chunk) + 1,
             images={},
-            tactile_kpa=steps.tactile_kpa[index].numpy(),
+            tactile_kpa=steps.tactile_kpa[index].numpy().copy(),
             action_reached=chunk,
             reached_is_measured=False,
             object_poses=poses,
@@ -300,10 +311,15 @@ class StateWorld:
     def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
         bounds = self._metadata.bounds
         disagreement_m = float(steps.disagreement_m[index])
+        count = len(self._metadata.object_names[state.task])
+        seen = torch.stack([start.objects.present[0, :count] for start in state.memory.start])
+        found = bool((seen > PRESENCE_THRESHOLD).all())
         distance = float(steps.distance[index])
         reason = None
         if state.num_moving > DOUBTED_HORIZONS * bounds.horizon_latents:
             reason = "hands moved longer than in any episode of training"
+        elif not found:
+            reason = "an object of the task was not found at the start, or members disagree whether"
         elif disagreement_m > bounds.disagreement_m:
             reason = (
                 f"members disagree by {1e3 * disagreement_m:.0f} mm about an object, more than "
@@ -365,20 +381,29 @@ class StateWorld:
             or fields.get("action_kind") not in ACTION_KINDS
             or not isinstance(step, int)
             or not isinstance(moving, int)
+            or min(step, moving) < 0
+            or arrays.get("image", np.zeros(0)).dtype != np.uint8
             or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
         ):
             raise InvalidInputError(
                 f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
                 "this world's own snapshot writes"
             )
+        anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
+        _check_geometry(anchor, K_head)
+        memory = memory_from_arrays(arrays, config, self._metadata.num_members)
+        if int(memory.start[0].task[0]) != config.tasks.index(name):
+            raise InvalidInputError(f"snapshot: its memory is not of task {name!r}")
+        first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
+        check_reach(first_reached)
         return StateRollout(
             task=name,
             action_kind=fields["action_kind"],
             image=arrays["image"],
-            anchor=AnchorPoses(*np.array(arrays["anchor"])),
-            K_head=np.array(arrays["K_head"]),
-            first_reached=check_actions(arrays["first_reached"][None], where="snapshot")[0],
-            memory=memory_from_arrays(arrays, config, self._metadata.num_members),
+            anchor=anchor,
+            K_head=K_head,
+            first_reached=first_reached[0],
+            memory=memory,
             step=step,
             num_moving=moving,
         )
@@ -405,9 +430,38 @@ def _scene_states(
     ]
 
 
-def num_moving(memory: SceneMemory, motions: Sequence[HandMotion]) -> list[int]:
-    """In how many latent steps of a chunk the hands of each rollout move."""
-    ends = np.stack([m.points_m[STEPS_PER_LATENT - 1 :: STEPS_PER_LATENT] for m in motions])
-    path = np.concatenate([memory.points_m[:, None].numpy(), ends], axis=1)
-    moved_m = np.linalg.norm(np.diff(path, axis=1), axis=-1).max(axis=(-1, -2))
-    return [int(count) for count in (moved_m >= STILL_M).sum(axis=1)]
+def _check_geometry(anchor: AnchorPoses, K_head: np.ndarray) -> None:
+    """Refuse poses far from the world's origin, and cameras that see nothing.
+
+    Raises:
+        InvalidInputError: an anchor farther than 5 m, a focal length or principal point out of
+            all proportion.
+        NonFiniteError: NaN or infinity.
+    """
+    Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
+    if not (np.isfinite(Ts).all() and np.isfinite(K_head).all()):
+        raise NonFiniteError("start: anchor or K_head hold NaN or infinity")
+    far_m = float(np.abs(Ts[:, :3, 3]).max())
+    if far_m > MAX_ANCHOR_M:
+        raise InvalidInputError(
+            f"start: an anchor pose lies {far_m:.3g} m from the world's origin, expected at most "
+            f"{MAX_ANCHOR_M} m; give poses in the frame of the table"
+        )
+    focal_px, centre_px = np.diag(K_head)[:2], np.abs(K_head[:2, 2])
+    if focal_px.min() < 1.0 or max(focal_px.max(), centre_px.max()) > MAX_CAMERA_PX:
+        raise InvalidInputError(
+            f"start: K_head has focal lengths {focal_px.tolist()} and centre "
+            f"{K_head[:2, 2].tolist()} px, expected 1 … {MAX_CAMERA_PX:.0f} px"
+        )
+
+
+def _refuse_non_finite(imagined: ImaginedSteps) -> None:
+    for what, values in (
+        ("touch", imagined.tactile_kpa),
+        ("object places", imagined.poses.position_m),
+        ("object axes", imagined.poses.axes),
+    ):
+        if not torch.isfinite(values).all():
+            raise UnavailableError(
+                f"state model: its {what} hold NaN or infinity; the rollout stands where it stood"
+            )

@@ -7,13 +7,15 @@ import torch
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.core import NUM_PADS, SceneStart
 from services.world_model.dynamics.hand_motion import NUM_POINTS
 from services.world_model.dynamics.model import SceneMemory
 from services.world_model.dynamics.objects import ObjectPoses
 
-_NUM_TAXELS = 320
+# Of metres, kilopascals and latents: whatever is larger was never written by this world.
+_LARGEST = 1e6
 
 
 def stack_memories(memories: Sequence[SceneMemory]) -> SceneMemory:
@@ -40,7 +42,8 @@ def stack_memories(memories: Sequence[SceneMemory]) -> SceneMemory:
 
 def memory_of(memory: SceneMemory, index: int) -> SceneMemory:
     """One rollout's memory out of a batch."""
-    one = slice(index, index + 1)
+    # Copies: a slice would keep the whole batch in memory, and share it with other rollouts.
+    one = torch.tensor([index])
     return SceneMemory(
         start=tuple(
             SceneStart(
@@ -52,7 +55,7 @@ def memory_of(memory: SceneMemory, index: int) -> SceneMemory:
             )
             for start in memory.start
         ),
-        hidden=memory.hidden[:, :, one].contiguous(),
+        hidden=memory.hidden[:, :, one],
         poses=memory.poses[one],
         tactile_kpa=memory.tactile_kpa[one],
         points_m=memory.points_m[one],
@@ -146,7 +149,7 @@ def _checked(
         "position_m": ((objects, 3), "float32"),
         "axes": ((objects, 2, 3), "float32"),
         "present": ((objects,), "float32"),
-        "tactile_kpa": ((2, _NUM_TAXELS), "float32"),
+        "tactile_kpa": ((2, NUM_TAXELS), "float32"),
         "points_m": ((2, NUM_POINTS, 3), "float32"),
         "num_still": ((1,), "int64"),
     }
@@ -160,5 +163,10 @@ def _checked(
             )
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             raise NonFiniteError(f"snapshot: {name} holds NaN or infinity")
+        if array.dtype.kind == "f" and np.abs(array).max() > _LARGEST:
+            raise InvalidInputError(
+                f"snapshot: {name} holds numbers up to {np.abs(array).max():.3g}, expected at most "
+                f"{_LARGEST:.0e}"
+            )
         found[name] = torch.from_numpy(np.array(array))
     return found

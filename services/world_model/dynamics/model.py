@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from jaxtyping import Float32, Int64
+from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
 from dextouch.tactile.layout import NUM_TAXELS, NUM_TIP_TAXELS, split_pads
@@ -74,8 +74,8 @@ class SceneMemory:
     """All that a rollout's dynamics carry from one chunk to the next.
 
     `start` holds what was read and felt at the first step, member by member; `hidden` the cores'
-    states; `poses` where objects are believed now (mean of the members); `points_m` the hands;
-    `num_still` for how many latent steps they have stood still.
+    states; `poses` where objects are believed now (mean of the members); `points_m` where the hands
+    stood when they last moved; `num_still` for how many latent steps they have stood there.
     """
 
     start: tuple[SceneStart, ...]
@@ -91,13 +91,15 @@ class ImaginedSteps:
     """What the ensemble says of the next 4k steps.
 
     `disagreement_m` is the largest spread (standard deviation over members) of an object's
-    position, `distance` how far command features leave the range of training (0: inside).
+    position; `distance` how far command features leave the range of training (0: inside);
+    `num_moving` counts the latent steps in which hands moved.
     """
 
     poses: ObjectPoses
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
     disagreement_m: Float32[Tensor, " batch"]
     distance: Float32[Tensor, " batch"]
+    num_moving: Int64[Tensor, " batch"]
 
 
 class DynamicsMember(nn.Module):
@@ -161,7 +163,7 @@ class DynamicsModel(nn.Module):
     def advance(self, memory: SceneMemory, commands: Commands) -> tuple[SceneMemory, ImaginedSteps]:
         """Imagine the steps of some commands.
 
-        Entries whose hands have stood still for two seconds and go on doing so are at rest:
+        Entries whose hands had stood still for two seconds before, and go on doing so, are at rest:
         nothing moves any more, and touch stays as it is.
         """
         futures, states, distances = [], [], []
@@ -173,16 +175,17 @@ class DynamicsModel(nn.Module):
             states.append(state)
             distances.append(_distance(features, member.core))
         imagined = self._imagined(memory, futures, torch.stack(distances).mean(0))
-        num_still, at_rest = _stillness(memory, commands)
-        imagined = _rested(imagined, memory, at_rest)
-        hidden = torch.where(at_rest[:, None], memory.hidden, torch.stack(states))
+        still = _stillness(memory, commands)
+        imagined = replace(imagined, num_moving=still.num_moving)
+        imagined = _rested(imagined, memory, still.at_rest)
+        hidden = torch.where(still.at_rest[:, None], memory.hidden, torch.stack(states))
         following = replace(
             memory,
             hidden=hidden,
             poses=imagined.poses[:, -1],
             tactile_kpa=imagined.tactile_kpa[:, -1],
-            points_m=commands.points_m[:, -1, -1],
-            num_still=num_still,
+            points_m=still.points_m,
+            num_still=still.num_still,
         )
         return following, imagined
 
@@ -207,6 +210,7 @@ class DynamicsModel(nn.Module):
             tactile_kpa=self.decode_touch(touch, contact).flatten(1, 2),
             disagreement_m=spread.amax((1, 2)),
             distance=distance,
+            num_moving=torch.zeros(len(distance), dtype=torch.int64),
         )
 
     def decode_touch(
@@ -232,10 +236,13 @@ def _distance(features: Tensor, core: RecurrentCore) -> Float32[Tensor, " batch"
 
 
 def _mean(poses: list[ObjectPoses]) -> ObjectPoses:
+    """Mean over members; a member that sees no object has no say about where it is."""
+    present = torch.stack([each.present for each in poses])
+    share = present / present.sum(0).clamp_min(1e-6)
     return ObjectPoses(
-        torch.stack([each.position_m for each in poses]).mean(0),
-        torch.stack([each.axes for each in poses]).mean(0),
-        torch.stack([each.present for each in poses]).mean(0),
+        (torch.stack([each.position_m for each in poses]) * share[..., None]).sum(0),
+        (torch.stack([each.axes for each in poses]) * share[..., None, None]).sum(0),
+        present.mean(0),
     )
 
 
@@ -260,15 +267,28 @@ def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
     )
 
 
-def _stillness(memory: SceneMemory, commands: Commands) -> tuple[Tensor, Tensor]:
-    """Latent steps of standing still so far, and who has been at rest since before this chunk."""
-    ends = torch.cat([memory.points_m[:, None], commands.points_m[:, :, -1]], dim=1)
-    moved_m = (ends[:, 1:] - ends[:, :-1]).norm(dim=-1).amax((-1, -2))
-    is_still = moved_m < STILL_M
-    trailing = is_still.flip(1).cumprod(1).sum(1)
-    all_still = is_still.all(1)
-    num_still = torch.where(all_still, memory.num_still + len(commands), trailing)
-    return num_still, all_still & (memory.num_still >= REST_LATENTS)
+@dataclass(frozen=True)
+class _Stillness:
+    """Where hands stood when they last moved, for how many latent steps, and who is at rest."""
+
+    points_m: Float32[Tensor, "batch 2 6 3"]
+    num_still: Int64[Tensor, " batch"]
+    num_moving: Int64[Tensor, " batch"]
+    at_rest: Bool[Tensor, " batch"]
+
+
+def _stillness(memory: SceneMemory, commands: Commands) -> _Stillness:
+    """Hands move when they leave the place where they stood, however slowly."""
+    stood, num_still = memory.points_m, memory.num_still
+    num_moving = torch.zeros_like(num_still)
+    for latent in range(len(commands)):
+        here = commands.points_m[:, latent, -1]
+        moves = (here - stood).norm(dim=-1).amax((-1, -2)) >= STILL_M
+        stood = torch.where(moves[:, None, None, None], here, stood)
+        num_still = torch.where(moves, 0, num_still + 1)
+        num_moving = num_moving + moves
+    at_rest = (num_moving == 0) & (memory.num_still >= REST_LATENTS)
+    return _Stillness(stood, num_still, num_moving, at_rest)
 
 
 def _rested(imagined: ImaginedSteps, memory: SceneMemory, at_rest: Tensor) -> ImaginedSteps:

@@ -1,5 +1,7 @@
 """Parts of the dynamics model against hand calculations, projections and other libraries."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 import torch
@@ -19,7 +21,13 @@ from services.world_model.dynamics.memory import (
     memory_of,
     stack_memories,
 )
-from services.world_model.dynamics.model import REST_LATENTS, Commands, DynamicsModel
+from services.world_model.dynamics.model import (
+    REST_LATENTS,
+    Commands,
+    DynamicsModel,
+    SceneMemory,
+    mean_start,
+)
 from services.world_model.dynamics.objects import (
     ObjectPoses,
     objects_from_poses,
@@ -283,6 +291,44 @@ def test_hands_that_stand_for_two_seconds_bring_everything_to_rest(model):
     assert (imagined.tactile_kpa == memory.tactile_kpa[:, None]).all()
     moving, _ = model.advance(rested, Commands.of([lifted(16)] * 2))
     assert (moving.hidden != rested.hidden).any()
+
+
+def test_hands_that_creep_do_not_stand_still(model):
+    memory, path = begun(model), still_actions(16 * 20)
+    path[:, 2] = 2e-5 * np.arange(1, len(path) + 1)
+    total = 0
+    for first in range(0, len(path), 16):
+        motion = hand_motion(path[first : first + 16], ANCHOR)
+        memory, imagined = model.advance(memory, Commands.of([motion] * 2))
+        total += int(imagined.num_moving[0])
+    # 6.4 mm at 0.08 mm a latent step: every second step has left the last place by 0.1 mm.
+    assert total == 40
+    assert memory.num_still.max() < REST_LATENTS
+
+
+def test_members_that_see_nothing_have_no_say_about_the_place():
+    seen = objects(position_m=torch.full((1, MAX_OBJECTS, 3), 0.2))
+    blind = objects(
+        position_m=torch.full((1, MAX_OBJECTS, 3), 0.9), present=torch.zeros(1, MAX_OBJECTS)
+    )
+    memory = SceneMemory(
+        start=tuple(dataclasses.replace(start(1), objects=each) for each in (seen, seen, blind)),
+        hidden=torch.zeros(3, 1, 1, 1), poses=seen, tactile_kpa=torch.zeros(1, 2, 320),
+        points_m=torch.zeros(1, 2, 6, 3), num_still=torch.zeros(1, dtype=torch.int64),
+    )  # fmt: skip
+    mean = mean_start(memory)
+    torch.testing.assert_close(mean.position_m, torch.full((1, MAX_OBJECTS, 3), 0.2))
+    torch.testing.assert_close(mean.present, torch.full((1, MAX_OBJECTS), 2 / 3))
+
+
+def test_rollouts_of_a_batch_share_no_memory(model):
+    both = begun(model)
+    one = memory_of(both, 0)
+    before = both.tactile_kpa.clone()
+    one.tactile_kpa.add_(1.0)
+    one.hidden.add_(1.0)
+    assert (both.tactile_kpa == before).all()
+    assert one.tactile_kpa.untyped_storage().nbytes() == 2 * 320 * 4
 
 
 def test_chunks_in_turn_imagine_what_one_long_chunk_does(model):
