@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
+from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.worlds.world import Observation, RolloutStart
 
@@ -21,6 +21,7 @@ def complete_start(
         InvalidInputError: no observation, anchor or K_head.
         UnknownNameError: no image of the head camera.
         ShapeError: more than one observed step.
+        NonFiniteError: NaN or infinity in touch.
     """
     if start.observation is None or start.anchor is None or start.K_head is None:
         raise InvalidInputError(
@@ -31,4 +32,6 @@ def complete_start(
         raise UnknownNameError("camera of the start", "none of them", [CAMERA])
     if len(start.observation) != 1:
         raise ShapeError(f"start: got {len(start.observation)} observed steps, expected one")
+    if not np.isfinite(start.observation.tactile_kpa).all():
+        raise NonFiniteError("start: touch holds NaN or infinity; mend or mask the sensor first")
     return start.observation, start.anchor, start.K_head

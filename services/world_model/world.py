@@ -180,7 +180,7 @@ class ModelWorld:
             precision=self._precision,
         )
         _refuse_non_finite(future)
-        images, touches = to_uint8(future.images).numpy(), future.tactile_kpa.numpy()
+        images, touches = to_uint8(future.images).cpu().numpy(), future.tactile_kpa.cpu().numpy()
         return [
             _advance(state, chunk, imagined, selector)
             for state, chunk, imagined, selector in zip(

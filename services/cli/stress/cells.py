@@ -43,18 +43,19 @@ class Check:
     def held(self) -> bool:
         """Whether something was checked and all of it holds."""
         has_checked = self._told or self._refusals or self._bounds
-        return bool(has_checked) and not self._broken
+        within = all(self.figures[what] <= bound for what, (bound, _) in self._bounds.items())
+        return bool(has_checked) and within and not self._broken
 
     @property
     def came_out(self) -> str:
         """What came out, in words; what does not hold stands first."""
-        figures = [
-            f"{what} {self.figures[what]:.2g} {unit}".rstrip() + f" (≤ {bound:g})"
-            for what, (bound, unit) in self._bounds.items()
-        ]
+        figures: dict[bool, list[str]] = {True: [], False: []}
+        for what, (bound, unit) in self._bounds.items():
+            text = f"{what} {self.figures[what]:.3g} {unit}".rstrip() + f" (≤ {bound:g})"
+            figures[self.figures[what] <= bound].append(text)
         refusals = [f"{kind}: {', '.join(what)}" for kind, what in self._refusals.items()]
-        broken = [f"NOT {text}" for text in self._broken]
-        return "; ".join([*broken, *figures, *self._told, *refusals])
+        broken = [f"NOT {text}" for text in (*self._broken, *figures[False])]
+        return "; ".join([*broken, *figures[True], *self._told, *refusals])
 
     def true(self, text: str, holds: object) -> None:
         """A statement that must be true."""
@@ -67,14 +68,9 @@ class Check:
     ) -> None:
         """A figure that must be finite and not above its bound; of several the largest is told."""
         figure = float(value)
-        if not figure <= bound:
-            self._broken.append(f"{what} {figure:.3g} {unit}".rstrip() + f" (≤ {bound:g})")
         if what not in self.figures or not figure <= self.figures[what]:
             self.figures[what] = figure
-        if self.figures[what] <= bound:
-            self._bounds[what] = (bound, unit)
-        else:
-            self._bounds.pop(what, None)
+        self._bounds[what] = (bound, unit)
 
     def finite(self, what: str, values: np.ndarray) -> None:
         """Numbers that must all be finite."""

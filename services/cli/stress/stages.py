@@ -13,6 +13,13 @@ STAGES: Final = {
     "retargeting": "services.cli.stress.retargeting",
     "tactile-calibration": "services.cli.stress.tactile_calibration",
     "resampling": "services.cli.stress.resampling",
+    "store": "services.cli.stress.storage",
+    "world-model": "services.cli.stress.world_model",
+    "state-model": "services.cli.stress.state_model",
+    "twin": "services.cli.stress.twin",
+    "metrics": "services.cli.stress.metrics",
+    "judging": "services.cli.stress.judging",
+    "training": "services.cli.stress.training",
 }
 
 

@@ -30,6 +30,9 @@ from services.evaluation.policies.cloning_network import (
 )
 
 KIND = "behaviour-cloning-policy"
+# Coefficients further from the mean chunk than this many standard deviations of training are cut:
+# no touch or image, however odd, sends a hand where no demonstration came near.
+MAX_DEVIATIONS = 5.0
 
 
 class CloningShape(BaseModel):
@@ -182,5 +185,7 @@ class BehaviourCloningPolicy:
         )
         with torch.no_grad():
             batch = cloning_batch([moment], self.shape)
-            chunk = self._network.codec.decode(self._network(batch), batch)[0].double().numpy()
+            bound = MAX_DEVIATIONS * self._network.coefficient_scale
+            coefficients = self._network(batch).clamp(-bound, bound)
+            chunk = self._network.codec.decode(coefficients, batch)[0].double().numpy()
         return chunk_from_start(chunk, moment.reached)

@@ -61,8 +61,9 @@ class ActionNormalizer(nn.Module):
     def forward(self, inputs: ModelInputs) -> ActionFeatures:
         """Features bounded to ten deviations, so that no input can blow up the network."""
         own = _bounded((inputs.hands - self.mean) / self.std)
-        camera = _bounded((inputs.camera - _NO_MOTION) / _CAMERA_SCALE)
-        layout = _bounded((inputs.layout - _TYPICAL_LAYOUT) / _LAYOUT_SCALE)
+        device = inputs.camera.device
+        camera = _bounded((inputs.camera - _NO_MOTION.to(device)) / _CAMERA_SCALE.to(device))
+        layout = _bounded((inputs.layout - _TYPICAL_LAYOUT.to(device)) / _LAYOUT_SCALE.to(device))
         return ActionFeatures(
             torch.cat([own, own.flip(2), camera], dim=-1),
             torch.cat([layout, layout.flip(1)], dim=-1),
@@ -79,7 +80,9 @@ class TimeEmbedding(nn.Module):
     def forward(self, t: Float32[Tensor, "..."]) -> Float32[Tensor, "*batch width"]:
         """Sines and cosines, then two layers."""
         half = TIME_WIDTH // 2
-        rates = torch.exp(-math.log(1e4) * torch.arange(half, dtype=torch.float32) / half)
+        rates = torch.exp(
+            -math.log(1e4) * torch.arange(half, dtype=torch.float32, device=t.device) / half
+        )
         angles = t[..., None] * TIME_RANGE * rates
         return self.project(torch.cat([angles.cos(), angles.sin()], dim=-1))
 

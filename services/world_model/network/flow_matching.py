@@ -59,7 +59,9 @@ def sample(
     video, tactile = noise
     times = shift_time(torch.linspace(1.0, 0.0, num_steps + 1), shift)
     for t, t_next in zip(times[:-1].tolist(), times[1:].tolist(), strict=True):
-        guess_video, guess_tactile = denoise(video, tactile, torch.full((len(video),), t))
+        guess_video, guess_tactile = denoise(
+            video, tactile, torch.full((len(video),), t, device=video.device)
+        )
         # x + (t' - t) (x - x_0) / t, written so that t' = 0 gives x_0 without rounding.
         keep = t_next / t
         video = keep * video + (1.0 - keep) * guess_video

@@ -83,6 +83,10 @@ class ModelInputs:
     def __len__(self) -> int:
         return len(self.first_image)
 
+    def to(self, device: torch.device) -> "ModelInputs":
+        """The same on a device."""
+        return ModelInputs(**{name: tensor.to(device) for name, tensor in vars(self).items()})
+
 
 def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
     """Check and stack requests of one length into the network's tensors.

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float32, UInt8
 from torch import Tensor, nn
 
+from dextouch.errors import InvalidInputError
 from services.world_model.network import flow_matching
 from services.world_model.network.conditioning import (
     ActionNormalizer,
@@ -110,7 +111,7 @@ class JointWorldModel(nn.Module):
             _first_zero(noisy.video), first.video, video_condition, inputs.raster
         )
         tactile = self.tactile.start(_first_zero(noisy.tactile), first.tactile, tactile_condition)
-        mask = self.attention_mask(inputs.num_steps)
+        mask = self.attention_mask(inputs.num_steps).to(t.device)
         for layer in self.layers:
             video, tactile = layer(video, tactile, mask)
         return JointLatents(
@@ -149,11 +150,16 @@ class JointWorldModel(nn.Module):
 
         Args:
             inputs: from `build_inputs`.
-            noise: one a request, from `noise`.
+            noise: one a request, from `noise`; like the inputs it may be on any device.
             sampling_steps: Euler steps; None takes the configuration's.
             all_images: decode every image, or only those of the last latent.
             precision: of the experts' matrix products, by autocast; codecs are always float32.
+
+        Raises:
+            InvalidInputError: weights that are not float32.
         """
+        device = self._checked_device()
+        inputs = inputs.to(device)
         first = self.first_latents(inputs)
 
         def denoise(video: Tensor, tactile: Tensor, t: Tensor) -> tuple[Tensor, Tensor]:
@@ -163,11 +169,23 @@ class JointWorldModel(nn.Module):
 
         video, tactile = flow_matching.sample(
             denoise,
-            (noise.video, noise.tactile),
+            (noise.video.to(device), noise.tactile.to(device)),
             num_steps=sampling_steps or self.config.sampling_steps,
             shift=self.config.sampling_time_shift,
         )
-        return self.decode(first, JointLatents(video, tactile), all_images=all_images)
+        future = self.decode(first, JointLatents(video, tactile), all_images=all_images)
+        touch = self.tokenizer.bounded(future.tactile_kpa, inputs.first_tactile_kpa)
+        return Prediction(future.images, touch)
+
+    def _checked_device(self) -> torch.device:
+        """Where the weights are; every one of them has to be float32."""
+        others = {weight.dtype for weight in self.parameters()} - {torch.float32}
+        if others:
+            raise InvalidInputError(
+                f"world model: got weights of {', '.join(sorted(map(str, others)))}, expected "
+                "float32; ask for precision='bfloat16' to have matrix products in bfloat16"
+            )
+        return self.video_residual_std.device
 
     def decode(
         self, first: FirstLatents, residuals: JointLatents, *, all_images: bool = True

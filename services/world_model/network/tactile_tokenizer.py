@@ -15,12 +15,19 @@ from services.world_model.network.principal_axes import principal_axes, root_sca
 
 # Palms get this share of the amplitude: found best against tips of amplitude one (touch study).
 PALM_SCALE = 0.7
+# Of checkpoints that do not say what pressure they were trained up to: twice the peak of eight
+# demonstrations of the twin's first two tasks.
+UNKNOWN_PEAK_KPA = 200.0
 
 
 class TactileTokenizer(nn.Module):
-    """Frozen encoder and decoder of taxels; zero pressure is the zero latent."""
+    """Frozen encoder and decoder of taxels; zero pressure is the zero latent.
+
+    `peak_kpa` is the highest pressure of training.
+    """
 
     tip_scale: Tensor
+    peak_kpa: Tensor
     palm_basis: Tensor
     palm_scale: Tensor
 
@@ -29,6 +36,7 @@ class TactileTokenizer(nn.Module):
         num_palm = NUM_TAXELS - NUM_TIP_TAXELS
         self.channels = NUM_TIP_TAXELS + config.palm_channels
         self.register_buffer("tip_scale", torch.ones(()))
+        self.register_buffer("peak_kpa", torch.full((), UNKNOWN_PEAK_KPA))
         self.register_buffer("palm_basis", torch.eye(num_palm, config.palm_channels))
         self.register_buffer("palm_scale", torch.ones(config.palm_channels))
 
@@ -42,6 +50,16 @@ class TactileTokenizer(nn.Module):
         self.palm_basis.copy_(basis)
         self.palm_scale.copy_(root_scale(rms) * PALM_SCALE)
         self.tip_scale.copy_(tips_rms.clamp_min(1e-3).float())
+        self.peak_kpa.copy_(tactile_kpa.max())
+
+    def bounded(
+        self,
+        tactile_kpa: Float32[Tensor, "batch steps 2 320"],
+        first_kpa: Float32[Tensor, "batch 2 320"],
+    ) -> Float32[Tensor, "batch steps 2 320"]:
+        """Decoded pressures, none above both the peak of training and the first touch's own."""
+        highest_kpa = torch.maximum(first_kpa.flatten(1).amax(dim=1), self.peak_kpa)
+        return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
 
     def encode(
         self, tactile_kpa: Float32[Tensor, "*batch 320"]

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dextouch.errors import ConflictError
+from dextouch.errors import ConflictError, NonFiniteError
 from services.world_model.checkpoints import (
     Checkpoint,
     CheckpointMetadata,
@@ -318,9 +318,14 @@ class TrainingRun:
             group["lr"] = learning_rate(settings, self.step, self.share())
         self._optimizer.zero_grad()
         torch.autograd.backward(loss.video + settings.tactile_weight * loss.tactile)
-        torch.nn.utils.clip_grad_norm_(
-            self.model.parameters(), settings.max_gradient_norm, error_if_nonfinite=True
-        )
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.max_gradient_norm)
+        if not torch.isfinite(norm):
+            raise NonFiniteError(
+                f"training: gradients of step {self.step} are NaN or infinite (loss of sight "
+                f"{loss.video.item():.3g}, of touch {loss.tactile.item():.3g}), expected finite "
+                "ones; no weight was moved: look for NaN in the episodes, or lower the learning "
+                "rate"
+            )
         self._optimizer.step()
         self._average()
         return loss.video.item(), loss.tactile.item()

@@ -1,0 +1,156 @@
+"""Stress of the world model in state form, opened through `open_world`.
+
+The package has no trained state model, so that a small one of random weights stands in: what is
+checked is what must hold whatever was learned.
+"""
+
+import tempfile
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dextouch.errors import EndedError, InvalidInputError
+from services.cli.stress import worlds
+from services.cli.stress.cells import Check, StageCells
+from services.cli.stress.worlds import TASK, Subject
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.state_checkpoints import (
+    StateCheckpoint,
+    StateMetadata,
+    read_state_checkpoint,
+    write_state_checkpoint,
+)
+from services.world_model.state_world import StateWorld
+from services.world_model.world import open_world
+
+STAGE = StageCells("state-model")
+_PX = 32
+_TRAINED_KPA = 10.0
+
+
+@STAGE.cell("rotations", "commands with columns of sine 2e-6 and 5e-7; wrists turned by π")
+def _rotations(check: Check) -> None:
+    worlds.check_rotations(check, _subject())
+
+
+@STAGE.cell(
+    "non_finite", "NaN, infinity, 5e-324 and 1e300 in actions; NaN and 1e-40 kPa at the start"
+)
+def _non_finite(check: Check) -> None:
+    worlds.check_non_finite(check, _subject())
+
+
+@STAGE.cell("touch", "every taxel at 0, -5, 2, 650, 99 999 and 200 000 kPa at the start")
+def _touch(check: Check) -> None:
+    worlds.check_touch(check, _subject(), _TRAINED_KPA)
+
+
+@STAGE.cell("ends", "chunks of 4 and 64 steps and beyond")
+def _ends(check: Check) -> None:
+    worlds.check_chunk_ends(check, _subject())
+
+
+@STAGE.cell(
+    "precision", "weights in bfloat16, float16 and float64; sampling steps, which it has none"
+)
+def _precision(check: Check) -> None:
+    subject = _subject()
+    for dtype in (torch.bfloat16, torch.float16, torch.float64):
+        found = _checkpoint()
+        checkpoint = StateCheckpoint(
+            found.dynamics.to(dtype), found.renderer, found.metadata, found.digest
+        )
+        check.refused(
+            f"weights {dtype}",
+            lambda c=checkpoint: Subject(  # type: ignore[misc]
+                StateWorld(c), subject.start, subject.actions
+            ).step(subject.still()),
+            InvalidInputError,
+        )
+
+
+@STAGE.cell("long_run", "hands that stand still for 63 chunks; hands that move until it refuses")
+def _long_run(check: Check) -> None:
+    subject = _subject()
+    first = subject.world.reset(subject.touching(0.0))
+    peaks = worlds.still_peaks_kpa(subject)
+    check.at_most("peak of still hands, of random weights", max(peaks), _TRAINED_KPA, "kPa")
+    state, poses = first.state, first.observation.object_poses
+    for chunk in range(worlds.NUM_CHUNKS):
+        stepped = subject.world.step(state, subject.still(), seed=chunk, selector=worlds.TOUCH_ONLY)
+        state = stepped.state
+    last = stepped.observation.object_poses
+    check.true("it gives object poses", poses is not None and last is not None)
+    if poses is not None and last is not None:
+        moved_m = np.abs(last[-1, :, :3] - poses[-1, :, :3]).max()
+        check.at_most("objects beside still hands move", moved_m, 1e-6, "m")
+    check.refused("hands that move for ever", lambda: _play(check, subject), EndedError)
+
+
+@STAGE.cell("batch", "three rollouts at once and alone, one of them at 650 kPa")
+def _batch(check: Check) -> None:
+    worlds.check_batch(check, _subject(), max_kpa=1e-2)
+
+
+STAGE.does_not_apply(
+    one_axis="nothing is estimated from motion; see hand-eye",
+    clock="steps are counted, there is no clock; see clocks",
+    device="it is loaded on the CPU, and nothing takes a device",
+)
+
+
+def _play(check: Check, subject: Subject) -> None:
+    state = subject.world.reset(subject.start).state
+    for index, chunk in enumerate(worlds.there_and_back(subject.actions)):
+        stepped = subject.world.step(state, chunk, seed=index, selector=worlds.TOUCH_ONLY)
+        state = stepped.state
+        check.finite("touch of moving hands", stepped.observation.tactile_kpa)
+        doubt = stepped.observation.doubt
+        check.true("every answer says how far it is trusted", doubt is not None)
+
+
+@cache
+def _subject() -> Subject:
+    start, actions = worlds.twin_start(_PX)
+    with tempfile.TemporaryDirectory() as folder:
+        world = open_world(_written(Path(folder)))
+    return Subject(world, start, actions)
+
+
+def _checkpoint() -> StateCheckpoint:
+    with tempfile.TemporaryDirectory() as folder:
+        return read_state_checkpoint(_written(Path(folder)))
+
+
+def _written(folder: Path) -> Path:
+    """A small state model of random weights in a file."""
+    generator = torch.Generator().manual_seed(0)
+    config = DynamicsConfig(tasks=(TASK,), num_objects=(1,), image_px=_PX, width=16)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        dynamics = DynamicsModel(config, num_members=2)
+        shape = RendererConfig(widths=(8, 8), depths=(1, 1))
+        renderer = RendererNetwork(shape)
+    dynamics.codec.fit(_TRAINED_KPA * torch.rand(272, 320, generator=generator))
+    metadata = StateMetadata(
+        name="untrained",
+        dynamics=config,
+        num_members=2,
+        renderer=shape,
+        object_names={TASK: ("bottle",)},
+        object_boxes_m={TASK: ((0.0, 0.0, 0.0, 0.03, 0.03, 0.1),)},
+        command="dextouch stress",
+        seed=0,
+        training_cpu_s=0.0,
+        num_training_episodes=0,
+        training_seeds={},
+        data_hash="0",
+    )
+    path = folder / "untrained.safetensors"
+    write_state_checkpoint(path, dynamics, renderer, metadata)
+    return path

@@ -1,0 +1,194 @@
+"""Stress of training: losses and steps on broken, untouched and saturated windows."""
+
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from tempfile import gettempdir
+
+import numpy as np
+import torch
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
+from services.cli.stress.cells import Check, StageCells
+from services.cli.stress.worlds import twin_start
+from services.world_model.network.configuration import NetworkConfig
+from services.world_model.network.flow_matching import MIN_TIME, training_times
+from services.world_model.network.inputs import build_inputs
+from services.world_model.settings import OptimizerSettings, TrainSettings, WindowSettings
+from services.world_model.training.dataset import EpisodeArrays, WindowBatch, WindowSampler
+from services.world_model.training.objective import losses
+from services.world_model.training.splits import check_disjoint
+from services.world_model.training.trainer import TrainingRun
+
+STAGE = StageCells("training")
+_PX = 32
+_STEPS = 33
+
+
+@STAGE.cell("rotations", "an action of parallel columns; wrists that turn by π", slow=True)
+def _rotations(check: Check) -> None:
+    for columns, is_taken in (([1.0, 0, 0, 1.0, 5e-7, 0], False), ([-1.0, 0, 0, 0, -1.0, 0], True)):
+        actions = _episode().actions["measured"].copy()
+        actions[7:, 3:9] = columns
+        broken = replace(_episode(), actions={"measured": actions, "commanded": actions})
+        if is_taken:
+            check.finite("losses", np.array(_run(broken).learn(_batch_of(broken, 8))))
+        else:
+            check.refused(
+                "parallel columns", partial(_batch_of, broken, 8), DegenerateRotationError
+            )
+
+
+@STAGE.cell("non_finite", "NaN and infinity in true touch and in a weight", slow=True)
+def _non_finite(check: Check) -> None:
+    for bad in (float("nan"), float("inf")):
+        batch = _batch_of(_episode(), 4)
+        touch = batch.tactile_kpa.clone()
+        touch[0, 3, 0, 5] = bad
+        run = _run(_episode())
+        before = [weight.clone() for weight in run.model.parameters()]
+        broken = replace(batch, tactile_kpa=touch)
+        check.refused(f"touch {bad}", partial(run.learn, broken), NonFiniteError)
+        same = all(torch.equal(a, b) for a, b in zip(before, run.model.parameters(), strict=True))
+        check.true("no weight moved", same)
+    run = _run(_episode())
+    with torch.no_grad():
+        next(run.model.parameters()).view(-1)[0] = float("nan")
+    check.refused("a weight NaN", lambda: run.learn(_batch_of(_episode(), 4)), NonFiniteError)
+
+
+@STAGE.cell("touch", "windows of 0, 650 and 99 999 kPa, and of no valid sample", slow=True)
+def _touch(check: Check) -> None:
+    for pressure_kpa in (0.0, 650.0, 99_999.0):
+        touch = np.full_like(_episode().tactile_kpa, pressure_kpa)
+        run = _run(replace(_episode(), tactile_kpa=touch))
+        check.finite(
+            "losses", np.array(run.learn(_batch_of(replace(_episode(), tactile_kpa=touch), 4)))
+        )
+    run = _run(_episode())
+    batch = _batch_of(_episode(), 4)
+    nothing = replace(batch, tactile_valid=torch.zeros_like(batch.tactile_valid))
+    check.at_most("loss of touch that nobody measured", run.learn(nothing)[1], 0.0)
+    check.finite("weights", np.array([float(w.abs().max()) for w in run.model.parameters()]))
+
+
+@STAGE.cell("ends", "10 000 flow times; gradients at the earliest and at 1", slow=True)
+def _ends(check: Check) -> None:
+    times = training_times(10_000, shift=5.0, generator=torch.Generator().manual_seed(0))
+    check.true("times in 0.001 … 1", float(times.min()) >= MIN_TIME and float(times.max()) <= 1)
+    run = _run(_episode())
+    batch = _batch_of(_episode(), 4)
+    inputs = build_inputs(batch.requests, run.settings.network)
+    target = run.model.residuals(batch.images, batch.tactile_kpa)
+    for t in (MIN_TIME, 1.0):
+        guess = run.model(inputs, run.model.first_latents(inputs), target, torch.full((4,), t))
+        loss = (guess.video - target.video).square().mean()
+        run.model.zero_grad()
+        torch.autograd.backward(loss)
+        grads = [w.grad.abs().max() for w in run.model.parameters() if w.grad is not None]
+        check.finite(f"gradients at t = {t:g}", torch.stack(grads).numpy())
+    check.refused(
+        "episodes shorter than a window",
+        lambda: WindowSampler([_episode()], np.random.default_rng(0), max_steps=65),
+    )
+    check.refused(
+        "held-out among trained",
+        lambda: check_disjoint([_episode()], [_episode()]),
+        InvalidInputError,
+    )
+
+
+@STAGE.cell("long_run", "1000 steps of a small network on one scene", slow=True)
+def _long_run(check: Check) -> None:
+    run = _run(_episode(), max_steps=1000)
+    log = run.run()
+    first, last = log[0], log[-1]
+    check.true("1000 steps", last.step == 1000)
+    check.finite("losses", np.array([[one.loss_video, one.loss_tactile] for one in log]))
+    check.at_most("last loss of images over the first", last.loss_video / first.loss_video, 1.0)
+    check.finite("weights", np.array([float(w.abs().max()) for w in run.averaged.parameters()]))
+
+
+@STAGE.cell("batch", "guesses of four windows at once and one by one", slow=True)
+def _batch(check: Check) -> None:
+    run = _run(_episode())
+    model = run.model.eval()
+    batch = _batch_of(_episode(), 4)
+    inputs = build_inputs(batch.requests, run.settings.network)
+    target = model.residuals(batch.images, batch.tactile_kpa)
+    t = torch.tensor([0.1, 0.4, 0.7, 1.0])
+    with torch.no_grad():
+        together = model(inputs, model.first_latents(inputs), target, t)
+        for index in range(4):
+            one = build_inputs(batch.requests[index : index + 1], run.settings.network)
+            part = type(target)(target.video[index : index + 1], target.tactile[index : index + 1])
+            alone = model(one, model.first_latents(one), part, t[index : index + 1])
+            off = float((alone.video[0] - together.video[index]).abs().max())
+            check.at_most("guesses differ", off, 1e-4)
+    pair = [losses(model, inputs, batch, generator=torch.Generator().manual_seed(1)) for _ in "ab"]
+    check.equal(
+        "the same seed, the same loss",
+        pair[0].video.detach().numpy(),
+        pair[1].video.detach().numpy(),
+    )
+
+
+STAGE.does_not_apply(
+    one_axis="nothing is estimated from motion; see hand-eye",
+    clock="windows are cut by steps; see resampling",
+    precision="training is in float32 only: there is no setting for another",
+    device="training is on the CPU only: there is no setting for another",
+)
+
+
+@cache
+def _episode() -> EpisodeArrays:
+    """A scene of the twin that stands still, with a moving hand and some touch."""
+    start, actions = twin_start(_PX)
+    observation = start.observation
+    if observation is None or start.anchor is None or start.K_head is None:
+        raise InvalidInputError("stress: the twin's start has no observation")
+    rows = np.concatenate([observation.action_reached, actions[: _STEPS - 1]])
+    touch = np.random.default_rng(0).uniform(0, 20, (_STEPS, 2, 320)).astype(np.float32)
+    return EpisodeArrays(
+        episode_id="stress",
+        task=start.task,
+        instruction=start.instruction,
+        seed=start.seed,
+        images=np.repeat(observation.images["camera_head"], _STEPS, axis=0),
+        tactile_kpa=touch,
+        tactile_valid=np.ones((_STEPS, 2), dtype=np.bool_),
+        actions={"measured": rows, "commanded": rows},
+        anchor=start.anchor,
+        K_head=start.K_head,
+        model_rate_hz=15.0,
+    )
+
+
+def _run(episode: EpisodeArrays, max_steps: int = 1) -> TrainingRun:
+    """A small network at the start of its training."""
+    settings = TrainSettings(
+        episodes="stress",
+        output=Path(gettempdir()) / "stress.safetensors",
+        network=NetworkConfig(
+            image_px=_PX,
+            video_width=32,
+            tactile_width=32,
+            num_layers=1,
+            num_heads=2,
+            head_width=16,
+            codec_channels=12,
+            palm_channels=8,
+        ),
+        optimizer=OptimizerSettings(batch=4, warmup_steps=10),
+        windows=WindowSettings(fit_windows=8),
+        max_steps=max_steps,
+    )
+    clean = replace(episode, actions=_episode().actions)
+    run = TrainingRun([clean], settings)
+    run.fit_codecs()
+    return run
+
+
+def _batch_of(episode: EpisodeArrays, num_windows: int) -> WindowBatch:
+    return WindowSampler([episode], np.random.default_rng(1), max_steps=17).draw(num_windows, 17)

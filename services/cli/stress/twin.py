@@ -1,0 +1,196 @@
+"""Stress of the twin: commands that no hand can follow, hard presses, 1008 steps."""
+
+from functools import cache
+
+import numpy as np
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
+from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, WRIST_RIGHT
+from dextouch.worlds.world import Observation, RolloutStart, StartedRollout
+from services.cli.stress.cells import Check, StageCells
+from services.cli.stress.worlds import (
+    NUM_CHUNKS,
+    SEED,
+    TASK,
+    TOUCH_ONLY,
+    there_and_back,
+    twin_start,
+)
+from services.twin.settings import TwinSettings
+from services.twin.world import TwinState, TwinWorld
+
+STAGE = StageCells("twin")
+# A fingertip has 16 taxels of 16 mm²: 2000 kPa on one of them are 32 N.
+_MAX_KPA = 20_000.0
+
+
+@STAGE.cell(
+    "rotations", "wrists turned by π - 1e-6, π and back within a step; columns of sine 2e-6"
+)
+def _rotations(check: Check) -> None:
+    for columns in (
+        [-1.0, 0, 0, 0, -1.0, 0],
+        [-1.0, 1e-6, 0, -1e-6, -1.0, 0],
+        [1.0, 0, 0, 0, -1.0, 0],
+        [1.0, 0, 0, 1.0, 2e-6, 0],
+    ):
+        actions = _still(16)
+        actions[4:8, WRIST_LEFT.start + 3 : WRIST_LEFT.stop] = columns
+        _answers(check, _step(actions))
+    lost = _still(16)
+    lost[4, WRIST_LEFT.start + 3 : WRIST_LEFT.stop] = [1.0, 0, 0, 1.0, 5e-7, 0]
+    check.refused("columns of sine 5e-7", lambda: _step(lost), DegenerateRotationError)
+
+
+@STAGE.cell("non_finite", "NaN and infinity in actions; 5e-324, 3 m and 50 rad in a step")
+def _non_finite(check: Check) -> None:
+    world, begun = _begun()
+    before = world.snapshot(begun.state)
+    for bad in (np.nan, np.inf):
+        actions = _still(16)
+        actions[3, 41] = bad
+        check.refused(f"{bad}", lambda a=actions: _step(a), NonFiniteError)  # type: ignore[misc]
+    tiny = _still(16)
+    tiny[:, 0] = 5e-324
+    _answers(check, _step(tiny))
+    for what, column, value in (("3 m", 0, 3.0), ("50 rad", JOINTS_LEFT.start, 50.0)):
+        wild = _still(16)
+        wild[4:, column] = value
+        _bounded_or_refused(check, what, wild)
+    check.true("the state stands as it was", world.snapshot(begun.state) == before)
+    check.equal("and plays as before", _step(_still(16)).tactile_kpa, _step(_still(16)).tactile_kpa)
+
+
+@STAGE.cell("touch", "hands in the air; a hand driven 0.4 m down into the table in a second")
+def _touch(check: Check) -> None:
+    check.at_most("touch of hands in the air", _step(_still(16)).tactile_kpa.max(), 0.0, "kPa")
+    world, begun = _begun()
+    state, peak_kpa = begun.state, 0.0
+    down = _still(16)
+    # Commands are relative to the wrist: down in the world is the anchor's third row.
+    direction = begun.anchor.T_world_wrist_right[2, :3]
+    down[:, WRIST_RIGHT.start : WRIST_RIGHT.start + 3] -= (
+        np.linspace(0.025, 0.4, 16)[:, None] * direction
+    )
+    for actions in (down, np.repeat(down[-1:], 16, axis=0)):
+        stepped = world.step(state, actions, seed=0, selector=TOUCH_ONLY)
+        state, kpa = stepped.state, stepped.observation.tactile_kpa
+        _answers(check, stepped.observation)
+        peak_kpa = max(peak_kpa, float(kpa.max()))
+    check.true("the hand feels the table", peak_kpa > 0)
+    check.at_most("peak pressure", peak_kpa, _MAX_KPA, "kPa")
+
+
+@STAGE.cell("ends", "one step; a rollout cut into chunks of 16 and of 4 steps")
+def _ends(check: Check) -> None:
+    world, begun = _begun()
+    _, actions = twin_start(16)
+    whole = world.step(begun.state, actions[:16], seed=0, selector=TOUCH_ONLY)
+    state = begun.state
+    for k in range(0, 16, 4):
+        stepped = world.step(state, actions[k : k + 4], seed=0, selector=TOUCH_ONLY)
+        state = stepped.state
+    check.equal("physics", state.physics, whole.state.physics)
+    check.true("one step gives one", len(_step(_still(1))) == 1)
+    check.refused("no step", lambda: _step(_still(1)[:0]))
+
+
+@STAGE.cell("precision", "a demonstration's commands rounded to float32 and bfloat16, five chunks")
+def _precision(check: Check) -> None:
+    _, actions = twin_start(16)
+    exact = _reached(actions[:80])
+    single = _reached(actions[:80].astype(np.float32).astype(np.float64))
+    check.at_most("float32: wrists off", np.abs(single - exact)[:, :3].max(), 1e-3, "m")
+    bits = actions[:80].astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
+    coarse = _reached(bits.view(np.float32).astype(np.float64))
+    check.finite("bfloat16: poses", coarse)
+    check.at_most("bfloat16: wrists off", np.abs(coarse - exact)[:, :3].max(), 0.01, "m")
+
+
+@STAGE.cell(
+    "long_run", "63 chunks: a demonstration forth and back; hands that stand still", slow=True
+)
+def _long_run(check: Check) -> None:
+    world, begun = _begun()
+    _, actions = twin_start(16)
+    state = begun.state
+    for chunk in there_and_back(actions):
+        stepped = world.step(state, chunk, seed=0, selector=TOUCH_ONLY)
+        state = stepped.state
+        _answers(check, stepped.observation)
+    check.at_most(
+        "wrist off its last command",
+        np.abs(stepped.observation.action_reached[-1] - chunk[-1])[:3].max(),
+        0.05,
+        "m",
+    )
+    state = begun.state
+    for _ in range(NUM_CHUNKS):
+        stepped = world.step(state, _still(16), seed=0, selector=TOUCH_ONLY)
+        state = stepped.state
+    drift_m = np.abs(stepped.observation.action_reached[-1] - _still(1)[0])[:3].max()
+    check.at_most("still wrist drifts", drift_m, 1e-5, "m")
+    check.at_most("still hands feel", stepped.observation.tactile_kpa.max(), 0.0, "kPa")
+
+
+@STAGE.cell("batch", "two rollouts in turns in one world, and alone in worlds of their own")
+def _batch(check: Check) -> None:
+    world = TwinWorld(_SETTINGS)
+    _, actions = twin_start(16)
+    states = [world.reset(RolloutStart(TASK, seed, "")).state for seed in (SEED, SEED + 1)]
+    for k in (0, 16):
+        states = [
+            world.step(s, actions[k : k + 16], seed=0, selector=TOUCH_ONLY).state for s in states
+        ]
+    for seed, state in zip((SEED, SEED + 1), states, strict=True):
+        alone = TwinWorld(_SETTINGS)
+        own = alone.reset(RolloutStart(TASK, seed, "")).state
+        for k in (0, 16):
+            own = alone.step(own, actions[k : k + 16], seed=0, selector=TOUCH_ONLY).state
+        check.equal("physics", state.physics, own.physics)
+
+
+STAGE.does_not_apply(
+    one_axis="nothing is estimated from motion; see hand-eye",
+    clock="physics counts its steps, there is no clock",
+    device="MuJoCo steps on the CPU",
+)
+_SETTINGS = TwinSettings(cameras=())
+
+
+@cache
+def _begun() -> tuple[TwinWorld, StartedRollout[TwinState]]:
+    world = TwinWorld(_SETTINGS)
+    return world, world.reset(RolloutStart(TASK, SEED, ""))
+
+
+def _still(num_steps: int) -> np.ndarray:
+    return np.repeat(_begun()[1].observation.action_reached[-1:], num_steps, axis=0)
+
+
+def _step(actions: np.ndarray) -> Observation:
+    world, begun = _begun()
+    return world.step(begun.state, actions, seed=0, selector=TOUCH_ONLY).observation
+
+
+def _reached(actions: np.ndarray) -> np.ndarray:
+    world, begun = _begun()
+    state, reached = begun.state, []
+    for k in range(0, len(actions), 16):
+        stepped = world.step(state, actions[k : k + 16], seed=0, selector=TOUCH_ONLY)
+        state = stepped.state
+        reached.append(stepped.observation.action_reached)
+    return np.concatenate(reached)
+
+
+def _answers(check: Check, observation: Observation) -> None:
+    check.finite("touch", observation.tactile_kpa)
+    check.finite("reached poses", observation.action_reached)
+    check.at_most("pressure below zero", -float(observation.tactile_kpa.min()), 0.0, "kPa")
+
+
+def _bounded_or_refused(check: Check, what: str, actions: np.ndarray) -> None:
+    try:
+        _answers(check, _step(actions))
+    except InvalidInputError as error:
+        check.true(f"{what}: {type(error).__name__}", holds=True)

@@ -1,0 +1,177 @@
+"""Stress of worlds: what every form of the world model must hold, and what it starts from."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
+from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, actions_from_poses
+from dextouch.worlds.world import BatchWorld, Observation, ReturnSelector, RolloutStart
+from services.cli.stress.cells import Check
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.world import TwinWorld
+
+CAMERA = "camera_head"
+CHUNK_STEPS, NUM_CHUNKS = 16, 63
+# Of the twin; nothing is trained on it.
+SEED = 30_001
+TASK = "stand_bottle"
+TOUCH_ONLY = ReturnSelector(cameras=())
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A world, a start that it takes, and the commanded actions of a demonstration from there."""
+
+    world: BatchWorld[Any]
+    start: RolloutStart
+    actions: np.ndarray
+
+    def still(self, num_steps: int = CHUNK_STEPS) -> np.ndarray:
+        """Commands to stay where the rollout begins."""
+        observation = self.start.observation
+        if observation is None:
+            raise InvalidInputError("stress: a world model starts from an observation")
+        return np.repeat(observation.action_reached[-1:], num_steps, axis=0)
+
+    def touching(self, pressure_kpa: float) -> RolloutStart:
+        """The start with every taxel at one pressure."""
+        observation = self.start.observation
+        if observation is None:
+            raise InvalidInputError("stress: a world model starts from an observation")
+        tactile_kpa = np.full_like(observation.tactile_kpa, pressure_kpa)
+        return replace(self.start, observation=replace(observation, tactile_kpa=tactile_kpa))
+
+    def step(self, actions: np.ndarray, start: RolloutStart | None = None) -> Observation:
+        """What the world answers to the first chunk."""
+        state = self.world.reset(start or self.start).state
+        return self.world.step(state, actions, seed=1).observation
+
+
+@cache
+def twin_start(image_px: int) -> tuple[RolloutStart, np.ndarray]:
+    """The first observation of a demonstration of the twin, and its commanded actions."""
+    settings = TwinSettings(cameras=(CAMERA,), image_height_px=image_px, image_width_px=image_px)
+    world, stage = TwinWorld(settings), Stage(TASK, "robot", settings)
+    begun = world.reset(RolloutStart(TASK, SEED, stage.task.instruction))
+    start = RolloutStart(
+        TASK,
+        SEED,
+        stage.task.instruction,
+        observation=begun.observation,
+        anchor=begun.anchor,
+        K_head=begun.K_head,
+    )
+    return start, actions_from_poses(stage.plan(SEED).commands, begun.anchor)[1:]
+
+
+def check_rotations(check: Check, subject: Subject) -> None:
+    """Commands whose rotation is nearly lost, and turns by π."""
+    for sine, is_taken in ((2e-6, True), (5e-7, False)):
+        actions = subject.still()
+        actions[5, WRIST_LEFT.start + 3 : WRIST_LEFT.stop] = [1.0, 0.0, 0.0, 1.0, sine, 0.0]
+        if is_taken:
+            check_answer(check, subject.step(actions))
+        else:
+            check.refused(
+                f"columns of sine {sine:g}",
+                lambda a=actions: subject.step(a),  # type: ignore[misc]
+                DegenerateRotationError,
+            )
+    turned = subject.still()
+    turned[8:, WRIST_LEFT.start + 3 : WRIST_LEFT.stop] = [-1.0, 0, 0, 0, -1.0, 0]
+    check_answer(check, subject.step(turned))
+
+
+def check_non_finite(check: Check, subject: Subject) -> None:
+    """NaN, infinity, denormal and huge numbers in actions and starts."""
+    state = subject.world.reset(subject.start).state
+    before = subject.world.snapshot(state)
+    for bad in (np.nan, np.inf, -np.inf):
+        for column in (0, 5, JOINTS_LEFT.start):
+            actions = subject.still()
+            actions[7, column] = bad
+            check.refused(
+                f"{bad} in actions",
+                lambda a=actions: subject.world.step(state, a, seed=1),  # type: ignore[misc]
+                NonFiniteError,
+            )
+        start = subject.touching(bad)
+        check.refused(f"{bad} kPa", lambda s=start: subject.step(subject.still(), s))  # type: ignore[misc]
+    for what, column, value in (("1e3 m", 0, 1e3), ("1e300 rad", JOINTS_LEFT.start, 1e300)):
+        actions = subject.still()
+        actions[7, column] = value
+        check.refused(what, lambda a=actions: subject.world.step(state, a, seed=1))  # type: ignore[misc]
+    check.true("refused chunks leave the state as it was", subject.world.snapshot(state) == before)
+    tiny = subject.still()
+    tiny[:, 0] = 5e-324
+    check_answer(check, subject.step(tiny, subject.touching(1e-40)))
+
+
+def check_touch(check: Check, subject: Subject, trained_kpa: float) -> None:
+    """Zero, negative and saturated touch: never more comes out than went in or was trained."""
+    for pressure_kpa in (0.0, -5.0, 2.0, 650.0, 99_999.0):
+        observation = subject.step(subject.still(), subject.touching(pressure_kpa))
+        check_answer(check, observation)
+        excess = observation.tactile_kpa.max() / max(pressure_kpa, trained_kpa)
+        check.at_most("peak out over the larger of peak in and trained peak", excess, 1.0 + 1e-6)
+    check.refused("2e5 kPa", lambda: subject.step(subject.still(), subject.touching(2e5)))
+
+
+def check_chunk_ends(check: Check, subject: Subject) -> None:
+    """The shortest and longest chunks, and those beyond."""
+    about = subject.world.description
+    for num in (about.chunk_multiple, about.max_chunk_steps):
+        observation = subject.step(subject.still(num))
+        check.true(f"a chunk of {num} steps gives {num}", len(observation) == num)
+    for num in (0, 1, about.chunk_multiple + 1, about.max_chunk_steps + about.chunk_multiple):
+        check.refused(f"{num} steps", lambda n=num: subject.step(subject.still(n)), ShapeError)  # type: ignore[misc]
+
+
+def check_batch(check: Check, subject: Subject, *, max_kpa: float) -> None:
+    """Three rollouts at once and alone, one of them with saturated touch."""
+    starts = [subject.start, subject.touching(650.0), subject.start]
+    chunks = np.stack([subject.actions[:16], subject.still(), subject.still()])
+    states = [subject.world.reset(start).state for start in starts]
+    together = subject.world.step_batch(states, chunks, seeds=[1, 1, 1])
+    for index, stepped in enumerate(together):
+        alone = subject.world.step(states[index], chunks[index], seed=1).observation
+        touch = np.abs(stepped.observation.tactile_kpa - alone.tactile_kpa).max()
+        check.at_most("touch differs", touch, max_kpa, "kPa")
+        images = stepped.observation.images[CAMERA].astype(int) - alone.images[CAMERA]
+        check.at_most("images differ", np.abs(images).max(), 1, "levels")
+    check.refused("no rollout", lambda: subject.world.step_batch([], chunks[:0], seeds=[]))
+
+
+def still_peaks_kpa(subject: Subject) -> list[float]:
+    """Largest pressure of each of 63 chunks while hands that nothing touches stand still."""
+    state = subject.world.reset(subject.touching(0.0)).state
+    peaks = []
+    for chunk in range(NUM_CHUNKS):
+        stepped = subject.world.step(state, subject.still(), seed=chunk, selector=TOUCH_ONLY)
+        state = stepped.state
+        peaks.append(float(stepped.observation.tactile_kpa.max()))
+    return peaks
+
+
+def there_and_back(actions: np.ndarray) -> Sequence[np.ndarray]:
+    """63 chunks of a demonstration, forth and back again and again."""
+    whole = actions[: len(actions) // CHUNK_STEPS * CHUNK_STEPS]
+    rounds = np.concatenate([whole, whole[::-1]])
+    wanted = np.arange(NUM_CHUNKS * CHUNK_STEPS) % len(rounds)
+    return [rounds[wanted[k : k + CHUNK_STEPS]] for k in range(0, len(wanted), CHUNK_STEPS)]
+
+
+def check_answer(check: Check, observation: Observation) -> None:
+    """An answer of finite numbers, with pressures of 0 or more."""
+    check.finite("touch", observation.tactile_kpa)
+    check.at_most("pressure below zero", -float(observation.tactile_kpa.min()), 0.0, "kPa")
+    check.true("images are whole", observation.images[CAMERA].dtype == np.uint8)
+    if observation.object_poses is not None:
+        check.finite("object poses", observation.object_poses)
+        length = np.linalg.norm(observation.object_poses[..., 3:], axis=-1)
+        check.at_most("quaternions off length 1", np.abs(length - 1).max(), 1e-5)
