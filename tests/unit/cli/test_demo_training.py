@@ -1,0 +1,36 @@
+"""`dextouch demo --train`: its commands are ones that the trainers take, in a sound order."""
+
+import pytest
+
+from services.cli import train
+from services.cli.demo import models
+from services.world_model.__main__ import _parse
+from services.world_model.settings import TrainStateCommand
+
+
+class LoadedError(Exception):
+    """Tells which files would be loaded."""
+
+
+def load(*paths):
+    raise LoadedError(*paths)
+
+
+def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, monkeypatch):
+    called = []
+    monkeypatch.setattr(train, "main", lambda words: called.append(list(words)) or 0)
+    monkeypatch.setattr(models, "_load", load)
+    with pytest.raises(LoadedError) as caught:
+        models.train_models(tmp_path)
+    world_model, _, probe = caught.value.args
+    words = [word for word, *_ in called]
+    assert words == ["data"] * 4 + ["state", "policy", "imagined", "probe"]
+    settings = _parse(TrainStateCommand, called[words.index("state")][1:])
+    assert settings.output == world_model
+    assert settings.tasks == ("stand_bottle", "stack_bowls")
+    assert settings.episodes == (str(tmp_path / "episodes"), str(tmp_path / "endings"))
+    assert (settings.num_members, settings.core.num_steps) == (1, 1500)
+    imagined, judged = called[words.index("imagined")], called[words.index("probe")]
+    assert imagined[imagined.index("--checkpoint") + 1] == str(world_model)
+    assert imagined[imagined.index("--store") + 1] in judged
+    assert judged[-1] == str(probe)
