@@ -223,12 +223,17 @@ def read_ending_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> li
         tasks: only these; empty for all.
 
     Raises:
-        NotFoundError: not one such episode.
+        NotFoundError: not one such episode, or a store without any.
         ConflictError: two stores hold an episode of the same id.
     """
     found: dict[str, EndingEpisode] = {}
-    for store in stores:
-        for episode_id in sorted(store.list(kind="episode")):
+    for place, store in enumerate(stores, 1):
+        names = sorted(store.list(kind="episode"))
+        if not names:
+            raise NotFoundError(
+                f"store {place} of the {len(stores)} given holds no episode; check its path"
+            )
+        for episode_id in names:
             reader = store.open(episode_id)
             about = reader.attributes
             if about.domain != "robot" or (tasks and about.task not in tasks):

@@ -93,6 +93,8 @@ def test_stores_add_up_but_no_episode_counts_twice(url, tmp_path):
     assert len(read_demonstrations(EpisodeStore(url), more)) == 25
     with pytest.raises(ConflictError, match="in two stores"):
         read_demonstrations(EpisodeStore(url), more, EpisodeStore(url))
+    with pytest.raises(NotFoundError, match="store 2 of the 2 given"):
+        read_demonstrations(EpisodeStore(url), EpisodeStore(str(tmp_path / "typo")))
 
 
 def test_an_unknown_outcome_is_refused(tmp_path):
