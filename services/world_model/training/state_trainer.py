@@ -7,6 +7,7 @@ interrupted run goes on with those that are missing.
 import hashlib
 import multiprocessing
 import time
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -286,10 +287,19 @@ def _assembled(work: _Work, codec: TouchCodec) -> DynamicsModel:
 
 def _command(settings: StateTrainSettings) -> str:
     """The command that repeats a run; stores go by their last name, since folders do not travel."""
-    given = settings.model_dump(mode="json", exclude_defaults=True, exclude={"output", "episodes"})
-    stores = [url.rstrip("/").rsplit("/", 1)[-1] for url in settings.episodes]
-    flags = [f"--episodes={','.join(stores)}"]
+    left_out = {"output", "episodes", "jobs", "json_path"}
+    given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
+    flags = [f"--episodes={url.rstrip('/').rsplit('/', 1)[-1]}" for url in settings.episodes]
+    return " ".join(["dextouch train state", *flags, *_flags("", given)])
+
+
+def _flags(prefix: str, given: Mapping[str, object]) -> list[str]:
+    found: list[str] = []
     for name, value in given.items():
-        items = value.items() if isinstance(value, dict) else [("", value)]
-        flags += [f"--{name}{'.' if inner else ''}{inner}={one}" for inner, one in items]
-    return " ".join(["dextouch train state", *flags])
+        if isinstance(value, dict):
+            found += _flags(f"{prefix}{name}.", value)
+        elif isinstance(value, list):
+            found += [f"--{prefix}{name}={one}" for one in value]
+        else:
+            found.append(f"--{prefix}{name}={value}")
+    return found

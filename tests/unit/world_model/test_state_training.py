@@ -1,10 +1,12 @@
 """Start readers and cores learn a toy scene: a bright block that a descending hand presses."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from pydantic_settings import CliApp
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.cameras import pinhole_matrix, project
@@ -12,7 +14,12 @@ from dextouch.geometry.transforms import apply, invert, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.settings import CoreSettings, ReaderSettings
+from services.world_model.settings import (
+    CoreLossWeights,
+    CoreSettings,
+    ReaderSettings,
+    TrainStateCommand,
+)
 from services.world_model.state_checkpoints import StateBounds
 from services.world_model.training.core_training import CoreData, touch_latents, train_core
 from services.world_model.training.reader_training import (
@@ -23,6 +30,7 @@ from services.world_model.training.reader_training import (
 from services.world_model.training.scene_episodes import SceneEpisode
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
+from services.world_model.training.state_trainer import _command
 
 PX, NUM_STEPS = 32, 17
 K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))
@@ -178,3 +186,19 @@ def test_a_task_has_one_number_of_objects():
     with pytest.raises(InvalidInputError, match="press"):
         vocabulary([episode(0), two])
     assert vocabulary([episode(0), episode(2)]) == (("press",), (1,))
+
+
+def test_the_command_in_a_checkpoint_can_be_typed_again():
+    settings = TrainStateCommand(
+        episodes=("file:///data/takes", "more"),
+        tasks=("press",),
+        core=CoreSettings(num_steps=7, weights=CoreLossWeights(touch=0.0)),
+        json=Path("/somewhere/figures.json"),
+    )
+    command = _command(settings)
+    assert command.startswith("dextouch train state --episodes=takes --episodes=more ")
+    assert "/" not in command
+    again = CliApp.run(TrainStateCommand, cli_args=command.split()[3:])
+    assert again.core.num_steps == 7
+    assert again.core.weights.touch == 0.0
+    assert again.tasks == ("press",)
