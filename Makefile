@@ -65,7 +65,8 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/imagined \
 		--development $(MADE)/development --development $(MADE)/imagined_development \
-		--output $(MADE)/success_probe.safetensors
+		--output $(MADE)/success_probe.safetensors --training.num_training_steps 6000 --training.max_cpu_s 300 \
+		--training.held_out_share 0.1
 	$(BIN)/dextouch bench evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
 		--keep $(MADE)/evaluator --out $(MADE)/bench
 
