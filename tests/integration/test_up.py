@@ -90,7 +90,7 @@ async def test_a_saved_take_becomes_an_episode_by_itself(solver, tmp_path, monke
     running = asyncio.create_task(up.run(settings, stop))
     urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
     async with httpx.AsyncClient(trust_env=False, timeout=60) as client:
-        recording_id = await save_a_take(client, urls["acquisition"], 3.0)
+        recording_id = await save_a_take(client, urls["acquisition"], 6.0)
         jobs = []
         while not jobs or jobs[0]["state"] in {"waiting", "running"}:
             await asyncio.sleep(0.2)
