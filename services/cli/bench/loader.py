@@ -13,7 +13,7 @@ from services.cli.bench.report import ResultTable, StageReport
 from services.cli.bench.rounds import interleaved
 from services.cli.bench.stages import Bar
 from services.cli.data_mix import MIXES
-from services.cli.training_data import make_training_data
+from services.cli.training_data import Scope, make_training_data
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
@@ -115,8 +115,9 @@ def _ignoring_round(work: Callable[[], float]) -> Callable[[int], float]:
 
 
 def _make_episodes(folder: Path, num_episodes: int) -> str:
-    seeds = range(-(-num_episodes // len(TASK_NAMES)))
-    make_training_data(str(folder), seeds, MIXES["demonstrations"])
+    tasks = TASK_NAMES[:num_episodes]
+    seeds = range(-(-num_episodes // len(tasks)))
+    make_training_data(str(folder), seeds, MIXES["demonstrations"], scope=Scope(tasks))
     return str(folder)
 
 
