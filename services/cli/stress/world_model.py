@@ -9,7 +9,7 @@ from dextouch.errors import InvalidInputError
 from services.cli.stress import worlds
 from services.cli.stress.cells import Check, StageCells
 from services.cli.stress.worlds import CAMERA, Subject
-from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
+from services.world_model.checkpoints import Checkpoint, paper_form_checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel
@@ -70,7 +70,7 @@ def _precision(check: Check) -> None:
     off = np.abs(coarse.images[CAMERA].astype(int) - exact.images[CAMERA]).max()
     check.at_most("bfloat16 products: images off", off, _BFLOAT16_LEVELS, "levels")
     for dtype in (torch.bfloat16, torch.float16, torch.float64):
-        model = read_checkpoint(default_checkpoint()).model.to(dtype)
+        model = read_checkpoint(paper_form_checkpoint()).model.to(dtype)
         checkpoint = Checkpoint(model, _checkpoint().metadata, _checkpoint().digest)
         broken = Subject(ModelWorld(checkpoint), subject.start, subject.actions)
         check.refused(
@@ -130,7 +130,7 @@ STAGE.does_not_apply(
 
 @cache
 def _checkpoint() -> Checkpoint:
-    return read_checkpoint(default_checkpoint())
+    return read_checkpoint(paper_form_checkpoint())
 
 
 @cache

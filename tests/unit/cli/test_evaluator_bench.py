@@ -68,17 +68,17 @@ def test_arrays_come_back_or_are_refused(tmp_path):
 def plan(tmp_path_factory):
     torch.set_num_threads(1)
     keep = tmp_path_factory.mktemp("kept")
-    return StudyPlan(keep, None, DEFAULT_PROBE, ("stand_bottle",), (77,), levels_mm=(0.0,))
+    return StudyPlan(keep, None, DEFAULT_PROBE, ("stand_bottle",), (39_077,), levels_mm=(0.0,))
 
 
 def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
     study, path = work.Study(plan), plan.keep / "rollouts.jsonl"
-    missing = study.missing(KeptRows(path), "stand_bottle", 77)
+    missing = study.missing(KeptRows(path), "stand_bottle", 39_077)
     assert missing == ["script 0 mm", *IDLE]
     # Killed in the first policy, after its two rollouts and before its verdicts.
-    rows = study.rows("stand_bottle", 77, ["script 0 mm"])
+    rows = study.rows("stand_bottle", 39_077, ["script 0 mm"])
     KeptRows(path).add([next(rows), next(rows)])
-    assert study.missing(KeptRows(path), "stand_bottle", 77) == missing
+    assert study.missing(KeptRows(path), "stand_bottle", 39_077) == missing
 
     def refuse(*_: object) -> None:
         raise AssertionError("rolled out again")
@@ -86,8 +86,8 @@ def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
     for name in ("play_in_twin", "play_in_imagination"):
         monkeypatch.setattr(work, name, refuse)
     kept = KeptRows(path)
-    kept.add(study.rows("stand_bottle", 77, ["script 0 mm"]))
-    assert study.missing(KeptRows(path), "stand_bottle", 77) == list(IDLE)
+    kept.add(study.rows("stand_bottle", 39_077, ["script 0 mm"]))
+    assert study.missing(KeptRows(path), "stand_bottle", 39_077) == list(IDLE)
     figures, failed = figures_of_tasks(study, kept)
     assert failed == len(IDLE)
     assert [row["real"] for row in figures[0].policy_rows()] == [1.0]
@@ -99,11 +99,11 @@ def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
 
 def test_starts_of_the_training_are_refused(plan):
     study = work.Study(plan)
-    first = work.start_in_twin(study.twin, "stand_bottle", 77, "")[0].observation
+    first = work.start_in_twin(study.twin, "stand_bottle", 39_077, "")[0].observation
     digest = work.first_digest(first)
     study.probe.metadata = study.probe.metadata.model_copy(update={"training_starts": (digest,)})
     with pytest.raises(ConflictError, match="trained on by the success probe"):
-        next(study.rows("stand_bottle", 77, ["hold"]))
+        next(study.rows("stand_bottle", 39_077, ["hold"]))
 
 
 def test_contact_f1_by_hand():

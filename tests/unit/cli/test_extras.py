@@ -135,7 +135,9 @@ def test_commands_name_the_extra_that_is_missing(tmp_path, installed, refused):
     for line in refused:
         assert answers[line][0] == 3, answers[line]
         assert named[line][1] not in installed
-        assert len(answers[line][1].splitlines()) == 1
+        # Ports of the machine may be taken by others; `up` says so before.
+        told = [text for text in answers[line][1].splitlines() if "is taken" not in text]
+        assert len(told) == 1
 
 
 def test_up_says_that_a_service_can_be_left_out(tmp_path):
