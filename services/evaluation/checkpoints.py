@@ -69,8 +69,8 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
     unfinished.replace(path)
 
 
-def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
-    """Read a checkpoint of one kind, or of one of several.
+def load_checkpoint(path: Path, *, kind: str) -> Checkpoint:
+    """Read a checkpoint of one kind.
 
     Raises:
         NotFoundError: no such file.
@@ -88,11 +88,10 @@ def load_checkpoint(path: Path, *, kind: str | tuple[str, ...]) -> Checkpoint:
     except SafetensorError as error:
         raise CorruptDataError(f"checkpoint {path.name!r}: no safetensors ({error})") from error
     metadata = _parse_metadata(text, path.name)
-    kinds = (kind,) if isinstance(kind, str) else kind
-    if metadata.kind not in kinds or metadata.format_version != FORMAT_VERSION:
+    if metadata.kind != kind or metadata.format_version != FORMAT_VERSION:
         raise InvalidInputError(
             f"checkpoint {path.name!r}: got {metadata.kind} version {metadata.format_version}, "
-            f"expected {' or '.join(kinds)} version {FORMAT_VERSION}"
+            f"expected {kind} version {FORMAT_VERSION}"
         )
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):

@@ -17,9 +17,8 @@ from services.evaluation.calibration import Calibration, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
 from services.evaluation.endings import Ending
 from services.evaluation.judge_network import ProbeNetwork, ProbeShape, probe_batch
-from services.evaluation.success_probe_2 import KIND_2, ProbeNetwork2
 
-# Version 3 of the network; checkpoints of the first are refused by this name.
+# Version 3 of the network; checkpoints of the first two are refused by this name.
 KIND = "success-probe-3"
 DECISION_THRESHOLD = 0.5
 Decision = Literal["success", "failure", "cannot tell"]
@@ -63,15 +62,14 @@ class SuccessProbe:
             for name, values in settings.get("calibration", {}).items()
         }
         self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
-        is_old = checkpoint.metadata.kind == KIND_2
-        self._network = (ProbeNetwork2 if is_old else ProbeNetwork)(self.shape)
+        self._network = ProbeNetwork(self.shape)
         load_weights(self._network, checkpoint, prefix="network")
         self._network.eval()
 
     @classmethod
     def load(cls, path: Path) -> "SuccessProbe":
         """A probe from its file."""
-        return cls(load_checkpoint(path, kind=(KIND, KIND_2)))
+        return cls(load_checkpoint(path, kind=KIND))
 
     def calibration(self, task: str, *, imagined: bool) -> Calibration:
         """How log odds of a task's endings become probabilities.
@@ -92,11 +90,6 @@ class SuccessProbe:
         """
         if not endings:
             raise InvalidInputError("success probe: got no endings, expected at least one")
-        if self.metadata.kind == KIND_2 and any(e.images is None for e in endings):
-            raise InvalidInputError(
-                f"success probe: got an ending without images, which a probe of {KIND_2} needs; "
-                "train it anew"
-            )
         parts = [endings[at : at + _BATCH] for at in range(0, len(endings), _BATCH)]
         with torch.no_grad():
             odds = [self._network(probe_batch(part, self.shape)) for part in parts]

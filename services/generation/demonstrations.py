@@ -61,30 +61,8 @@ def imagine_episode(
         raise InvalidInputError(
             f"episode {attributes.episode_id!r}: has no commanded actions to play in {world!r}"
         )
-    window = source.window(0, source.num_steps, cameras=(CAMERA,))
     commanded = source.read("action_commanded").values
-    first = Observation(
-        first_step=0,
-        images={CAMERA: window.images[CAMERA][:1]},
-        tactile_kpa=window.tactile_kpa[:1],
-        action_reached=window.actions[:1],
-        reached_is_measured=True,
-    )
-    seen = [first]
-    with client.start(
-        world=world,
-        task=attributes.task,
-        seed=attributes.seed or 0,
-        instruction=attributes.instruction,
-        init=(first, window.anchor, window.K_head),
-    ) as rollout:
-        seen.extend(
-            rollout.step(
-                commanded[begin:end],
-                selector=None if shown else ReturnSelector(cameras=()),
-            )
-            for begin, end, shown in _chunks(len(commanded), image_steps)
-        )
+    seen = _played(source, commanded, client, world, image_steps)
     lineage = (
         *attributes.lineage,
         LineageEntry(kind="episode", id=attributes.episode_id, sha256=source.content_sha256),
@@ -104,6 +82,42 @@ def imagine_episode(
     )
     _write(store, imagined, seen, commanded)
     return name
+
+
+def _played(
+    source: EpisodeReader,
+    commanded: np.ndarray,
+    client: RolloutClient,
+    world: str,
+    image_steps: Collection[int] | None,
+) -> list[Observation]:
+    """What the world shows of an episode's commands, its first observation included."""
+    attributes = source.attributes
+    window = source.window(0, source.num_steps, cameras=(CAMERA,))
+    first = Observation(
+        first_step=0,
+        images={CAMERA: window.images[CAMERA][:1]},
+        tactile_kpa=window.tactile_kpa[:1],
+        action_reached=window.actions[:1],
+        reached_is_measured=True,
+    )
+    with client.start(
+        world=world,
+        task=attributes.task,
+        seed=attributes.seed or 0,
+        instruction=attributes.instruction,
+        init=(first, window.anchor, window.K_head),
+    ) as rollout:
+        return [
+            first,
+            *(
+                rollout.step(
+                    commanded[begin:end],
+                    selector=None if shown else ReturnSelector(cameras=()),
+                )
+                for begin, end, shown in _chunks(len(commanded), image_steps)
+            ),
+        ]
 
 
 def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:

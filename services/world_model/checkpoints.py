@@ -1,34 +1,21 @@
-"""A model and its history in, one safetensors file named by its SHA-256 out, and strictly back."""
+"""Checkpoints of the paper's form, and which checkpoint comes with the package."""
 
 import hashlib
-import json
-from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
 
-import torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor, nn
+from pydantic import BaseModel, ConfigDict, Field
 
-from dextouch.errors import (
-    CorruptDataError,
-    InvalidInputError,
-    LimitExceededError,
-    NonFiniteError,
-    NotFoundError,
-    UnknownNameError,
-)
+from dextouch.errors import InvalidInputError, UnknownNameError
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
+from services.world_model.weights import half_weights, load_strictly, read_weights, write_weights
 
 FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_world_model"
 # Statistics that files of older releases do not hold; the network's own defaults stand in.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
-MAX_CHECKPOINT_BYTES = 64 * 2**20
 PRETRAINED = Path(__file__).parent / "pretrained"
 STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
@@ -68,55 +55,23 @@ class Checkpoint:
     digest: str
 
 
-def to_bytes(model: JointWorldModel, metadata: CheckpointMetadata) -> bytes:
-    """The checkpoint file. Learned weights are stored as float16, statistics as float32."""
-    learned = {name for name, _ in model.named_parameters()}
-    tensors = {
-        name: (tensor.half() if name in learned else tensor).contiguous()
-        for name, tensor in model.state_dict().items()
-    }
-    _refuse_non_finite(tensors, "checkpoint to be written")
-    return save(tensors, {METADATA_KEY: metadata.model_dump_json()})
-
-
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
     """Write the file in one move and return its digest."""
-    data = to_bytes(model, metadata)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(path.suffix + ".partial")
-    partial.write_bytes(data)
-    partial.replace(path)
-    return hashlib.sha256(data).hexdigest()
+    return write_weights(path, half_weights(model), metadata, METADATA_KEY)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
     """Load a checkpoint strictly, in float32, ready to predict.
 
     Raises:
-        NotFoundError: no such file.
-        LimitExceededError: larger than 64 MiB.
-        CorruptDataError: no safetensors file, or without our metadata.
+        NotFoundError, LimitExceededError, CorruptDataError: as `read_weights`.
         InvalidInputError: another format version; tensors missing, foreign or of other shapes.
         NonFiniteError: weights that are NaN or infinite.
     """
-    if not path.is_file():
-        raise NotFoundError(f"checkpoint: no file {path.name} in {path.parent}")
-    size = path.stat().st_size
-    if size > MAX_CHECKPOINT_BYTES:
-        raise LimitExceededError(
-            f"checkpoint {path.name}: got {size} bytes, expected at most {MAX_CHECKPOINT_BYTES}"
-        )
-    try:
-        with safe_open(path, framework="pt") as file:
-            notes = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise CorruptDataError(f"checkpoint {path.name}: no safetensors file ({error})") from error
-    metadata = _metadata(notes, path.name)
+    tensors, metadata, digest = read_weights(path, CheckpointMetadata, METADATA_KEY)
     model = JointWorldModel(metadata.network)
-    _load_strictly(model, tensors, path.name)
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    return Checkpoint(model.eval().requires_grad_(requires_grad=False), metadata, digest)
+    load_strictly({"": model}, tensors, where=f"checkpoint {path.name}", later=LATER_STATISTICS)
+    return Checkpoint(model, metadata, digest)
 
 
 def find_checkpoint(folder: Path, digest: str) -> Path:
@@ -154,46 +109,3 @@ def default_checkpoint() -> Path:
 def paper_form_checkpoint() -> Path:
     """The checkpoint of the paper's form that comes with the package."""
     return PRETRAINED / PAPER_FORM
-
-
-def _metadata(notes: Mapping[str, str], name: str) -> CheckpointMetadata:
-    if METADATA_KEY not in notes:
-        raise CorruptDataError(
-            f"checkpoint {name}: has no {METADATA_KEY!r} metadata; it is no world model of ours"
-        )
-    try:
-        version = json.loads(notes[METADATA_KEY]).get("format_version")
-        if version != FORMAT_VERSION:
-            raise InvalidInputError(
-                f"checkpoint {name}: format version {version}, expected {FORMAT_VERSION}; "
-                "train it anew with this version"
-            )
-        return CheckpointMetadata.model_validate_json(notes[METADATA_KEY])
-    except (ValidationError, json.JSONDecodeError, AttributeError) as error:
-        raise CorruptDataError(f"checkpoint {name}: metadata unreadable ({error})") from error
-
-
-def _load_strictly(model: nn.Module, tensors: Mapping[str, Tensor], name: str) -> None:
-    expected = model.state_dict()
-    tensors = {**{key: expected[key] for key in LATER_STATISTICS}, **tensors}
-    missing = sorted(expected.keys() - tensors.keys())
-    foreign = sorted(tensors.keys() - expected.keys())
-    if missing or foreign:
-        raise InvalidInputError(
-            f"checkpoint {name}: {len(missing)} tensors missing {missing[:3]}, {len(foreign)} "
-            f"foreign {foreign[:3]}; expected exactly those of its own network settings"
-        )
-    for key, tensor in tensors.items():
-        if tensor.shape != expected[key].shape or not tensor.is_floating_point():
-            raise InvalidInputError(
-                f"checkpoint {name}: {key} is {tensor.dtype} {tuple(tensor.shape)}, expected "
-                f"floating point {tuple(expected[key].shape)}"
-            )
-    _refuse_non_finite(tensors, f"checkpoint {name}")
-    model.load_state_dict({key: tensor.float() for key, tensor in tensors.items()})
-
-
-def _refuse_non_finite(tensors: Mapping[str, Tensor], where: str) -> None:
-    bad = [key for key, tensor in tensors.items() if not torch.isfinite(tensor).all()]
-    if bad:
-        raise NonFiniteError(f"{where}: NaN or infinity in {bad[:3]} ({len(bad)} tensors)")

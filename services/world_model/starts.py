@@ -1,37 +1,108 @@
-"""Starts of rollouts as every world of this service takes them: from one observed step."""
+"""Starts of rollouts as both forms of the world model take them: one observed step, checked."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.hands.actions import AnchorPoses
+from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.worlds.world import Observation, RolloutStart
 
 CAMERA: Final = "camera_head"
+# Farther poses and larger cameras are mistakes of units or frames.
+MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 
 
-def complete_start(
-    start: RolloutStart,
-) -> tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]:
-    """The observation of a start, the poses it refers to, and the head camera's matrix.
+@dataclass(frozen=True)
+class ObservedStart:
+    """The step that a rollout begins with; its arrays are copies.
+
+    Touch is not below zero; the pose parts of `reached` are the identity, since the poses of
+    step 0 are what actions are relative to.
+    """
+
+    image: UInt8[np.ndarray, "h w 3"]
+    tactile_kpa: Float32[np.ndarray, "2 320"]
+    reached: Float64[np.ndarray, "67"]
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+    def observation(
+        self, object_poses: Float32[np.ndarray, "1 objects 7"] | None = None
+    ) -> Observation:
+        """The step as a world's first answer."""
+        return Observation(
+            first_step=0,
+            images={CAMERA: self.image[None].copy()},
+            tactile_kpa=self.tactile_kpa[None].copy(),
+            action_reached=self.reached[None].copy(),
+            reached_is_measured=True,
+            object_poses=object_poses,
+        )
+
+
+def observed_start(start: RolloutStart, *, tasks: Sequence[str]) -> ObservedStart:
+    """The observed step of a start.
+
+    Args:
+        start: of a rollout.
+        tasks: that the world knows.
 
     Raises:
         InvalidInputError: no observation, anchor or K_head.
-        UnknownNameError: no image of the head camera.
+        UnknownNameError: another task, or no image of the head camera.
         ShapeError: more than one observed step.
         NonFiniteError: NaN or infinity in touch.
     """
-    if start.observation is None or start.anchor is None or start.K_head is None:
+    if start.task not in tasks:
+        raise UnknownNameError("task", start.task, list(tasks))
+    observation = start.observation
+    if observation is None or start.anchor is None or start.K_head is None:
         raise InvalidInputError(
             "start: this world begins from an observation; send one step of images, touch and "
             "reached action together with the anchor poses and K_head"
         )
-    if CAMERA not in start.observation.images:
+    if CAMERA not in observation.images:
         raise UnknownNameError("camera of the start", "none of them", [CAMERA])
-    if len(start.observation) != 1:
-        raise ShapeError(f"start: got {len(start.observation)} observed steps, expected one")
-    if not np.isfinite(start.observation.tactile_kpa).all():
-        raise NonFiniteError("start: touch holds NaN or infinity; mend or mask the sensor first")
-    return start.observation, start.anchor, start.K_head
+    if len(observation) != 1:
+        raise ShapeError(f"start: got {len(observation)} observed steps, expected one")
+    if not np.isfinite(observation.tactile_kpa).all():
+        raise NonFiniteError("start: touch holds NaN or infinity; mask the sensor first")
+    reached = observation.action_reached[-1].copy()
+    for part in POSE_SLICES:
+        reached[part] = IDENTITY_POSE_9D
+    return ObservedStart(
+        image=observation.images[CAMERA][-1].copy(),
+        tactile_kpa=np.maximum(observation.tactile_kpa[-1], 0.0),
+        reached=reached,
+        anchor=start.anchor,
+        K_head=np.array(start.K_head),
+    )
+
+
+def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> None:
+    """Refuse poses far from the world's origin, and cameras that see nothing.
+
+    Raises:
+        InvalidInputError: an anchor farther than 5 m, a focal length or principal point out of
+            all proportion.
+        NonFiniteError: NaN or infinity.
+    """
+    Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
+    if not (np.isfinite(Ts).all() and np.isfinite(K_head).all()):
+        raise NonFiniteError("start: anchor or K_head hold NaN or infinity")
+    far_m = float(np.abs(Ts[:, :3, 3]).max())
+    if far_m > MAX_ANCHOR_M:
+        raise InvalidInputError(
+            f"start: an anchor pose lies {far_m:.3g} m from the world's origin, expected at most "
+            f"{MAX_ANCHOR_M} m; give poses in the frame of the table"
+        )
+    focal_px, centre_px = np.diag(K_head)[:2], np.abs(K_head[:2, 2])
+    if focal_px.min() < 1.0 or max(focal_px.max(), centre_px.max()) > MAX_CAMERA_PX:
+        raise InvalidInputError(
+            f"start: K_head has focal lengths {focal_px.tolist()} and centre "
+            f"{K_head[:2, 2].tolist()} px, expected 1 … {MAX_CAMERA_PX:.0f} px"
+        )

@@ -1,32 +1,24 @@
 """Checkpoints of state models: dynamics and renderer in one safetensors file with its history."""
 
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-from pydantic import BaseModel, ConfigDict, ValidationError
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
-from torch import Tensor
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from dextouch.errors import (
-    CorruptDataError,
-    InvalidInputError,
-    LimitExceededError,
-    NonFiniteError,
-    NotFoundError,
-)
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.rendering.checkpoints import renderer_from_tensors, renderer_tensors
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork
+from services.world_model.weights import (
+    half_weights,
+    holds,
+    load_strictly,
+    read_weights,
+    write_weights,
+)
 
 FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_state_model"
-MAX_CHECKPOINT_BYTES = 64 * 2**20
 _DYNAMICS, _RENDERER = "dynamics.", "renderer."
 
 
@@ -39,9 +31,9 @@ class StateBounds(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    disagreement_m: float = 1.0
-    distance: float = 1.0
-    horizon_latents: int = 20
+    disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
+    distance: float = Field(default=1.0, gt=0, allow_inf_nan=False)
+    horizon_latents: int = Field(default=20, ge=1)
 
 
 class StateMetadata(BaseModel):
@@ -52,7 +44,7 @@ class StateMetadata(BaseModel):
     format_version: int = FORMAT_VERSION
     name: str
     dynamics: DynamicsConfig
-    num_members: int
+    num_members: int = Field(ge=1, le=16)
     renderer: RendererConfig
     object_names: dict[str, tuple[str, ...]]
     object_boxes_m: dict[str, tuple[tuple[float, ...], ...]]
@@ -65,6 +57,20 @@ class StateMetadata(BaseModel):
     training_seeds: dict[str, tuple[int, int]]
     data_hash: str
     metrics: dict[str, float] = {}
+
+    @model_validator(mode="after")
+    def _names_and_boxes_fit_the_tasks(self) -> "StateMetadata":
+        for task, count in zip(self.dynamics.tasks, self.dynamics.num_objects, strict=True):
+            boxes = self.object_boxes_m.get(task, ())
+            if (
+                len(self.object_names.get(task, ())) != count
+                or [len(b) for b in boxes] != [6] * count
+            ):
+                raise ValueError(
+                    f"task {task!r}: got names {self.object_names.get(task)} and {len(boxes)} "
+                    f"boxes, expected {count} of each, six numbers a box"
+                )
+        return self
 
 
 @dataclass(frozen=True)
@@ -79,109 +85,28 @@ class StateCheckpoint:
 
 def is_state_checkpoint(path: Path) -> bool:
     """Whether a safetensors file says that it holds a state model."""
-    try:
-        with safe_open(path, framework="pt") as file:
-            return METADATA_KEY in (file.metadata() or {})
-    except (SafetensorError, OSError):
-        return False
+    return holds(path, METADATA_KEY)
 
 
 def write_state_checkpoint(
     path: Path, dynamics: DynamicsModel, renderer: RendererNetwork, metadata: StateMetadata
 ) -> str:
-    """Write the file in one move and return its digest.
-
-    Learned weights are stored as float16, statistics as float32.
-    """
-    learned = {name for name, _ in dynamics.named_parameters()}
-    tensors = {
-        f"{_DYNAMICS}{name}": (tensor.half() if name in learned else tensor).contiguous()
-        for name, tensor in dynamics.state_dict().items()
-    }
-    _refuse_non_finite(tensors, "state model to be written")
-    tensors |= renderer_tensors(renderer, prefix=_RENDERER)
-    data = save(tensors, {METADATA_KEY: metadata.model_dump_json()})
-    path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(path.suffix + ".partial")
-    partial.write_bytes(data)
-    partial.replace(path)
-    return hashlib.sha256(data).hexdigest()
+    """Write the file in one move and return its digest."""
+    tensors = half_weights(dynamics, prefix=_DYNAMICS) | half_weights(renderer, prefix=_RENDERER)
+    return write_weights(path, tensors, metadata, METADATA_KEY)
 
 
 def read_state_checkpoint(path: Path) -> StateCheckpoint:
     """Load a state model strictly, in float32, ready to predict.
 
     Raises:
-        NotFoundError: no such file.
-        LimitExceededError: larger than 64 MiB.
-        CorruptDataError: no safetensors file, or without our metadata.
+        NotFoundError, LimitExceededError, CorruptDataError: as `read_weights`.
         InvalidInputError: another format version; tensors missing, foreign or of other shapes.
         NonFiniteError: weights that are NaN or infinite.
     """
-    if not path.is_file():
-        raise NotFoundError(f"state model: no file {path.name} in {path.parent}")
-    size = path.stat().st_size
-    if size > MAX_CHECKPOINT_BYTES:
-        raise LimitExceededError(
-            f"state model {path.name}: got {size} bytes, expected at most {MAX_CHECKPOINT_BYTES}"
-        )
-    try:
-        with safe_open(path, framework="pt") as file:
-            notes = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except SafetensorError as error:
-        raise CorruptDataError(f"state model {path.name}: no safetensors file ({error})") from error
-    metadata = _metadata(notes.get(METADATA_KEY), path.name)
+    tensors, metadata, digest = read_weights(path, StateMetadata, METADATA_KEY)
     dynamics = DynamicsModel(metadata.dynamics, metadata.num_members)
-    drawing = {name: t for name, t in tensors.items() if name.startswith(_RENDERER)}
-    _load_strictly(dynamics, {n: t for n, t in tensors.items() if n not in drawing}, path.name)
-    renderer = renderer_from_tensors(
-        drawing, metadata.renderer, prefix=_RENDERER, where=f"state model {path.name}"
-    )
-    digest = hashlib.sha256(path.read_bytes()).hexdigest()
-    dynamics.eval().requires_grad_(requires_grad=False)
+    renderer = RendererNetwork(metadata.renderer)
+    models = {_DYNAMICS: dynamics, _RENDERER: renderer}
+    load_strictly(models, tensors, where=f"checkpoint {path.name}")
     return StateCheckpoint(dynamics, renderer, metadata, digest)
-
-
-def _metadata(text: str | None, name: str) -> StateMetadata:
-    if text is None:
-        raise CorruptDataError(
-            f"state model {name}: has no {METADATA_KEY!r} metadata; it is no state model of ours"
-        )
-    try:
-        version = json.loads(text).get("format_version")
-        if version != FORMAT_VERSION:
-            raise InvalidInputError(
-                f"state model {name}: format version {version}, expected {FORMAT_VERSION}; "
-                "train it anew with this version"
-            )
-        return StateMetadata.model_validate_json(text)
-    except (ValidationError, json.JSONDecodeError, AttributeError) as error:
-        raise CorruptDataError(f"state model {name}: metadata unreadable ({error})") from error
-
-
-def _load_strictly(dynamics: DynamicsModel, tensors: dict[str, Tensor], name: str) -> None:
-    expected = {f"{_DYNAMICS}{key}": value for key, value in dynamics.state_dict().items()}
-    missing = sorted(expected.keys() - tensors.keys())
-    foreign = sorted(tensors.keys() - expected.keys())
-    if missing or foreign:
-        raise InvalidInputError(
-            f"state model {name}: {len(missing)} tensors missing {missing[:3]}, {len(foreign)} "
-            f"foreign {foreign[:3]}; expected exactly those of its own settings"
-        )
-    for key, tensor in tensors.items():
-        if tensor.shape != expected[key].shape or not tensor.is_floating_point():
-            raise InvalidInputError(
-                f"state model {name}: {key} is {tensor.dtype} {tuple(tensor.shape)}, expected "
-                f"floating point {tuple(expected[key].shape)}"
-            )
-    _refuse_non_finite(tensors, f"state model {name}")
-    dynamics.load_state_dict(
-        {key.removeprefix(_DYNAMICS): tensor.float() for key, tensor in tensors.items()}
-    )
-
-
-def _refuse_non_finite(tensors: dict[str, Tensor], where: str) -> None:
-    bad = [key for key, tensor in tensors.items() if not torch.isfinite(tensor).all()]
-    if bad:
-        raise NonFiniteError(f"{where}: NaN or infinity in {bad[:3]} ({len(bad)} tensors)")

@@ -1,7 +1,7 @@
 """World of a state model: rollouts whose imagined scene lasts from the first chunk to the last."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -10,25 +10,19 @@ from jaxtyping import Float32, Float64, UInt8
 from dextouch.errors import (
     EndedError,
     InvalidInputError,
-    NonFiniteError,
     ShapeError,
     UnavailableError,
-    UnknownNameError,
 )
 from dextouch.hands.actions import (
-    IDENTITY_POSE_9D,
     JOINTS_LEFT,
     JOINTS_RIGHT,
-    POSE_SLICES,
     AnchorPoses,
     check_actions,
     poses_from_actions,
 )
 from dextouch.schemas.rollouts import Doubt
-from dextouch.streams.packing import pack, unpack
 from dextouch.worlds.world import (
     EVERYTHING,
-    ActionKind,
     Observation,
     ReturnSelector,
     RolloutStart,
@@ -39,8 +33,6 @@ from dextouch.worlds.world import (
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
 from services.world_model.dynamics.hand_motion import hand_motion
 from services.world_model.dynamics.memory import (
-    memory_arrays,
-    memory_from_arrays,
     memory_of,
     stack_memories,
 )
@@ -48,7 +40,6 @@ from services.world_model.dynamics.model import (
     PRESENCE_THRESHOLD,
     Commands,
     ImaginedSteps,
-    SceneMemory,
     mean_start,
     pad_means_kpa,
 )
@@ -63,37 +54,16 @@ from services.world_model.network.inputs import (
 )
 from services.world_model.rendering.renderer import Renderer
 from services.world_model.rendering.scene_states import SceneState
-from services.world_model.starts import CAMERA, complete_start
+from services.world_model.starts import CAMERA, ObservedStart, check_geometry, observed_start
 from services.world_model.state_checkpoints import StateCheckpoint
+from services.world_model.state_rollout import StateRollout, rollout_bytes, rollout_from_bytes
 
 MAX_CHUNK_STEPS = 64
-MAX_SNAPSHOT_BYTES = 2**20
-# Of a start: farther poses and larger cameras are mistakes of units or frames.
-MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 # An object believed absent is shown here, under the table, where no task leaves one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
 # A rollout is doubted once its hands have moved half as long again as an episode of training, and
 # ends at four times that length: so far no state was ever trained.
 DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
-
-
-@dataclass(frozen=True)
-class StateRollout:
-    """Where a rollout stands: its start, and the memory of its scene.
-
-    `first_reached` and `reached` are relative to `anchor`, the poses of step 0; `num_moving` counts
-    the latent steps in which hands moved.
-    """
-
-    task: str
-    action_kind: ActionKind
-    image: UInt8[np.ndarray, "h w 3"]
-    anchor: AnchorPoses
-    K_head: Float64[np.ndarray, "3 3"]
-    first_reached: Float64[np.ndarray, "67"]
-    memory: SceneMemory
-    step: int = 0
-    num_moving: int = 0
 
 
 class StateWorld:
@@ -147,57 +117,45 @@ class StateWorld:
             UnknownNameError: a task or action kind that the model was not trained on.
             InvalidInputError: no observation, anchor or K_head, or ones that do not fit.
         """
-        if start.task not in self._description.tasks:
-            raise UnknownNameError("task", start.task, list(self._description.tasks))
-        observation, anchor, K_head = complete_start(start)
-        reached = observation.action_reached[-1].copy()
-        for part in POSE_SLICES:
-            reached[part] = IDENTITY_POSE_9D
-        # Copies, so that what a caller does to its arrays later changes no rollout.
-        image, tactile_kpa = observation.images[CAMERA][-1].copy(), observation.tactile_kpa[-1]
-        K_head = np.array(K_head)
-        self._check_start(start, reached)
-        tactile_kpa = np.maximum(tactile_kpa, 0.0)
-        motion = hand_motion(reached[None], anchor)
-        first = FirstStep(
-            torch.from_numpy(image)[None],
-            torch.tensor(K_head, dtype=torch.float32)[None],
-            torch.from_numpy(motion.Ts_world_camera).float(),
-            torch.from_numpy(motion.points_m),
-            torch.from_numpy(pad_means_kpa(tactile_kpa))[None],
-            torch.tensor([self._description.tasks.index(start.task)]),
-        )
+        first = observed_start(start, tasks=self._description.tasks)
+        self._check_start(start, first)
+        motion = hand_motion(first.reached[None], first.anchor)
         memory = self._dynamics.begin(
-            first,
-            torch.from_numpy(tactile_kpa)[None],
+            FirstStep(
+                torch.from_numpy(first.image)[None],
+                torch.from_numpy(first.K_head).float()[None],
+                torch.from_numpy(motion.Ts_world_camera).float(),
+                torch.from_numpy(motion.points_m),
+                torch.from_numpy(pad_means_kpa(first.tactile_kpa))[None],
+                torch.tensor([self._description.tasks.index(start.task)]),
+            ),
+            torch.from_numpy(first.tactile_kpa)[None],
             Commands.standing([motion]),
             torch.tensor([float(start.action_kind == "commanded")]),
         )
         rollout = StateRollout(
-            start.task, start.action_kind, image, anchor, K_head, reached, memory
+            task=start.task,
+            action_kind=start.action_kind,
+            image=first.image,
+            anchor=first.anchor,
+            K_head=first.K_head,
+            first_reached=first.reached,
+            memory=memory,
         )
-        seen = Observation(
-            first_step=0,
-            images={CAMERA: image[None].copy()},
-            tactile_kpa=tactile_kpa[None].copy(),
-            action_reached=reached[None].copy(),
-            reached_is_measured=True,
-            object_poses=self._poses(memory.poses, start.task),
-        )
-        return StartedRollout(rollout, seen, anchor, K_head)
+        seen = first.observation(self._poses(memory.poses, start.task))
+        return StartedRollout(rollout, seen, first.anchor, first.K_head)
 
-    def _check_start(self, start: RolloutStart, reached: np.ndarray) -> None:
+    def _check_start(self, start: RolloutStart, first: ObservedStart) -> None:
         """The checks of every other model, and that hands and camera are within reach."""
-        observation, anchor, K_head = complete_start(start)
-        _check_geometry(anchor, K_head)
+        check_geometry(first.anchor, first.K_head)
         request = PredictionRequest(
-            first_image=observation.images[CAMERA][-1],
-            first_tactile_kpa=observation.tactile_kpa[-1],
-            actions=np.repeat(reached[None], 1 + STEPS_PER_LATENT, axis=0),
+            first_image=first.image,
+            first_tactile_kpa=first.tactile_kpa,
+            actions=np.repeat(first.reached[None], 1 + STEPS_PER_LATENT, axis=0),
             action_kind=start.action_kind,
             instruction=start.instruction,
-            anchor=anchor,
-            K_head=K_head,
+            anchor=first.anchor,
+            K_head=first.K_head,
         )
         build_inputs([request], NetworkConfig(image_px=self._metadata.dynamics.image_px))
 
@@ -354,20 +312,7 @@ class StateWorld:
 
     def snapshot(self, state: StateRollout) -> bytes:
         """The state as bytes that `restore` of the same checkpoint accepts."""
-        fields = {
-            "digest": self._digest,
-            "task": state.task,
-            "action_kind": state.action_kind,
-            "step": state.step,
-            "num_moving": state.num_moving,
-        }
-        arrays = {
-            "image": state.image,
-            "anchor": np.stack(state.anchor.as_tuple()),
-            "K_head": state.K_head,
-            "first_reached": state.first_reached,
-        }
-        return pack(fields, {**arrays, **memory_arrays(state.memory)})
+        return rollout_bytes(state, self._digest)
 
     def restore(self, data: bytes) -> StateRollout:
         """The state of a snapshot.
@@ -375,47 +320,7 @@ class StateWorld:
         Raises:
             InvalidInputError: bytes that are no snapshot of this checkpoint.
         """
-        fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
-        if fields.get("digest") != self._digest:
-            raise InvalidInputError(
-                f"snapshot: of world {str(fields.get('digest'))[:12]!r}, expected "
-                f"{self._digest[:12]!r}; restore it in the world that made it"
-            )
-        config, name = self._metadata.dynamics, fields.get("task")
-        step, moving = fields.get("step"), fields.get("num_moving")
-        size = (config.image_px, config.image_px, 3)
-        shapes = {"image": size, "anchor": (3, 4, 4), "K_head": (3, 3), "first_reached": (67,)}
-        if (
-            name not in config.tasks
-            or fields.get("action_kind") not in ACTION_KINDS
-            or not isinstance(step, int)
-            or not isinstance(moving, int)
-            or min(step, moving) < 0
-            or arrays.get("image", np.zeros(0)).dtype != np.uint8
-            or any(key not in arrays or arrays[key].shape != shapes[key] for key in shapes)
-        ):
-            raise InvalidInputError(
-                f"snapshot: got {sorted(fields)} and arrays {sorted(arrays)}, expected those that "
-                "this world's own snapshot writes"
-            )
-        anchor, K_head = AnchorPoses(*np.array(arrays["anchor"])), np.array(arrays["K_head"])
-        _check_geometry(anchor, K_head)
-        memory = memory_from_arrays(arrays, config, self._metadata.num_members)
-        if int(memory.start[0].task[0]) != config.tasks.index(name):
-            raise InvalidInputError(f"snapshot: its memory is not of task {name!r}")
-        first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
-        check_reach(first_reached)
-        return StateRollout(
-            task=name,
-            action_kind=fields["action_kind"],
-            image=arrays["image"],
-            anchor=anchor,
-            K_head=K_head,
-            first_reached=first_reached[0],
-            memory=memory,
-            step=step,
-            num_moving=moving,
-        )
+        return rollout_from_bytes(data, self._metadata, self._digest)
 
 
 def _scene_states(
@@ -437,31 +342,6 @@ def _scene_states(
         )
         for index in range(len(actions))
     ]
-
-
-def _check_geometry(anchor: AnchorPoses, K_head: np.ndarray) -> None:
-    """Refuse poses far from the world's origin, and cameras that see nothing.
-
-    Raises:
-        InvalidInputError: an anchor farther than 5 m, a focal length or principal point out of
-            all proportion.
-        NonFiniteError: NaN or infinity.
-    """
-    Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])
-    if not (np.isfinite(Ts).all() and np.isfinite(K_head).all()):
-        raise NonFiniteError("start: anchor or K_head hold NaN or infinity")
-    far_m = float(np.abs(Ts[:, :3, 3]).max())
-    if far_m > MAX_ANCHOR_M:
-        raise InvalidInputError(
-            f"start: an anchor pose lies {far_m:.3g} m from the world's origin, expected at most "
-            f"{MAX_ANCHOR_M} m; give poses in the frame of the table"
-        )
-    focal_px, centre_px = np.diag(K_head)[:2], np.abs(K_head[:2, 2])
-    if focal_px.min() < 1.0 or max(focal_px.max(), centre_px.max()) > MAX_CAMERA_PX:
-        raise InvalidInputError(
-            f"start: K_head has focal lengths {focal_px.tolist()} and centre "
-            f"{K_head[:2, 2].tolist()} px, expected 1 … {MAX_CAMERA_PX:.0f} px"
-        )
 
 
 def _refuse_non_finite(imagined: ImaginedSteps) -> None:

@@ -12,11 +12,8 @@ from dextouch.errors import (
     InvalidInputError,
     ShapeError,
     UnavailableError,
-    UnknownNameError,
 )
 from dextouch.hands.actions import (
-    IDENTITY_POSE_9D,
-    POSE_SLICES,
     AnchorPoses,
     check_actions,
     poses_from_actions,
@@ -37,7 +34,7 @@ from services.world_model.checkpoints import Checkpoint, default_checkpoint, rea
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Precision, Prediction, stack_noise
 from services.world_model.network.visual_codec import to_uint8
-from services.world_model.starts import CAMERA, complete_start
+from services.world_model.starts import CAMERA, observed_start
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.state_world import StateWorld
 
@@ -106,26 +103,21 @@ class ModelWorld:
             UnknownNameError: a task or action kind that the model was not trained on.
             InvalidInputError: no observation, anchor or K_head, or ones that do not fit.
         """
-        if start.task not in self._description.tasks:
-            raise UnknownNameError("task", start.task, list(self._description.tasks))
-        observation, anchor, K_head = complete_start(start)
-        reached = observation.action_reached[-1].copy()
-        for part in POSE_SLICES:
-            reached[part] = IDENTITY_POSE_9D
+        first = observed_start(start, tasks=self._description.tasks)
         state = ModelState(
-            image=observation.images[CAMERA][-1],
-            tactile_kpa=np.maximum(observation.tactile_kpa[-1], 0.0),
-            reached=reached,
-            anchor=anchor,
-            K_head=K_head,
+            image=first.image,
+            tactile_kpa=first.tactile_kpa,
+            reached=first.reached,
+            anchor=first.anchor,
+            K_head=first.K_head,
             instruction=start.instruction,
             action_kind=start.action_kind,
             step=0,
         )
         # The same checks as of a chunk, now rather than at the first one.
-        standing = np.repeat(reached[None], self._description.chunk_multiple, axis=0)
+        standing = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
         build_inputs([_request(state, standing)], self._model.config)
-        return StartedRollout(state, _first_observation(state), anchor, K_head)
+        return StartedRollout(state, first.observation(), first.anchor, first.K_head)
 
     def step(
         self,
@@ -322,16 +314,6 @@ def _advance(
         step=state.step + len(chunk),
     )
     return SteppedRollout(following, observation)
-
-
-def _first_observation(state: ModelState) -> Observation:
-    return Observation(
-        first_step=0,
-        images={CAMERA: state.image[None]},
-        tactile_kpa=state.tactile_kpa[None],
-        action_reached=state.reached[None],
-        reached_is_measured=True,
-    )
 
 
 def _generator(seed: int) -> torch.Generator:

@@ -123,7 +123,7 @@ def ray_at_height(
     K_head: Float32[Tensor, "batch 3 3"],
     T_world_camera: Float32[Tensor, "batch 4 4"],
 ) -> Float32[Tensor, "batch objects 3"]:
-    """World point (m) where a pixel's ray is at a height; within `MAX_DISTANCE_M` of the origin.
+    """World point (m) where a pixel's ray is at a height; each coordinate within `MAX_DISTANCE_M`.
 
     Rays that look up or almost along the horizon are bent down to meet the height far away.
     """

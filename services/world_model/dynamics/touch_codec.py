@@ -31,14 +31,20 @@ class TouchCodec(nn.Module):
         self.register_buffer("peak_kpa", torch.full((), 1e3))
 
     @torch.no_grad()
-    def fit(self, tactile_kpa: Float32[Tensor, "n 320"]) -> None:
-        """Take axes, scale and peak from training touch of single hands."""
+    def fit(self, tactile_kpa: Float32[Tensor, "n 320"], *, peak_kpa: float | None = None) -> None:
+        """Take axes, scale and peak from training touch of single hands.
+
+        Args:
+            tactile_kpa: a sample of it.
+            peak_kpa: the highest pressure of all of it; None takes that of the sample.
+        """
         roots = root_pressure(tactile_kpa).double()
         # Not centred: the mean of touch is no touch that ever happens.
         basis, rms = principal_axes(roots.T @ roots / len(roots), self.basis.shape[1])
         self.basis.copy_(basis)
         self.scale.copy_(rms[0].clamp_min(1e-3))
-        self.peak_kpa.copy_(tactile_kpa.max().clamp_min(FREE_KPA))
+        peak = float(tactile_kpa.max()) if peak_kpa is None else peak_kpa
+        self.peak_kpa.fill_(max(peak, FREE_KPA))
 
     def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
         """Latents; pressures below zero count as zero, those above the peak as the peak."""

@@ -28,8 +28,9 @@ OnStep = Callable[[int, float], None]
 class CoreData:
     """What cores are trained on: episodes, their touch as latents, and what readers saw.
 
-    `readings` are a reader's objects by start step; the core learns from them and from true
-    poses with errors of the same size, so that it neither trusts its start too much nor too little.
+    `readings` are a reader's objects by start step, of the same episodes that the reader learned
+    from. Since it errs less there than elsewhere, the core learns from true poses with errors of
+    `pose_noise_m` as often.
     """
 
     table: SceneTable

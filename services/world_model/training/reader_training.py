@@ -40,7 +40,7 @@ def train_reader(
     seed: int,
     on_step: OnStep | None = None,
 ) -> StartReader:
-    """A reader of objects from single steps: half of them first ones, half from amid episodes.
+    """A reader of objects from single steps: first ones, and ones from amid episodes.
 
     Args:
         table: training episodes.

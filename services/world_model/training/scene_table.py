@@ -172,17 +172,17 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
     Raises:
         InvalidInputError: no episodes, or a task whose episodes differ in their objects.
     """
-    counts: dict[str, set[int]] = {}
+    names: dict[str, set[tuple[str, ...]]] = {}
     for episode in episodes:
-        counts.setdefault(episode.task, set()).add(episode.object_poses.shape[1])
-    uneven = {task: sorted(found) for task, found in counts.items() if len(found) > 1}
-    if not counts or uneven:
+        names.setdefault(episode.task, set()).add(episode.object_names)
+    uneven = {task: sorted(found) for task, found in names.items() if len(found) > 1}
+    if not names or uneven:
         raise InvalidInputError(
-            f"training episodes: got {len(episodes)} episodes, tasks with several numbers of "
-            f"objects {uneven}; expected at least one episode and one number for every task"
+            f"training episodes: got {len(episodes)} episodes, tasks with several lists of "
+            f"objects {uneven}; expected at least one episode and one list for every task"
         )
-    tasks = tuple(sorted(counts))
-    return tasks, tuple(counts[task].pop() for task in tasks)
+    tasks = tuple(sorted(names))
+    return tasks, tuple(len(*names[task]) for task in tasks)
 
 
 def scene_table(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> SceneTable:
@@ -231,6 +231,12 @@ def _check(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> None:
     if not episodes:
         raise InvalidInputError("training episodes: got none, expected at least one")
     first = episodes[0]
+    later = [step for step in first.image_steps[1:] if step % STEPS_PER_LATENT == 0]
+    if list(first.image_steps[:1]) != [0] or not later:
+        raise InvalidInputError(
+            f"episode {first.episode_id}: has images of steps {list(first.image_steps)[:4]} …, "
+            "expected step 0 and a later multiple of 4; record with --images 1, 2 or 4"
+        )
     num_steps, size = len(first.tactile_kpa), (config.image_px, config.image_px, 3)
     for episode in episodes:
         if episode.task not in config.tasks or episode.object_poses.shape[1] > MAX_OBJECTS:

@@ -15,14 +15,14 @@ from pathlib import Path
 import numpy as np
 import structlog
 import torch
+from safetensors import safe_open
 from safetensors.torch import load_file, save_file
-from torch import Tensor
+from torch import Tensor, nn
 
 from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
 from services.world_model.dynamics.touch_codec import TouchCodec
-from services.world_model.rendering.checkpoints import renderer_from_tensors, renderer_tensors
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.training import RendererProgress, train_renderer
 from services.world_model.settings import StateTrainSettings
@@ -43,12 +43,15 @@ from services.world_model.training.scene_episodes import (
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
+# Goes up with every change of training that makes other weights of the same settings and data.
+TRAINING_VERSION = 2
 # Cores learn to begin at these steps beside the first.
 LATER_STARTS = tuple(range(8, 64, 8))
 # The renderer learns from this many episodes at most: it sees few of their images anyway.
 MAX_CLIPS = 1500
 _LOG_EVERY = 500
 _SEED_STRIDE = 1000
+_CPU_S = "cpu_s"
 logger = structlog.get_logger(__name__)
 
 
@@ -79,9 +82,12 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     data_hash = _data_hash(training)
-    table = scene_table(training, config)
+    # Before training, so that episodes that do not fit are found at once.
+    heldout_table, table = scene_table(heldout, config), scene_table(training, config)
     codec = TouchCodec(config.touch_channels)
-    codec.fit(table.tactile_kpa[:, ::4].float().flatten(0, 2))
+    codec.fit(
+        table.tactile_kpa[:, ::4].float().flatten(0, 2), peak_kpa=float(table.tactile_kpa.max())
+    )
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
@@ -89,7 +95,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     cpu_s = _train_parts(work)
     dynamics = _assembled(work, codec)
     renderer = _trained_renderer(work)
-    measured = evaluate_dynamics(dynamics, scene_table(heldout, config))
+    measured = evaluate_dynamics(dynamics, heldout_table)
     metadata = StateMetadata(
         name=settings.name,
         dynamics=config,
@@ -166,7 +172,8 @@ def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> Dynam
 
 
 def _key(settings: StateTrainSettings, data_hash: str) -> str:
-    chosen = settings.model_dump_json(exclude={"output", "jobs", "num_members", "name"})
+    left_out = {"output", "jobs", "num_members", "name", "json_path"}
+    chosen = f"{TRAINING_VERSION} {settings.model_dump_json(exclude=left_out)}"
     return hashlib.sha256((chosen + data_hash).encode()).hexdigest()[:16]
 
 
@@ -188,20 +195,20 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
 
 
 def _train_parts(work: _Work) -> float:
-    """Train the parts that are not there yet, several at a time; the CPU seconds that took."""
+    """Train the parts that are not there yet, several at a time; the CPU seconds of all parts."""
     missing = [m for m in range(work.settings.num_members) if not work.file_of(m).exists()]
     spawned = multiprocessing.get_context("spawn")
-    total_s = 0.0
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
         orders = [pool.submit(_train_member, work, member) for member in missing]
         if not work.renderer_file.exists():
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
-            total_s += done.result()
-    return total_s
+            done.result()
+    parts = [work.file_of(member) for member in range(work.settings.num_members)]
+    return sum(_cpu_s_of(part) for part in (*parts, work.renderer_file))
 
 
-def _train_renderer(work: _Work) -> float:
+def _train_renderer(work: _Work) -> None:
     torch.set_num_threads(1)
     settings = work.settings
     episodes, _ = split_by_scene(_episodes(settings), held_out_share=settings.heldout_share)
@@ -211,10 +218,7 @@ def _train_renderer(work: _Work) -> float:
     trained = train_renderer(
         clips, settings.renderer, settings.drawing, rng=rng, on_progress=_say_drawing
     )
-    partial = work.renderer_file.with_suffix(".partial")
-    save_file(renderer_tensors(trained.network), partial)
-    partial.replace(work.renderer_file)
-    return trained.cpu_s
+    _keep(trained.network, work.renderer_file, trained.cpu_s)
 
 
 def _say_drawing(now: RendererProgress) -> None:
@@ -225,13 +229,26 @@ def _say_drawing(now: RendererProgress) -> None:
         )  # fmt: skip
 
 
+def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
+    """Write a finished part in one move, with the CPU seconds that it took."""
+    partial = path.with_suffix(".partial")
+    tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
+    save_file(tensors, partial, metadata={_CPU_S: str(cpu_s)})
+    partial.replace(path)
+
+
+def _cpu_s_of(path: Path) -> float:
+    with safe_open(path, framework="pt") as file:
+        return float(file.metadata()[_CPU_S])
+
+
 def _trained_renderer(work: _Work) -> RendererNetwork:
-    tensors = load_file(work.renderer_file)
-    where = f"renderer {work.renderer_file.name}"
-    return renderer_from_tensors(tensors, work.settings.renderer, where=where)
+    renderer = RendererNetwork(work.settings.renderer)
+    renderer.load_state_dict(load_file(work.renderer_file))
+    return renderer
 
 
-def _train_member(work: _Work, member: int) -> float:
+def _train_member(work: _Work, member: int) -> None:
     torch.set_num_threads(1)
     started_s = time.process_time()
     flat = load_file(work.parts / "table.safetensors")
@@ -250,10 +267,7 @@ def _train_member(work: _Work, member: int) -> float:
     readings = {step: read_objects(made.reader, table, step) for step in starts}
     data = CoreData(table, touch_latents(codec, table), readings)
     made.core = train_core(data, work.config, work.settings.core, seed=seed, on_step=log.core)
-    partial = work.file_of(member).with_suffix(".partial")
-    save_file({k: v.contiguous() for k, v in made.state_dict().items()}, partial)
-    partial.replace(work.file_of(member))
-    return time.process_time() - started_s
+    _keep(made, work.file_of(member), time.process_time() - started_s)
 
 
 class _Log:

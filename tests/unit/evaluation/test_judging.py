@@ -12,12 +12,10 @@ from services.evaluation.calibration import Calibration
 from services.evaluation.demonstrations import Demonstration
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.judge_network import ProbeShape
-from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
-from services.evaluation.success_probe_2 import KIND_2
 from services.evaluation.success_probe_data import labelled_endings
 from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
-from tests.unit.evaluation import toy, true_endings
+from tests.unit.evaluation import toy
 
 NEAR_M = 0.02
 
@@ -202,17 +200,3 @@ def test_true_and_imagined_endings_weigh_as_asked():
     # In the middle only milestones are known.
     assert labelled.known[3].tolist() == [False, True, True, True]
     assert labelled.known[0].all()
-
-
-def test_the_committed_probe_of_kind_2_still_judges_images():
-    probe = SuccessProbe.load(DEFAULT_PROBE)
-    if probe.metadata.kind != KIND_2:
-        pytest.skip("the committed probe is of the newest kind")
-    endings, _ = true_endings.read("stand_bottle")
-    verdict = probe.verdict(endings[0])
-    assert verdict.decision in {"success", "failure"}
-    assert verdict.milestones == {}
-    with pytest.raises(InvalidInputError, match="train it anew"):
-        probe.verdict(
-            replace(endings[0], images=None, object_poses=np.zeros((3, 1, 7), np.float32))
-        )

@@ -14,14 +14,13 @@ from dextouch.errors import (
     NotFoundError,
     UnknownNameError,
 )
-from services.world_model import checkpoints
+from services.world_model import checkpoints, weights
 from services.world_model.checkpoints import (
     METADATA_KEY,
     default_checkpoint,
     find_checkpoint,
     list_checkpoints,
     read_checkpoint,
-    to_bytes,
     write_checkpoint,
 )
 from services.world_model.settings import WorldModelSettings
@@ -33,7 +32,8 @@ def path(tmp_path):
 
 
 def _damage(path, model, metadata, *, change=None, notes=None):
-    tensors = load(to_bytes(model, metadata))
+    write_checkpoint(path, model, metadata)
+    tensors = load(path.read_bytes())
     if change is not None:
         change(tensors)
     note = metadata.model_dump_json() if notes is None else notes
@@ -53,8 +53,8 @@ def test_weights_and_history_come_back(path, tiny_model, metadata):
 
 
 def test_storing_what_was_loaded_gives_the_same_bytes(path, tiny_model, metadata):
-    write_checkpoint(path, tiny_model, metadata)
-    assert to_bytes(read_checkpoint(path).model, metadata) == path.read_bytes()
+    digest = write_checkpoint(path, tiny_model, metadata)
+    assert write_checkpoint(path, read_checkpoint(path).model, metadata) == digest
 
 
 def test_statistics_keep_their_full_precision(path, tiny_model, metadata):
@@ -99,7 +99,7 @@ def test_weights_that_are_no_numbers_are_refused_both_ways(path, tiny_model, met
     with torch.no_grad():
         tiny_model.tactile.hands[0, 0] = 1e6
     with pytest.raises(NonFiniteError, match="to be written"):
-        to_bytes(tiny_model, metadata)
+        write_checkpoint(path, tiny_model, metadata)
 
 
 def test_foreign_files_are_refused(path, tiny_model, metadata, monkeypatch):
@@ -115,7 +115,7 @@ def test_foreign_files_are_refused(path, tiny_model, metadata, monkeypatch):
     newer = json.dumps({**metadata.model_dump(mode="json"), "format_version": 2})
     with pytest.raises(InvalidInputError, match="format version 2"):
         read_checkpoint(_damage(path, tiny_model, metadata, notes=newer))
-    monkeypatch.setattr(checkpoints, "MAX_CHECKPOINT_BYTES", 100)
+    monkeypatch.setattr(weights, "MAX_FILE_BYTES", 100)
     with pytest.raises(LimitExceededError):
         read_checkpoint(path)
 
