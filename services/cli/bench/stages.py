@@ -80,9 +80,11 @@ STAGES = {
         "in the world model from the same first observations, on starts that nothing was trained "
         "on. The judge tells imagined success from the imagined ending alone. Reports the judge on "
         "true endings, imagined against real success for each rollout and for the policies, "
-        "calibration, chained touch beside a copy and chained images beside the warped start, with "
-        "intervals over the starts. Everything is kept in --keep when it is computed, so a run "
-        "that was broken off goes on where it stood.",
+        "calibration, chained touch and images beside a copy, the warped start and true context, "
+        "what another episode's actions cost, and hands that hold still for 1000 steps, with "
+        "intervals over the starts; of several training seeds the mean and the worst. Everything "
+        "is kept in --keep when it is computed, so a run that was broken off goes on where it "
+        "stood.",
     ),
     "clocks": StageEntry(
         "services.cli.bench.clocks.stage",

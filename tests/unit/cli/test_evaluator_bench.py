@@ -8,17 +8,16 @@ import torch
 
 from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
 from dextouch.geometry.transforms import transform
-from services.cli.bench.evaluator import work
+from services.cli.bench.evaluator import rollouts, work
+from services.cli.bench.evaluator.chunk_lines import f1
 from services.cli.bench.evaluator.keeping import KeptRows, array_path, read_arrays, write_arrays
-from services.cli.bench.evaluator.lines import Rolled, TaskFigures, f1
 from services.cli.bench.evaluator.measuring import (
     contact_counts,
     object_region,
     psnr_within,
     warp_over_table,
 )
-from services.cli.bench.evaluator.page import write_page
-from services.cli.bench.evaluator.plan import IDLE, ClonedPolicy, StudyPlan
+from services.cli.bench.evaluator.plan import IDLE, ClonedPolicy, StudyPlan, Trained, trained_seeds
 from services.cli.bench.evaluator.stage import figures_of_tasks
 from services.evaluation.settings import DEFAULT_PROBE
 
@@ -68,26 +67,28 @@ def test_arrays_come_back_or_are_refused(tmp_path):
 def plan(tmp_path_factory):
     torch.set_num_threads(1)
     keep = tmp_path_factory.mktemp("kept")
-    return StudyPlan(keep, None, DEFAULT_PROBE, ("stand_bottle",), (39_077,), levels_mm=(0.0,))
+    trained = (Trained(None, DEFAULT_PROBE),)
+    return StudyPlan(keep, trained, ("stand_bottle",), (39_077,), (0.0,), num_still_starts=0)
 
 
 def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
     study, path = work.Study(plan), plan.keep / "rollouts.jsonl"
     missing = study.missing(KeptRows(path), "stand_bottle", 39_077)
-    assert missing == ["script 0 mm", *IDLE]
+    assert list(missing) == ["script 0 mm", *IDLE]
     # Killed in the first policy, after its two rollouts and before its verdicts.
-    rows = study.rows("stand_bottle", 39_077, ["script 0 mm"])
+    rows = study.rows("stand_bottle", 39_077, {"script 0 mm": missing["script 0 mm"]})
     KeptRows(path).add([next(rows), next(rows)])
-    assert study.missing(KeptRows(path), "stand_bottle", 39_077) == missing
+    left = study.missing(KeptRows(path), "stand_bottle", 39_077)["script 0 mm"]
+    assert left == missing["script 0 mm"][2:]
 
     def refuse(*_: object) -> None:
         raise AssertionError("rolled out again")
 
     for name in ("play_in_twin", "play_in_imagination"):
-        monkeypatch.setattr(work, name, refuse)
+        monkeypatch.setattr(rollouts, name, refuse)
     kept = KeptRows(path)
-    kept.add(study.rows("stand_bottle", 39_077, ["script 0 mm"]))
-    assert study.missing(KeptRows(path), "stand_bottle", 39_077) == list(IDLE)
+    kept.add(study.rows("stand_bottle", 39_077, {"script 0 mm": left}))
+    assert list(study.missing(KeptRows(path), "stand_bottle", 39_077)) == list(IDLE)
     figures, failed = figures_of_tasks(study, kept)
     assert failed == len(IDLE)
     assert [row["real"] for row in figures[0].policy_rows()] == [1.0]
@@ -95,15 +96,46 @@ def test_a_killed_run_goes_on_without_rolling_out_again(plan, monkeypatch):
     assert [row["chunk"] for row in chunks] == [1, 2, 3, 4, 5]
     # The camera's motion over a table is known: the warped start is no wild guess.
     assert all(row["psnr_of_warped_start"] > 15 for row in chunks)
+    # The first chunk begins at the true start either way.
+    about = study.keys("stand_bottle", 39_077, "script 0 mm")
+    imagined, context = (kept.get(**about[kind, 0]) for kind in ("imagined", "true context"))
+    assert context["contact"][0] == imagined["contact"][0]
+    # The true touch of a chunk is the same, from wherever it is imagined.
+    assert [each[2] for each in context["contact"]] == [each[2] for each in imagined["contact"]]
+    assert context["moves"][:3] == [True, True, True]
+
+
+def test_training_seeds_share_what_really_happened(plan):
+    study = work.Study(plan)
+    study.members = (study.members[0], study.members[0])
+    keys = study.keys("stand_bottle", 39_077, "script 0 mm")
+    assert {number for _, number in keys} == {0, 1}
+    assert keys["real", 0] == keys["real", 1]
+    # The same checkpoints twice: every row is wanted once.
+    rows = study.missing(KeptRows(plan.keep / "none.jsonl"), "stand_bottle", 39_077)
+    assert len(rows["script 0 mm"]) == len(keys) // 2
+    assert list(study.about) == ["twin", "world 1", "judge 1", "world 2", "judge 2"]
+
+
+def test_judges_belong_to_worlds_in_their_order(tmp_path):
+    worlds, probes = [tmp_path / "a", tmp_path / "b"], [tmp_path / "p", tmp_path / "q"]
+    assert [one.probe for one in trained_seeds(worlds, probes, ())] == probes
+    assert [one.probe for one in trained_seeds(worlds, probes[:1], ())] == [probes[0]] * 2
+    assert [one.direct for one in trained_seeds(worlds, probes, probes[1:])] == [probes[1]] * 2
+    with pytest.raises(InvalidInputError, match="2 --probe for 1 --world"):
+        trained_seeds(worlds[:1], probes, ())
+    with pytest.raises(InvalidInputError, match="0 --probe"):
+        trained_seeds(worlds, (), ())
 
 
 def test_starts_of_the_training_are_refused(plan):
     study = work.Study(plan)
     first = work.start_in_twin(study.twin, "stand_bottle", 39_077, "")[0].observation
     digest = work.first_digest(first)
-    study.probe.metadata = study.probe.metadata.model_copy(update={"training_starts": (digest,)})
-    with pytest.raises(ConflictError, match="trained on by the success probe"):
-        next(study.rows("stand_bottle", 39_077, ["hold"]))
+    probe = study.members[0].probe
+    probe.metadata = probe.metadata.model_copy(update={"training_starts": (digest,)})
+    with pytest.raises(ConflictError, match="trained on by a judge"):
+        next(study.rows("stand_bottle", 39_077, {"hold": (("real", 0),)}))
 
 
 def test_contact_f1_by_hand():
@@ -143,56 +175,8 @@ def test_the_region_of_an_object_by_hand():
     assert psnr_within(other, image, region) == 100.0
 
 
-def _rolled(policy: str, seed: int, *, real: bool, told: float) -> Rolled:
-    verdict = {"probability": told, "likely_success": told >= 0.5, "decision": "success"}
-    truth = {"probability": float(real), "likely_success": real, "decision": "success"}
-    contact = [[[2.0, 4.0, 6.0]] * 5, [[3.0, 6.0, 6.0]] * 5]
-    chunks = {
-        "contact": contact[0],
-        "contact_of_copy": contact[1],
-        "psnr": [[25.0, 20.0 + chunk] for chunk in range(5)],
-        "psnr_of_objects": [[18.0, 19.0]] * 5,
-    }
-    return Rolled(policy, seed, real, truth, verdict, chunks)
-
-
-def test_lines_by_hand(tmp_path):
-    rolled = [
-        _rolled("script 0 mm", 1, real=True, told=0.9),
-        _rolled("script 0 mm", 2, real=True, told=0.4),
-        _rolled("script 9 mm", 1, real=False, told=0.4),
-        _rolled("script 9 mm", 2, real=False, told=0.1),
-        _rolled("hold", 1, real=False, told=0.8),
-        _rolled("hold", 2, real=False, told=0.2),
-    ]
-    figures = TaskFigures("a", rolled, ("script 0 mm", "script 9 mm"))
-    lines = {line.what: line for line in figures.lines()}
-    # Wins 0.9 and 0.4 against losses 0.4 and 0.1: three pairs right, one tied.
-    assert lines["imagined against real, each rollout, AUC"].value == pytest.approx(3.5 / 4)
-    balanced = lines["imagined against real, each rollout, balanced accuracy"]
-    assert balanced.value == pytest.approx(0.75)
-    assert lines["judge on true endings, AUC"].value == 1.0
-    assert lines["policies (scripts), Pearson"].value == pytest.approx(1.0)
-    # Real 1, 0, 0 and imagined 0.5, 0, 0.5: the first is not above the last in imagination.
-    worst = lines["policies (all), MMRV with ties"]
-    assert worst.value == pytest.approx((1 + 0 + 0) / 3)
-    assert worst.requirement().is_met is False
-    assert lines["imagined success of hold"].value == 0.5
-    assert lines["imagined success of retreat"].value is None
-    contact = lines["chained contact F1 less copy, worst of chunks 1 to 4"]
-    assert contact.value == pytest.approx(0.4 - 0.5)
-    assert lines["chained image less warped start, worst of chunks 2 to 5"].value == 1.0
-    assert lines["the same where objects are or were"].value == -1.0
-    page = tmp_path / "page.html"
-    write_page(page, {"twin": "0" * 64}, list(lines.values()), [figures.policy_rows()], ["<note>"])
-    text = page.read_text(encoding="utf-8")
-    assert "&lt;note&gt;" in text
-    assert 'class="missed"' in text
-    assert 'class="met"' in text
-
-
 def test_plans_without_anything_are_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="0 starts"):
-        StudyPlan(tmp_path, None, DEFAULT_PROBE, ("stand_bottle",), ())
+        StudyPlan(tmp_path, (Trained(None, DEFAULT_PROBE),), ("stand_bottle",), ())
     with pytest.raises(InvalidInputError, match="NAME=PATH"):
         ClonedPolicy.parse("no-path")

@@ -8,9 +8,11 @@ from jaxtyping import Bool, Float64, UInt8
 from dextouch.geometry.transforms import apply, invert, transform_from_pose
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from dextouch.metrics.image import PEAK, decibels
+from dextouch.metrics.tactile import mse
 from dextouch.tactile.contact import in_contact
 from services.cli.bench.evaluator.plan import CHUNK_STEPS
 from services.cli.bench.evaluator.playing import ImaginedRollout, TrueRollout
+from services.world_model.rendering.evaluation import sharpness
 
 # Pixels about an object's box that belong to its region too.
 _MARGIN_PX: Final = 1
@@ -129,3 +131,27 @@ def _bilinear(image: np.ndarray, at_px: np.ndarray) -> UInt8[np.ndarray, "n 3"]:
         + image[bottom, right] * fx * fy
     )
     return np.round(values).astype(np.uint8)
+
+
+def wrong_action_figures(
+    real: TrueRollout, own: ImaginedRollout, wrong: ImaginedRollout
+) -> dict[str, list[float] | list[list[float]]]:
+    """Errors [own, wrong] of what is imagined for a rollout's own actions and for another's.
+
+    Squared error of touch in kPa², mean over all steps, and PSNR at the end of every chunk.
+    """
+    both = (own, wrong)
+    everywhere = np.ones(real.images_of_chunks.shape[1:3], dtype=bool)
+    return {
+        "touch_error": [mse(predicted_kpa=o.tactile_kpa, true_kpa=real.tactile_kpa) for o in both],
+        "psnr": [
+            [psnr_within(one.images_of_chunks[index], image, everywhere) for one in both]
+            for index, image in enumerate(real.images_of_chunks)
+        ],
+    }
+
+
+def sharpness_of_chunks(real: TrueRollout, imagined: ImaginedRollout) -> list[list[float]]:
+    """Mean absolute Laplacian [imagined, true] of the image at the end of every chunk."""
+    pair = (imagined.images_of_chunks, real.images_of_chunks)
+    return np.stack([sharpness(one.astype(np.float64)) for one in pair], axis=1).tolist()

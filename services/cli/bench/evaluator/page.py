@@ -5,7 +5,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from services.cli.bench.evaluator.lines import Line
+from services.cli.bench.evaluator.drawn import Line
 
 _STYLE = """body{font:15px/1.45 system-ui,sans-serif;max-width:72rem;
 margin:2rem auto;padding:0 1rem}
@@ -45,20 +45,24 @@ def write_page(
 
 
 def _table(task: str, lines: Sequence[Line]) -> str:
-    head = "".join(f"<th>{word}</th>" for word in ("", "figure", "interval", "bound", "verdict"))
-    rows = "".join(_row(line) for line in lines)
+    several = any(len(line.by_seed) > 1 for line in lines)
+    words = ["", "figure", "interval", "bound", "verdict", *["training seeds"] * several]
+    head = "".join(f"<th>{word}</th>" for word in words)
+    rows = "".join(_row(line, several=several) for line in lines)
     return f"<table><caption>{escape(task)}</caption><tr>{head}</tr>{rows}</table>"
 
 
-def _row(line: Line) -> str:
+def _row(line: Line, *, several: bool) -> str:
     is_met = line.requirement().is_met
     word = {None: "not measured", True: "met", False: "missed"}[is_met]
+    seeds = ", ".join("undefined" if one is None else f"{one:.3f}" for one in line.by_seed)
     cells = (
         escape(line.what),
         "" if line.value is None else f"{line.value:.3f} {escape(line.unit)}",
         "" if line.interval is None else f"{line.interval[0]:.3f} … {line.interval[1]:.3f}",
         f"{escape(line.sense)} {line.bound:g}",
         f'<span class="{word.split()[-1]}">{word}</span>',
+        *([seeds] if several else []),
     )
     return "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
 

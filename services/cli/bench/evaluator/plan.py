@@ -1,6 +1,7 @@
 """What the stage `evaluator` rolls out: tasks, starts, and policies by name."""
 
 import hashlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -11,6 +12,9 @@ CAMERA: Final = "camera_head"
 # 5 1/3 s at 15 steps a second, in chunks as policies send them.
 NUM_STEPS: Final = 80
 CHUNK_STEPS: Final = 16
+# A still hand is watched for 63 chunks, 1008 steps, and looked at after every 9th.
+STILL_CHUNKS: Final = 63
+STILL_SHOWN_EVERY: Final = 9
 FIRST_SEED: Final = 30_000
 # Where the scripts of "another scene" come from: the same task, objects elsewhere.
 OTHER_SCENE: Final = 5_000
@@ -46,20 +50,55 @@ class ClonedPolicy:
 
 
 @dataclass(frozen=True)
+class Trained:
+    """The checkpoints of one training seed.
+
+    Args:
+        world: of the world model; None is the one that comes with the package.
+        probe: of the judge of imagined endings.
+        direct: of the direct judge, its rival without a world model; None for none.
+    """
+
+    world: Path | None
+    probe: Path
+    direct: Path | None = None
+
+
+def trained_seeds(
+    worlds: Sequence[Path | None], probes: Sequence[Path], directs: Sequence[Path]
+) -> tuple[Trained, ...]:
+    """One entry for each world, with the judges of the same place or the only ones there are.
+
+    Raises:
+        InvalidInputError: several judges, but not one for each world; or no world or judge.
+    """
+    for what, paths, least in (("--probe", probes, 1), ("--direct", directs, 0)):
+        if not worlds or not (least <= len(paths) <= 1 or len(paths) == len(worlds)):
+            raise InvalidInputError(
+                f"evaluator: got {len(paths)} {what} for {len(worlds)} --world, expected one for "
+                "all or one for each, in the same order"
+            )
+    count = len(worlds)
+    judges = list(probes) * (count if len(probes) == 1 else 1)
+    rivals: list[Path | None] = [*directs] * (count if len(directs) == 1 else 1) or [None] * count
+    return tuple(map(Trained, worlds, judges, rivals))
+
+
+@dataclass(frozen=True)
 class StudyPlan:
     """Everything that one run of the stage is about.
 
-    `world` is a checkpoint of the world model (None: the one that comes with the package), `probe`
-    one of the judge; `keep` is the folder of results and arrays.
+    `trained` are the checkpoints of every training seed; `keep` is the folder of results and
+    arrays; the first `num_still_starts` starts of a task are also held still for 1000 steps.
     """
 
     keep: Path
-    world: Path | None
-    probe: Path
+    trained: tuple[Trained, ...]
     tasks: tuple[str, ...]
     seeds: tuple[int, ...]
     levels_mm: tuple[float, ...] = LEVELS_MM
     cloned: tuple[ClonedPolicy, ...] = ()
+    num_still_starts: int = 3
 
     def __post_init__(self) -> None:
         if not self.tasks or not self.seeds or not self.levels_mm:

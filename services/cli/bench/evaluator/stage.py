@@ -11,11 +11,18 @@ from pathlib import Path
 from typing import Any
 
 from dextouch.errors import InvalidInputError
+from services.cli.bench.evaluator.drawn import Line, Rolled
 from services.cli.bench.evaluator.keeping import KeptRows, Row
-from services.cli.bench.evaluator.lines import Line, Rolled, TaskFigures
+from services.cli.bench.evaluator.lines import TaskFigures
 from services.cli.bench.evaluator.page import cell, write_page
-from services.cli.bench.evaluator.plan import FIRST_SEED, LEVELS_MM, ClonedPolicy, StudyPlan
-from services.cli.bench.evaluator.work import Study, open_study, unit_rows
+from services.cli.bench.evaluator.plan import (
+    FIRST_SEED,
+    LEVELS_MM,
+    ClonedPolicy,
+    StudyPlan,
+    trained_seeds,
+)
+from services.cli.bench.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from services.cli.bench.machine import describe_machine
 from services.cli.bench.report import ResultTable, StageReport
 from services.cli.bench.stages import Bar
@@ -29,8 +36,18 @@ _QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """The options of this stage."""
-    parser.add_argument("--world", type=Path, help="checkpoint of the world model (committed one)")
-    parser.add_argument("--probe", type=Path, default=DEFAULT_PROBE, help="checkpoint of the judge")
+    parser.add_argument(
+        "--world",
+        action="append",
+        type=Path,
+        help="checkpoint of the world model (committed one); repeated for other training seeds",
+    )
+    parser.add_argument(
+        "--probe",
+        action="append",
+        type=Path,
+        help="checkpoint of the judge (committed one); once for all worlds, or once for each",
+    )
     parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
     parser.add_argument(
         "--starts", type=int, help=f"starts a task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
@@ -61,7 +78,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     plan = _plan(options)
     study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")
     units = [
-        (task, seed, tuple(missing))
+        (task, seed, missing)
         for seed in plan.seeds
         for task in study.tasks
         if (missing := study.missing(kept, task, seed))
@@ -109,45 +126,51 @@ def figures_of_tasks(study: Study, kept: KeptRows) -> tuple[list[TaskFigures], i
     figures: list[TaskFigures] = []
     failed = 0
     for task in study.tasks:
-        rolled: list[Rolled] = []
+        by_seed: list[list[Rolled]] = [[] for _ in study.members]
         for seed in study.plan.seeds:
             for policy in study.policies(task):
-                keys = study.keys(task, seed, policy)
-                found = {name: kept.get(**key) for name, key in keys.items()}
-                rows = {name: row for name, row in found.items() if row and "error" not in row}
-                if len(rows) == len(keys):
-                    rolled.append(_rolled(policy, seed, rows))
-                else:
-                    failed += 1
-        if rolled:
-            figures.append(TaskFigures(task, rolled, study.plan.scripts))
+                rolled = _rolled(study, kept, (task, seed, policy))
+                failed += not rolled
+                for mine, one in zip(by_seed, rolled, strict=False):
+                    mine.append(one)
+        if by_seed[0]:
+            figures.append(TaskFigures(task, by_seed, study.plan.scripts))
     return figures, failed
 
 
-def _rolled(policy: str, seed: int, rows: dict[str, Row]) -> Rolled:
-    return Rolled(
-        policy,
-        seed,
-        bool(rows["real"]["success"]),
-        rows["true verdict"],
-        rows["imagined verdict"],
-        rows["imagined"],
-    )
+def _rolled(study: Study, kept: KeptRows, about: tuple[str, int, str]) -> list[Rolled]:
+    """One rollout in the world of every training seed; nothing if it failed in one of them."""
+    rows: list[dict[str, Row]] = [{} for _ in study.members]
+    for (kind, number), key in study.keys(*about).items():
+        row = kept.get(**key)
+        if row is not None and "error" not in row:
+            rows[number][kind] = row
+    if any(kind not in each for each in rows for kind in NEEDED):
+        return []
+    _, seed, policy = about
+    return [Rolled(policy, seed, bool(each["real"]["success"]), each) for each in rows]
 
 
 def interval_table(lines: Sequence[Line]) -> ResultTable:
-    """Figures with their intervals."""
+    """Figures with their intervals, and with those of every training seed if there are several."""
+    several = max((len(line.by_seed) for line in lines), default=1) > 1
     rows = [
         (
             f"{line.task}: {line.what}",
-            "undefined" if line.value is None else f"{line.value:.3f}",
+            _number(line.value),
             "" if line.interval is None else f"{line.interval[0]:.3f} to {line.interval[1]:.3f}",
             str(line.num),
+            *([", ".join(map(_number, line.by_seed))] if several else []),
         )
         for line in lines
     ]
-    columns = ("", "figure", "95 % over starts", "rollouts or policies")
-    return ResultTable("Imagined and real", columns, rows)
+    columns = ["", "figure", "95 % over starts", "rollouts or policies"]
+    columns += ["training seeds"] * several
+    return ResultTable("Imagined and real", tuple(columns), rows)
+
+
+def _number(value: float | None) -> str:
+    return "undefined" if value is None else f"{value:.3f}"
 
 
 def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:
@@ -157,12 +180,12 @@ def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:
 
 
 def _results(
-    plan: StudyPlan, units: Sequence[tuple[str, int, tuple[str, ...]]], num_jobs: int
+    plan: StudyPlan, units: Sequence[tuple[str, int, Missing]], num_jobs: int
 ) -> Iterator[tuple[list[Row], str]]:
     """Rows of every unit, as soon as it is done."""
     if num_jobs == 1 or len(units) < 2:
-        for task, seed, policies in units:
-            yield unit_rows(plan, task, seed, policies), f"{task} {seed}"
+        for task, seed, missing in units:
+            yield unit_rows(plan, task, seed, missing), f"{task} {seed}"
         return
     # A fresh interpreter: a forked one would share the threads of torch.
     with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
@@ -182,10 +205,10 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
     cloned = options.cloned or [f"cloned={DEFAULT_POLICY}"]
     return StudyPlan(
         keep=options.keep,
-        world=options.world,
-        probe=options.probe,
+        trained=trained_seeds(options.world or [None], options.probe or [DEFAULT_PROBE], ()),
         tasks=tuple(options.tasks),
         seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
         levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,
         cloned=tuple(ClonedPolicy.parse(text) for text in cloned),
+        num_still_starts=1 if options.quick else 3,
     )

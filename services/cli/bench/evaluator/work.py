@@ -1,68 +1,57 @@
-"""All rollouts of one start that are not kept yet: one unit of work of the stage `evaluator`."""
+"""All rows of one start that are not kept yet: one unit of work of the stage `evaluator`."""
 
-import hashlib
-from collections.abc import Iterator
-from dataclasses import asdict
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from dextouch.clients.policy import Policy
 from dextouch.errors import DexTouchError
-from dextouch.worlds.world import BatchWorld
-from services.cli.bench.evaluator.keeping import (
-    KeptRows,
-    Row,
-    array_path,
-    read_arrays,
-    write_arrays,
-)
-from services.cli.bench.evaluator.measuring import chunk_figures
-from services.cli.bench.evaluator.plan import CAMERA, StudyPlan
-from services.cli.bench.evaluator.playing import (
-    Actions,
-    ImaginedRollout,
-    TrueRollout,
-    play_in_imagination,
-    play_in_twin,
-    scripted_actions,
-    start_in_twin,
-)
+from services.cli.bench.evaluator.keeping import KeptRows, Row, row_key
+from services.cli.bench.evaluator.members import open_members
+from services.cli.bench.evaluator.plan import CAMERA, ELSEWHERE, HOLD, StudyPlan, script_name
+from services.cli.bench.evaluator.playing import Actions, scripted_actions, start_in_twin
+from services.cli.bench.evaluator.rollouts import DEPENDS_ON, PolicyRollout
 from services.evaluation.closed_loop import first_digest
-from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.starts import refuse_training_starts
-from services.evaluation.success_probe import SuccessProbe
-from services.twin.bounding_boxes import object_boxes_m
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
-from services.world_model.world import open_world
+
+# What a row is: its kind, and the number of the training seed.
+RowName = tuple[str, int]
+Missing = Mapping[str, Sequence[RowName]]
+EXACT = script_name(0.0)
+# Rows that a rollout cannot be without, and those of scripts alone.
+NEEDED = ("real", "imagined", "true verdict", "imagined verdict")
+_OF_SCRIPTS = ("verdict of the last image", "sharpness", "true context")
 
 
 class Study:
-    """The worlds, the judge and the policies of a plan, opened once in a process."""
+    """The twin, the networks of every training seed and the policies, opened once in a process."""
 
     def __init__(self, plan: StudyPlan) -> None:
         torch.set_num_threads(1)
         self.plan = plan
         self.twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
-        self.world: BatchWorld[Any] = open_world(plan.world)
-        self.probe = SuccessProbe.load(plan.probe)
+        self.members = open_members(plan.trained)
         self.cloned = {one.key: BehaviourCloningPolicy.load(one.path) for one in plan.cloned}
-        self.about = {
-            "twin": self.twin.description.digest,
-            "world": self.world.description.digest,
-            "judge": hashlib.sha256(plan.probe.read_bytes()).hexdigest(),
-        }
+
+    @property
+    def about(self) -> dict[str, str]:
+        """Digests of everything; a number is added where there are several training seeds."""
+        found = {"twin": self.twin.description.digest}
+        for index, member in enumerate(self.members, 1):
+            suffix = f" {index}" if len(self.members) > 1 else ""
+            found |= {name + suffix: digest for name, digest in member.about.items()}
+        return found
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """The asked tasks that twin, world and judge all know."""
-        known = set(self.world.description.tasks) & set(self.probe.shape.tasks)
-        return tuple(t for t in self.plan.tasks if t in known & set(self.twin.description.tasks))
+        """The asked tasks that the twin and the networks of all training seeds know."""
+        known = set(self.twin.description.tasks).intersection(*(m.tasks for m in self.members))
+        return tuple(task for task in self.plan.tasks if task in known)
 
     def policies(self, task: str) -> tuple[str, ...]:
         """The policies that can act in a task."""
@@ -72,52 +61,77 @@ class Study:
             if name not in self.cloned or task in self.cloned[name].shape.tasks
         )
 
-    def keys(self, task: str, seed: int, policy: str) -> dict[str, dict[str, Any]]:
-        """What each row of a rollout is about: the real one, the imagined one, and two verdicts."""
+    def keys(self, task: str, seed: int, policy: str) -> dict[RowName, dict[str, Any]]:
+        """What each row of a rollout is about."""
         rollout = {"task": task, "seed": seed, "policy": policy}
-        twin, world, judge = (self.about[name] for name in ("twin", "world", "judge"))
-        return {
-            "real": {"kind": "real", "twin": twin, **rollout},
-            "imagined": {"kind": "imagined", "twin": twin, "world": world, **rollout},
-            "true verdict": {"kind": "true verdict", "twin": twin, "judge": judge, **rollout},
-            "imagined verdict": {
-                "kind": "imagined verdict", "twin": twin, "world": world, "judge": judge, **rollout,
-            },
-        }  # fmt: skip
+        found: dict[RowName, dict[str, Any]] = {}
+        for number, member in enumerate(self.members):
+            digests = {"twin": self.twin.description.digest, **member.about}
+            for kind in self.kinds(seed, policy):
+                needed = {name: digests[name] for name in DEPENDS_ON[kind]}
+                found[kind, number] = {"kind": kind, **needed, **rollout}
+        return found
 
-    def missing(self, kept: KeptRows, task: str, seed: int) -> list[str]:
-        """The policies of a start of which a row is not kept yet."""
-        return [
-            policy
-            for policy in self.policies(task)
-            if any(kept.get(**key) is None for key in self.keys(task, seed, policy).values())
-        ]
+    def kinds(self, seed: int, policy: str) -> tuple[str, ...]:
+        """The kinds of rows that a policy has from a start."""
+        kinds = [*NEEDED, "verdict without touch"]
+        if policy in self.plan.scripts:
+            kinds += _OF_SCRIPTS
+        if policy == ELSEWHERE and EXACT in self.plan.scripts:
+            kinds.append("wrong actions")
+        if policy == HOLD and seed in self.plan.seeds[: self.plan.num_still_starts]:
+            kinds.append("still hand")
+        return tuple(kinds)
 
-    def rows(self, task: str, seed: int, policies: list[str]) -> Iterator[Row]:
+    def missing(self, kept: KeptRows, task: str, seed: int) -> dict[str, tuple[RowName, ...]]:
+        """The rows of a start that are not kept yet, by policy."""
+        found = {}
+        for policy in self.policies(task):
+            # Training seeds may share rows: twin and judge are often the same.
+            names = {
+                row_key(key): name
+                for name, key in self.keys(task, seed, policy).items()
+                if kept.get(**key) is None
+            }
+            if names:
+                found[policy] = tuple(names.values())
+        return found
+
+    def rows(self, task: str, seed: int, missing: Missing) -> Iterator[Row]:
         """Roll out and judge; rollouts whose arrays are kept are not made again.
 
         Raises:
-            ConflictError: judge or cloned policy were trained on this start.
+            ConflictError: a judge or cloned policy was trained on this start.
         """
         self._refuse_training_start(task, seed)
-        for policy in policies:
-            keys = self.keys(task, seed, policy)
-            try:
-                yield from _Rollout(self, task, seed, policy).rows(keys)
-            except DexTouchError as error:
-                yield from (
-                    {**key, "error": type(error).__name__, "message": error.message}
-                    for key in keys.values()
-                )
+        for policy, names in missing.items():
+            keys, rollout = self.keys(task, seed, policy), None
+            for name in names:
+                try:
+                    rollout = rollout or self._rollout(task, seed, policy)
+                    yield {**keys[name], **self._row(rollout, name, task, seed)}
+                except DexTouchError as error:
+                    yield {**keys[name], "error": type(error).__name__, "message": error.message}
+
+    def _row(self, rollout: PolicyRollout, name: RowName, task: str, seed: int) -> Row:
+        kind, number = name
+        member = self.members[number]
+        if kind == "wrong actions":
+            return rollout.wrong_actions(member, self._rollout(task, seed, EXACT))
+        return rollout.row(kind, member)
+
+    def _rollout(self, task: str, seed: int, policy: str) -> PolicyRollout:
+        about = {"task": task, "seed": seed, "policy": policy}
+        return PolicyRollout(self.twin, self.plan.keep, about, self.actor(task, seed, policy))
 
     def _refuse_training_start(self, task: str, seed: int) -> None:
         instruction = self.twin.stage(task).task.instruction
         first = start_in_twin(self.twin, task, seed, instruction)[0].observation
         digest = first_digest(first)
-        trained = {"the success probe": self.probe.metadata.training_starts}
-        trained |= {name: one.metadata.training_starts for name, one in self.cloned.items()}
-        for what, starts in trained.items():
-            refuse_training_starts([digest], trained_on=starts, what=what)
+        trained = [("a judge", member.probe.metadata) for member in self.members]
+        trained += [(name, one.metadata) for name, one in self.cloned.items()]
+        for what, metadata in trained:
+            refuse_training_starts([digest], trained_on=metadata.training_starts, what=what)
 
     def actor(self, task: str, seed: int, policy: str) -> Policy | Actions:
         """A policy that looks, or the actions of one that does not."""
@@ -126,77 +140,12 @@ class Study:
         return scripted_actions(self.twin.stage(task), seed, policy, self.plan.levels_mm)
 
 
-class _Rollout:
-    """One policy from one start."""
-
-    def __init__(self, study: Study, task: str, seed: int, policy: str) -> None:
-        self._study, self._task, self._seed, self._policy = study, task, seed, policy
-        self._actor = study.actor(task, seed, policy)
-        stage = study.twin.stage(task)
-        self._boxes_m = object_boxes_m(stage.simulation.scene)
-        self._started, self._first, self._for_policy = start_in_twin(
-            study.twin, task, seed, stage.task.instruction
-        )
-
-    def rows(self, keys: dict[str, dict[str, Any]]) -> Iterator[Row]:
-        """Rows of both rollouts and both verdicts."""
-        keep, probe = self._study.plan.keep, self._study.probe
-        real = self._real(array_path(keep, **keys["real"]))
-        yield {**keys["real"], "success": real.success}
-        imagined, figures = self._imagined(array_path(keep, **keys["imagined"]), real)
-        yield {**keys["imagined"], "doubted": imagined.doubted, **figures}
-        endings = {
-            "true verdict": Ending(
-                real.last_images, real.tactile_kpa[-NUM_SEEN_STEPS:], self._task
-            ),
-            "imagined verdict": Ending(
-                imagined.last_images,
-                imagined.tactile_kpa[-NUM_SEEN_STEPS:],
-                self._task,
-                imagined.object_poses,
-                imagined=True,
-                doubted=imagined.doubted,
-            ),
-        }
-        for name, ending in endings.items():
-            verdict = asdict(probe.verdict(ending))
-            yield {**keys[name], **verdict}
-
-    def _real(self, path: Path) -> TrueRollout:
-        if path.is_file():
-            kept = read_arrays(path)
-            return TrueRollout(success=bool(kept.pop("success")), **kept)
-        real = play_in_twin(self._study.twin, self._started, self._actor, self._for_policy)
-        write_arrays(path, vars(real) | {"success": np.array(real.success)})
-        return real
-
-    def _imagined(self, path: Path, real: TrueRollout) -> tuple[ImaginedRollout, dict[str, Any]]:
-        if path.is_file():
-            kept = read_arrays(path)
-            poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
-            imagined = ImaginedRollout(**kept, object_poses=poses, doubted=doubted or None)
-        else:
-            world = self._study.world
-            imagined = play_in_imagination(world, self._first, self._actor, self._for_policy)
-            arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
-            write_arrays(path, arrays | {"doubted": np.array(imagined.doubted or "")})
-        figures = chunk_figures(
-            real,
-            imagined,
-            self._started.anchor,
-            self._started.K_head,
-            self._started.observation.images[CAMERA][0],
-            self._boxes_m,
-        )
-        return imagined, dict(figures)
-
-
 @lru_cache(maxsize=1)
 def open_study(plan: StudyPlan) -> Study:
     """The study of this process."""
     return Study(plan)
 
 
-def unit_rows(plan: StudyPlan, task: str, seed: int, policies: tuple[str, ...]) -> list[Row]:
+def unit_rows(plan: StudyPlan, task: str, seed: int, missing: Missing) -> list[Row]:
     """What a worker process does."""
-    return list(open_study(plan).rows(task, seed, list(policies)))
+    return list(open_study(plan).rows(task, seed, missing))
