@@ -25,8 +25,10 @@ _DYNAMICS, _RENDERER = "dynamics.", "renderer."
 class StateBounds(BaseModel):
     """Beyond these a rollout is doubted, or ends.
 
-    `disagreement_m` and `distance` are figures of development episodes that almost none of them
-    passes; `horizon_latents` is the length of an episode that the cores were trained on.
+    `disagreement_m` and `distance` are figures of held-out episodes that almost none of them
+    passes; `horizon_latents` is the length of an episode that the cores were trained on. Bounds
+    `of_chunks` are of the worst latent step in 16 steps from anywhere in an episode; others, of
+    older checkpoints, are of whole episodes: the worst disagreement and the mean distance.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -34,6 +36,16 @@ class StateBounds(BaseModel):
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
     distance: float = Field(default=1.0, gt=0, allow_inf_nan=False)
     horizon_latents: int = Field(default=20, ge=1)
+    of_chunks: bool = False
+
+    @property
+    def latent_distance(self) -> float:
+        """The largest distance of a latent step that is not doubted.
+
+        No step of an episode with a bounded mean is farther than that mean times the number of
+        steps.
+        """
+        return self.distance * (1 if self.of_chunks else self.horizon_latents)
 
 
 class StateMetadata(BaseModel):

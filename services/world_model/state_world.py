@@ -206,7 +206,7 @@ class StateWorld:
                     state,
                     memory=memory_of(following, index),
                     step=state.step + len(chunks[index]),
-                    num_moving=state.num_moving + int(imagined.num_moving[index]),
+                    num_moving=state.num_moving + int(imagined.moves[index].sum()),
                 ),
                 chunks[index],
                 (imagined, index),
@@ -277,11 +277,12 @@ class StateWorld:
 
     def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
         bounds = self._metadata.bounds
-        disagreement_m = float(steps.disagreement_m[index])
+        # Of the worst latent step, whatever the length of the chunk.
+        disagreement_m = float(steps.disagreement_m[index].max())
+        distance = float(steps.distance[index].max())
         count = len(self._metadata.object_names[state.task])
         seen = torch.stack([start.objects.present[0, :count] for start in state.memory.start])
         found = bool((seen > PRESENCE_THRESHOLD).all())
-        distance = float(steps.distance[index])
         reason = None
         if state.num_moving > DOUBTED_HORIZONS * bounds.horizon_latents:
             reason = "hands moved longer than in any episode of training"
@@ -292,10 +293,9 @@ class StateWorld:
                 f"members disagree by {1e3 * disagreement_m:.0f} mm about an object, more than "
                 f"{1e3 * bounds.disagreement_m:.0f} mm"
             )
-        elif distance > bounds.distance:
-            reason = (
-                f"hands are {distance / bounds.distance:.1f} times as far from training as allowed"
-            )
+        elif distance > bounds.latent_distance:
+            times = distance / bounds.latent_distance
+            reason = f"hands are {times:.1f} times as far from training as allowed"
         return Doubt(
             disagreement=disagreement_m,
             distance=distance,

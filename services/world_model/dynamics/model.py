@@ -24,14 +24,11 @@ from services.world_model.dynamics.features import LOOKS, command_features
 from services.world_model.dynamics.hand_motion import HandMotion
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, StartReader
+from services.world_model.dynamics.stillness import stillness
 from services.world_model.dynamics.touch_codec import TouchCodec
 
 # An object whose probability of being there is below this is not there.
 PRESENCE_THRESHOLD = 0.5
-# Hands that move less than this between latent steps stand still.
-STILL_M = 1e-4
-# After this many latent steps of standing still (2 s) everything has come to rest.
-REST_LATENTS = 8
 
 
 def pad_means_kpa(tactile_kpa: Float32[np.ndarray, "*batch 2 320"]) -> np.ndarray:
@@ -51,6 +48,12 @@ class Commands:
 
     def __len__(self) -> int:
         return self.points_m.shape[1]
+
+    def __getitem__(self, latents: slice) -> "Commands":
+        """Some of the latent steps."""
+        return Commands(
+            self.points_m[:, latents], self.axes[:, latents], self.joints_rad[:, latents]
+        )
 
     @classmethod
     def of(cls, motions: list[HandMotion]) -> "Commands":
@@ -74,13 +77,15 @@ class SceneMemory:
     """All that a rollout's dynamics carry from one chunk to the next.
 
     `start` holds what was read and felt at the first step, member by member; `hidden` the cores'
-    states; `poses` where objects are believed now (mean of the members); `points_m` where the hands
-    stood when they last moved; `num_still` for how many latent steps they have stood there.
+    states; `poses` where objects are believed now (mean of the members), `disagreement_m` how far
+    members differ about that; `points_m` where the hands stood when they last moved; `num_still`
+    for how many latent steps they have stood there.
     """
 
     start: tuple[SceneStart, ...]
     hidden: Float32[Tensor, "members layers batch width"]
     poses: ObjectPoses
+    disagreement_m: Float32[Tensor, " batch"]
     tactile_kpa: Float32[Tensor, "batch 2 320"]
     points_m: Float32[Tensor, "batch 2 6 3"]
     num_still: Int64[Tensor, " batch"]
@@ -88,18 +93,19 @@ class SceneMemory:
 
 @dataclass(frozen=True)
 class ImaginedSteps:
-    """What the ensemble says of the next 4k steps.
+    """What the ensemble says of the next 4k steps, and of the k latent steps that they are.
 
     `disagreement_m` is the largest spread (standard deviation over members) of an object's
-    position; `distance` how far command features leave the range of training (0: inside);
-    `num_moving` counts the latent steps in which hands moved.
+    position; `distance` how far command features leave the range of training (0: inside); `moves`
+    says where hands moved and `at_rest` where nothing moves any more.
     """
 
     poses: ObjectPoses
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
-    disagreement_m: Float32[Tensor, " batch"]
-    distance: Float32[Tensor, " batch"]
-    num_moving: Int64[Tensor, " batch"]
+    disagreement_m: Float32[Tensor, "batch latents"]
+    distance: Float32[Tensor, "batch latents"]
+    moves: Bool[Tensor, "batch latents"]
+    at_rest: Bool[Tensor, "batch latents"]
 
 
 class DynamicsMember(nn.Module):
@@ -154,6 +160,7 @@ class DynamicsModel(nn.Module):
             start=tuple(starts),
             hidden=torch.stack(states),
             poses=_mean([start.objects for start in starts]),
+            disagreement_m=_spread_m([start.objects for start in starts]),
             tactile_kpa=torch.minimum(tactile_kpa, self.codec.peak_kpa),
             points_m=standing.points_m[:, -1, -1],
             num_still=torch.zeros(len(tactile_kpa), dtype=torch.int64),
@@ -163,31 +170,56 @@ class DynamicsModel(nn.Module):
     def advance(self, memory: SceneMemory, commands: Commands) -> tuple[SceneMemory, ImaginedSteps]:
         """Imagine the steps of some commands.
 
-        Entries whose hands had stood still for two seconds before, and go on doing so, are at rest:
-        nothing moves any more, and touch stays as it is.
+        Entries whose hands have stood still for two seconds, and go on doing so, are at rest:
+        nothing moves any more, and touch stays as it is. Commands that are cut into several calls
+        give the same as those of one call.
         """
-        futures, states, distances = [], [], []
-        for index, member in enumerate(self._members()):
-            start = memory.start[index]
-            features = _features(commands, start.objects)
-            future, state = member.core(features, start, memory.hidden[index])
-            futures.append(future)
-            states.append(state)
-            distances.append(_distance(features, member.core))
-        imagined = self._imagined(memory, futures, torch.stack(distances).mean(0))
-        still = _stillness(memory, commands)
-        imagined = replace(imagined, num_moving=still.num_moving)
-        imagined = _rested(imagined, memory, still.at_rest)
-        hidden = torch.where(still.at_rest[:, None], memory.hidden, torch.stack(states))
-        following = replace(
-            memory,
-            hidden=hidden,
-            poses=imagined.poses[:, -1],
-            tactile_kpa=imagined.tactile_kpa[:, -1],
-            points_m=still.points_m,
-            num_still=still.num_still,
+        still = stillness(memory.points_m, memory.num_still, commands.points_m)
+        parts: list[_Run] = []
+        for latents, at_rest in still.runs():
+            memory, part = self._advance_run(memory, commands[latents], at_rest)
+            parts.append(part)
+        following = replace(memory, points_m=still.points_m, num_still=still.num_still)
+        imagined = ImaginedSteps(
+            ObjectPoses(
+                torch.cat([part.poses.position_m for part in parts], dim=1),
+                torch.cat([part.poses.axes for part in parts], dim=1),
+                torch.cat([part.poses.present for part in parts], dim=1),
+            ),
+            torch.cat([part.tactile_kpa for part in parts], dim=1),
+            torch.cat([part.disagreement_m for part in parts], dim=1),
+            torch.cat([part.distance for part in parts], dim=1),
+            still.moves,
+            still.at_rest,
         )
         return following, imagined
+
+    def _advance_run(
+        self, memory: SceneMemory, commands: Commands, at_rest: Bool[Tensor, " batch"]
+    ) -> tuple[SceneMemory, "_Run"]:
+        """Some latent steps during all of which the same entries are at rest."""
+        features = [_features(commands, start.objects) for start in memory.start]
+        distance = torch.stack(
+            [_distance(f, m.core) for f, m in zip(features, self._members(), strict=True)]
+        ).mean(0)
+        resting = _resting(memory, distance)
+        if bool(at_rest.all()):
+            return memory, resting
+        futures, states = [], []
+        for index, member in enumerate(self._members()):
+            start = memory.start[index]
+            future, state = member.core(features[index], start, memory.hidden[index])
+            futures.append(future)
+            states.append(state)
+        run = _chosen(at_rest, resting, self._imagined(memory, futures, distance))
+        following = replace(
+            memory,
+            hidden=torch.where(at_rest[:, None], memory.hidden, torch.stack(states)),
+            poses=run.poses[:, -1],
+            disagreement_m=run.disagreement_m[:, -1],
+            tactile_kpa=run.tactile_kpa[:, -1],
+        )
+        return following, run
 
     def readers(self) -> list[StartReader]:
         """The start reader of every member."""
@@ -198,19 +230,15 @@ class DynamicsModel(nn.Module):
 
     def _imagined(
         self, memory: SceneMemory, futures: list[SceneFuture], distance: Tensor
-    ) -> ImaginedSteps:
-        latents = _mean([future.objects for future in futures])
-        positions = torch.stack([future.objects.position_m for future in futures])
-        used = latents.present > PRESENCE_THRESHOLD
-        spread = positions.std(0, correction=0).norm(dim=-1) * used
+    ) -> "_Run":
+        objects = [future.objects for future in futures]
         touch = torch.stack([future.touch for future in futures]).mean(0)
         contact = torch.stack([future.contact for future in futures]).mean(0)
-        return ImaginedSteps(
-            poses=_between(memory.poses, latents),
+        return _Run(
+            poses=_between(memory.poses, _mean(objects)),
             tactile_kpa=self.decode_touch(touch, contact).flatten(1, 2),
-            disagreement_m=spread.amax((1, 2)),
+            disagreement_m=_spread_m(objects),
             distance=distance,
-            num_moving=torch.zeros(len(distance), dtype=torch.int64),
         )
 
     def decode_touch(
@@ -225,14 +253,31 @@ class DynamicsModel(nn.Module):
         return self.codec.decode(touch) * torch.cat([tips, palm], dim=-1)
 
 
+@dataclass(frozen=True)
+class _Run:
+    """What is imagined of some latent steps."""
+
+    poses: ObjectPoses
+    tactile_kpa: Float32[Tensor, "batch steps 2 320"]
+    disagreement_m: Float32[Tensor, "batch latents"]
+    distance: Float32[Tensor, "batch latents"]
+
+
 def _features(commands: Commands, objects: ObjectPoses) -> Float32[Tensor, "batch latents f"]:
     return command_features(commands.points_m, commands.axes, commands.joints_rad, objects)
 
 
-def _distance(features: Tensor, core: RecurrentCore) -> Float32[Tensor, " batch"]:
+def _distance(features: Tensor, core: RecurrentCore) -> Float32[Tensor, "batch latents"]:
     """Mean excess of features over the range that the core sees unclipped."""
     scaled = ((features - core.feature_mean) / core.feature_std).abs()
-    return (scaled - MAX_DEVIATION).clamp_min(0.0).mean((1, 2))
+    return (scaled - MAX_DEVIATION).clamp_min(0.0).mean(2)
+
+
+def _spread_m(poses: list[ObjectPoses]) -> Float32[Tensor, "*batch"]:
+    """Largest standard deviation over members of the position of an object that is there."""
+    used = torch.stack([each.present for each in poses]).mean(0) > PRESENCE_THRESHOLD
+    positions = torch.stack([each.position_m for each in poses])
+    return (positions.std(0, correction=0).norm(dim=-1) * used).amax(-1)
 
 
 def _mean(poses: list[ObjectPoses]) -> ObjectPoses:
@@ -267,41 +312,37 @@ def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
     )
 
 
-@dataclass(frozen=True)
-class _Stillness:
-    """Where hands stood when they last moved, for how many latent steps, and who is at rest."""
+def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) -> _Run:
+    """Latent steps in which everything stays as it is."""
+    num_latents = distance.shape[1]
 
-    points_m: Float32[Tensor, "batch 2 6 3"]
-    num_still: Int64[Tensor, " batch"]
-    num_moving: Int64[Tensor, " batch"]
-    at_rest: Bool[Tensor, " batch"]
+    def held(now: Tensor, count: int) -> Tensor:
+        return now[:, None].expand(-1, count, *now.shape[1:])
 
-
-def _stillness(memory: SceneMemory, commands: Commands) -> _Stillness:
-    """Hands move when they leave the place where they stood, however slowly."""
-    stood, num_still = memory.points_m, memory.num_still
-    num_moving = torch.zeros_like(num_still)
-    for latent in range(len(commands)):
-        here = commands.points_m[:, latent, -1]
-        moves = (here - stood).norm(dim=-1).amax((-1, -2)) >= STILL_M
-        stood = torch.where(moves[:, None, None, None], here, stood)
-        num_still = torch.where(moves, 0, num_still + 1)
-        num_moving = num_moving + moves
-    at_rest = (num_moving == 0) & (memory.num_still >= REST_LATENTS)
-    return _Stillness(stood, num_still, num_moving, at_rest)
+    steps = num_latents * STEPS_PER_LATENT
+    poses = memory.poses
+    return _Run(
+        ObjectPoses(held(poses.position_m, steps), held(poses.axes, steps),
+            held(poses.present, steps)),
+        held(memory.tactile_kpa, steps),
+        held(memory.disagreement_m, num_latents),
+        distance,
+    )  # fmt: skip
 
 
-def _rested(imagined: ImaginedSteps, memory: SceneMemory, at_rest: Tensor) -> ImaginedSteps:
-    def held(now: Tensor, steps: Tensor) -> Tensor:
-        chosen = at_rest.view(-1, *[1] * now.ndim)
-        return torch.where(chosen, now[:, None].expand_as(steps), steps)
+def _chosen(at_rest: Bool[Tensor, " batch"], resting: _Run, moving: _Run) -> _Run:
+    """Entries at rest from one, all others from the other."""
 
-    return replace(
-        imagined,
-        poses=ObjectPoses(
-            held(memory.poses.position_m, imagined.poses.position_m),
-            held(memory.poses.axes, imagined.poses.axes),
-            held(memory.poses.present, imagined.poses.present),
+    def chosen(held: Tensor, steps: Tensor) -> Tensor:
+        return torch.where(at_rest.view(-1, *[1] * (steps.ndim - 1)), held, steps)
+
+    return _Run(
+        ObjectPoses(
+            chosen(resting.poses.position_m, moving.poses.position_m),
+            chosen(resting.poses.axes, moving.poses.axes),
+            chosen(resting.poses.present, moving.poses.present),
         ),
-        tactile_kpa=held(memory.tactile_kpa, imagined.tactile_kpa),
+        chosen(resting.tactile_kpa, moving.tactile_kpa),
+        chosen(resting.disagreement_m, moving.disagreement_m),
+        moving.distance,
     )

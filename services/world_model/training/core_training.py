@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float16, Float32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneFuture, SceneStart
 from services.world_model.dynamics.features import command_features
 from services.world_model.dynamics.model import Commands
@@ -21,6 +21,8 @@ from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
 _FIT_EPISODES = 400
+# Cores learn to begin at the first step and at every so many steps after it.
+_START_STRIDE = 8
 OnStep = Callable[[int, float], None]
 
 
@@ -105,13 +107,29 @@ def fit_features(core: RecurrentCore, table: SceneTable) -> None:
     core.feature_std.copy_(features.std(0) + 0.05)
 
 
+def start_steps(table: SceneTable) -> list[int]:
+    """Steps with an image at which cores learn to begin: up to the last latent step of all."""
+    last = table.num_steps - 1 - STEPS_PER_LATENT
+    wanted = {*range(0, last, _START_STRIDE), last}
+    return [step for step in table.image_steps if step in wanted]
+
+
+def _later_start(later: list[int], num_steps: int, rng: np.random.Generator) -> int:
+    """One of some starts, as often as the root of what follows it is long.
+
+    A start near the end teaches little of what lasts, but rollouts begin there, too.
+    """
+    weight = np.sqrt([num_steps - 1 - step for step in later])
+    return int(rng.choice(later, p=weight / weight.sum()))
+
+
 def _draw(
     data: CoreData, settings: CoreSettings, generator: torch.Generator, rng: np.random.Generator
 ) -> _Batch:
     table = data.table
     is_first = rng.random() < settings.first_fraction
     later = [step for step in data.readings if step > 0]
-    start_step = 0 if is_first or not later else int(rng.choice(later))
+    start_step = 0 if is_first or not later else _later_start(later, table.num_steps, rng)
     rows = torch.randint(len(table), (settings.batch,), generator=generator)
 
     def chance(fraction: float) -> Bool[Tensor, " batch"]:

@@ -1,4 +1,4 @@
-"""Accuracy of a dynamics model on held-out scenes, open loop over whole episodes."""
+"""Accuracy of a dynamics model on held-out scenes, open loop from several starts to the end."""
 
 from dataclasses import dataclass
 
@@ -9,22 +9,28 @@ from torch import Tensor
 
 from dextouch.metrics import tactile as tactile_metrics
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
-from services.world_model.dynamics.model import Commands, DynamicsModel
+from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.training.reader_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
 CHUNK_STEPS = 16
+# Rollouts begin at these steps, as far as there are images of them.
+STARTS = (0, 16, 32, 48, 64)
 _BATCH = 64
-# Of held-out episodes, this share may pass a bound.
-_BOUND_QUANTILE = 0.995
+# Of held-out chunks of 16 steps, from any start, this share may pass a bound; of episodes of five
+# chunks, therefore, at most one in 200.
+_BOUND_QUANTILE = 0.999
+_SMALLEST_DISTANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class StateFigures:
-    """What was measured, with the bounds that almost no held-out episode passes.
+    """What was measured, with the bounds that almost no held-out chunk passes.
 
     `figures` hold errors of readers (of the first member) and objects in mm, contact F1 and error
-    of touch for each chunk of 16 steps, and those of copying the touch before the chunk.
+    of touch for each chunk of 16 steps, and those of copying the touch before the chunk. Names with
+    `from_16` are of rollouts that begin with the true step 16, and so on; their chunks are counted
+    from there. `object_mm` is the median error of an object's place at the end of a chunk.
     """
 
     figures: dict[str, float]
@@ -35,70 +41,102 @@ class StateFigures:
 
 @dataclass(frozen=True)
 class _Imagined:
+    """Whole episodes from one start; the last two say how far each latent step is doubted."""
+
     tactile_kpa: Float32[Tensor, "episodes steps 2 320"]
-    last_m: Float32[Tensor, "episodes objects 3"]
-    disagreement_m: Float32[Tensor, " episodes"]
-    distance: Float32[Tensor, " episodes"]
+    position_m: Float32[Tensor, "episodes steps objects 3"]
+    disagreement_m: Float32[Tensor, "episodes latents"]
+    distance: Float32[Tensor, "episodes latents"]
 
 
 def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
-    """Imagine every episode from its first step and compare."""
-    parts = [
-        _imagine(dynamics, table, rows) for rows in torch.split(torch.arange(len(table)), _BATCH)
-    ]
-    tactile = torch.cat([part.tactile_kpa for part in parts]).numpy()
-    true = table.tactile_kpa.float().numpy()
+    """Imagine every episode from its first step and from later ones, and compare."""
     figures: dict[str, float] = {}
-    for index, first in enumerate(range(0, true.shape[1] - 1, CHUNK_STEPS)):
-        steps = slice(first + 1, first + 1 + CHUNK_STEPS)
-        copied = np.broadcast_to(true[:, first : first + 1], true[:, steps].shape)
-        for name, guess in (("", tactile[:, first : first + CHUNK_STEPS]), ("_of_copy", copied)):
-            pair = {"predicted_kpa": guess, "true_kpa": np.ascontiguousarray(true[:, steps])}
-            figures[f"contact_f1_chunk_{index + 1}{name}"] = tactile_metrics.contact_f1(**pair)
-            figures[f"tactile_mse_chunk_{index + 1}{name}"] = tactile_metrics.mse(**pair)
-    last = torch.cat([part.last_m for part in parts])
-    rows = torch.arange(len(table))
-    end = table.objects_at(rows, table.num_steps - 1)
-    there = (end.present > 0) & (table.objects_at(rows, 0).present > 0)
-    off_mm = 1e3 * (last - end.position_m).norm(dim=-1)
-    reader = dynamics.readers()[0]
-    for task, index in ((t, i) for i, t in enumerate(dynamics.config.tasks)):
-        found = there & (table.task == index)[:, None]
-        if found.any():
-            figures[f"final_object_mm_{task}"] = float(off_mm[found].median())
-    for task, error in reader_errors(reader, table, 0).items():
-        figures[f"start_lateral_mm_{task}"] = error.lateral_mm
-        figures[f"start_lateral_90_mm_{task}"] = error.lateral_90_mm
-    quantile = torch.tensor(_BOUND_QUANTILE)
+    disagreement_m, distance = [], []
+    last_start = table.num_steps - 1 - STEPS_PER_LATENT
+    for start in (s for s in STARTS if s in table.image_steps and s <= last_start):
+        imagined = _imagined(dynamics, table, start)
+        figures |= _chunk_figures(imagined, table, start)
+        if start == 0:
+            figures |= _episode_figures(imagined, table, dynamics)
+        disagreement_m.append(chunk_peaks(imagined.disagreement_m))
+        distance.append(chunk_peaks(imagined.distance))
     return StateFigures(
         {name: round(float(value), 4) for name, value in figures.items()},
-        disagreement_m=float(torch.cat([p.disagreement_m for p in parts]).quantile(quantile)),
-        distance=max(1e-3, float(torch.cat([p.distance for p in parts]).quantile(quantile))),
+        disagreement_m=float(torch.cat(disagreement_m).quantile(_BOUND_QUANTILE)),
+        distance=max(_SMALLEST_DISTANCE, float(torch.cat(distance).quantile(_BOUND_QUANTILE))),
         num_latents=(table.num_steps - 1) // STEPS_PER_LATENT,
     )
 
 
+def chunk_peaks(latents: Float32[Tensor, "episodes latents"]) -> Float32[Tensor, " chunks"]:
+    """Figures of the worst latent step of every chunk of 16 steps: what a rollout is asked."""
+    chunks = latents.split(CHUNK_STEPS // STEPS_PER_LATENT, dim=1)
+    return torch.cat([chunk.amax(1) for chunk in chunks])
+
+
+def _chunk_figures(imagined: _Imagined, table: SceneTable, start: int) -> dict[str, float]:
+    figures: dict[str, float] = {}
+    place = "" if start == 0 else f"from_{start}_"
+    for index, first in enumerate(range(start, table.num_steps - 1, CHUNK_STEPS)):
+        steps = slice(first + 1, first + 1 + CHUNK_STEPS)
+        true = table.tactile_kpa[:, steps].float().numpy()
+        said = slice(first - start, first - start + CHUNK_STEPS)
+        guesses = {"": imagined.tactile_kpa[:, said].numpy()}
+        if start == 0:
+            before = table.tactile_kpa[:, first : first + 1].float().numpy()
+            guesses["_of_copy"] = np.broadcast_to(before, true.shape)
+        for name, guess in guesses.items():
+            chunk = f"{place}chunk_{index + 1}{name}"
+            pair = {"predicted_kpa": guess, "true_kpa": true}
+            figures[f"contact_f1_{chunk}"] = tactile_metrics.contact_f1(**pair)
+            figures[f"tactile_mse_{chunk}"] = tactile_metrics.mse(**pair)
+        end = min(first + CHUNK_STEPS, table.num_steps - 1)
+        off_mm, there = _object_errors(imagined.position_m[:, end - start - 1], table, start, end)
+        if there.any():
+            figures[f"object_mm_{place}chunk_{index + 1}"] = float(off_mm[there].median())
+    return figures
+
+
+def _episode_figures(
+    imagined: _Imagined, table: SceneTable, dynamics: DynamicsModel
+) -> dict[str, float]:
+    """Errors of objects at the end and of readers at the start, task by task."""
+    figures: dict[str, float] = {}
+    off_mm, there = _object_errors(imagined.position_m[:, -1], table, 0, table.num_steps - 1)
+    for index, task in enumerate(dynamics.config.tasks):
+        found = there & (table.task == index)[:, None]
+        if found.any():
+            figures[f"final_object_mm_{task}"] = float(off_mm[found].median())
+    for task, error in reader_errors(dynamics.readers()[0], table, 0).items():
+        figures[f"start_lateral_mm_{task}"] = error.lateral_mm
+        figures[f"start_lateral_90_mm_{task}"] = error.lateral_90_mm
+    return figures
+
+
+def _object_errors(
+    position_m: Float32[Tensor, "episodes objects 3"], table: SceneTable, start: int, step: int
+) -> tuple[Tensor, Tensor]:
+    """Errors in mm at a step, and which objects are there both then and at the start."""
+    rows = torch.arange(len(table))
+    true = table.objects_at(rows, step)
+    there = (true.present > 0) & (table.objects_at(rows, start).present > 0)
+    return 1e3 * (position_m - true.position_m).norm(dim=-1), there
+
+
 @torch.no_grad()
-def _imagine(dynamics: DynamicsModel, table: SceneTable, rows: Tensor) -> _Imagined:
-    first = table.first_steps(rows, torch.zeros_like(rows))
-    commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
-    standing, following = _split(commands)
-    touch = table.tactile_kpa[rows, 0].float()
-    memory = dynamics.begin(first, touch, standing, table.commanded[rows].float())
-    _, imagined = dynamics.advance(memory, following)
+def _imagined(dynamics: DynamicsModel, table: SceneTable, start: int) -> _Imagined:
+    parts = []
+    for rows in torch.split(torch.arange(len(table)), _BATCH):
+        first = table.first_steps(rows, torch.full_like(rows, start))
+        commands = table.commands(rows, start, torch.zeros(len(rows), dtype=torch.bool))
+        touch = table.tactile_kpa[rows, start].float()
+        sent = table.commanded[rows].float()
+        memory = dynamics.begin(first, touch, commands[:1], sent)
+        parts.append(dynamics.advance(memory, commands[1:])[1])
     return _Imagined(
-        imagined.tactile_kpa,
-        imagined.poses.position_m[:, -1],
-        imagined.disagreement_m,
-        imagined.distance,
+        torch.cat([part.tactile_kpa for part in parts]),
+        torch.cat([part.poses.position_m for part in parts]),
+        torch.cat([part.disagreement_m for part in parts]),
+        torch.cat([part.distance for part in parts]),
     )
-
-
-def _split(commands: Commands) -> tuple[Commands, Commands]:
-    def parts(first: int | None, last: int | None) -> Commands:
-        steps = slice(first, last)
-        return Commands(
-            commands.points_m[:, steps], commands.axes[:, steps], commands.joints_rad[:, steps]
-        )
-
-    return parts(None, 1), parts(1, None)

@@ -31,7 +31,12 @@ from services.world_model.state_checkpoints import (
     StateMetadata,
     write_state_checkpoint,
 )
-from services.world_model.training.core_training import CoreData, touch_latents, train_core
+from services.world_model.training.core_training import (
+    CoreData,
+    start_steps,
+    touch_latents,
+    train_core,
+)
 from services.world_model.training.reader_training import read_objects, train_reader
 from services.world_model.training.scene_clips import scene_clips
 from services.world_model.training.scene_episodes import (
@@ -44,9 +49,7 @@ from services.world_model.training.scene_table import SceneTable, scene_table, v
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
 # Goes up with every change of training that makes other weights of the same settings and data.
-TRAINING_VERSION = 2
-# Cores learn to begin at these steps beside the first.
-LATER_STARTS = tuple(range(8, 64, 8))
+TRAINING_VERSION = 3
 # The renderer learns from this many episodes at most: it sees few of their images anyway.
 MAX_CLIPS = 1500
 _LOG_EVERY = 500
@@ -109,6 +112,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
             disagreement_m=measured.disagreement_m,
             distance=measured.distance,
             horizon_latents=measured.num_latents,
+            of_chunks=True,
         ),
         command=_command(settings),
         seed=settings.seed,
@@ -263,8 +267,7 @@ def _train_member(work: _Work, member: int) -> None:
     made.reader = train_reader(
         table, work.config, work.settings.reader, seed=seed, on_step=log.reader
     )
-    starts = [step for step in (0, *LATER_STARTS) if step in table.image_steps]
-    readings = {step: read_objects(made.reader, table, step) for step in starts}
+    readings = {step: read_objects(made.reader, table, step) for step in start_steps(table)}
     data = CoreData(table, touch_latents(codec, table), readings)
     made.core = train_core(data, work.config, work.settings.core, seed=seed, on_step=log.core)
     _keep(made, work.file_of(member), time.process_time() - started_s)

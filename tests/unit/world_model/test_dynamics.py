@@ -22,7 +22,6 @@ from services.world_model.dynamics.memory import (
     stack_memories,
 )
 from services.world_model.dynamics.model import (
-    REST_LATENTS,
     Commands,
     DynamicsModel,
     SceneMemory,
@@ -34,6 +33,7 @@ from services.world_model.dynamics.objects import (
     poses_from_objects,
 )
 from services.world_model.dynamics.start_reader import FirstStep, ray_at_height
+from services.world_model.dynamics.stillness import REST_LATENTS
 from services.world_model.dynamics.touch_codec import TouchCodec
 
 CONFIG = DynamicsConfig(tasks=("one", "two"), num_objects=(1, 2), image_px=32, width=16)
@@ -300,7 +300,7 @@ def test_hands_that_creep_do_not_stand_still(model):
     for first in range(0, len(path), 16):
         motion = hand_motion(path[first : first + 16], ANCHOR)
         memory, imagined = model.advance(memory, Commands.of([motion] * 2))
-        total += int(imagined.num_moving[0])
+        total += int(imagined.moves[0].sum())
     # 6.4 mm at 0.08 mm a latent step: every second step has left the last place by 0.1 mm.
     assert total == 40
     assert memory.num_still.max() < REST_LATENTS
@@ -313,7 +313,8 @@ def test_members_that_see_nothing_have_no_say_about_the_place():
     )
     memory = SceneMemory(
         start=tuple(dataclasses.replace(start(1), objects=each) for each in (seen, seen, blind)),
-        hidden=torch.zeros(3, 1, 1, 1), poses=seen, tactile_kpa=torch.zeros(1, 2, 320),
+        hidden=torch.zeros(3, 1, 1, 1), poses=seen, disagreement_m=torch.zeros(1),
+        tactile_kpa=torch.zeros(1, 2, 320),
         points_m=torch.zeros(1, 2, 6, 3), num_still=torch.zeros(1, dtype=torch.int64),
     )  # fmt: skip
     mean = mean_start(memory)
@@ -344,7 +345,7 @@ def test_chunks_in_turn_imagine_what_one_long_chunk_does(model):
 def test_members_that_agree_do_not_disagree(model):
     model.members[1].load_state_dict(model.members[0].state_dict())
     _, imagined = model.advance(begun(model), Commands.of([lifted(8)] * 2))
-    torch.testing.assert_close(imagined.disagreement_m, torch.zeros(2), atol=1e-6, rtol=0)
+    torch.testing.assert_close(imagined.disagreement_m, torch.zeros(2, 2), atol=1e-6, rtol=0)
 
 
 def test_a_memory_survives_its_arrays(model):

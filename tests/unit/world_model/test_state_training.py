@@ -1,6 +1,7 @@
 """Start readers and cores learn a toy scene: a bright block that a descending hand presses."""
 
 import dataclasses
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,10 @@ from dextouch.geometry.cameras import pinhole_matrix, project
 from dextouch.geometry.transforms import apply, invert, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.core import RecurrentCore
 from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.dynamics.start_reader import StartReader
+from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.settings import (
     CoreLossWeights,
     CoreSettings,
@@ -21,7 +25,14 @@ from services.world_model.settings import (
     TrainStateCommand,
 )
 from services.world_model.state_checkpoints import StateBounds
-from services.world_model.training.core_training import CoreData, touch_latents, train_core
+from services.world_model.training.core_training import (
+    CoreData,
+    _draw,
+    core_loss,
+    start_steps,
+    touch_latents,
+    train_core,
+)
 from services.world_model.training.reader_training import (
     read_objects,
     reader_errors,
@@ -38,7 +49,7 @@ CAMERA = transform(np.diag([1.0, -1.0, -1.0]), np.array([0.0, 0.0, 0.5]))
 BLOCK_HEIGHT_M = 0.03
 
 
-def episode(seed):
+def episode(seed, num_steps=NUM_STEPS):
     """The right hand comes down at its own place; it presses only if the block is under it."""
     rng = np.random.default_rng(seed)
     block_m = np.array([*rng.uniform(-0.1, 0.1, 2), BLOCK_HEIGHT_M])
@@ -46,16 +57,16 @@ def episode(seed):
     hand_m = block_m + ([0.0, 0.0, 0.2] if hits else [0.12, 0.12, 0.2])
     left_m = np.array([-0.3, 0.0, 0.2])
     anchor = np.stack([transform(np.eye(3), left_m), transform(np.eye(3), hand_m), CAMERA])
-    actions = np.zeros((NUM_STEPS, 67))
+    actions = np.zeros((num_steps, 67))
     for part in POSE_SLICES:
         actions[:, part] = IDENTITY_POSE_9D
-    down = np.clip(np.arange(NUM_STEPS) / 10, 0, 1)
+    down = np.clip(np.arange(num_steps) / 10, 0, 1)
     actions[:, 11] = -0.2 * down
-    tactile = np.zeros((NUM_STEPS, 2, 320), dtype=np.float16)
+    tactile = np.zeros((num_steps, 2, 320), dtype=np.float16)
     tactile[down >= 0.8, 1, 80:] = 20.0 if hits else 0.0
-    poses = np.zeros((NUM_STEPS, 1, 7), dtype=np.float32)
+    poses = np.zeros((num_steps, 1, 7), dtype=np.float32)
     poses[:, 0, :3], poses[:, 0, 3] = block_m, 1.0
-    steps = np.arange(0, NUM_STEPS, 4)
+    steps = np.arange(0, num_steps, 4)
     return SceneEpisode(
         episode_id=f"toy-{seed}", task="press", instruction="press the block", domain="robot",
         seed=seed, motion="script", noise_m=0.0, success=hits, event_times_s={},
@@ -130,7 +141,52 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
     assert measured.figures["contact_f1_chunk_1_of_copy"] == 0.0
     assert measured.figures["final_object_mm_press"] < 25
     assert measured.disagreement_m == 0.0
+    assert measured.figures["object_mm_chunk_1"] < 25
     assert StateBounds(distance=measured.distance).distance > 0
+
+
+def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
+    table = scene_table([episode(seed, 81) for seed in range(2)], config)
+    starts = start_steps(table)
+    assert starts == [0, 8, 16, 24, 32, 40, 48, 56, 64, 72, 76]
+    torch.manual_seed(0)
+    blank = {step: read_objects(StartReader(config), table, step) for step in starts}
+    data = CoreData(table, touch_latents(TouchCodec(8), table), blank)
+    rng, generator = np.random.default_rng(0), torch.Generator().manual_seed(0)
+    settings = CoreSettings(batch=2, bfloat16=False, first_fraction=0.5)
+    drawn = [_draw(data, settings, generator, rng) for _ in range(600)]
+    counts = Counter(batch.start_step for batch in drawn)
+    assert set(counts) == set(starts)
+    # sqrt(18) : 1, within what 600 draws leave open.
+    assert 2 < counts[8] / counts[76] < 9
+    core = RecurrentCore(config)
+    latest = next(batch for batch in drawn if batch.start_step == 76)
+    assert len(latest.commands) == 2
+    assert torch.isfinite(core_loss(core, data, latest, settings))
+
+
+def test_rollouts_from_the_middle_are_measured_with_true_context(config):
+    held_out = scene_table([episode(seed, 49) for seed in range(1000, 1008)], config)
+    torch.manual_seed(0)
+    dynamics = DynamicsModel(config, num_members=2).eval()
+    measured = evaluate_dynamics(dynamics, held_out).figures
+    chunks = {0: 3, 16: 2, 32: 1}
+    for start, count in chunks.items():
+        place = f"from_{start}_" if start else ""
+        for chunk in range(1, count + 1):
+            assert 0 <= measured[f"contact_f1_{place}chunk_{chunk}"] <= 1
+            assert measured[f"object_mm_{place}chunk_{chunk}"] > 0
+        assert f"object_mm_{place}chunk_{count + 1}" not in measured
+    # The block never moves: what is wrong is what an untrained reader saw and the core adds.
+    true = held_out.objects_at(torch.arange(8), 32).position_m[:, 0]
+    rows = torch.arange(8)
+    commands = held_out.commands(rows, 32, torch.zeros(8, dtype=torch.bool))
+    first = held_out.first_steps(rows, torch.full((8,), 32))
+    touch = held_out.tactile_kpa[:, 32].float()
+    memory = dynamics.begin(first, touch, commands[:1], torch.ones(8))
+    _, imagined = dynamics.advance(memory, commands[1:])
+    off_mm = 1e3 * (imagined.poses.position_m[:, -1, 0] - true).norm(dim=-1)
+    np.testing.assert_allclose(measured["object_mm_from_32_chunk_1"], off_mm.median(), atol=1e-3)
 
 
 def test_a_table_survives_its_tensors(table):

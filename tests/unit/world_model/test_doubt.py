@@ -1,0 +1,89 @@
+"""What bounds of doubt were measured of is what rollouts are asked, whatever their chunks."""
+
+import numpy as np
+import pytest
+import torch
+
+from dextouch.worlds.world import ReturnSelector
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.state_checkpoints import StateBounds
+from services.world_model.state_world import StateWorld
+from services.world_model.training.scene_table import scene_table
+from services.world_model.training.state_evaluation import evaluate_dynamics
+from tests.contracts.test_world import from_observation
+from tests.unit.world_model.test_rest import seeing_checkpoint
+from tests.unit.world_model.test_state_training import PX, episode
+
+TOUCH_ONLY = ReturnSelector(cameras=())
+NUM_STEPS = 49
+
+
+@pytest.fixture(scope="module")
+def table():
+    config = DynamicsConfig(tasks=("press",), num_objects=(1,), image_px=PX, width=16)
+    return scene_table([episode(seed, NUM_STEPS) for seed in range(12)], config), config
+
+
+@pytest.fixture(scope="module")
+def dynamics(table):
+    torch.manual_seed(0)
+    model = DynamicsModel(table[1], num_members=2).eval()
+    for member in model.members:
+        # So narrow that every hand is far from what was trained, each by another amount.
+        member.core.feature_std.fill_(0.1)
+    return model
+
+
+def asked(dynamics, table, start):
+    """Worst disagreement and distance of every chunk of 16 steps, asked one chunk after another."""
+    rows = torch.arange(len(table))
+    commands = table.commands(rows, start, torch.zeros(len(rows), dtype=torch.bool))
+    memory = dynamics.begin(
+        table.first_steps(rows, torch.full_like(rows, start)),
+        table.tactile_kpa[rows, start].float(),
+        commands[:1],
+        table.commanded[rows].float(),
+    )
+    found = []
+    for first in range(1, len(commands), 4):
+        memory, imagined = dynamics.advance(memory, commands[first : first + 4])
+        found.append(torch.stack([imagined.disagreement_m, imagined.distance]).amax(2))
+    return torch.cat(found, dim=1)
+
+
+def test_bounds_are_of_the_chunks_that_rollouts_are_asked(dynamics, table):
+    measured = evaluate_dynamics(dynamics, table[0])
+    chunks = torch.cat([asked(dynamics, table[0], start) for start in (0, 16, 32)], dim=1)
+    disagreement_m, distance = np.quantile(chunks.numpy(), 0.999, axis=1)
+    assert distance > 0.01
+    np.testing.assert_allclose(measured.disagreement_m, disagreement_m, rtol=1e-3)
+    np.testing.assert_allclose(measured.distance, distance, rtol=1e-3)
+
+
+def test_a_long_chunk_is_as_doubtful_as_the_worst_of_its_parts():
+    checkpoint = seeing_checkpoint()
+    for member in checkpoint.dynamics.members:
+        member.core.feature_std.fill_(0.1)
+    world = StateWorld(checkpoint)
+    started = world.reset(from_observation(world))
+    rows = np.repeat(started.observation.action_reached, 64, axis=0)
+    # Far away in the middle, and back.
+    rows[:, 9] += 0.4 * np.sin(np.linspace(0, np.pi, 64))
+    whole = world.step(started.state, rows, seed=0, selector=TOUCH_ONLY).observation.doubt
+    state, parts = started.state, []
+    for first in range(0, 64, 4):
+        step = world.step(state, rows[first : first + 4], seed=0, selector=TOUCH_ONLY)
+        state = step.state
+        parts.append(step.observation.doubt)
+    np.testing.assert_allclose(whole.distance, max(p.distance for p in parts), rtol=1e-5)
+    np.testing.assert_allclose(whole.disagreement, max(p.disagreement for p in parts), rtol=1e-4)
+    assert whole.disagreement > 0
+    assert whole.distance > 1.03 * np.mean([part.distance for part in parts])
+
+
+def test_older_bounds_of_whole_episodes_keep_their_meaning():
+    # An episode of 20 latent steps with a mean of 0.01: a single step may carry all of it.
+    old = StateBounds.model_validate({"distance": 0.01, "horizon_latents": 20})
+    np.testing.assert_allclose(old.latent_distance, 0.2)
+    assert StateBounds(distance=0.01, of_chunks=True).latent_distance == 0.01
