@@ -24,8 +24,8 @@ from services.world_model.dynamics.features import LOOKS, command_features
 from services.world_model.dynamics.hand_motion import HandMotion
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import FirstStep, StartReader
-from services.world_model.dynamics.stillness import stillness
-from services.world_model.dynamics.touch_codec import TouchCodec
+from services.world_model.dynamics.stillness import REST_LATENTS, stillness
+from services.world_model.dynamics.touch_codec import FREE_KPA, TouchCodec
 
 # An object whose probability of being there is below this is not there.
 PRESENCE_THRESHOLD = 0.5
@@ -79,7 +79,8 @@ class SceneMemory:
     `start` holds what was read and felt at the first step, member by member; `hidden` the cores'
     states; `poses` where objects are believed now (mean of the members), `disagreement_m` how far
     members differ about that; `points_m` where the hands stood when they last moved; `num_still`
-    for how many latent steps they have stood there.
+    for how many latent steps they have stood there (from the start on, at least `REST_LATENTS`
+    where they touch nothing).
     """
 
     start: tuple[SceneStart, ...]
@@ -141,6 +142,8 @@ class DynamicsModel(nn.Module):
     ) -> SceneMemory:
         """Read the scene of an observed step.
 
+        Hands that touch nothing leave the scene at rest until they move.
+
         Args:
             first: the step as readers see it.
             tactile_kpa: pressure of that step.
@@ -163,7 +166,7 @@ class DynamicsModel(nn.Module):
             disagreement_m=_spread_m([start.objects for start in starts]),
             tactile_kpa=torch.minimum(tactile_kpa, self.codec.peak_kpa),
             points_m=standing.points_m[:, -1, -1],
-            num_still=torch.zeros(len(tactile_kpa), dtype=torch.int64),
+            num_still=REST_LATENTS * (tactile_kpa.amax((1, 2)) < FREE_KPA).long(),
         )
 
     @torch.no_grad()

@@ -21,6 +21,10 @@ from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
 _FIT_EPISODES = 400
+# How much more often hands are held still at later starts, of which fewer are free to be.
+_LATER_HELD = 2.5
+# Objects that moved less than this in the latent step before lie still.
+_SETTLED_M = 1e-3
 # Cores learn to begin at the first step and at every so many steps after it.
 _START_STRIDE = 8
 OnStep = Callable[[int, float], None]
@@ -137,8 +141,8 @@ def _draw(
 
     measured = chance(settings.measured_fraction) | ~table.commanded[rows]
     commands = table.commands(rows, start_step, measured)
-    free = ~table.in_contact[rows, start_step].any(-1)
-    held = chance(settings.held_fraction) & free & (start_step == 0)
+    held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
+    held &= _is_settled(table, rows, start_step)
     objects = _start_objects(data, rows, start_step, settings, generator)
     return _Batch(
         rows=rows,
@@ -153,6 +157,15 @@ def _draw(
         commands=_held_still(commands, held),
         is_held=held,
     )
+
+
+def _is_settled(table: SceneTable, rows: Tensor, start_step: int) -> Bool[Tensor, " batch"]:
+    """Where hands touch nothing and nothing moves by itself: there, nothing would ever happen."""
+    free = ~table.in_contact[rows, start_step].any(-1)
+    before = max(0, start_step - STEPS_PER_LATENT)
+    position_m = table.objects.position_m
+    moved_m = (position_m[rows, start_step] - position_m[rows, before]).norm(dim=-1).amax(-1)
+    return free & (moved_m < _SETTLED_M)
 
 
 def _start_objects(

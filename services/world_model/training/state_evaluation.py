@@ -71,7 +71,7 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
 
 def chunk_peaks(latents: Float32[Tensor, "episodes latents"]) -> Float32[Tensor, " chunks"]:
     """Figures of the worst latent step of every chunk of 16 steps: what a rollout is asked."""
-    chunks = latents.split(CHUNK_STEPS // STEPS_PER_LATENT, dim=1)
+    chunks = torch.split(latents, CHUNK_STEPS // STEPS_PER_LATENT, dim=1)
     return torch.cat([chunk.amax(1) for chunk in chunks])
 
 

@@ -131,6 +131,32 @@ def test_resting_rollouts_of_a_batch_leave_moving_ones_alone(world, started, com
     assert (rested == resting.memory.tactile_kpa.numpy()).all()
 
 
+def test_hands_that_touch_nothing_leave_everything_where_it_was(world):
+    start = from_observation(world)
+    seen = start.observation
+    free = dataclasses.replace(seen, tactile_kpa=np.minimum(seen.tactile_kpa, 1.9))
+    begun = world.reset(dataclasses.replace(start, observation=free))
+    still = np.repeat(seen.action_reached, 64, axis=0)
+    state = begun.state
+    for _ in range(2):
+        step = world.step(state, still, seed=0, selector=ReturnSelector(steps="last"))
+        state = step.state
+    assert (step.observation.object_poses == begun.observation.object_poses).all()
+    assert (step.observation.tactile_kpa == free.tactile_kpa).all()
+    assert (step.observation.images["camera_head"] == seen.images["camera_head"]).all()
+    # Hands that begin to move then do as if they had moved at once.
+    lift = still[:16] + np.linspace(0, 0.01, 16)[:, None] * (np.arange(67) == 11)
+    late = world.step(state, lift, seed=0, selector=TOUCH_ONLY).observation
+    early = world.step(begun.state, lift, seed=0, selector=TOUCH_ONLY).observation
+    assert (late.tactile_kpa == early.tactile_kpa).all()
+    assert (late.object_poses == early.object_poses).all()
+    assert (late.object_poses != begun.observation.object_poses).any()
+    touching = dataclasses.replace(seen, tactile_kpa=np.full_like(seen.tactile_kpa, 3.0))
+    held = world.reset(dataclasses.replace(start, observation=touching))
+    pressed = world.step(held.state, still, seed=0, selector=TOUCH_ONLY).observation
+    assert (pressed.object_poses != held.observation.object_poses).any()
+
+
 @pytest.mark.parametrize("num_steps", [20, 48, 72])
 def test_a_snapshot_amid_a_rollout_goes_on_bit_for_bit(world, started, commands, num_steps):
     """Before the hands stand, at rest, and after they moved again."""

@@ -28,6 +28,7 @@ from services.world_model.state_checkpoints import StateBounds
 from services.world_model.training.core_training import (
     CoreData,
     _draw,
+    _is_settled,
     core_loss,
     start_steps,
     touch_latents,
@@ -163,6 +164,17 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     latest = next(batch for batch in drawn if batch.start_step == 76)
     assert len(latest.commands) == 2
     assert torch.isfinite(core_loss(core, data, latest, settings))
+
+
+def test_hands_are_held_still_only_where_nothing_would_happen(config):
+    table = scene_table([episode(seed, 49) for seed in range(4)], config)
+    # The hand of even seeds presses from step 8 on; one block of an odd seed slides at step 24.
+    table.objects.position_m[3, 24:, 0, 0] += 0.01
+    rows = torch.arange(4)
+    assert _is_settled(table, rows, 0).all()
+    assert _is_settled(table, rows, 16).tolist() == [False, True, False, True]
+    assert _is_settled(table, rows, 24).tolist() == [False, True, False, False]
+    assert _is_settled(table, rows, 32).tolist() == [False, True, False, True]
 
 
 def test_rollouts_from_the_middle_are_measured_with_true_context(config):
