@@ -84,6 +84,21 @@ class _Start:
 
 
 @dataclass(frozen=True)
+class PreparedScenes:
+    """Scenes with all that does not depend on what is drawn of them: done once for all images."""
+
+    scenes: Scenes
+    before: Bodies
+    start: _Start
+
+    @classmethod
+    def of(cls, scenes: Scenes) -> "PreparedScenes":
+        """Bodies and planes of the start images."""
+        before = Bodies.seen(scenes.states, scenes.boxes_m, scenes.K_head)
+        return cls(scenes, before, _start(scenes, before))
+
+
+@dataclass(frozen=True)
 class _SeenObjects:
     """Pixels that show objects, the start each image belongs to, and where it shows the same."""
 
@@ -96,13 +111,22 @@ def drawing_inputs(
     scenes: Scenes, states: SceneStates, owner: Int64[np.ndarray, " n"], config: RendererConfig
 ) -> DrawingInputs:
     """Inputs for drawing each state from the scene whose number is in `owner`."""
+    return drawing_inputs_from(PreparedScenes.of(scenes), states, owner, config)
+
+
+def drawing_inputs_from(
+    prepared: "PreparedScenes",
+    states: SceneStates,
+    owner: Int64[np.ndarray, " n"],
+    config: RendererConfig,
+) -> DrawingInputs:
+    """`drawing_inputs` of scenes whose own part is done already."""
+    scenes, before, start = prepared.scenes, prepared.before, prepared.start
     shape_px = scenes.images.shape[1], scenes.images.shape[2]
     K, boxes_m = scenes.K_head[owner], scenes.boxes_m[owner]
-    before = Bodies.seen(scenes.states, scenes.boxes_m, scenes.K_head)
     now = Bodies.seen(states, boxes_m, K)
     motion = CameraMotion.between(K, scenes.states.Ts_world_camera[owner], states.Ts_world_camera)
     present = scenes.states.object_present[owner] & states.object_present
-    start = _start(scenes, before)
     points = project_hands(now.hands_world, K, states.Ts_world_camera)
     hands = splat_hands(points, start.hand_colours[owner], shape_px)
     hits = cast_boxes(now.Ts_camera_box, boxes_m[..., 3:], present, K, shape_px)

@@ -34,8 +34,8 @@ class ResidualBlock(nn.Module):
 
     def forward(self, x: Float[Tensor, "n width h w"]) -> Float[Tensor, "n width h w"]:
         """The input and what the block adds to it."""
-        added: Tensor = self.second(functional.relu(self.first(functional.relu(x))))
-        return x + added
+        added: Tensor = self.second(functional.relu_(self.first(functional.relu(x))))
+        return added.add_(x)
 
 
 class RendererNetwork(nn.Module):
@@ -64,20 +64,38 @@ class RendererNetwork(nn.Module):
 
     def forward(self, inputs: DrawingInputs) -> Float32[Tensor, "n 3 h w"]:
         """Images in 0 … 1."""
-        x = torch.cat([functional.pixel_unshuffle(inputs.fine, 2), inputs.coarse], dim=1)
-        dtype = self.stem.weight.dtype
-        drawn = self._unet(x.to(dtype, memory_format=torch.channels_last)).float()
+        drawn = self._unet(self._entered(inputs)).contiguous().float()
         drawn = functional.pixel_shuffle(drawn, 2)
         warped, objects, hands = (inputs.fine[:, 3 * i : 3 * i + 3] for i in range(3))
         weights = drawn[:, :3].softmax(dim=1)
-        hit, is_hand = inputs.fine[:, 11:12], inputs.fine[:, 9:11].amax(dim=1, keepdim=True)
+        hit, is_hand = inputs.fine[:, 11:12], torch.maximum(*inputs.fine[:, 9:11].split(1, dim=1))
         # Colours exist only where something is hit: elsewhere the weights count for nothing.
         mixed = weights[:, 1:2] * hit * (objects - warped)
-        mixed = mixed + weights[:, 2:] * is_hand * (hands - warped) + drawn[:, 3:].tanh()
+        mixed = mixed + weights[:, 2:] * is_hand * (hands - warped)
+        mixed = mixed + drawn[:, 3:].contiguous().tanh()
         return warped + inputs.change * mixed
 
+    def _entered(self, inputs: DrawingInputs) -> Float[Tensor, "n width rows cols"]:
+        """The stem: a convolution of all channels, each 2×2 block of fine pixels side by side.
+
+        Blocks are not moved side by side for it: the same sum is a convolution of the fine pixels
+        with stride 2, whose kernel is the stem's with its channels laid out as pixels.
+        """
+        dtype, rim = self.stem.weight.dtype, self.stem.weight.shape[-1] // 2
+        # In float32, because a sum of two parts that are rounded apart is not the rounded sum.
+        weight, bias = self.stem.weight.float(), self.stem.bias
+        fine, coarse = (planes.to(dtype).float() for planes in (inputs.fine, inputs.coarse))
+        split = 4 * FINE_CHANNELS
+        kernel = functional.pixel_shuffle(weight[:, :split], 2)
+        entered = functional.conv2d(
+            fine, kernel, None if bias is None else bias.float(), stride=2, padding=2 * rim
+        )
+        entered = entered.add_(functional.conv2d(coarse, weight[:, split:], padding=rim))
+        # Under autocast weights are float32 and sums narrower already.
+        narrowed = entered if dtype == torch.float32 else entered.to(dtype)
+        return narrowed.contiguous(memory_format=torch.channels_last)
+
     def _unet(self, x: Tensor) -> Tensor:
-        x = self.stem(x)
         passed = []
         for level, blocks in enumerate(self.encoder):
             x = blocks(x)
@@ -86,6 +104,6 @@ class RendererNetwork(nn.Module):
                 x = self.down[level](x)
         for level in reversed(range(len(self.down))):
             x = functional.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
-            x = self.decoder[level](x + passed[level])
-        out: Tensor = self.head(functional.relu(x))
+            x = self.decoder[level](x.add_(passed[level]))
+        out: Tensor = self.head(functional.relu_(x))
         return out

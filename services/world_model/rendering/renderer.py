@@ -10,7 +10,12 @@ from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.inputs import DrawingInputs, Scenes, drawing_inputs
+from services.world_model.rendering.inputs import (
+    DrawingInputs,
+    PreparedScenes,
+    Scenes,
+    drawing_inputs_from,
+)
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.precision import has_fast_bfloat16
 from services.world_model.rendering.scene_states import SceneState, SceneStates
@@ -30,6 +35,8 @@ class Renderer:
         dtype = torch.bfloat16 if fast else torch.float32
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
         self._network.to(dtype)
+        # A rollout draws chunk after chunk from one start.
+        self._last_start: tuple[bytes, PreparedScenes] | None = None
 
     @property
     def config(self) -> RendererConfig:
@@ -71,7 +78,8 @@ class Renderer:
             )
         owner = np.zeros(len(states), dtype=np.int64)
         with torch.inference_mode():
-            images = self._drawn(drawing_inputs(scenes, stacked, owner, self.config))
+            prepared = self._prepared(scenes)
+            images = self._drawn(drawing_inputs_from(prepared, stacked, owner, self.config))
             rounded = (images * 255.0).round_().clamp_(0, 255).to(torch.uint8)
             return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
 
@@ -85,6 +93,22 @@ class Renderer:
             some = DrawingInputs(inputs.fine[asked], inputs.coarse[asked], inputs.change[asked])
             images[asked] = self._network(some)
         return images
+
+    def _prepared(self, scenes: Scenes) -> PreparedScenes:
+        """What is known of a start; that of the start before is not worked out again."""
+        states = scenes.states
+        arrays = (
+            scenes.images, scenes.K_head, scenes.boxes_m, states.Ts_world_camera,
+            states.Ts_world_wrist, states.joints_rad, states.object_poses, states.object_present,
+        )  # fmt: skip
+        key = b"".join(array.tobytes() for array in arrays) + bytes(
+            str(scenes.images.shape), "ascii"
+        )
+        last = self._last_start
+        if last is None or last[0] != key:
+            copied = copy.deepcopy(scenes)
+            last = self._last_start = (key, PreparedScenes.of(copied))
+        return last[1]
 
     def _scene(
         self,

@@ -1,0 +1,108 @@
+"""What makes drawing faster changes nothing: the network as it is written down, and the start."""
+
+import numpy as np
+import pytest
+import torch
+from torch.nn import functional
+
+from services.world_model.checkpoints import PRETRAINED
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
+from services.world_model.rendering.renderer import Renderer
+from services.world_model.state_checkpoints import read_state_checkpoint
+from tests.unit.world_model.rendering.scene_by_hand import BOXES_M, K, shifted, turned
+
+
+class PlainNetwork(RendererNetwork):
+    """The same layers by the plain formula: no operation is merged, moved or done in place."""
+
+    def forward(self, inputs):
+        def block(layers, x):
+            return x + layers.second(functional.relu(layers.first(functional.relu(x))))
+
+        x = torch.cat([functional.pixel_unshuffle(inputs.fine, 2), inputs.coarse], dim=1)
+        x = self.stem(x.to(self.stem.weight.dtype))
+        passed = []
+        for level, blocks in enumerate(self.encoder):
+            for layers in blocks:
+                x = block(layers, x)
+            if level < len(self.down):
+                passed.append(x)
+                x = self.down[level](x)
+        for level in reversed(range(len(self.down))):
+            x = functional.interpolate(self.up[level](x), scale_factor=2.0, mode="nearest")
+            x = block(self.decoder[level], x + passed[level])
+        told = functional.pixel_shuffle(self.head(functional.relu(x)).float(), 2)
+        warped, objects, hands = inputs.fine[:, :9].split(3, dim=1)
+        weights = told[:, :3].softmax(dim=1)
+        mixed = weights[:, 1:2] * inputs.fine[:, 11:12] * (objects - warped)
+        mixed = mixed + weights[:, 2:] * inputs.fine[:, 9:11].amax(1, keepdim=True) * (
+            hands - warped
+        )
+        return warped + inputs.change * (mixed + torch.tanh(told[:, 3:]))
+
+
+def weights_of(config):
+    network = RendererNetwork(config)
+    generator = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for weight in network.parameters():
+            weight.normal_(std=0.08, generator=generator)
+    return network
+
+
+def trained():
+    return read_state_checkpoint(PRETRAINED / "state.safetensors").renderer
+
+
+def moved_states(still):
+    """A swaying camera, and bodies that move."""
+    return [
+        turned(
+            shifted(still, camera_m=(0.002 * i, -0.001 * i, 0.0), objects_m=(0.01 * i, 0.0, 0.0)),
+            (0.004 * i, 0.0, 0.01 * i),
+        )
+        if i
+        else still
+        for i in range(16)
+    ]
+
+
+@pytest.mark.parametrize("uses_bfloat16", [False, True])
+@pytest.mark.parametrize("which", ["trained", "wide stem"])
+def test_images_are_those_of_the_plain_formula(image, still, which, uses_bfloat16):
+    torch.set_num_threads(1)
+    shape = RendererConfig(widths=(8, 16), depths=(1, 2), stem_px=3)
+    network = trained() if which == "trained" else weights_of(shape)
+    plain = PlainNetwork(network.config)
+    plain.load_state_dict(network.state_dict())
+    # Like a photograph: neighbours resemble each other.
+    rows = np.linspace(0, 255, 64)
+    smooth = (0.5 * rows[:, None, None] + 0.4 * rows[:, None] + 0.1 * image).astype(np.uint8)
+    drawn, expected = (
+        Renderer(one, uses_bfloat16=uses_bfloat16).draw(
+            smooth, K, still, moved_states(still), BOXES_M
+        )
+        for one in (network, plain)
+    )
+    assert (expected[1:] != smooth).any(axis=(1, 2, 3)).all()
+    off = np.abs(drawn.astype(int) - expected.astype(int))
+    assert off.max() <= 1
+    if not uses_bfloat16:
+        assert (off > 0).mean() < 1e-3
+
+
+def test_a_start_that_is_remembered_draws_the_same_bits(small, image, still):
+    remembering = Renderer(weights_of(small))
+    states = moved_states(still)
+    other = shifted(still, objects_m=(0.0, 0.02, 0.0))
+    brighter = image // 2 + 100
+    for start_image, start in ((image, still), (image, still), (brighter, still), (image, other)):
+        expected = Renderer(weights_of(small)).draw(start_image, K, start, states, BOXES_M)
+        assert (remembering.draw(start_image, K, start, states, BOXES_M) == expected).all()
+    # Arrays of the caller that change afterwards are another start.
+    changing = image.copy()
+    remembering.draw(changing, K, still, states, BOXES_M)
+    changing[:] = 7
+    expected = Renderer(weights_of(small)).draw(changing, K, still, states, BOXES_M)
+    assert (remembering.draw(changing, K, still, states, BOXES_M) == expected).all()
