@@ -68,7 +68,8 @@ class RendererNetwork(nn.Module):
         drawn = functional.pixel_shuffle(drawn, 2)
         warped, objects, hands = (inputs.fine[:, 3 * i : 3 * i + 3] for i in range(3))
         weights = drawn[:, :3].softmax(dim=1)
-        hit, is_hand = inputs.fine[:, 11:12], torch.maximum(*inputs.fine[:, 9:11].split(1, dim=1))
+        hit = inputs.fine[:, 11:12]
+        is_hand = torch.maximum(inputs.fine[:, 9:10], inputs.fine[:, 10:11])
         # Colours exist only where something is hit: elsewhere the weights count for nothing.
         mixed = weights[:, 1:2] * hit * (objects - warped)
         mixed = mixed + weights[:, 2:] * is_hand * (hands - warped)
