@@ -54,7 +54,7 @@ bench: $(VENV)/.dev      ## time the stages against their errors, one after anot
 	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
 
 # Every step goes on where it was broken off. The last one says which bounds are met.
-reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model and its judge anew, in runs/reproduce
+reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model, its judge and the cloned policies anew, in runs/reproduce
 	$(BIN)/dextouch train data --store $(MADE)/train --tasks stand_bottle,stack_bowls --count 600 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/train --count 450 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 36 --images 4
@@ -67,7 +67,11 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state
 		--development $(MADE)/development --development $(MADE)/imagined_development \
 		--output $(MADE)/success_probe.safetensors --training.num_training_steps 6000 --training.max_cpu_s 300 \
 		--training.held_out_share 0.1
+	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8
+	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early_at 0.1 \
+		--training.num_training_steps 3600 --training.max_cpu_s 150 --output $(MADE)/cloned.safetensors
 	$(BIN)/dextouch bench evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
+		--cloned cloned=$(MADE)/cloned.safetensors --cloned "cloned early=$(MADE)/cloned_early.safetensors" \
 		--keep $(MADE)/evaluator --out $(MADE)/bench
 
 fix: $(VENV)/.dev        ## let the tools mend what they can

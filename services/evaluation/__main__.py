@@ -17,6 +17,7 @@ from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evalua
 from services.evaluation.demonstrations import read_demonstrations
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.cloning_episodes import read_cloning_episodes
 from services.evaluation.policies.cloning_training import train_cloned_policy
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.outside import PolicySource
@@ -65,13 +66,18 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run_train_policy(arguments: list[str]) -> int:
-    """Train the cloned policy and keep it."""
+    """Train the cloned policy and keep it, and an early one if asked."""
     settings = parse(TrainPolicySettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
-    demonstrations = read_demonstrations(*stores, tasks=settings.tasks)
-    command = command_line("train-policy", arguments)
-    checkpoint = train_cloned_policy(demonstrations, settings.training, command=command)
-    return _keep(checkpoint, settings.output, settings.json_path)
+    trained = train_cloned_policy(
+        read_cloning_episodes(*stores, tasks=settings.tasks),
+        settings.training,
+        command=command_line("train-policy", arguments),
+        early_at=settings.early_at,
+    )
+    if trained.early is not None:
+        _keep(trained.early, settings.early_output(), None)
+    return _keep(trained.finished, settings.output, settings.json_path)
 
 
 def run_train_probe(arguments: list[str]) -> int:

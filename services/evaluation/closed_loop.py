@@ -246,12 +246,14 @@ class _Study:
         actor, description = self.policies[policy], self.worlds.descriptions[world]
         where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
         ask(actor.reset, start.for_policy(), where=f"{where}: reset")
-        looks = getattr(actor, "looks", True)
+        looks, cameras = getattr(actor, "looks", True), self.worlds.cameras
         while (left := self.plan.num_steps - rollout.info.last_step) > 0:
             acting = f"{where}, chunk {rollout.info.next_chunk}: act"
             answer = ask(actor.act, rollout.observation, where=acting)
             chunk = action_chunk(answer, description, where=acting)[:left]
-            if looks:
+            if looks == "last" and len(chunk) < left:
+                rollout.step(chunk, selector=ReturnSelector(cameras=cameras, steps="last"))
+            elif looks and looks != "last":
                 rollout.step(chunk)
             else:
                 _step_unseen(rollout, chunk, left, description)
@@ -270,7 +272,7 @@ def _step_unseen(
     """Advance by a chunk of which only the rollout's ending is seen: images take most of the time.
 
     Args:
-        rollout: whose policy does not look.
+        rollout: whose policy does not look at the steps before.
         chunk: rows to carry out.
         left: steps to the end of the rollout, those of the chunk included.
         description: of the world; its chunks are whole multiples of something.

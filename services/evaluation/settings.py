@@ -16,21 +16,33 @@ from services.evaluation.success_probe_training import ProbeSettings
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
+EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
 DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
 _SEEDS = re.compile(r"(\d+):(\d+)")
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
 class TrainPolicySettings(BaseSettings):
-    """Imitate the robot episodes of some stores."""
+    """Imitate the robot episodes of some stores that succeeded."""
 
     model_config = service_config("evaluation_train_policy")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     output: Path = Path("runs/evaluation/behaviour_cloning.safetensors")
     tasks: tuple[str, ...] = ()
+    early_at: float | None = Field(
+        default=None,
+        gt=0,
+        lt=1,
+        description="share of training after which a policy that is not finished is kept too, "
+        "beside the output as …_early.safetensors",
+    )
     training: CloningSettings = CloningSettings()
     json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+
+    def early_output(self) -> Path:
+        """Where the early policy goes."""
+        return self.output.with_stem(f"{self.output.stem}_early")
 
 
 class TrainProbeSettings(BaseSettings):

@@ -1,4 +1,4 @@
-"""Observations in, action chunks out: a network that imitates demonstrations, in closed loop."""
+"""A policy that imitates demonstrations: a network that looks, feels and acts in closed loop."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -14,9 +14,8 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import (
     AnchorPoses,
     actions_from_poses,
-    pose_from_9d,
+    pose_to_9d,
     poses_from_actions,
-    unpack_action,
 )
 from dextouch.schemas.rollouts import Observation
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
@@ -29,7 +28,9 @@ from services.evaluation.policies.cloning_network import (
     phase_features,
 )
 
-KIND = "behaviour-cloning-policy"
+# Checkpoints of "behaviour-cloning-policy", whose chunks began at the reached pose, do not fit.
+KIND = "cloned-policy"
+_WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 # Coefficients further from the mean chunk than this many standard deviations of training are cut:
 # no touch or image, however odd, sends a hand where no demonstration came near.
 MAX_DEVIATIONS = 5.0
@@ -68,6 +69,7 @@ class CloningInput:
     first_image: UInt8[np.ndarray, "h w 3"]
     image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: np.ndarray
+    anchor: AnchorPoses
     reached: Float64[np.ndarray, "67"]
     reached_is_measured: bool
     step: int
@@ -90,43 +92,62 @@ def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> Clonin
                 f"cloned policy: got images {item.first_image.shape} and {item.image.shape}, "
                 f"expected {size}"
             )
-    images = np.stack([np.concatenate([i.image, i.first_image], axis=-1) for i in inputs])
+    return CloningBatch(
+        scaled_images(torch.from_numpy(np.stack([i.first_image for i in inputs]))),
+        torch.arange(len(inputs)),
+        scaled_images(torch.from_numpy(np.stack([half_size(i.image) for i in inputs]))),
+        *cloning_state(inputs, shape),
+    )
+
+
+def half_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "half_h half_w 3"]:
+    """The image with the mean of 2 × 2 pixels in each; an odd last row or column is left out."""
+    height, width = image.shape[0] // 2, image.shape[1] // 2
+    blocks = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
+    return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
+
+
+def scaled_images(images: torch.Tensor) -> torch.Tensor:
+    """Bytes [..., h, w, 3] as the network wants them: [..., 3, h, w] in −0.5 … 0.5."""
+    return images.movedim(-1, -3).float() / 255 - 0.5
+
+
+def cloning_state(
+    inputs: Sequence[CloningInput], shape: CloningShape
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """State, task and slot of moments: a `CloningBatch` without its images."""
     state = np.concatenate(
         [
             pad_features(np.stack([i.tactile_kpa for i in inputs])),
-            np.stack([i.reached for i in inputs]),
+            np.concatenate([in_world(i.reached[None], i.anchor) for i in inputs]),
+            np.stack([pose_to_9d(np.stack(i.anchor.as_tuple())).ravel() for i in inputs]),
             phase_features(np.array([i.step for i in inputs]), horizon_steps=shape.horizon_steps),
             np.array([[float(i.reached_is_measured)] for i in inputs]),
         ],
         axis=1,
     )
-    return CloningBatch(
-        torch.from_numpy(images).permute(0, 3, 1, 2).float() / 255 - 0.5,
+    return (
         torch.tensor(state, dtype=torch.float32),
         torch.tensor([shape.tasks.index(i.task) for i in inputs]),
         torch.tensor([min(i.step // SLOT_STEPS, shape.num_slots - 1) for i in inputs]),
     )
 
 
-def chunk_from_start(chunk: np.ndarray, reached: np.ndarray) -> Float64[np.ndarray, "steps 67"]:
-    """A chunk relative to the current pose as one relative to the rollout's step 0.
+def in_world(actions: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "steps 67"]:
+    """Actions [K, 67] relative to the anchor as the same ones with absolute poses."""
+    return actions_from_poses(poses_from_actions(actions, anchor), _WORLD)
 
-    Args:
-        chunk: [K, 67], relative to the poses of `reached`.
-        reached: [67], where the hands are, relative to step 0.
-    """
-    now = unpack_action(reached)
-    here = AnchorPoses(
-        pose_from_9d(now.wrist_left), pose_from_9d(now.wrist_right), pose_from_9d(now.camera_head)
-    )
-    origin = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
-    return actions_from_poses(poses_from_actions(chunk, here), origin)
+
+def from_world(actions: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "steps 67"]:
+    """The inverse of `in_world`."""
+    return actions_from_poses(poses_from_actions(actions, _WORLD), anchor)
 
 
 class BehaviourCloningPolicy:
     """Looks at the newest image, touch and pose, and sends the next 16 actions.
 
-    Between `reset` calls it remembers the first image of the rollout, nothing else.
+    Between `reset` calls it remembers the first image and the anchor of the rollout, nothing else.
+    Of an observation it needs the last step alone (`looks`).
 
     Args:
         checkpoint: from `load_checkpoint` or straight from training.
@@ -135,13 +156,15 @@ class BehaviourCloningPolicy:
         CorruptDataError: weights that do not fit the shape in the metadata.
     """
 
+    looks = "last"
+
     def __init__(self, checkpoint: Checkpoint) -> None:
         self.metadata = checkpoint.metadata
         self.shape = CloningShape.model_validate(checkpoint.metadata.settings["shape"])
         self._network = self.shape.network()
         load_weights(self._network, checkpoint, prefix="network")
         self._network.eval()
-        self._task: str | None = None
+        self._start: PolicyStart | None = None
         self._first_image: np.ndarray | None = None
 
     @classmethod
@@ -157,7 +180,7 @@ class BehaviourCloningPolicy:
         """
         if start.task not in self.shape.tasks:
             raise UnknownNameError("task of the cloned policy", start.task, list(self.shape.tasks))
-        self._task = start.task
+        self._start = start
         self._first_image = None
 
     def act(self, observation: Observation) -> Float64[np.ndarray, "16 67"]:
@@ -167,7 +190,7 @@ class BehaviourCloningPolicy:
             InvalidInputError: not reset, or images of another size.
             UnknownNameError: the observation has no head camera.
         """
-        if self._task is None:
+        if self._start is None:
             raise InvalidInputError("cloned policy: act before reset; call reset with the start")
         if CAMERA not in observation.images:
             raise UnknownNameError("camera", CAMERA, list(observation.images))
@@ -178,14 +201,15 @@ class BehaviourCloningPolicy:
             self._first_image,
             image,
             observation.tactile_kpa[-1],
+            self._start.anchor,
             observation.action_reached[-1],
             observation.reached_is_measured,
             observation.first_step + len(observation) - 1,
-            self._task,
+            self._start.task,
         )
         with torch.no_grad():
             batch = cloning_batch([moment], self.shape)
             bound = MAX_DEVIATIONS * self._network.coefficient_scale
             coefficients = self._network(batch).clamp(-bound, bound)
-            chunk = self._network.codec.decode(coefficients, batch)[0].double().numpy()
-        return chunk_from_start(chunk, moment.reached)
+            chunk = self._network.codec.decode(coefficients, batch.task, batch.slot)[0]
+        return from_world(chunk.double().numpy(), moment.anchor)

@@ -1,4 +1,4 @@
-"""Two head images, touch, pose and time in; the next action chunk as codec coefficients out."""
+"""The network of a cloned policy: head images, touch, poses and time to the next action chunk."""
 
 import math
 from dataclasses import dataclass
@@ -7,36 +7,41 @@ import numpy as np
 import torch
 from torch import nn
 
-from dextouch.hands.actions import ACTION_DIM, CAMERA_HEAD, POSE_SLICES
+from dextouch.hands.actions import ACTION_DIM, CAMERA_HEAD, POSE_DIM, POSE_SLICES
 from services.evaluation.features import NUM_PAD_FEATURES
 
 CHUNK_STEPS = 16
 CHUNK_SIZE = CHUNK_STEPS * ACTION_DIM
 NUM_PHASE_FEATURES = 8
 SLOT_STEPS = 8
-STATE_DIM = NUM_PAD_FEATURES + ACTION_DIM + NUM_PHASE_FEATURES + 1
-_REACHED = slice(NUM_PAD_FEATURES, NUM_PAD_FEATURES + ACTION_DIM)
-_CHANNELS = (16, 16, 24)
+# Where hands and head are now (as an action), and where they were at step 0 (three poses).
+NUM_POSE_FEATURES = ACTION_DIM + POSE_DIM * len(POSE_SLICES)
+STATE_DIM = NUM_PAD_FEATURES + NUM_POSE_FEATURES + NUM_PHASE_FEATURES + 1
+_POSES = slice(NUM_PAD_FEATURES, NUM_PAD_FEATURES + NUM_POSE_FEATURES)
+_CHANNELS = (16, 24, 24)
 _TASK_FEATURES = 8
 
 
 @dataclass(frozen=True)
 class CloningBatch:
-    """Inputs of the network: images [n, 6, h, w] in −0.5 … 0.5, state [n, 100], task and slot [n].
+    """Inputs of the network, all images in −0.5 … 0.5.
 
-    A slot is a stretch of `SLOT_STEPS` steps since the start.
+    Args:
+        first: [m, 3, h, w], the first images of rollouts.
+        rollout: [n], which of them belongs to each moment.
+        newest: [n, 3, h/2, w/2], what is seen now, at half size.
+        state: [n, 127]: pad features, the reached action with poses in the world, the poses of
+            step 0 in the world, the phase, and whether the reached action was measured.
+        task: [n].
+        slot: [n], the stretch of `SLOT_STEPS` steps since the start.
     """
 
-    images: torch.Tensor
+    first: torch.Tensor
+    rollout: torch.Tensor
+    newest: torch.Tensor
     state: torch.Tensor
     task: torch.Tensor
     slot: torch.Tensor
-
-    def pick(self, index: torch.Tensor) -> "CloningBatch":
-        """Some of the moments."""
-        return CloningBatch(
-            self.images[index], self.state[index], self.task[index], self.slot[index]
-        )
 
 
 def action_weights() -> np.ndarray:
@@ -70,7 +75,7 @@ class SpatialSoftmax(nn.Module):
 
 
 class ChunkCodec(nn.Module):
-    """Action chunks [n, 16, 67], relative to the current pose, as a few principal components.
+    """Action chunks [n, 16, 67], their poses in the world, as a few principal components.
 
     The mean chunk of a task and slot is taken off first, so that the network only has to tell how
     this moment differs from others of its kind. Linear and orthonormal in weighted units: the
@@ -87,7 +92,7 @@ class ChunkCodec(nn.Module):
         self.register_buffer("basis", torch.zeros(num_components, CHUNK_SIZE))
         self.register_buffer("weights", torch.tensor(action_weights(), dtype=torch.float32))
 
-    def fit(self, chunks: torch.Tensor, batch: CloningBatch) -> None:
+    def fit(self, chunks: torch.Tensor, tasks: torch.Tensor, slots: torch.Tensor) -> None:
         """Take means and principal components from training chunks [n, 16, 67].
 
         A slot without examples gets the mean of the nearest earlier one.
@@ -95,34 +100,62 @@ class ChunkCodec(nn.Module):
         flat = (chunks * self.weights).flatten(1)
         for task in range(self.mean.shape[0]):
             for slot in range(self.mean.shape[1]):
-                chosen = (batch.task == task) & (batch.slot == slot)
+                chosen = (tasks == task) & (slots == slot)
                 known = bool(chosen.any())
                 self.mean[task, slot] = (
                     flat[chosen].mean(0) if known else self.mean[task, max(slot - 1, 0)]
                 )
-        residual = flat - self.mean[batch.task, batch.slot]
+        residual = flat - self.mean[tasks, slots]
         _, _, directions = torch.linalg.svd(residual, full_matrices=False)
         basis = directions[: len(self.basis)]
         # The sign of a direction is free: make its largest entry positive.
         largest = basis.gather(1, basis.abs().argmax(1, keepdim=True))
         self.basis[: len(basis)].copy_(basis * largest.sign())
 
-    def encode(self, chunks: torch.Tensor, batch: CloningBatch) -> torch.Tensor:
+    def encode(
+        self, chunks: torch.Tensor, tasks: torch.Tensor, slots: torch.Tensor
+    ) -> torch.Tensor:
         """Coefficients [n, k]."""
         flat = (chunks * self.weights).flatten(1)
-        return (flat - self.mean[batch.task, batch.slot]) @ self.basis.T
+        return (flat - self.mean[tasks, slots]) @ self.basis.T
 
-    def decode(self, coefficients: torch.Tensor, batch: CloningBatch) -> torch.Tensor:
+    def decode(
+        self, coefficients: torch.Tensor, tasks: torch.Tensor, slots: torch.Tensor
+    ) -> torch.Tensor:
         """Chunks [n, 16, 67]."""
-        flat = coefficients @ self.basis + self.mean[batch.task, batch.slot]
+        flat = coefficients @ self.basis + self.mean[tasks, slots]
         return flat.reshape(-1, CHUNK_STEPS, ACTION_DIM) / self.weights
+
+
+class CloningEye(nn.Module):
+    """Where the things of a task are in an image: 2 numbers for each of 24 feature maps."""
+
+    num_features = 2 * _CHANNELS[-1]
+
+    def __init__(self) -> None:
+        super().__init__()
+        first, second, third = _CHANNELS
+        self.coarse = nn.Conv2d(3, first, 5, stride=2, padding=2)
+        self.middle = nn.Conv2d(first, second, 3, padding=1)
+        self.fine = nn.Conv2d(second, third, 3, padding=1)
+        # Which of the things matter depends on the task.
+        self.wanted = nn.Linear(_TASK_FEATURES, first + second)
+        self.places = SpatialSoftmax()
+
+    def forward(self, images: torch.Tensor, task: torch.Tensor) -> torch.Tensor:
+        """Features [n, 48] of images [n, 3, h, w], for task features [n, 8]."""
+        biases = self.wanted(task)[:, :, None, None].split(_CHANNELS[:2], dim=1)
+        images = images.contiguous(memory_format=torch.channels_last)
+        maps = torch.relu(self.coarse(images) + biases[0])
+        maps = torch.relu(self.middle(maps) + biases[1])
+        return torch.as_tensor(self.places(self.fine(maps).float()))
 
 
 class CloningNetwork(nn.Module):
     """A small convolutional network with spatial softmax, and a multilayer perceptron on top."""
 
-    reached_mean: torch.Tensor
-    reached_scale: torch.Tensor
+    pose_mean: torch.Tensor
+    pose_scale: torch.Tensor
     coefficient_scale: torch.Tensor
 
     def __init__(self, *, num_tasks: int, num_slots: int, num_components: int, hidden: int) -> None:
@@ -130,21 +163,14 @@ class CloningNetwork(nn.Module):
         self.codec = ChunkCodec(
             num_tasks=num_tasks, num_slots=num_slots, num_components=num_components
         )
-        self.register_buffer("reached_mean", torch.zeros(ACTION_DIM))
-        self.register_buffer("reached_scale", torch.ones(ACTION_DIM))
+        self.register_buffer("pose_mean", torch.zeros(NUM_POSE_FEATURES))
+        self.register_buffer("pose_scale", torch.ones(NUM_POSE_FEATURES))
         self.register_buffer("coefficient_scale", torch.ones(num_components))
         self.task = nn.Embedding(num_tasks, _TASK_FEATURES)
-        first, second, third = _CHANNELS
-        self.eye = nn.Sequential(
-            nn.Conv2d(6, first, 5, stride=2, padding=2),
-            nn.ReLU(),
-            nn.Conv2d(first, second, 3, padding=1),
-            nn.ReLU(),
-            nn.Conv2d(second, third, 3, padding=1),
-            SpatialSoftmax(),
-        )
+        self.first_eye = CloningEye()
+        self.newest_eye = CloningEye()
         self.head = nn.Sequential(
-            nn.Linear(2 * third + STATE_DIM + _TASK_FEATURES, hidden),
+            nn.Linear(2 * CloningEye.num_features + STATE_DIM + _TASK_FEATURES, hidden),
             nn.ReLU(),
             nn.Linear(hidden, hidden),
             nn.ReLU(),
@@ -152,14 +178,22 @@ class CloningNetwork(nn.Module):
         )
 
     def forward(self, batch: CloningBatch) -> torch.Tensor:
-        """Codec coefficients [n, k] of the next chunk."""
-        before, after = batch.state[:, : _REACHED.start], batch.state[:, _REACHED.stop :]
-        reached = (self.reached(batch.state) - self.reached_mean) / self.reached_scale
-        seen = self.eye(batch.images)
-        features = torch.cat([seen, before, reached, after, self.task(batch.task)], dim=1)
-        return torch.as_tensor(self.head(features)) * self.coefficient_scale
+        """Codec coefficients [n, k] of the next chunk.
+
+        Convolutions of training run in bfloat16: half the time.
+        """
+        before, after = batch.state[:, : _POSES.start], batch.state[:, _POSES.stop :]
+        poses = (self.poses(batch.state) - self.pose_mean) / self.pose_scale
+        task = self.task(batch.task)
+        task_of_first = torch.zeros(len(batch.first), dtype=torch.long)
+        task_of_first[batch.rollout] = batch.task
+        with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self.training):
+            first = self.first_eye(batch.first, self.task(task_of_first)).float()
+            newest = self.newest_eye(batch.newest, task).float()
+        features = [first[batch.rollout], newest, before, poses, after, task]
+        return torch.as_tensor(self.head(torch.cat(features, dim=1))) * self.coefficient_scale
 
     @staticmethod
-    def reached(state: torch.Tensor) -> torch.Tensor:
-        """The part [n, 67] of the state that says where the hands are."""
-        return state[:, _REACHED]
+    def poses(state: torch.Tensor) -> torch.Tensor:
+        """The part [n, 94] of the state that says where hands and head are and were."""
+        return state[:, _POSES]

@@ -1,7 +1,7 @@
-"""Demonstrations in; a behaviour cloning checkpoint with its held-out error out."""
+"""Training of a cloned policy, with its held-out error; it can keep an early checkpoint too."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,30 +9,36 @@ import torch
 from pydantic import BaseModel, ConfigDict, Field
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands.actions import ACTION_DIM, WRIST_LEFT, WRIST_RIGHT, reanchor
+from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
-from services.evaluation.demonstrations import (
-    Demonstration,
-    data_hash,
-    instructions_of,
-    split_by_seed,
-)
+from services.evaluation.demonstrations import instructions_of, split_by_seed
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
     CloningInput,
     CloningShape,
-    cloning_batch,
+    cloning_state,
+    half_size,
+    in_world,
+    scaled_images,
+)
+from services.evaluation.policies.cloning_episodes import (
+    DECISION_STRIDE,
+    CloningEpisode,
+    cloning_hash,
 )
 from services.evaluation.policies.cloning_network import (
     CHUNK_STEPS,
-    SLOT_STEPS,
+    NUM_POSE_FEATURES,
     CloningBatch,
     CloningNetwork,
 )
 from services.evaluation.progress import Progress
 
-# Decisions are learned at these steps; an evaluation with chunks of 16 decides at every second.
-DECISION_STRIDE = SLOT_STEPS
+# Moments a pass through the network when it is tested.
+_TESTED_AT_ONCE = 128
+MOMENTS_AN_EPISODE = 3
+# Large weights whose last digits do not matter: files stay below a megabyte.
+_KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
 
 class CloningSettings(BaseModel):
@@ -43,7 +49,7 @@ class CloningSettings(BaseModel):
     seed: int = 0
     num_training_steps: int = Field(default=3000, ge=1)
     max_cpu_s: float = Field(default=240.0, gt=0)
-    batch_size: int = Field(default=64, ge=1)
+    batch_size: int = Field(default=72, ge=1)
     learning_rate: float = Field(default=1.5e-3, gt=0)
     weight_decay: float = Field(default=1e-3, ge=0)
     image_noise: float = Field(default=0.02, ge=0)
@@ -53,154 +59,257 @@ class CloningSettings(BaseModel):
 
 
 @dataclass(frozen=True)
-class Decisions:
-    """Moments of decision as tensors, with the chunks that the demonstrator sent next."""
+class Trained:
+    """The finished policy, and the early one if it was asked for."""
 
-    batch: CloningBatch
+    finished: Checkpoint
+    early: Checkpoint | None = None
+
+
+@dataclass(frozen=True)
+class Decisions:
+    """Moments of decision as tensors, with the chunks (in the world) that were sent next.
+
+    Images are bytes: `firsts` [m, h, w, 3], one an episode; `newest` [k, h/2, w/2, 3]. Of moment n,
+    `episode` and `frame` say which. The moments of an episode lie side by side: `begins` [m + 1].
+    """
+
+    firsts: torch.Tensor
+    newest: torch.Tensor
+    episode: torch.Tensor
+    frame: torch.Tensor
+    begins: torch.Tensor
+    state: torch.Tensor
+    task: torch.Tensor
+    slot: torch.Tensor
     chunks: torch.Tensor
 
     def __len__(self) -> int:
         return len(self.chunks)
 
-    def pick(self, index: torch.Tensor) -> "Decisions":
-        """Some of the moments."""
-        return Decisions(self.batch.pick(index), self.chunks[index])
+    def batch(self, index: torch.Tensor) -> CloningBatch:
+        """Inputs of some moments; first images that several of them share are there once."""
+        episodes, rollout = torch.unique(self.episode[index], return_inverse=True)
+        return CloningBatch(
+            scaled_images(self.firsts[episodes]),
+            rollout,
+            scaled_images(self.newest[self.frame[index]]),
+            self.state[index],
+            self.task[index],
+            self.slot[index],
+        )
+
+    def drawn(self, num_moments: int, generator: torch.Generator) -> torch.Tensor:
+        """Indices of random moments, three an episode: looking at first images takes most time."""
+        num_episodes = -(-num_moments // MOMENTS_AN_EPISODE)
+        episodes = torch.randint(len(self.firsts), (num_episodes,), generator=generator)
+        shares = torch.rand((num_episodes, MOMENTS_AN_EPISODE), generator=generator)
+        begins, ends = self.begins[episodes, None], self.begins[episodes + 1, None]
+        return (begins + (shares * (ends - begins)).long()).flatten()[:num_moments]
 
 
-def decisions_of(demonstrations: Sequence[Demonstration], shape: CloningShape) -> Decisions:
-    """Every eighth step of successful demonstrations, twice: as measured and as imagined.
+def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Decisions:
+    """Every eighth step of successful episodes, twice: as measured and as imagined.
 
     An imagined world senses no joints and answers with the actions it was given, so each moment
     is also learned with the commanded pose in the place of the reached one.
 
     Raises:
-        InvalidInputError: no successful demonstration that is long enough.
+        InvalidInputError: no successful episode that is long enough, or images of several sizes.
     """
+    wanted = [item for item in episodes if item.success and item.num_steps > CHUNK_STEPS]
+    if not wanted:
+        raise InvalidInputError("behaviour cloning: no successful demonstration to imitate")
+    sizes = sorted({item.moments[0].image.shape for item in wanted})
+    if len(sizes) > 1:
+        raise InvalidInputError(
+            f"behaviour cloning: got images of {sizes[0]} and of {sizes[1]}, expected one size"
+        )
     inputs: list[CloningInput] = []
     chunks: list[np.ndarray] = []
-    for item in demonstrations:
-        if not item.success:
-            continue
+    newest: list[np.ndarray] = []
+    frame: list[int] = []
+    begins = [0]
+    for item in wanted:
+        commanded = in_world(item.commanded, item.anchor)
         for step in range(0, item.num_steps - CHUNK_STEPS, DECISION_STRIDE):
+            moment = item.moments[step]
+            newest.append(half_size(moment.image))
             for measured in (True, False) if step else (True,):
                 reached = (item.measured if measured else item.commanded)[step]
-                sent = item.commanded[step + 1 : step + 1 + CHUNK_STEPS]
-                chunks.append(reanchor(sent, 0, anchor_action=reached))
+                chunks.append(commanded[step + 1 : step + 1 + CHUNK_STEPS])
+                frame.append(len(newest) - 1)
                 inputs.append(
                     CloningInput(
-                        item.images[0], item.images[step], item.tactile_kpa[step],
+                        item.moments[0].image, moment.image, moment.tactile_kpa, item.anchor,
                         reached, measured, step, item.task,
                     )
                 )  # fmt: skip
-    if not inputs:
-        raise InvalidInputError("behaviour cloning: no successful demonstration to imitate")
+        begins.append(len(inputs))
+    counts = torch.tensor(begins).diff()
     return Decisions(
-        cloning_batch(inputs, shape), torch.tensor(np.stack(chunks), dtype=torch.float32)
+        torch.from_numpy(np.stack([item.moments[0].image for item in wanted])),
+        torch.from_numpy(np.stack(newest)),
+        torch.arange(len(wanted)).repeat_interleave(counts),
+        torch.tensor(frame),
+        torch.tensor(begins),
+        *cloning_state(inputs, shape),
+        torch.tensor(np.stack(chunks), dtype=torch.float32),
     )
 
 
 def train_cloned_policy(
-    demonstrations: Sequence[Demonstration], settings: CloningSettings, *, command: str
-) -> Checkpoint:
-    """Imitate the successful demonstrations.
+    episodes: Sequence[CloningEpisode],
+    settings: CloningSettings,
+    *,
+    command: str,
+    early_at: float | None = None,
+) -> Trained:
+    """Imitate successful episodes.
+
+    Args:
+        episodes: failed ones among them are left out.
+        settings: of training.
+        command: that repeats it.
+        early_at: share of the training after which the early policy is kept.
 
     Returns:
         The weights, with the held-out error beside that of the mean chunk in the metadata.
     """
     torch.manual_seed(settings.seed)
-    tasks = tuple(sorted({d.task for d in demonstrations}))
-    shape = CloningShape(tasks=tasks, image_size_px=demonstrations[0].images.shape[1])
-    training, held_out = split_by_seed(demonstrations, held_out_share=settings.held_out_share)
+    tasks = tuple(sorted({item.task for item in episodes}))
+    shape = CloningShape(tasks=tasks, image_size_px=episodes[0].moments[0].image.shape[0])
+    training, held_out = split_by_seed(episodes, held_out_share=settings.held_out_share)
     learned, tested = decisions_of(training, shape), decisions_of(held_out, shape)
     network = shape.network()
     _fit_statistics(network, learned)
-    cpu_s = _optimize(network, learned, settings)
-    metadata = CheckpointMetadata(
-        kind=KIND,
-        command=command,
-        seed=settings.seed,
-        data_hash=data_hash(demonstrations),
-        tasks=tasks,
-        training_episodes=tuple(d.episode_id for d in training),
-        training_starts=tuple(sorted({d.start_digest for d in training})),
-        settings={
-            "shape": shape.model_dump(),
-            "training": settings.model_dump(),
-            "instructions": instructions_of(demonstrations),
-        },
-        metrics={
-            "num_training_decisions": len(learned),
-            "num_held_out_decisions": len(tested),
-            "training_cpu_s": round(cpu_s, 1),
-            **_errors(network, tested),
-        },
-    )
-    tensors = {f"network.{name}": t.clone() for name, t in network.state_dict().items()}
-    return Checkpoint(metadata, tensors)
+
+    def checkpoint(cpu_s: float, share: float) -> Checkpoint:
+        metadata = CheckpointMetadata(
+            kind=KIND,
+            command=command,
+            seed=settings.seed,
+            data_hash=cloning_hash(episodes),
+            tasks=tasks,
+            training_episodes=tuple(item.episode_id for item in training),
+            training_starts=tuple(sorted({item.start_digest for item in training})),
+            settings={
+                "shape": shape.model_dump(),
+                "training": settings.model_dump(),
+                "instructions": instructions_of(episodes),
+                "share_of_training": share,
+            },
+            metrics={
+                "num_training_decisions": len(learned),
+                "num_held_out_decisions": len(tested),
+                "training_cpu_s": round(cpu_s, 1),
+                **_errors(network, tested, tasks),
+            },
+        )
+        tensors = {
+            f"network.{name}": t.half() if name in _KEPT_AS_HALF else t.clone()
+            for name, t in network.state_dict().items()
+        }
+        return Checkpoint(metadata, tensors)
+
+    network.train()
+    early: Checkpoint | None = None
+    cpu_s = 0.0
+    for done, cpu_s in _optimize(network, learned, settings):
+        if early_at is not None and early is None and done >= early_at:
+            early = checkpoint(cpu_s, round(done, 4))
+    return Trained(checkpoint(cpu_s, 1.0), early)
 
 
 def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
     with torch.no_grad():
-        network.codec.fit(learned.chunks, learned.batch)
-        coefficients = network.codec.encode(learned.chunks, learned.batch)
+        network.codec.fit(learned.chunks, learned.task, learned.slot)
+        coefficients = network.codec.encode(learned.chunks, learned.task, learned.slot)
         network.coefficient_scale.copy_(coefficients.std(0).clamp_min(1e-3))
-        reached = network.reached(learned.batch.state)
-        network.reached_mean.copy_(reached.mean(0))
-        network.reached_scale.copy_(reached.std(0).clamp_min(1e-2))
+        poses = network.poses(learned.state)
+        network.pose_mean.copy_(poses.mean(0))
+        network.pose_scale.copy_(poses.std(0).clamp_min(1e-2))
 
 
-def _optimize(network: CloningNetwork, learned: Decisions, settings: CloningSettings) -> float:
-    """Minimize the weighted action error; gives the CPU seconds it took."""
+def _optimize(
+    network: CloningNetwork, learned: Decisions, settings: CloningSettings
+) -> Iterator[tuple[float, float]]:
+    """Minimize the weighted action error; says after each step what share is done, in how many s.
+
+    The seconds are of the CPU, since the first step.
+    """
     generator = torch.Generator().manual_seed(settings.seed)
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
-    variance = network.codec.encode(learned.chunks, learned.batch).var(0).sum()
+    wanted = network.codec.encode(learned.chunks, learned.task, learned.slot)
+    variance = wanted.var(0).sum()
     started = time.process_time()
+    done = 0.0
     with Progress("policy", settings.num_training_steps) as progress:
         for step in range(settings.num_training_steps):
-            elapsed = time.process_time() - started
-            done = max(step / settings.num_training_steps, elapsed / settings.max_cpu_s)
             if done >= 1:
                 break
             for group in optimizer.param_groups:
                 group["lr"] = settings.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
-            index = torch.randint(len(learned), (settings.batch_size,), generator=generator)
-            part = learned.pick(index)
-            images = _disturb(part.batch.images, settings, generator)
-            state = part.batch.state.clone()
-            noise = torch.randn((len(state), ACTION_DIM), generator=generator)
-            network.reached(state).add_(noise * network.reached_scale * settings.pose_noise)
-            guess = network(replace(part.batch, images=images, state=state))
-            wanted = network.codec.encode(part.chunks, part.batch)
-            loss = (guess - wanted).square().sum(1).mean() / variance
+            index = learned.drawn(settings.batch_size, generator)
+            part = _disturbed(learned.batch(index), network, settings, generator)
+            loss = (network(part) - wanted[index]).square().sum(1).mean() / variance
             optimizer.zero_grad()
             loss.backward()
             torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
             optimizer.step()
             progress.advance(loss=float(loss.detach()))
-    return time.process_time() - started
+            elapsed = time.process_time() - started
+            done = max((step + 1) / settings.num_training_steps, elapsed / settings.max_cpu_s)
+            yield done, elapsed
 
 
-def _disturb(
-    images: torch.Tensor, settings: CloningSettings, generator: torch.Generator
-) -> torch.Tensor:
-    """Pixel noise and a random brightness for each example."""
-    noise = torch.randn(images.shape, generator=generator) * settings.image_noise
-    brightness = torch.randn((len(images), 1, 1, 1), generator=generator) * settings.brightness
-    return images + noise + brightness
+def _disturbed(
+    batch: CloningBatch,
+    network: CloningNetwork,
+    settings: CloningSettings,
+    generator: torch.Generator,
+) -> CloningBatch:
+    """Pixel noise, a random brightness for each example, and poses that are slightly wrong.
+
+    What is commanded next stays where it is in the world, so that a policy that strayed comes
+    back.
+    """
+    state = batch.state.clone()
+    noise = torch.randn((len(state), NUM_POSE_FEATURES), generator=generator)
+    network.poses(state).add_(noise * network.pose_scale * settings.pose_noise)
+
+    def spoilt(images: torch.Tensor) -> torch.Tensor:
+        noise = torch.randn(images.shape, generator=generator) * settings.image_noise
+        brightness = torch.randn((len(images), 1, 1, 1), generator=generator) * settings.brightness
+        return images + noise + brightness
+
+    return replace(batch, state=state, first=spoilt(batch.first), newest=spoilt(batch.newest))
 
 
-def _errors(network: CloningNetwork, tested: Decisions) -> dict[str, float]:
+def _errors(network: CloningNetwork, tested: Decisions, tasks: Sequence[str]) -> dict[str, float]:
     """Wrist error at the end of a held-out chunk, and that of its task's and slot's mean chunk."""
-    with torch.no_grad():
-        coefficients = network(tested.batch)
-        guess = network.codec.decode(coefficients, tested.batch)
-        mean = network.codec.decode(torch.zeros_like(coefficients), tested.batch)
     columns = [*range(WRIST_LEFT.start, WRIST_LEFT.start + 3)]
     columns += [*range(WRIST_RIGHT.start, WRIST_RIGHT.start + 3)]
+    found: dict[str, list[torch.Tensor]] = {"": [], "_of_mean_chunk": []}
+    network.eval()
+    with torch.no_grad():
+        for index in torch.split(torch.arange(len(tested)), _TESTED_AT_ONCE):
+            coefficients = network(tested.batch(index))
+            for name, used in zip(
+                found, (coefficients, torch.zeros_like(coefficients)), strict=True
+            ):
+                chunks = network.codec.decode(used, tested.task[index], tested.slot[index])
+                difference = (chunks - tested.chunks[index])[:, -1, columns].reshape(-1, 2, 3)
+                found[name].append(1e3 * difference.norm(dim=-1).mean(1))
+    network.train()
     figures = {}
-    for name, chunks in (("", guess), ("_of_mean_chunk", mean)):
-        difference = (chunks - tested.chunks)[:, -1, columns].reshape(len(tested), 2, 3)
-        figures[f"wrist_error_mm{name}"] = round(1e3 * float(difference.norm(dim=-1).mean()), 2)
+    for name, parts in found.items():
+        errors_mm = torch.cat(parts)
+        figures[f"wrist_error_mm{name}"] = round(float(errors_mm.mean()), 2)
+        for number, task in enumerate(tasks):
+            chosen = errors_mm[tested.task == number]
+            if len(chosen):
+                figures[f"wrist_error_mm{name}_{task}"] = round(float(chosen.mean()), 2)
     return figures

@@ -1,4 +1,4 @@
-"""The Policy protocol: an observation in, the next action chunk out."""
+"""The protocol of policies, which act in any world."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -30,7 +30,8 @@ class Policy(Protocol):
     """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md).
 
     A policy with an attribute `looks` that is False gets no images after the first step, so that
-    worlds need not make them.
+    worlds need not make them. With `looks = "last"` it may get nothing but the last step of each
+    chunk.
     """
 
     def reset(self, start: PolicyStart) -> None:

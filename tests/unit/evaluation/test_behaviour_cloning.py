@@ -8,19 +8,33 @@ from dextouch.clients.policy import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import transform
-from dextouch.hands.actions import pose_to_9d, reanchor
-from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy, chunk_from_start
-from services.evaluation.policies.cloning_network import (
-    ChunkCodec,
-    CloningBatch,
-    SpatialSoftmax,
+from dextouch.hands.actions import AnchorPoses, pose_to_9d
+from services.evaluation.policies.behaviour_cloning import (
+    BehaviourCloningPolicy,
+    CloningInput,
+    CloningShape,
+    cloning_batch,
+    from_world,
+    half_size,
+    in_world,
 )
-from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
+from services.evaluation.policies.cloning_episodes import CloningEpisode
+from services.evaluation.policies.cloning_network import ChunkCodec, SpatialSoftmax
+from services.evaluation.policies.cloning_training import (
+    CloningSettings,
+    decisions_of,
+    train_cloned_policy,
+)
 from tests.unit.evaluation import toy
 
 
 def start(task: str, seed: int) -> PolicyStart:
     return PolicyStart(task, toy.INSTRUCTIONS[task], seed, toy.ANCHOR, toy.K_HEAD)
+
+
+def episodes(seeds: range, **changed: object) -> list[CloningEpisode]:
+    items = [CloningEpisode.of(item, toy.ANCHOR) for item in toy.demonstrations(seeds)]
+    return [toy.replace(item, **changed) for item in items]
 
 
 def roll(policy: Policy, task: str, seed: int, *, num_chunks: int = 5) -> np.ndarray:
@@ -56,17 +70,91 @@ def test_a_rollout_does_not_depend_on_the_one_before(policy_checkpoint):
 
 
 def test_training_repeats_itself():
-    few = toy.demonstrations(range(12))
+    few = episodes(range(12))
     settings = CloningSettings(num_training_steps=3, batch_size=4, held_out_share=0.3)
-    first, second = (train_cloned_policy(few, settings, command="x").tensors for _ in range(2))
-    for name, tensor in first.items():
-        assert torch.equal(tensor, second[name]), name
+    first, second, other = (
+        train_cloned_policy(few, settings.model_copy(update={"seed": seed}), command="x").finished
+        for seed in (0, 0, 1)
+    )
+    for name, tensor in first.tensors.items():
+        assert torch.equal(tensor, second.tensors[name]), name
+    assert any(not torch.equal(t, other.tensors[name]) for name, t in first.tensors.items())
+
+
+def test_an_early_policy_comes_from_the_same_training(trained_policies):
+    early, finished = trained_policies.early.metadata, trained_policies.finished.metadata
+    assert early.training_starts == finished.training_starts
+    assert early.tasks == finished.tasks
+    assert early.settings["share_of_training"] == 0.02
+    assert finished.settings["share_of_training"] == 1.0
+    assert finished.metrics["wrist_error_mm"] < early.metrics["wrist_error_mm"]
+    policies = [BehaviourCloningPolicy(c) for c in vars(trained_policies).values()]
+    assert roll(policies[0], "reach", 1003) != roll(policies[1], "reach", 1003)
+
+
+def test_without_being_asked_there_is_no_early_policy():
+    settings = CloningSettings(num_training_steps=2, batch_size=4, held_out_share=0.3)
+    assert train_cloned_policy(episodes(range(12)), settings, command="x").early is None
 
 
 def test_training_needs_a_success():
-    failed = [toy.replace(d, success=False) for d in toy.demonstrations(range(12))]
     with pytest.raises(InvalidInputError, match="no successful demonstration"):
-        train_cloned_policy(failed, CloningSettings(), command="x")
+        train_cloned_policy(episodes(range(12), success=False), CloningSettings(), command="x")
+
+
+def test_decisions_are_whole_moments_of_one_episode():
+    few = episodes(range(3))
+    shape = CloningShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    found = decisions_of(few, shape)
+    # 81 steps: 0, 8 … 64; all but the first as measured and as imagined.
+    assert len(found) == 6 * 17
+    index = found.drawn(30, torch.Generator().manual_seed(0))
+    batch = found.batch(index)
+    assert len(batch.first) <= 10
+    for place, moment in enumerate(index.tolist()):
+        item = few[moment // 17]
+        first = torch.from_numpy(item.moments[0].image).movedim(-1, 0) / 255 - 0.5
+        torch.testing.assert_close(batch.first[batch.rollout[place]], first)
+        step = 8 * ((moment % 17 + 1) // 2)
+        sent = torch.tensor(item.commanded[step + 1 : step + 17], dtype=torch.float32)
+        torch.testing.assert_close(found.chunks[moment], sent)
+        newest = torch.from_numpy(half_size(item.moments[step].image)).movedim(-1, 0) / 255 - 0.5
+        torch.testing.assert_close(batch.newest[place], newest)
+
+
+def test_half_an_image_holds_the_means_of_its_pixels():
+    image = np.zeros((5, 4, 3), np.uint8)
+    image[0, 0], image[0, 1], image[3, 3] = 40, 80, 100
+    half = half_size(image)
+    assert half.shape == (2, 2, 3)
+    np.testing.assert_array_equal(half[..., 0], [[30, 0], [0, 25]])
+
+
+def test_an_answer_does_not_depend_on_the_others_of_a_batch(policy_checkpoint):
+    policy = BehaviourCloningPolicy(policy_checkpoint)
+    moments = [
+        CloningInput(
+            item.moments[0].image, item.moments[step].image, item.moments[step].tactile_kpa,
+            item.anchor, item.measured[step], step == 0, step, item.task,
+        )
+        for item in episodes(range(3)) for step in (0, 32)
+    ]  # fmt: skip
+    with torch.no_grad():
+        together = policy._network(cloning_batch(moments, policy.shape))
+        alone = [policy._network(cloning_batch([moment], policy.shape)) for moment in moments]
+    torch.testing.assert_close(together, torch.cat(alone), rtol=1e-4, atol=1e-4)
+
+
+def test_only_the_last_step_of_an_observation_counts(policy_checkpoint):
+    policy = BehaviourCloningPolicy(policy_checkpoint)
+    world = toy.ToyWorld("judge", judge=True)
+    begun = world.reset(toy.RolloutStart("reach", 1004, ""))
+    sent = []
+    for last_only in (False, True):
+        policy.reset(start("reach", 1004))
+        seen = world.step(begun.state, policy.act(begun.observation), seed=0).observation
+        sent.append(policy.act(seen.last() if last_only else seen))
+    np.testing.assert_array_equal(sent[0], sent[1])
 
 
 def test_what_it_was_not_made_for_is_refused(policy_checkpoint):
@@ -85,31 +173,32 @@ def test_what_it_was_not_made_for_is_refused(policy_checkpoint):
         policy.act(toy.replace(seen, images={}))
 
 
-def test_chunks_are_moved_back_to_step_zero():
+def test_actions_in_the_world_have_absolute_poses():
     rng = np.random.default_rng(8)
-    poses = transform(rotation_from_vector(rng.normal(size=(3, 6, 3))), rng.normal(size=(3, 6, 3)))
-    actions = rng.normal(size=(6, 67))
-    for part, Ts in zip((slice(0, 9), slice(9, 18), slice(58, 67)), poses, strict=True):
-        actions[:, part] = pose_to_9d(Ts)
-    here = actions[2]
-    relative = reanchor(actions, 0, anchor_action=here)
-    np.testing.assert_allclose(chunk_from_start(relative, here), actions, atol=1e-12)
-
-
-def moments(task: torch.Tensor, slot: torch.Tensor) -> CloningBatch:
-    return CloningBatch(torch.zeros(len(task), 6, 8, 8), torch.zeros(len(task), 100), task, slot)
+    anchors = transform(rotation_from_vector(rng.normal(size=(3, 3))), rng.normal(size=(3, 3)))
+    Ts = transform(rotation_from_vector(rng.normal(size=(3, 6, 3))), rng.normal(size=(3, 6, 3)))
+    actions, expected = rng.normal(size=(2, 6, 67))
+    expected[:, 18:58] = actions[:, 18:58]
+    parts = (slice(0, 9), slice(9, 18), slice(58, 67))
+    for part, T_world_anchor, Ts_anchor_part in zip(parts, anchors, Ts, strict=True):
+        actions[:, part] = pose_to_9d(Ts_anchor_part)
+        expected[:, part] = pose_to_9d(np.stack([T_world_anchor @ T for T in Ts_anchor_part]))
+    anchor = AnchorPoses(*anchors)
+    np.testing.assert_allclose(in_world(actions, anchor), expected, atol=1e-12)
+    np.testing.assert_allclose(from_world(expected, anchor), actions, atol=1e-12)
 
 
 def test_codec_keeps_what_its_components_span():
     rng = np.random.default_rng(9)
-    batch = moments(torch.arange(40) % 2, torch.arange(40) % 4 // 2)
+    tasks, slots = torch.arange(40) % 2, torch.arange(40) % 4 // 2
     basis = rng.normal(size=(3, 16 * 67))
-    offsets = 5.0 * rng.normal(size=(2, 2, 16 * 67))[batch.task, batch.slot]
+    offsets = 5.0 * rng.normal(size=(2, 2, 16 * 67))[tasks, slots]
     chunks = torch.tensor(rng.normal(size=(40, 3)) @ basis + offsets).reshape(40, 16, 67).float()
     codec = ChunkCodec(num_tasks=2, num_slots=3, num_components=3)
-    codec.fit(chunks, batch)
-    coefficients = codec.encode(chunks, batch)
-    torch.testing.assert_close(codec.decode(coefficients, batch), chunks, atol=1e-2, rtol=1e-3)
+    codec.fit(chunks, tasks, slots)
+    coefficients = codec.encode(chunks, tasks, slots)
+    back = codec.decode(coefficients, tasks, slots)
+    torch.testing.assert_close(back, chunks, atol=1e-2, rtol=1e-3)
     assert coefficients.mean(0).abs().max() < 1e-2
     torch.testing.assert_close(codec.mean[:, 2], codec.mean[:, 1])
 

@@ -108,7 +108,7 @@ def test_a_faithful_world_agrees_and_a_false_one_does_not(report):
 
 
 def test_probe_is_judged_by_the_real_outcomes(report):
-    assert report.to_report()["probe_accuracy_on_real"] >= 0.85
+    assert report.to_report()["probe_accuracy_on_real"] >= 0.8
 
 
 def test_the_real_world_alone_is_enough(client, probe):

@@ -13,6 +13,12 @@ from dextouch.streams.descriptors import StreamDescriptor
 from services.evaluation.__main__ import main
 from services.evaluation.demonstrations import instructions_of, read_demonstrations
 from services.evaluation.endings import read_ending_episodes
+from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
+from services.evaluation.policies.cloning_episodes import (
+    CloningEpisode,
+    cloning_hash,
+    read_cloning_episodes,
+)
 from services.evaluation.reporting import action_picture, episode_picture
 from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.success_probe import SuccessProbe
@@ -150,6 +156,47 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     assert json.loads(figures.read_text())["metrics"] == probe.metadata.metrics
 
 
+def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
+    output = tmp_path / "policy.safetensors"
+    training = ["--training.num_training_steps", "4", "--training.held_out_share", "0.5"]
+    flags = ["--episodes", url, "--output", str(output), "--early_at", "0.5"]
+    assert main(["train-policy", *flags, *training]) == 0
+    assert capsys.readouterr().out.count("wrist_error_mm_of_mean_chunk ") == 2
+    finished, early = (
+        BehaviourCloningPolicy.load(path)
+        for path in (output, tmp_path / "policy_early.safetensors")
+    )
+    assert finished.metadata.settings["instructions"] == toy.INSTRUCTIONS
+    assert early.metadata.settings["share_of_training"] == 0.5
+    assert finished.metadata.training_starts == early.metadata.training_starts
+
+
+def test_policies_learn_from_images_of_every_eighth_step(tmp_path):
+    store = EpisodeStore(tmp_path)
+    item = toy.demonstration("reach", 1)
+    write(store, item, shown=SPARSE)
+    write(store, toy.demonstration("reach", 2, name="failed"), success=False)
+    (episode,) = read_cloning_episodes(store)
+    assert episode.start_digest == item.start_digest
+    assert sorted(episode.moments) == list(range(0, 81, 8))
+    for step, moment in episode.moments.items():
+        np.testing.assert_array_equal(moment.image, item.images[step])
+        np.testing.assert_allclose(moment.tactile_kpa, item.tactile_kpa[step])
+    for name in ("measured", "commanded"):
+        np.testing.assert_allclose(getattr(episode, name), getattr(item, name), atol=1e-12)
+    whole = CloningEpisode.of(item, toy.ANCHOR)
+    assert cloning_hash([episode]) == cloning_hash([whole])
+    moved = toy.replace(whole, commanded=whole.commanded + 1e-9)
+    assert cloning_hash([moved]) != cloning_hash([whole])
+    with pytest.raises(ConflictError, match="in two stores"):
+        read_cloning_episodes(store, store)
+    with pytest.raises(NotFoundError, match="juggle"):
+        read_cloning_episodes(store, tasks=["juggle"])
+    write(store, toy.demonstration("reach", 3), shown=range(0, 81, 6))
+    with pytest.raises(InvalidInputError, match=r"reach-3-0.*at step 8, .*--images 8"):
+        read_cloning_episodes(store)
+
+
 def test_the_command_line_refuses_clearly(capsys):
     assert main(["juggle"]) == 2
     assert "unknown command 'juggle'" in capsys.readouterr().err
@@ -157,6 +204,8 @@ def test_the_command_line_refuses_clearly(capsys):
         main(["run", "--seeds", "9:3"])
     with pytest.raises(InvalidInputError, match="episodes"):
         main(["train-policy"])
+    with pytest.raises(InvalidInputError, match="early_at"):
+        main(["train-policy", "--episodes", "x", "--early_at", "1.5"])
 
 
 def test_starts_are_told_apart_by_image_and_touch():

@@ -1,6 +1,7 @@
 """One policy in the twin, and in an imagined world from the same first observation."""
 
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
@@ -109,18 +110,16 @@ def play_in_twin(
     touch, sent = [started.observation.tactile_kpa], []
     poses, images = [stage_poses(twin, state)], []
     seen = started.observation
-    looks = not isinstance(policy, np.ndarray)
-    if looks:
-        ask(policy.reset, start, where="policy: reset")  # type: ignore[union-attr]
+    looks = _begin(policy, start)
     for first in range(0, NUM_STEPS, CHUNK_STEPS):
         chunk = _chunk(policy, seen, first, twin)
-        is_last = first + CHUNK_STEPS == NUM_STEPS
-        head = CHUNK_STEPS - 4 if is_last else CHUNK_STEPS
+        shows_end = looks == "last" or first + CHUNK_STEPS == NUM_STEPS
+        head = CHUNK_STEPS - 4 if shows_end else CHUNK_STEPS
         # Images are slow, so only those that somebody looks at are made.
-        selector = ReturnSelector() if looks else _NO_IMAGES
+        selector = ReturnSelector() if looks == "all" else _NO_IMAGES
         step = twin.step(state, chunk[:head], seed=start.seed, selector=selector)
         parts = [step]
-        if is_last:
+        if shows_end:
             parts.append(twin.step(step.state, chunk[head:], seed=start.seed))
         touch.extend(part.observation.tactile_kpa for part in parts)
         state, seen = parts[-1].state, parts[-1].observation
@@ -151,22 +150,19 @@ def play_in_imagination(
     started = world.reset(first)
     state, seen = started.state, started.observation
     touch, images = [seen.tactile_kpa], []
-    looks = not isinstance(policy, np.ndarray)
-    if looks:
-        ask(policy.reset, start, where="policy: reset")  # type: ignore[union-attr]
+    looks = _begin(policy, start)
     doubted: str | None = None
     for at in range(0, NUM_STEPS, CHUNK_STEPS):
         chunk = _chunk(policy, seen, at, world)
-        if looks or at + CHUNK_STEPS == NUM_STEPS:
-            step = world.step(state, chunk, seed=start.seed + at)
-            images.append(step.observation.images[CAMERA][-1])
+        if looks == "all" or at + CHUNK_STEPS == NUM_STEPS:
+            step = last = world.step(state, chunk, seed=start.seed + at)
         else:
             # A world is a function: asking twice gives touch of all steps and the last image.
             step = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
             last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
-            images.append(last.observation.images[CAMERA][-1])
-        state, seen = step.state, step.observation
-        touch.append(seen.tactile_kpa)
+        images.append(last.observation.images[CAMERA][-1])
+        state, seen = step.state, last.observation
+        touch.append(step.observation.tactile_kpa)
         if seen.doubt is not None and seen.doubt.outside:
             doubted = doubted or seen.doubt.reason
     poses = seen.object_poses
@@ -177,6 +173,15 @@ def play_in_imagination(
         None if poses is None else poses[-NUM_SEEN_STEPS:],
         doubted,
     )
+
+
+def _begin(policy: Policy | Actions, start: PolicyStart) -> Literal["no", "last", "all"]:
+    """Tell a policy that looks where it begins; which steps of a chunk it looks at."""
+    if isinstance(policy, np.ndarray):
+        return "no"
+    ask(policy.reset, start, where="policy: reset")
+    looks = getattr(policy, "looks", True)
+    return "last" if looks == "last" else "all" if looks else "no"
 
 
 def _chunk(

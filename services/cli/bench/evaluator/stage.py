@@ -26,7 +26,7 @@ from services.cli.bench.evaluator.work import NEEDED, Missing, Study, open_study
 from services.cli.bench.machine import describe_machine
 from services.cli.bench.report import ResultTable, StageReport
 from services.cli.bench.stages import Bar
-from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
+from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
 from services.twin.tasks import TASK_NAMES
 
 PACKAGES = ("numpy", "torch", "mujoco")
@@ -57,7 +57,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--cloned",
         action="append",
         metavar="NAME=PATH",
-        help="cloned policy to roll out in closed loop; may be repeated (the committed one)",
+        help="cloned policy to roll out in closed loop; may be repeated (the committed two)",
     )
     parser.add_argument(
         "--keep",
@@ -202,7 +202,7 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         raise InvalidInputError(
             f"evaluator: got {num_starts} starts and {options.jobs} jobs, expected at least one"
         )
-    cloned = options.cloned or [f"cloned={DEFAULT_POLICY}"]
+    cloned = options.cloned or [f"cloned={DEFAULT_POLICY}", f"cloned early={EARLY_POLICY}"]
     return StudyPlan(
         keep=options.keep,
         trained=trained_seeds(options.world or [None], options.probe or [DEFAULT_PROBE], ()),

@@ -1,0 +1,161 @@
+"""Successful robot episodes as a cloned policy learns from them: only moments of decision."""
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.hands.actions import AnchorPoses
+from services.evaluation.demonstrations import CAMERA, Demonstration
+from services.evaluation.policies.cloning_network import SLOT_STEPS
+from services.evaluation.starts import start_digest
+
+# Decisions are learned at these steps; an evaluation with chunks of 16 decides at every second.
+DECISION_STRIDE: Final = SLOT_STEPS
+
+
+@dataclass(frozen=True)
+class Moment:
+    """What is seen and felt at one step."""
+
+    image: UInt8[np.ndarray, "h w 3"]
+    tactile_kpa: Float32[np.ndarray, "2 320"]
+
+
+@dataclass(frozen=True)
+class CloningEpisode:
+    """One robot episode: what was reached and commanded at every step, and seen at some.
+
+    Both actions are relative to the measured poses of step 0, which are `anchor`. `moments` maps
+    steps to what was seen there; step 0 is among them.
+    """
+
+    episode_id: str
+    task: str
+    instruction: str
+    seed: int
+    success: bool
+    anchor: AnchorPoses
+    moments: Mapping[int, Moment]
+    measured: Float64[np.ndarray, "steps 67"]
+    commanded: Float64[np.ndarray, "steps 67"]
+
+    @property
+    def num_steps(self) -> int:
+        """Steps of the model grid, the first included."""
+        return len(self.measured)
+
+    @property
+    def start_digest(self) -> str:
+        """Digest of the first observation."""
+        return start_digest(self.moments[0].image, self.moments[0].tactile_kpa)
+
+    @classmethod
+    def of(cls, item: Demonstration, anchor: AnchorPoses) -> "CloningEpisode":
+        """An episode that is in memory with all its images."""
+        return cls(
+            item.episode_id,
+            item.task,
+            item.instruction,
+            item.seed,
+            item.success,
+            anchor,
+            {
+                step: Moment(item.images[step], item.tactile_kpa[step])
+                for step in range(0, item.num_steps, DECISION_STRIDE)
+            },
+            item.measured,
+            item.commanded,
+        )
+
+
+def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
+    """One robot episode that succeeded; only images of decisions are decoded.
+
+    Raises:
+        InvalidInputError: no seed, or no image at a decision's step.
+    """
+    about = reader.attributes
+    if about.seed is None:
+        raise InvalidInputError(
+            f"episode {about.episode_id!r}: no seed, expected one, as in episodes of the twin"
+        )
+    wanted = range(0, reader.num_steps, DECISION_STRIDE)
+    missing = sorted(set(wanted) - set(reader.shown_steps(CAMERA)[0].tolist()))
+    if missing:
+        raise InvalidInputError(
+            f"episode {about.episode_id!r}: no image of {CAMERA!r} at step {missing[0]}, expected "
+            f"one at least every {DECISION_STRIDE} steps; record it with `dextouch train data "
+            f"--images {DECISION_STRIDE}` or fewer"
+        )
+    first = reader.window(0, num_steps=reader.num_steps, cameras=())
+    return CloningEpisode(
+        about.episode_id,
+        about.task,
+        about.instruction,
+        about.seed,
+        bool(about.success),
+        first.anchor,
+        {
+            step: Moment(
+                reader.window(step, num_steps=1, cameras=(CAMERA,)).images[CAMERA][0],
+                first.tactile_kpa[step].copy(),
+            )
+            for step in wanted
+        },
+        first.actions,
+        reader.read("action_commanded").values,
+    )
+
+
+def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[CloningEpisode]:
+    """The robot episodes of some stores that succeeded, store by store in the order of their ids.
+
+    Args:
+        stores: where to read.
+        tasks: only these; empty for all.
+
+    Raises:
+        NotFoundError: not one such episode, or a store without any episode.
+        ConflictError: two stores hold an episode of the same id.
+    """
+    found: dict[str, CloningEpisode] = {}
+    for place, store in enumerate(stores, 1):
+        names = sorted(store.list(kind="episode"))
+        if not names:
+            raise NotFoundError(
+                f"store {place} of the {len(stores)} given holds no episode; check its path"
+            )
+        for episode_id in names:
+            reader = store.open(episode_id)
+            about = reader.attributes
+            is_wanted = about.domain == "robot" and (not tasks or about.task in tasks)
+            if not is_wanted or not about.success:
+                continue
+            if episode_id in found:
+                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
+            found[episode_id] = read_cloning_episode(reader)
+    if not found:
+        raise NotFoundError(
+            f"no robot episode of {', '.join(tasks) or 'any task'} in the store succeeded; "
+            "record some with `dextouch train data` first"
+        )
+    return list(found.values())
+
+
+def cloning_hash(episodes: Sequence[CloningEpisode]) -> str:
+    """sha256 over everything that training sees, in the order of the episode ids."""
+    digest = hashlib.sha256()
+    for item in sorted(episodes, key=lambda e: e.episode_id):
+        digest.update(repr((item.episode_id, item.task, item.instruction, item.success)).encode())
+        for moment in (item.moments[step] for step in sorted(item.moments)):
+            digest.update(np.ascontiguousarray(moment.image).tobytes())
+            digest.update(np.ascontiguousarray(moment.tactile_kpa).tobytes())
+        for array in (item.measured, item.commanded, *vars(item.anchor).values()):
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
