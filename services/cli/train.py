@@ -12,9 +12,10 @@ TRAINERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "imagined": ("services.cli.imagined_data", ()),
     "policy": ("services.evaluation.__main__", ("train-policy",)),
     "probe": ("services.evaluation.__main__", ("train-probe",)),
+    "direct-judge": ("services.evaluation.__main__", ("train-direct-judge",)),
 }
 
-USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe [options]
+USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe|direct-judge [options]
 
   data         record the mixed twin episodes that everything is trained on
   world-model  the joint visuo-tactile flow-matching model
@@ -22,6 +23,7 @@ USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe [o
   imagined     those episodes as the world model imagines them
   policy       a closed-loop policy that imitates the demonstrations
   probe        the judge of imagined success; give it data made with --ladder
+  direct-judge its rival, which imagines nothing: for `dextouch bench evaluator --direct`
 
 Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`
 trains a small state model, a policy and a probe; docs/evaluation.md has the commands."""

@@ -15,6 +15,8 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
 from services.evaluation.demonstrations import read_demonstrations
+from services.evaluation.direct_data import read_attempts
+from services.evaluation.direct_training import train_direct_judge
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import read_cloning_episodes
@@ -28,6 +30,7 @@ from services.evaluation.results import ResultLog
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
+    TrainDirectSettings,
     TrainPolicySettings,
     TrainProbeSettings,
     command_line,
@@ -36,11 +39,12 @@ from services.evaluation.settings import (
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_training import train_success_probe
 
-USAGE = """usage: evaluation train-policy|train-probe|run [flags]
+USAGE = """usage: evaluation train-policy|train-probe|train-direct-judge|run [flags]
 
-  train-policy   imitate the successful robot episodes of a store
-  train-probe    learn to tell success from the last images and touch
-  run            roll policies out in a real and in imagined worlds, and score both
+  train-policy         imitate the successful robot episodes of a store
+  train-probe          learn to tell success from the last images and touch
+  train-direct-judge   the probe's rival: success from first observation and commands alone
+  run                  roll policies out in a real and in imagined worlds, and score both
 
 Flags: evaluation COMMAND --help"""
 EXIT_FAILED = 1
@@ -53,6 +57,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands: dict[str, Callable[[list[str]], int]] = {
         "train-policy": run_train_policy,
         "train-probe": run_train_probe,
+        "train-direct-judge": run_train_direct_judge,
         "run": run_evaluation,
     }
     word, *rest = arguments or ["--help"]
@@ -95,6 +100,16 @@ def run_train_probe(arguments: list[str]) -> int:
         development=read(settings.development),
         held_out=read(settings.held_out),
     )
+    return _keep(checkpoint, settings.output, settings.json_path)
+
+
+def run_train_direct_judge(arguments: list[str]) -> int:
+    """Train the direct judge and keep it."""
+    settings = parse(TrainDirectSettings, arguments)
+    stores = [EpisodeStore(url) for url in settings.episodes]
+    items = read_attempts(*stores, tasks=settings.tasks)
+    command = command_line("train-direct-judge", arguments)
+    checkpoint = train_direct_judge(items, settings.training, command=command)
     return _keep(checkpoint, settings.output, settings.json_path)
 
 

@@ -11,6 +11,7 @@ from pydantic_settings import BaseSettings, CliApp
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.problems import first_problems
 from dextouch.serving.settings import service_config
+from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
 from services.evaluation.success_probe_training import ProbeSettings
 
@@ -60,6 +61,18 @@ class TrainProbeSettings(BaseSettings):
     output: Path = Path("runs/evaluation/success_probe.safetensors")
     tasks: tuple[str, ...] = ()
     training: ProbeSettings = ProbeSettings()
+    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+
+
+class TrainDirectSettings(BaseSettings):
+    """Learn to tell success from first observations and commands, without imagining anything."""
+
+    model_config = service_config("evaluation_train_direct_judge")
+
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    output: Path = Path("runs/evaluation/direct_judge.safetensors")
+    tasks: tuple[str, ...] = ()
+    training: DirectSettings = DirectSettings()
     json_path: Path | None = Field(default=None, alias="json", description="write figures here")
 
 

@@ -193,3 +193,38 @@ def test_a_chunk_moves_where_a_finger_or_an_object_does():
     turned = poses.copy()
     turned[5, 0, 3:] = [np.cos(0.02), 0, 0, np.sin(0.02)]
     assert chunks_that_move(commands, turned)[4]
+
+
+def test_rivals_by_hand(rolled):
+    # The direct judge calls the start's second level right, and everything unlike it a success.
+    told = {"script 0 mm": (0.9, 0.6), "script 9 mm": (0.7, 0.1), "hold": (0.9, 0.9)}
+    judged = [
+        replace(
+            one,
+            rows=one.rows
+            | {
+                "direct verdict": _verdict(told[one.policy][one.seed - 1]),
+                "verdict without touch": _verdict(0.5),
+            },
+        )
+        for one in rolled
+    ]
+    figures = TaskFigures("a", [judged, judged], SCRIPTS)
+    lines = {line.what: line for line in figures.lines()}
+    # 0.9 and 0.6 against 0.7 and 0.1: three pairs of four, where imagination has 3.5.
+    assert lines["AUC of imagined endings less the direct judge's, scripts"].value == 0.125
+    assert lines["AUC of imagined endings less those with touch at zero, scripts"].value == 0.375
+    # Nothing else than scripts succeeded: there is no area.
+    assert lines["AUC of imagined endings less the direct judge's, other policies"].value is None
+    rows = {(row["judge"], row["policies"]): row for row in figures.rival_rows()}
+    direct = rows["direct judge", "scripts"]
+    assert (direct["auc"], direct["called_success"], direct["succeeded"]) == (0.75, 0.75, 0.5)
+    held = rows["direct judge", "other policies"]
+    assert (held["auc"], held["called_success"], held["succeeded"]) == (None, 1.0, 0.0)
+    assert rows["imagined ending", "other policies"]["called_success"] == 0.5
+
+
+def test_without_direct_judge_there_is_no_line_of_it(rolled):
+    figures = TaskFigures("a", [rolled], SCRIPTS)
+    assert not [line for line in figures.lines() if "direct" in line.what]
+    assert {row["judge"] for row in figures.rival_rows()} == {"imagined ending"}

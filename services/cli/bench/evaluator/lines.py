@@ -17,6 +17,7 @@ from services.cli.bench.evaluator.drawn import (
     undefined,
 )
 from services.cli.bench.evaluator.plan import IDLE
+from services.cli.bench.evaluator.rival_lines import rival_figures, rival_rows
 from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws, rates_of_draws
 
 TRUE, IMAGINED = "true verdict", "imagined verdict"
@@ -38,15 +39,16 @@ class TaskFigures:
     ) -> None:
         self._task, self._by_seed = task, by_seed
         self._scripts = [[one for one in mine if one.policy in scripts] for mine in by_seed]
+        self._others = [[one for one in mine if one.policy not in scripts] for mine in by_seed]
         self._sampling = Sampling(by_seed[0])
 
     def lines(self) -> list[Line]:
         """Every line of the table."""
-        pairs = zip(self._by_seed, self._scripts, strict=True)
+        pairs = zip(self._scripts, self._others, strict=True)
         return lines_over_seeds(self._task, [self._drawn(*pair) for pair in pairs])
 
-    def _drawn(self, everything: Sequence[Rolled], scripts: Sequence[Rolled]) -> list[Drawn]:
-        sampling = self._sampling
+    def _drawn(self, scripts: Sequence[Rolled], others: Sequence[Rolled]) -> list[Drawn]:
+        sampling, everything = self._sampling, [*scripts, *others]
         return [
             *_judge_figures(sampling, scripts),
             *_rollout_figures(sampling, scripts),
@@ -55,6 +57,7 @@ class TaskFigures:
             *chunk_figures_drawn(sampling, scripts),
             *_wrong_action_figures(sampling, everything),
             *_still_figures(sampling, everything),
+            *rival_figures(sampling, scripts, others),
         ]
 
     def policy_rows(self) -> list[dict[str, Any]]:
@@ -76,6 +79,10 @@ class TaskFigures:
             several = {f"imagined_{number}": rate for number, rate in enumerate(rates, 1)}
             rows.append(row | (several if len(rates) > 1 else {}))
         return rows
+
+    def rival_rows(self) -> list[dict[str, Any]]:
+        """AUC and successes of every judge, over scripts and over all other policies."""
+        return rival_rows(self._task, self._sampling, self._scripts, self._others)
 
     def chunk_rows(self) -> list[dict[str, Any]]:
         """Figures of every chunk of the scripts, by training seed where there are several."""

@@ -8,32 +8,45 @@ from typing import Any
 
 from dextouch.worlds.world import BatchWorld
 from services.cli.bench.evaluator.plan import Trained
+from services.evaluation.direct_judge import DirectJudge
 from services.evaluation.success_probe import SuccessProbe
 from services.world_model.world import open_world
 
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A world model and its judge; `about` are the digests that results are known by."""
+    """A world model, its judge and its rival, if there is one.
+
+    `about` are the digests that results are known by.
+    """
 
     about: dict[str, str]
     world: BatchWorld[Any]
     probe: SuccessProbe
+    direct: DirectJudge | None = None
 
     @property
     def tasks(self) -> set[str]:
         """The tasks that all its networks know."""
         return set(self.world.description.tasks) & set(self.probe.metadata.tasks)
 
+    @property
+    def judges(self) -> list[SuccessProbe | DirectJudge]:
+        """All that were trained on starts of their own."""
+        return [self.probe, *([] if self.direct is None else [self.direct])]
+
 
 def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
     """The networks of every training seed; a file that several share is opened once."""
-    worlds, probes = cache(open_world), cache(SuccessProbe.load)
+    worlds, probes, directs = cache(open_world), cache(SuccessProbe.load), cache(DirectJudge.load)
     found = []
     for one in trained:
         world: BatchWorld[Any] = worlds(one.world)
         about = {"world": world.description.digest, "judge": file_digest(one.probe)}
-        found.append(Member(about, world, probes(one.probe)))
+        if one.direct is not None:
+            about["direct judge"] = file_digest(one.direct)
+        direct = None if one.direct is None else directs(one.direct)
+        found.append(Member(about, world, probes(one.probe), direct))
     return tuple(found)
 
 

@@ -9,6 +9,7 @@ from typing import Any, Final
 import numpy as np
 
 from dextouch.clients.policy import Policy
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
 from dextouch.worlds.world import RolloutStart
 from services.cli.bench.evaluator.keeping import Row, array_path, read_arrays, write_arrays
@@ -30,7 +31,9 @@ from services.cli.bench.evaluator.playing import (
 )
 from services.cli.bench.evaluator.restarts import chunks_that_move, contact_with_true_context
 from services.cli.bench.evaluator.still_hand import StillRollout, hold_still, still_figures
+from services.evaluation.direct_network import Attempt
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
+from services.evaluation.success_probe import DECISION_THRESHOLD
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.world import TwinWorld
 
@@ -46,6 +49,7 @@ DEPENDS_ON: Final[dict[str, tuple[str, ...]]] = {
     "true context": ("twin", "world"),
     "wrong actions": ("twin", "world"),
     "still hand": ("twin", "world"),
+    "direct verdict": ("twin", "direct judge"),
 }
 
 
@@ -87,6 +91,7 @@ class PolicyRollout:
             },
             "true context": self._context_row,
             "still hand": self._still_row,
+            "direct verdict": self._direct_row,
         }  # fmt: skip
 
     def row(self, kind: str, member: Member) -> Row:
@@ -171,6 +176,22 @@ class PolicyRollout:
             write_arrays(path, {"images": true.images})
         imagined: StillRollout = hold_still(member.world, self._first, row)
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)
+
+    def _direct_row(self, member: Member) -> Row:
+        """What a judge says that sees the first observation and what was commanded in the twin."""
+        if member.direct is None:
+            raise InvalidInputError("evaluator: no direct judge was given; name one by --direct")
+        seen, first = self._started.observation, self._started
+        attempt = Attempt(
+            self._task,
+            self._first_image,
+            seen.tactile_kpa[0],
+            self.real.actions,
+            first.anchor,
+            first.K_head,
+        )
+        probability = float(member.direct.probabilities([attempt])[0])
+        return {"probability": probability, "likely_success": probability >= DECISION_THRESHOLD}
 
 
 def without_touch(ending: Ending) -> Ending:

@@ -48,6 +48,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         help="checkpoint of the judge (committed one); once for all worlds, or once for each",
     )
+    parser.add_argument(
+        "--direct",
+        action="append",
+        type=Path,
+        help="checkpoint of the direct judge, which imagines nothing, as a rival (none); once for "
+        "all worlds, or once for each",
+    )
     parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
     parser.add_argument(
         "--starts", type=int, help=f"starts a task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
@@ -91,15 +98,17 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     lines = [line for each in figures for line in each.lines()]
     policies = [row for each in figures for row in each.policy_rows()]
     chunks = [row for each in figures for row in each.chunk_rows()]
+    rivals = [row for each in figures for row in each.rival_rows()]
     notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
              if task not in study.tasks]  # fmt: skip
     if failed:
         notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
-    write_page(plan.keep / "evaluator.html", study.about, lines, (policies, chunks), notes)
+    write_page(plan.keep / "evaluator.html", study.about, lines, (policies, rivals, chunks), notes)
     content = {
         "about": study.about,
         "lines": [asdict(line) for line in lines],
         "policies": policies,
+        "rivals": rivals,
         "chunks": chunks,
         "notes": notes,
     }
@@ -112,11 +121,12 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         tables=[
             interval_table(lines),
             row_table("Success rates", policies),
+            row_table("AUC of single rollouts, by who judges what", rivals),
             row_table("Chunks of scripts, each figure beside its rival", chunks),
         ],
         panels=[],
         requirements=[line.requirement() for line in lines],
-        data={name: content[name] for name in ("about", "lines", "policies", "chunks")},
+        data={name: content[name] for name in ("about", "lines", "policies", "rivals", "chunks")},
         notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
     )
 
@@ -205,7 +215,9 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
     cloned = options.cloned or [f"cloned={DEFAULT_POLICY}", f"cloned early={EARLY_POLICY}"]
     return StudyPlan(
         keep=options.keep,
-        trained=trained_seeds(options.world or [None], options.probe or [DEFAULT_PROBE], ()),
+        trained=trained_seeds(
+            options.world or [None], options.probe or [DEFAULT_PROBE], options.direct or []
+        ),
         tasks=tuple(options.tasks),
         seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
         levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,

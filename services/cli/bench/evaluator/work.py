@@ -9,7 +9,7 @@ import torch
 from dextouch.clients.policy import Policy
 from dextouch.errors import DexTouchError
 from services.cli.bench.evaluator.keeping import KeptRows, Row, row_key
-from services.cli.bench.evaluator.members import open_members
+from services.cli.bench.evaluator.members import Member, open_members
 from services.cli.bench.evaluator.plan import CAMERA, ELSEWHERE, HOLD, StudyPlan, script_name
 from services.cli.bench.evaluator.playing import Actions, scripted_actions, start_in_twin
 from services.cli.bench.evaluator.rollouts import DEPENDS_ON, PolicyRollout
@@ -67,14 +67,16 @@ class Study:
         found: dict[RowName, dict[str, Any]] = {}
         for number, member in enumerate(self.members):
             digests = {"twin": self.twin.description.digest, **member.about}
-            for kind in self.kinds(seed, policy):
+            for kind in self.kinds(task, seed, policy, member):
                 needed = {name: digests[name] for name in DEPENDS_ON[kind]}
                 found[kind, number] = {"kind": kind, **needed, **rollout}
         return found
 
-    def kinds(self, seed: int, policy: str) -> tuple[str, ...]:
+    def kinds(self, task: str, seed: int, policy: str, member: Member) -> tuple[str, ...]:
         """The kinds of rows that a policy has from a start."""
         kinds = [*NEEDED, "verdict without touch"]
+        if member.direct is not None and task in member.direct.shape.tasks:
+            kinds.append("direct verdict")
         if policy in self.plan.scripts:
             kinds += _OF_SCRIPTS
         if policy == ELSEWHERE and EXACT in self.plan.scripts:
@@ -128,7 +130,7 @@ class Study:
         instruction = self.twin.stage(task).task.instruction
         first = start_in_twin(self.twin, task, seed, instruction)[0].observation
         digest = first_digest(first)
-        trained = [("a judge", member.probe.metadata) for member in self.members]
+        trained = [("a judge", one.metadata) for m in self.members for one in m.judges]
         trained += [(name, one.metadata) for name, one in self.cloned.items()]
         for what, metadata in trained:
             refuse_training_starts([digest], trained_on=metadata.training_starts, what=what)

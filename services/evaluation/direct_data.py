@@ -1,0 +1,143 @@
+"""Stored episodes as attempts of known outcome: what a direct judge learns from."""
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.hands.actions import AnchorPoses, poses_from_actions
+from services.evaluation.demonstrations import CAMERA
+from services.evaluation.direct_network import NUM_STEPS, Attempt
+from services.evaluation.endings import OBJECT_POSES
+from services.evaluation.starts import start_digest
+
+# Where objects lie is learned from the images of these steps.
+_VIEW_STEPS = (0, 16, 32, 48, 64, 80)
+
+
+@dataclass(frozen=True)
+class View:
+    """One image of an episode, with the camera's pose and the true poses of the objects."""
+
+    image: np.ndarray
+    T_world_camera: Float64[np.ndarray, "4 4"]
+    object_poses: Float64[np.ndarray, "objects 7"]
+
+
+@dataclass(frozen=True)
+class LabelledAttempt:
+    """An attempt, what came of it, and some of its views, the first one at the start."""
+
+    episode_id: str
+    instruction: str
+    seed: int
+    success: bool
+    attempt: Attempt
+    views: Sequence[View]
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.attempt.task
+
+    @property
+    def start_digest(self) -> str:
+        """Digest of the first observation."""
+        return start_digest(self.attempt.image, self.attempt.tactile_kpa)
+
+
+def read_attempts(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[LabelledAttempt]:
+    """The true robot episodes of some stores.
+
+    Args:
+        stores: where to read; imagined episodes and those of people are left out.
+        tasks: only these; empty for all.
+
+    Raises:
+        NotFoundError: not one such episode.
+        InvalidInputError: an episode of unknown outcome, of another length or without object
+            poses.
+    """
+    found = []
+    for store in stores:
+        for episode_id in sorted(store.list(kind="episode")):
+            reader = store.open(episode_id)
+            about = reader.attributes
+            if (
+                about.domain != "robot"
+                or about.origin != "twin"
+                or (tasks and about.task not in tasks)
+            ):
+                continue
+            found.append(read_attempt(reader))
+    if not found:
+        raise NotFoundError(
+            f"no robot episode of {', '.join(tasks) or 'any task'} in the stores; "
+            "record some with `dextouch train data` first"
+        )
+    return found
+
+
+def read_attempt(reader: EpisodeReader) -> LabelledAttempt:
+    """One episode as an attempt.
+
+    Raises:
+        InvalidInputError: unknown outcome, another length, or no object poses or commands.
+    """
+    about = reader.attributes
+    missing = {"action_commanded", OBJECT_POSES} - set(reader.streams)
+    if about.success is None or about.seed is None or missing or reader.num_steps != 1 + NUM_STEPS:
+        raise InvalidInputError(
+            f"episode {about.episode_id!r}: success {about.success}, seed {about.seed}, "
+            f"{reader.num_steps} steps, without {sorted(missing)}; expected an episode of the twin "
+            f"with {1 + NUM_STEPS} steps, as `dextouch train data` records them"
+        )
+    window = reader.window(0, reader.num_steps, cameras=())
+    steps, images = reader.shown_steps(CAMERA)
+    chosen = np.isin(steps, _VIEW_STEPS)
+    if not len(steps) or steps[0] != 0:
+        raise InvalidInputError(f"episode {about.episode_id!r}: no image of step 0")
+    cameras = poses_from_actions(window.actions, window.anchor).Ts_world_camera_head
+    poses = reader.read(OBJECT_POSES)
+    views = [
+        View(image, cameras[step], _nearest(poses.t_ref_ns, poses.values, window.t_ref_ns[step]))
+        for step, image in zip(
+            steps[chosen].tolist(), reader.images(CAMERA)[images[chosen]], strict=True
+        )
+    ]
+    actions = reader.read("action_commanded").values.astype(np.float64)
+    attempt = Attempt(
+        about.task,
+        views[0].image,
+        window.tactile_kpa[0],
+        actions[1:],
+        AnchorPoses(*window.anchor.as_tuple()),
+        window.K_head,
+    )
+    return LabelledAttempt(
+        about.episode_id, about.instruction, about.seed, about.success, attempt, views
+    )
+
+
+def _nearest(t_ref_ns: np.ndarray, values: np.ndarray, now_ns: int) -> Float64[np.ndarray, "k 7"]:
+    return np.asarray(values[np.abs(t_ref_ns - now_ns).argmin()], dtype=np.float64)
+
+
+def attempts_hash(items: Iterable[LabelledAttempt]) -> str:
+    """sha256 over everything that a direct judge learns from, in the order of the ids."""
+    digest = hashlib.sha256()
+    for item in sorted(items, key=lambda one: one.episode_id):
+        digest.update(repr((item.episode_id, item.task, item.success)).encode())
+        arrays: Mapping[str, np.ndarray] = {
+            "actions": item.attempt.actions,
+            "touch": item.attempt.tactile_kpa,
+            "images": np.stack([view.image for view in item.views]),
+            "poses": np.stack([view.object_poses for view in item.views]),
+        }
+        for array in arrays.values():
+            digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
