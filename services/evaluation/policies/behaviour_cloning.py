@@ -167,6 +167,11 @@ class BehaviourCloningPolicy:
         self._start: PolicyStart | None = None
         self._first_image: np.ndarray | None = None
 
+    @property
+    def tasks(self) -> tuple[str, ...]:
+        """The tasks it was trained on."""
+        return self.shape.tasks
+
     @classmethod
     def load(cls, path: Path) -> "BehaviourCloningPolicy":
         """A policy from its file."""

@@ -138,6 +138,7 @@ class ColourServo:
     """
 
     looks = "last"
+    tasks = tuple(_PLANS)
 
     def __init__(self) -> None:
         self._start: PolicyStart | None = None

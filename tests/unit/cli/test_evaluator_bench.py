@@ -1,12 +1,14 @@
 """Stage `evaluator`: what is kept is not computed again, and its figures by hand."""
 
+import hashlib
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError
+from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, UnknownNameError
 from dextouch.geometry.transforms import transform
 from services.cli.bench.evaluator import rollouts, work
 from services.cli.bench.evaluator.chunk_lines import f1
@@ -17,9 +19,20 @@ from services.cli.bench.evaluator.measuring import (
     psnr_within,
     warp_over_table,
 )
-from services.cli.bench.evaluator.plan import IDLE, ClonedPolicy, StudyPlan, Trained, trained_seeds
+from services.cli.bench.evaluator.plan import (
+    IDLE,
+    ClonedPolicy,
+    OutsidePolicy,
+    StudyPlan,
+    Trained,
+    trained_seeds,
+)
+from services.cli.bench.evaluator.playing import play_in_twin, start_in_twin
 from services.cli.bench.evaluator.stage import figures_of_tasks
+from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.settings import DEFAULT_PROBE
+from services.twin.settings import TwinSettings
+from services.twin.world import TwinWorld
 
 K = np.array([[50.0, 0, 16], [0, 50.0, 16], [0, 0, 1]])
 # One metre above the table, looking straight down: x right, y away from world y.
@@ -173,6 +186,42 @@ def test_the_region_of_an_object_by_hand():
     other = image.copy()
     other[~region] = 255
     assert psnr_within(other, image, region) == 100.0
+
+
+class LooksAtAll(ColourServo):
+    """The same policy, to which worlds show every step."""
+
+    looks = True
+
+
+def test_a_policy_that_looks_last_acts_as_if_it_saw_every_step():
+    twin = TwinWorld(TwinSettings(cameras=("camera_head",)))
+    started, _, start = start_in_twin(twin, "open_drawer", 39_077, "")
+    last, everything = (
+        play_in_twin(twin, started, policy, start) for policy in (ColourServo(), LooksAtAll())
+    )
+    for name, array in vars(last).items():
+        np.testing.assert_array_equal(array, getattr(everything, name), err_msg=name)
+
+
+def test_outside_policies_are_known_by_their_files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    code = "class Still:\n    tasks = ('juggle',)\n\n    def act(self, observation): ...\n"
+    (tmp_path / "still_policy_of_a_test.py").write_text(code)
+    found = OutsidePolicy.parse("still=still_policy_of_a_test:Still")
+    assert found.key == f"still@{hashlib.sha256(code.encode()).hexdigest()[:8]}"
+    with pytest.raises(UnknownNameError, match="Still"):
+        OutsidePolicy.parse("still_policy_of_a_test:Moving")
+    with pytest.raises(InvalidInputError, match="MODULE:FACTORY"):
+        OutsidePolicy.parse("no address")
+
+
+def test_policies_act_in_their_own_tasks(plan):
+    servo = OutsidePolicy.parse("servo=services.evaluation.policies.colour_servo:ColourServo")
+    study = work.Study(replace(plan, outside=(servo,)))
+    assert servo.key in study.policies("stand_bottle")
+    assert servo.key not in study.policies("insert_peg")
+    assert isinstance(study.actor("stand_bottle", 39_077, servo.key), ColourServo)
 
 
 def test_plans_without_anything_are_refused(tmp_path):

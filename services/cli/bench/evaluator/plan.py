@@ -1,12 +1,14 @@
 """What the stage `evaluator` rolls out: tasks, starts, and policies by name."""
 
 import hashlib
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
 from dextouch.errors import InvalidInputError
+from services.evaluation.policies.outside import PolicySource
 
 CAMERA: Final = "camera_head"
 # 5 1/3 s at 15 steps a second, in chunks as policies send them.
@@ -47,6 +49,32 @@ class ClonedPolicy:
     def key(self) -> str:
         """Its name in results; another checkpoint of the same name has another one."""
         return f"{self.name}@{hashlib.sha256(self.path.read_bytes()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True)
+class OutsidePolicy:
+    """A policy of somebody's own, known by its name and the content of its module's file."""
+
+    source: PolicySource
+    digest: str
+
+    @classmethod
+    def parse(cls, text: str) -> "OutsidePolicy":
+        """A policy from [NAME=]MODULE:FACTORY.
+
+        Raises:
+            InvalidInputError, NotFoundError, UnknownNameError: it does not load.
+        """
+        source = PolicySource.parse(text)
+        source.load({})
+        path = sys.modules[source.module].__file__
+        content = source.module.encode() if path is None else Path(path).read_bytes()
+        return cls(source, hashlib.sha256(content).hexdigest()[:8])
+
+    @property
+    def key(self) -> str:
+        """Its name in results; another file of the same name has another one."""
+        return f"{self.source.name}@{self.digest}"
 
 
 @dataclass(frozen=True)
@@ -98,6 +126,7 @@ class StudyPlan:
     seeds: tuple[int, ...]
     levels_mm: tuple[float, ...] = LEVELS_MM
     cloned: tuple[ClonedPolicy, ...] = ()
+    outside: tuple[OutsidePolicy, ...] = ()
     num_still_starts: int = 3
 
     def __post_init__(self) -> None:
@@ -115,7 +144,8 @@ class StudyPlan:
     @property
     def policies(self) -> tuple[str, ...]:
         """Names of all policies."""
-        return (*self.scripts, *IDLE, *(cloned.key for cloned in self.cloned))
+        closed_loop: tuple[ClonedPolicy | OutsidePolicy, ...] = (*self.cloned, *self.outside)
+        return (*self.scripts, *IDLE, *(policy.key for policy in closed_loop))
 
 
 def script_name(level_mm: float) -> str:

@@ -19,6 +19,7 @@ from services.cli.bench.evaluator.plan import (
     FIRST_SEED,
     LEVELS_MM,
     ClonedPolicy,
+    OutsidePolicy,
     StudyPlan,
     trained_seeds,
 )
@@ -30,6 +31,7 @@ from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_PO
 from services.twin.tasks import TASK_NAMES
 
 PACKAGES = ("numpy", "torch", "mujoco")
+_SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
 _USUAL_STARTS, _QUICK_STARTS = 20, 2
 _QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
 
@@ -65,6 +67,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         action="append",
         metavar="NAME=PATH",
         help="cloned policy to roll out in closed loop; may be repeated (the committed two)",
+    )
+    parser.add_argument(
+        "--policy",
+        action="append",
+        metavar="[NAME=]MODULE:FACTORY",
+        help="policy of your own in closed loop; may be repeated (the colour servo)",
     )
     parser.add_argument(
         "--keep",
@@ -222,5 +230,6 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
         seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
         levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,
         cloned=tuple(ClonedPolicy.parse(text) for text in cloned),
+        outside=tuple(OutsidePolicy.parse(text) for text in options.policy or [_SERVO]),
         num_still_starts=1 if options.quick else 3,
     )

@@ -37,6 +37,8 @@ class Study:
         self.twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
         self.members = open_members(plan.trained)
         self.cloned = {one.key: BehaviourCloningPolicy.load(one.path) for one in plan.cloned}
+        outside = {one.key: one.source.load({}) for one in plan.outside}
+        self.actors: dict[str, Policy] = {**self.cloned, **outside}
 
     @property
     def about(self) -> dict[str, str]:
@@ -58,7 +60,7 @@ class Study:
         return tuple(
             name
             for name in self.plan.policies
-            if name not in self.cloned or task in self.cloned[name].shape.tasks
+            if task in getattr(self.actors.get(name), "tasks", (task,))
         )
 
     def keys(self, task: str, seed: int, policy: str) -> dict[RowName, dict[str, Any]]:
@@ -137,8 +139,8 @@ class Study:
 
     def actor(self, task: str, seed: int, policy: str) -> Policy | Actions:
         """A policy that looks, or the actions of one that does not."""
-        if policy in self.cloned:
-            return self.cloned[policy]
+        if policy in self.actors:
+            return self.actors[policy]
         return scripted_actions(self.twin.stage(task), seed, policy, self.plan.levels_mm)
 
 
