@@ -123,6 +123,34 @@ def test_the_real_world_alone_is_enough(client, probe):
     assert found.to_report()["agreement"] == {}
 
 
+class SeesAll(BehaviourCloningPolicy):
+    """The same policy, to which worlds show every step."""
+
+    looks = True
+
+
+def test_a_policy_that_looks_last_scores_as_if_it_saw_every_step(client, probe, policy_checkpoint):
+    found = evaluate(
+        real=WorldAddress(client, "judge"),
+        imagined=addresses(client, "dream"),
+        policies={
+            "last": BehaviourCloningPolicy(policy_checkpoint),
+            "all": SeesAll(policy_checkpoint),
+        },
+        plan=EvaluationPlan({"reach": ""}, [2000, 2001]),
+        probe=probe,
+    )
+    assert not found.failures
+    by_policy = {
+        name: [
+            (s.world, s.seed, s.success, s.probability) for s in found.scores if s.policy == name
+        ]
+        for name in ("last", "all")
+    }
+    assert len(by_policy["last"]) == 4
+    assert by_policy["last"] == by_policy["all"]
+
+
 class Choosy(toy.ToyWorld):
     """A judge that does not begin from one seed."""
 
