@@ -33,6 +33,9 @@ from services.evaluation.policies.colour_servo import ColourServo
 from services.evaluation.settings import DEFAULT_PROBE
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
+from services.world_model.checkpoints import PRETRAINED
+
+TINY = PRETRAINED / "tiny.safetensors"
 
 K = np.array([[50.0, 0, 16], [0, 50.0, 16], [0, 0, 1]])
 # One metre above the table, looking straight down: x right, y away from world y.
@@ -135,10 +138,26 @@ def test_judges_belong_to_worlds_in_their_order(tmp_path):
     assert [one.probe for one in trained_seeds(worlds, probes, ())] == probes
     assert [one.probe for one in trained_seeds(worlds, probes[:1], ())] == [probes[0]] * 2
     assert [one.direct for one in trained_seeds(worlds, probes, probes[1:])] == [probes[1]] * 2
+    both = trained_seeds(worlds, probes, (), worlds)
+    assert [(one.direct, one.untouched) for one in both] == [(None, worlds[0]), (None, worlds[1])]
+    with pytest.raises(InvalidInputError, match="3 --without-touch for 2 --world"):
+        trained_seeds(worlds, probes, (), [*worlds, *worlds[:1]])
     with pytest.raises(InvalidInputError, match="2 --probe for 1 --world"):
         trained_seeds(worlds[:1], probes, ())
     with pytest.raises(InvalidInputError, match="0 --probe"):
         trained_seeds(worlds, (), ())
+
+
+def test_a_world_without_touch_is_judged_without_it(plan):
+    untouched = replace(plan, trained=(Trained(None, DEFAULT_PROBE, untouched=TINY),))
+    study = work.Study(untouched)
+    # The package's model of the paper's form knows the bottle and the bowls; any world will do.
+    name = ("verdict of a world without touch", 0)
+    key = study.keys("stand_bottle", 39_077, "script 0 mm")[name]
+    assert key["world without touch"] != study.members[0].about["world"]
+    assert "world" not in key
+    rows = list(study.rows("stand_bottle", 39_077, {"script 0 mm": (name,)}))
+    assert 0 <= rows[0]["probability"] <= 1
 
 
 def test_starts_of_the_training_are_refused(plan):

@@ -124,7 +124,7 @@ def test_wrong_actions_and_still_hands_by_hand(rolled):
     still = {"greatest_kpa": 1.5, "psnr": [[29.0, 30.0], [31.0, 31.0]]}
     worse = {"greatest_kpa": 2.5, "psnr": [[28.0, 30.0], [30.0, 31.0]]}
     for index, row in ((4, still), (5, worse)):
-        more = {"wrong actions": wrong, "still hand": row}
+        more = {"wrong actions": wrong, "held still": row}
         rolled[index] = replace(rolled[index], rows=rolled[index].rows | more)
     lines = {line.what: line for line in TaskFigures("a", [rolled], SCRIPTS).lines()}
     touch = lines["touch error with another episode's actions over that with their own"]
@@ -205,6 +205,7 @@ def test_rivals_by_hand(rolled):
             | {
                 "direct verdict": _verdict(told[one.policy][one.seed - 1]),
                 "verdict without touch": _verdict(0.5),
+                "verdict of a world without touch": _verdict(float(not one.success)),
             },
         )
         for one in rolled
@@ -214,6 +215,8 @@ def test_rivals_by_hand(rolled):
     # 0.9 and 0.6 against 0.7 and 0.1: three pairs of four, where imagination has 3.5.
     assert lines["AUC of imagined endings less the direct judge's, scripts"].value == 0.125
     assert lines["AUC of imagined endings less those with touch at zero, scripts"].value == 0.375
+    without = lines["AUC of imagined endings less those of a world trained without touch, scripts"]
+    assert without.value == 0.875
     # Nothing else than scripts succeeded: there is no area.
     assert lines["AUC of imagined endings less the direct judge's, other policies"].value is None
     rows = {(row["judge"], row["policies"]): row for row in figures.rival_rows()}

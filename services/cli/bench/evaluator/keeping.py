@@ -15,7 +15,10 @@ import numpy as np
 from dextouch.errors import CorruptDataError, StorageError
 
 # What tells rows apart; fields that a kind of row does not have are left out.
-KEY_FIELDS = ("kind", "twin", "world", "judge", "direct judge", "task", "seed", "policy")
+KEY_FIELDS = (
+    "kind", "twin", "world", "judge", "direct judge", "world without touch",
+    "task", "seed", "policy",
+)  # fmt: skip
 Row = dict[str, Any]
 
 

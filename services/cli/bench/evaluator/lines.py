@@ -180,7 +180,7 @@ def _wrong_action_figures(sampling: Sampling, everything: Sequence[Rolled]) -> l
 def _still_figures(sampling: Sampling, everything: Sequence[Rolled]) -> list[Drawn]:
     """The worst of the starts that were held still, so without an interval over starts."""
     touch, image = "still hands over 1000 steps, greatest pressure", "the same, image less copy"
-    mine = [one.rows["still hand"] for one in everything if "still hand" in one.rows]
+    mine = [one.rows["held still"] for one in everything if "held still" in one.rows]
     if not mine:
         return [undefined(touch, ("at most", 2.0)), undefined(image, ("at least", -1.0))]
     pressure = max(float(row["greatest_kpa"]) for row in mine)

@@ -15,8 +15,9 @@ from services.world_model.world import open_world
 
 @dataclass(frozen=True, eq=False)
 class Member:
-    """A world model, its judge and its rival, if there is one.
+    """A world model, its judge, and its rivals where there are any.
 
+    `direct` judges without imagining; `untouched` is a world that learned nothing of touch.
     `about` are the digests that results are known by.
     """
 
@@ -24,6 +25,7 @@ class Member:
     world: BatchWorld[Any]
     probe: SuccessProbe
     direct: DirectJudge | None = None
+    untouched: BatchWorld[Any] | None = None
 
     @property
     def tasks(self) -> set[str]:
@@ -46,7 +48,10 @@ def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
         if one.direct is not None:
             about["direct judge"] = file_digest(one.direct)
         direct = None if one.direct is None else directs(one.direct)
-        found.append(Member(about, world, probes(one.probe), direct))
+        untouched: BatchWorld[Any] | None = None if one.untouched is None else worlds(one.untouched)
+        if untouched is not None:
+            about["world without touch"] = untouched.description.digest
+        found.append(Member(about, world, probes(one.probe), direct, untouched))
     return tuple(found)
 
 

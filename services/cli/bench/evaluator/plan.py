@@ -85,22 +85,28 @@ class Trained:
         world: of the world model; None is the one that comes with the package.
         probe: of the judge of imagined endings.
         direct: of the direct judge, its rival without a world model; None for none.
+        untouched: of a world model that learned nothing of touch; None for none.
     """
 
     world: Path | None
     probe: Path
     direct: Path | None = None
+    untouched: Path | None = None
 
 
 def trained_seeds(
-    worlds: Sequence[Path | None], probes: Sequence[Path], directs: Sequence[Path]
+    worlds: Sequence[Path | None],
+    probes: Sequence[Path],
+    directs: Sequence[Path] = (),
+    untouched: Sequence[Path] = (),
 ) -> tuple[Trained, ...]:
-    """One entry for each world, with the judges of the same place or the only ones there are.
+    """One entry for each world, with the others of the same place or the only ones there are.
 
     Raises:
         InvalidInputError: several judges, but not one for each world; or no world or judge.
     """
-    for what, paths, least in (("--probe", probes, 1), ("--direct", directs, 0)):
+    asked = (("--probe", probes, 1), ("--direct", directs, 0), ("--without-touch", untouched, 0))
+    for what, paths, least in asked:
         if not worlds or not (least <= len(paths) <= 1 or len(paths) == len(worlds)):
             raise InvalidInputError(
                 f"evaluator: got {len(paths)} {what} for {len(worlds)} --world, expected one for "
@@ -108,8 +114,12 @@ def trained_seeds(
             )
     count = len(worlds)
     judges = list(probes) * (count if len(probes) == 1 else 1)
-    rivals: list[Path | None] = [*directs] * (count if len(directs) == 1 else 1) or [None] * count
-    return tuple(map(Trained, worlds, judges, rivals))
+    rivals = [_one_each(paths, count) for paths in (directs, untouched)]
+    return tuple(map(Trained, worlds, judges, *rivals))
+
+
+def _one_each(paths: Sequence[Path], count: int) -> list[Path | None]:
+    return [*paths] * (count if len(paths) == 1 else 1) or [None] * count
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,17 @@ from services.cli.bench.evaluator.drawn import Drawn, Rolled, Sampling, having, 
 JUDGES: Final = {
     "imagined verdict": "imagined ending",
     "verdict without touch": "imagined ending, touch at zero",
+    "verdict of a world without touch": "world trained without touch",
     "direct verdict": "direct judge",
 }
 SCRIPTS, OTHERS = "scripts", "other policies"
 _DIRECT, _TOUCHLESS = "direct verdict", "verdict without touch"
+_UNTOUCHED = "verdict of a world without touch"
+_LESS: Final = {
+    _DIRECT: "the direct judge's",
+    _TOUCHLESS: "those with touch at zero",
+    _UNTOUCHED: "those of a world trained without touch",
+}
 
 
 def rival_figures(
@@ -26,6 +33,7 @@ def rival_figures(
         (_DIRECT, scripts, SCRIPTS),
         (_DIRECT, others, OTHERS),
         (_TOUCHLESS, scripts, SCRIPTS),
+        (_UNTOUCHED, scripts, SCRIPTS),
     ):
         mine = having(kind, rollouts)[0]
         if not mine:
@@ -33,13 +41,9 @@ def rival_figures(
         ours, theirs = (
             sampling.area("", each, mine, 0.0, None) for each in ("imagined verdict", kind)
         )
-        what = f"AUC of imagined endings less {_less(kind)}, {where}"
+        what = f"AUC of imagined endings less {_LESS[kind]}, {where}"
         found.append(ours.less(theirs, what, 0.0))
     return found
-
-
-def _less(kind: str) -> str:
-    return "the direct judge's" if kind == _DIRECT else "those with touch at zero"
 
 
 def rival_rows(

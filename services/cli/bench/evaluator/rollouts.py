@@ -11,7 +11,7 @@ import numpy as np
 from dextouch.clients.policy import Policy
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
-from dextouch.worlds.world import RolloutStart
+from dextouch.worlds.world import BatchWorld, RolloutStart
 from services.cli.bench.evaluator.keeping import Row, array_path, read_arrays, write_arrays
 from services.cli.bench.evaluator.measuring import (
     chunk_figures,
@@ -19,14 +19,13 @@ from services.cli.bench.evaluator.measuring import (
     wrong_action_figures,
 )
 from services.cli.bench.evaluator.members import Member
-from services.cli.bench.evaluator.plan import CAMERA, HOLD
+from services.cli.bench.evaluator.plan import CAMERA
 from services.cli.bench.evaluator.playing import (
     Actions,
     ImaginedRollout,
     TrueRollout,
     play_in_imagination,
     play_in_twin,
-    scripted_actions,
     start_in_twin,
 )
 from services.cli.bench.evaluator.restarts import chunks_that_move, contact_with_true_context
@@ -48,8 +47,9 @@ DEPENDS_ON: Final[dict[str, tuple[str, ...]]] = {
     "sharpness": ("twin", "world"),
     "true context": ("twin", "world"),
     "wrong actions": ("twin", "world"),
-    "still hand": ("twin", "world"),
+    "held still": ("twin", "world"),
     "direct verdict": ("twin", "direct judge"),
+    "verdict of a world without touch": ("twin", "world without touch", "judge"),
 }
 
 
@@ -90,8 +90,9 @@ class PolicyRollout:
                 "sharpness": sharpness_of_chunks(self.real, self.imagined(m))
             },
             "true context": self._context_row,
-            "still hand": self._still_row,
+            "held still": self._still_row,
             "direct verdict": self._direct_row,
+            "verdict of a world without touch": self._untouched_row,
         }  # fmt: skip
 
     def row(self, kind: str, member: Member) -> Row:
@@ -114,12 +115,15 @@ class PolicyRollout:
         return real
 
     def _imagined(self, member: Member) -> ImaginedRollout:
-        path = self._path("imagined", member.about["world"])
+        return self._imagined_by(member.world)
+
+    def _imagined_by(self, world: BatchWorld[Any]) -> ImaginedRollout:
+        path = self._path("imagined", world.description.digest)
         if path.is_file():
             kept = read_arrays(path)
             poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
             return ImaginedRollout(**kept, object_poses=poses, doubted=doubted or None)
-        imagined = play_in_imagination(member.world, self._first, self._actor, self._for_policy)
+        imagined = play_in_imagination(world, self._first, self._actor, self._for_policy)
         arrays = {n: a for n, a in vars(imagined).items() if isinstance(a, np.ndarray)}
         write_arrays(path, arrays | {"doubted": np.array(imagined.doubted or "")})
         return imagined
@@ -149,7 +153,9 @@ class PolicyRollout:
         return Ending(self.real.last_images, touch, self._task)
 
     def _imagined_ending(self, member: Member) -> Ending:
-        imagined = self.imagined(member)
+        return self._ending(self.imagined(member))
+
+    def _ending(self, imagined: ImaginedRollout) -> Ending:
         return Ending(
             imagined.last_images,
             imagined.tactile_kpa[-NUM_SEEN_STEPS:],
@@ -168,14 +174,22 @@ class PolicyRollout:
         return {"contact": contact, "moves": moves.tolist()}
 
     def _still_row(self, member: Member) -> Row:
-        row = scripted_actions(self._stage, self._seed, HOLD, ())[0]
-        path = self._path("still", self._twin.description.digest)
+        """Of hands that are told to stay where they are seen to be, as the hold policy does."""
+        row = self._started.observation.action_reached[-1]
+        path = self._path("held_still", self._twin.description.digest)
         if not path.is_file():
             asked = RolloutStart(self._task, self._seed, self._first.instruction)
             true = hold_still(self._twin, asked, row)
             write_arrays(path, {"images": true.images})
         imagined: StillRollout = hold_still(member.world, self._first, row)
         return still_figures(imagined, read_arrays(path)["images"], self._first_image)
+
+    def _untouched_row(self, member: Member) -> Row:
+        """The verdict on what a world imagines that learned nothing of touch; it shows none."""
+        if member.untouched is None:
+            raise InvalidInputError("evaluator: no world was given by --without-touch")
+        ending = self._ending(self._imagined_by(member.untouched))
+        return asdict(member.probe.verdict(without_touch(ending)))
 
     def _direct_row(self, member: Member) -> Row:
         """What a judge says that sees the first observation and what was commanded in the twin."""

@@ -57,6 +57,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="checkpoint of the direct judge, which imagines nothing, as a rival (none); once for "
         "all worlds, or once for each",
     )
+    parser.add_argument(
+        "--without-touch",
+        action="append",
+        type=Path,
+        help="checkpoint of a world model that learned nothing of touch, as a rival (none); once "
+        "for all worlds, or once for each",
+    )
     parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
     parser.add_argument(
         "--starts", type=int, help=f"starts a task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
@@ -224,7 +231,10 @@ def _plan(options: argparse.Namespace) -> StudyPlan:
     return StudyPlan(
         keep=options.keep,
         trained=trained_seeds(
-            options.world or [None], options.probe or [DEFAULT_PROBE], options.direct or []
+            options.world or [None],
+            options.probe or [DEFAULT_PROBE],
+            options.direct or [],
+            options.without_touch or [],
         ),
         tasks=tuple(options.tasks),
         seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),

@@ -81,10 +81,12 @@ class Study:
             kinds.append("direct verdict")
         if policy in self.plan.scripts:
             kinds += _OF_SCRIPTS
+            if member.untouched is not None and task in member.untouched.description.tasks:
+                kinds.append("verdict of a world without touch")
         if policy == ELSEWHERE and EXACT in self.plan.scripts:
             kinds.append("wrong actions")
         if policy == HOLD and seed in self.plan.seeds[: self.plan.num_still_starts]:
-            kinds.append("still hand")
+            kinds.append("held still")
         return tuple(kinds)
 
     def missing(self, kept: KeptRows, task: str, seed: int) -> dict[str, tuple[RowName, ...]]:
