@@ -13,7 +13,7 @@ from safetensors.torch import save
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, NotFoundError
 
 FORMAT_VERSION = 1
-MAX_CHECKPOINT_BYTES = 2 * 2**20
+MAX_CHECKPOINT_BYTES = 8 * 2**20
 _METADATA_KEY = "dextouch"
 
 
@@ -51,7 +51,7 @@ def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
 
     Raises:
         InvalidInputError: weights that are not finite.
-        LimitExceededError: more than 2 MB.
+        LimitExceededError: more than 8 MiB.
     """
     for name, tensor in checkpoint.tensors.items():
         if not bool(torch.isfinite(tensor).all()):

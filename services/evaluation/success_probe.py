@@ -18,8 +18,8 @@ from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_we
 from services.evaluation.endings import Ending
 from services.evaluation.judge_network import ProbeNetwork, ProbeShape, probe_batch
 
-# Version 3 of the network; checkpoints of the first two are refused by this name.
-KIND = "success-probe-3"
+# Version 4 of the network, one a task; checkpoints of earlier ones are refused by this name.
+KIND = "success-probe-4"
 DECISION_THRESHOLD = 0.5
 Decision = Literal["success", "failure", "cannot tell"]
 TRUE, IMAGINED = "true", "imagined"

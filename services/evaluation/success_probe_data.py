@@ -37,6 +37,11 @@ class Labelled:
     def __len__(self) -> int:
         return len(self.outcome)
 
+    def of_task(self, index: int) -> "Labelled":
+        """The endings of one task."""
+        mine = torch.nonzero(self.batch.task == index)[:, 0]
+        return Labelled(self.batch[mine], self.outcome[mine], self.known[mine], self.weight[mine])
+
 
 @dataclass(frozen=True)
 class _Example:
@@ -132,17 +137,12 @@ def _group_weights(examples: Sequence[_Example], what: str) -> Float64[np.ndarra
     return weight
 
 
-def object_scale(labelled: Labelled, num_tasks: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean and standard deviation of the features of object poses, [tasks, features] each.
+def object_scale(batch: ProbeBatch) -> tuple[torch.Tensor, torch.Tensor]:
+    """Mean and standard deviation of the features of object poses, each [features].
 
-    Tasks without a known pose keep 0 and 1.
+    They are 0 and 1 where no pose, or a single one, is known.
     """
-    features, batch = labelled.batch.objects, labelled.batch
-    mean = torch.zeros((num_tasks, features.shape[1]))
-    std = torch.ones_like(mean)
-    for task in range(num_tasks):
-        mine = features[batch.has_objects & (batch.task == task)]
-        if len(mine) > 1:
-            mean[task] = mine.mean(dim=0)
-            std[task] = mine.std(dim=0).clamp_min(_LEAST_STD)
-    return mean, std
+    known = batch.objects[batch.has_objects]
+    if len(known) < 2:
+        return torch.zeros(batch.objects.shape[1]), torch.ones(batch.objects.shape[1])
+    return known.mean(dim=0), known.std(dim=0).clamp_min(_LEAST_STD)

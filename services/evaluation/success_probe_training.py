@@ -16,7 +16,13 @@ from torch.nn import functional
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
 from services.evaluation.demonstrations import instructions_of, split_by_seed
 from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
-from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, unit_images
+from services.evaluation.judge_network import (
+    ProbeBatch,
+    ProbeNetwork,
+    ProbeShape,
+    TaskNetwork,
+    unit_images,
+)
 from services.evaluation.progress import Progress
 from services.evaluation.starts import refuse_training_starts
 from services.evaluation.success_probe import DECISION_THRESHOLD, KIND, SuccessProbe
@@ -34,7 +40,8 @@ class ProbeSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = 0
-    num_training_steps: int = Field(default=1500, ge=1)
+    # Of each task.
+    num_training_steps: int = Field(default=2000, ge=1)
     max_cpu_s: float = Field(default=200.0, gt=0)
     batch_size: int = Field(default=48, ge=2)
     learning_rate: float = Field(default=1.5e-3, gt=0)
@@ -138,10 +145,9 @@ def train_success_probe(
     )
     network = ProbeNetwork(shape)
     learned = labelled_endings(sets.training, shape, imagined_share=settings.imagined_share)
-    mean, std = object_scale(learned, len(shape.tasks))
-    network.object_mean.copy_(mean)
-    network.object_std.copy_(std)
-    cpu_s = _optimize(network, learned, settings)
+    cpu_s = 0.0
+    for index, task in enumerate(shape.tasks):
+        cpu_s += _optimize(network.of(task), learned.of_task(index), settings, name=f"probe {task}")
     tensors = {f"network.{name}": t.clone() for name, t in network.state_dict().items()}
     plain = Checkpoint(_metadata(sets, settings, shape, command, cpu_s), tensors)
     return _measured(_calibrated(plain, sets, settings), sets)
@@ -205,15 +211,20 @@ def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
     )
 
 
-def _optimize(network: ProbeNetwork, learned: Labelled, settings: ProbeSettings) -> float:
-    """Minimize the balanced cross entropy; gives the CPU seconds it took."""
+def _optimize(
+    network: TaskNetwork, learned: Labelled, settings: ProbeSettings, *, name: str
+) -> float:
+    """Minimize the balanced cross entropy of one task; gives the CPU seconds it took."""
+    mean, std = object_scale(learned.batch)
+    network.object_mean.copy_(mean)
+    network.object_std.copy_(std)
     generator = torch.Generator().manual_seed(settings.seed)
     optimizer = torch.optim.AdamW(
         network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
     )
     network.train()
     started = time.process_time()
-    with Progress("probe", settings.num_training_steps) as progress:
+    with Progress(name, settings.num_training_steps) as progress:
         for step in range(settings.num_training_steps):
             elapsed = time.process_time() - started
             done = max(step / settings.num_training_steps, elapsed / settings.max_cpu_s)
@@ -227,7 +238,7 @@ def _optimize(network: ProbeNetwork, learned: Labelled, settings: ProbeSettings)
             batch = _some_parts(learned.batch[index], network.object_std, settings, generator)
             images = _disturb(unit_images(batch.images), settings, generator)
             loss = _loss(
-                network.judge(images, batch), learned.outcome[index], learned.known[index], settings
+                network(images, batch), learned.outcome[index], learned.known[index], settings
             )
             optimizer.zero_grad()
             loss.backward()  # type: ignore[no-untyped-call]
@@ -258,7 +269,7 @@ def _some_parts(
     noise = torch.randn(batch.objects.shape, generator=generator) * settings.pose_noise
     return replace(
         batch,
-        objects=batch.objects + noise * object_std[batch.task],
+        objects=batch.objects + noise * object_std,
         has_image=batch.has_image & ~no_image,
         has_objects=batch.has_objects & ~no_poses,
     )
