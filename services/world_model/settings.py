@@ -100,6 +100,7 @@ class CoreLossWeights(BaseModel):
     objects: float = Field(default=1.0, ge=0)
     touch: float = Field(default=6.0, ge=0)
     contact: float = Field(default=0.5, ge=0)
+    taxels: float = Field(default=2.0, ge=0)
     success: float = Field(default=1.0, ge=0)
 
 

@@ -26,7 +26,7 @@ class DynamicsConfig(BaseModel):
     reader_keypoints: int = Field(default=40, ge=4, le=256)
     width: int = Field(default=192, ge=8, le=1024)
     num_layers: int = Field(default=2, ge=1, le=8)
-    touch_channels: int = Field(default=48, ge=4, le=320)
+    touch_channels: int = Field(default=96, ge=4, le=320)
 
     @model_validator(mode="after")
     def _objects_fit(self) -> "DynamicsConfig":

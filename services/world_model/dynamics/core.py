@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Float32, Int64
 from torch import Tensor, nn
 
+from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.dynamics.configuration import (
     MAX_OBJECTS,
     STEPS_PER_LATENT,
@@ -20,6 +21,8 @@ from services.world_model.dynamics.features import NUM_FEATURES, compressed
 from services.world_model.dynamics.objects import ObjectPoses
 
 NUM_PADS = 12
+# Which taxels of a hand touch something is a mixture of this many patterns.
+NUM_PATTERNS = 48
 # Positions are predicted as moves from the start in this unit.
 MOVE_M = 0.05
 MAX_DEVIATION = 5.0
@@ -45,13 +48,15 @@ class SceneStart:
 class SceneFuture:
     """What the core says of every latent step.
 
-    `touch` and `contact` (log odds of each pad) are of the four steps that end at the latent;
+    `touch`, `contact` (log odds of each pad) and `pattern` (what `RecurrentCore.taxels` makes log
+    odds of each taxel of) are of the four steps that end at the latent;
     `success` are log odds that the task is done at it, a training target.
     """
 
     objects: ObjectPoses
     touch: Float32[Tensor, "batch latents 4 2 channels"]
     contact: Float32[Tensor, "batch latents 4 12"]
+    pattern: Float32[Tensor, "batch latents 4 2 patterns"]
     success: Float32[Tensor, "batch latents"]
 
 
@@ -90,6 +95,8 @@ class RecurrentCore(nn.Module):
         self.objects = nn.Linear(width, MAX_OBJECTS * 9)
         self.touch = nn.Linear(width, STEPS_PER_LATENT * 2 * channels)
         self.contact = nn.Linear(width, STEPS_PER_LATENT * NUM_PADS)
+        self.pattern = nn.Linear(width, STEPS_PER_LATENT * 2 * NUM_PATTERNS)
+        self.taxels = nn.Linear(NUM_PATTERNS, NUM_TAXELS)
         self.success = nn.Sequential(nn.Linear(width, 64), nn.GELU(), nn.Linear(64, 1))
 
     def first_state(self, start: SceneStart) -> Float32[Tensor, "layers batch width"]:
@@ -143,5 +150,6 @@ class RecurrentCore(nn.Module):
             ObjectPoses(position, axes, present),
             self.touch(hidden).unflatten(-1, steps),
             self.contact(hidden).unflatten(-1, (STEPS_PER_LATENT, NUM_PADS)),
+            self.pattern(hidden).unflatten(-1, (STEPS_PER_LATENT, 2, NUM_PATTERNS)),
             self.success(hidden)[..., 0],
         )

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
+from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TAXELS, NUM_TIP_TAXELS, split_pads
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import (
@@ -237,9 +238,15 @@ class DynamicsModel(nn.Module):
         objects = [future.objects for future in futures]
         touch = torch.stack([future.touch for future in futures]).mean(0)
         contact = torch.stack([future.contact for future in futures]).mean(0)
+        taxels = torch.stack(
+            [
+                member.core.taxels(future.pattern)
+                for member, future in zip(self._members(), futures, strict=True)
+            ]
+        ).mean(0)
         return _Run(
             poses=_between(memory.poses, _mean(objects)),
-            tactile_kpa=self.decode_touch(touch, contact).flatten(1, 2),
+            tactile_kpa=self.decode_touch(touch, contact, taxels).flatten(1, 2),
             disagreement_m=_spread_m(objects),
             distance=distance,
         )
@@ -248,12 +255,18 @@ class DynamicsModel(nn.Module):
         self,
         touch: Float32[Tensor, "*batch 2 channels"],
         contact: Float32[Tensor, "*batch 12"],
+        taxels: Float32[Tensor, "*batch 2 320"],
     ) -> Float32[Tensor, "*batch 2 320"]:
-        """Pressures in kPa; pads that are more likely free than in contact feel nothing."""
+        """Pressures in kPa, of latents and of log odds of contact of pads and of taxels.
+
+        A taxel touches something where it and its pad are more likely in contact than free; then
+        it feels at least the pressure that counts as contact, and nothing otherwise.
+        """
         pads = (contact > 0).reshape(*contact.shape[:-1], 2, NUM_PADS // 2)
         tips = pads[..., :5].repeat_interleave(NUM_TIP_TAXELS // 5, dim=-1)
         palm = pads[..., 5:].expand(*pads.shape[:-1], NUM_TAXELS - NUM_TIP_TAXELS)
-        return self.codec.decode(touch) * torch.cat([tips, palm], dim=-1)
+        touches = torch.cat([tips, palm], dim=-1) & (taxels > 0)
+        return self.codec.decode(touch).clamp_min(CONTACT_THRESHOLD_KPA) * touches
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float16, Float32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
+from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneFuture, SceneStart
 from services.world_model.dynamics.features import command_features
@@ -27,6 +28,7 @@ _LATER_HELD = 2.5
 _SETTLED_M = 1e-3
 # Cores learn to begin at the first step and at every so many steps after it.
 _START_STRIDE = 8
+_TAXEL_SHARE = 4
 OnStep = Callable[[int, float], None]
 
 
@@ -219,6 +221,10 @@ def core_loss(
     at_start = start.touch[:, None, None].expand_as(touch)
     touch = torch.where(moves.view(-1, 1, 1, 1, 1), touch, at_start)
     contact = table.in_contact[rows][:, steps] & moves.view(-1, 1, 1, 1)
+    # Of part of the batch: each of its rows has thousands of taxels already.
+    few = slice(0, -(-len(rows) // _TAXEL_SHARE))
+    felt = table.tactile_kpa[rows[few]][:, steps] >= CONTACT_THRESHOLD_KPA
+    felt &= moves[few].view(-1, 1, 1, 1, 1)
     success = table.success[rows] * moves
     weights = settings.weights
     return (
@@ -226,6 +232,10 @@ def core_loss(
         + weights.touch * (future.touch[:, 1:] - touch).square().sum(-1).mean()
         + weights.contact
         * functional.binary_cross_entropy_with_logits(future.contact[:, 1:], contact.float())
+        + weights.taxels
+        * functional.binary_cross_entropy_with_logits(
+            core.taxels(future.pattern[few, 1:]), felt.float()
+        )
         + weights.success
         * functional.binary_cross_entropy_with_logits(future.success[:, -1], success)
     )
@@ -237,6 +247,7 @@ def _in_float32(future: SceneFuture) -> SceneFuture:
         ObjectPoses(objects.position_m.float(), objects.axes.float(), objects.present.float()),
         future.touch.float(),
         future.contact.float(),
+        future.pattern.float(),
         future.success.float(),
     )
 
