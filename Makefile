@@ -57,16 +57,16 @@ bench: $(VENV)/.dev      ## time the stages against their errors, one after anot
 reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model, its judge and the cloned policies anew, in runs/reproduce
 	$(BIN)/dextouch train data --store $(MADE)/train --tasks stand_bottle,stack_bowls --count 600 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/train --count 450 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 36 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 300 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
 	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:100 --store $(MADE)/imagined \
+	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --seeds 1000:1200 --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/development --store $(MADE)/imagined_development \
-		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/imagined \
+	$(BIN)/dextouch train imagined --episodes $(MADE)/development --seeds 20000:20072 \
+		--store $(MADE)/imagined_development --checkpoint $(MADE)/state.safetensors
+	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
 		--development $(MADE)/development --development $(MADE)/imagined_development \
-		--output $(MADE)/success_probe.safetensors --training.num_training_steps 6000 --training.max_cpu_s 300 \
-		--training.held_out_share 0.1
+		--output $(MADE)/success_probe.safetensors --training.num_training_steps 1500 --training.held_out_share 0.1
 	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8
 	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early_at 0.1 \
 		--training.num_training_steps 3600 --training.max_cpu_s 150 --output $(MADE)/cloned.safetensors

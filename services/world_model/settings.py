@@ -132,7 +132,7 @@ class StateTrainSettings(BaseModel):
     output: Path = Path("runs/world_model/state.safetensors")
     name: str = "state"
     seed: int = Field(default=0, ge=0)
-    num_members: int = Field(default=3, ge=1, le=16, description="of the ensemble")
+    num_members: int = Field(default=2, ge=1, le=16, description="of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="of scenes, to measure on")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained at the same time")
     width: int = Field(default=192, ge=8, le=1024, description="of the recurrent cores")

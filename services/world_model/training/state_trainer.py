@@ -94,7 +94,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     table_file = parts / "table.safetensors"
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
-    work = _Work(settings, config, parts, _key(settings, data_hash))
+    work = _Work(settings, config, parts, data_hash)
     cpu_s = _train_parts(work)
     dynamics = _assembled(work, codec)
     renderer = _trained_renderer(work)
@@ -142,16 +142,22 @@ class _Work:
     settings: StateTrainSettings
     config: DynamicsConfig
     parts: Path
-    key: str
+    data_hash: str
 
     def file_of(self, member: int) -> Path:
         """Where a finished member is kept; other settings or data have other names."""
-        return self.parts / f"member-{self.key}-{member}.safetensors"
+        return self.parts / f"member-{self._key('width', 'reader', 'core')}-{member}.safetensors"
 
     @property
     def renderer_file(self) -> Path:
         """Where the finished renderer is kept."""
-        return self.parts / f"renderer-{self.key}.safetensors"
+        return self.parts / f"renderer-{self._key('renderer', 'drawing')}.safetensors"
+
+    def _key(self, *names: str) -> str:
+        """A digest of the data and of those settings that make other weights."""
+        chosen = self.settings.model_dump_json(include={"seed", "heldout_share", *names})
+        text = f"{TRAINING_VERSION} {chosen} {self.data_hash}"
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _episodes(settings: StateTrainSettings) -> list[SceneEpisode]:
@@ -173,12 +179,6 @@ def _config(episodes: list[SceneEpisode], settings: StateTrainSettings) -> Dynam
     return DynamicsConfig(
         tasks=tasks, num_objects=num_objects, image_px=sides.pop(), width=settings.width
     )
-
-
-def _key(settings: StateTrainSettings, data_hash: str) -> str:
-    left_out = {"output", "jobs", "num_members", "name", "json_path"}
-    chosen = f"{TRAINING_VERSION} {settings.model_dump_json(exclude=left_out)}"
-    return hashlib.sha256((chosen + data_hash).encode()).hexdigest()[:16]
 
 
 def _data_hash(episodes: list[SceneEpisode]) -> str:
