@@ -8,8 +8,11 @@ probe looks at.
 
 import argparse
 import json
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 
 import torch
@@ -30,15 +33,22 @@ WORLD = "world_model"
 
 @dataclass(frozen=True)
 class Choice:
-    """Which episodes of a store are imagined: of these tasks and seeds; None takes all."""
+    """Which episodes of a store are imagined: of these tasks and seeds; None takes all.
+
+    Of these, a process takes those whose seed leaves the remainder `part` when divided by
+    `num_parts`.
+    """
 
     tasks: tuple[str, ...] | None = None
     seeds: range | None = None
+    part: int = 0
+    num_parts: int = 1
 
     def takes(self, task: str, seed: int | None) -> bool:
         """Whether an episode of this task and seed is one of them."""
         of_task = self.tasks is None or task in self.tasks
-        return of_task and (self.seeds is None or seed in self.seeds)
+        of_part = (seed or 0) % self.num_parts == self.part
+        return of_task and of_part and (self.seeds is None or seed in self.seeds)
 
 
 EVERYTHING = Choice()
@@ -70,6 +80,19 @@ def imagine_all(
     return {"imagined": made}
 
 
+def imagine_in_parts(
+    episodes: str, output: str, checkpoint: Path, choice: Choice, num_jobs: int
+) -> dict[str, int]:
+    """Imagine episodes in several processes; arguments and result as of `imagine_all`."""
+    if num_jobs == 1:
+        return imagine_all(episodes, output, checkpoint, choice)
+    parts = [replace(choice, part=part, num_parts=num_jobs) for part in range(num_jobs)]
+    # A fresh interpreter: a forked one would share the threads of torch.
+    with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
+        running = [pool.submit(imagine_all, episodes, output, checkpoint, one) for one in parts]
+        return {"imagined": sum(done.result()["imagined"] for done in running)}
+
+
 def judged_steps(episode: EpisodeReader) -> set[int]:
     """The steps of an episode whose images a judge of success looks at."""
     seed, last = episode.attributes.seed or 0, episode.num_steps - 1
@@ -89,6 +112,17 @@ def seed_range(text: str) -> range:
     return range(int(first), int(stop))
 
 
+def positive(text: str) -> int:
+    """A number of processes.
+
+    Raises:
+        ArgumentTypeError: none, or no number.
+    """
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
+    return int(text)
+
+
 def main(argv: Sequence[str]) -> int:
     """`dextouch train imagined`."""
     parser = argparse.ArgumentParser(prog="dextouch train imagined", description=__doc__)
@@ -102,11 +136,19 @@ def main(argv: Sequence[str]) -> int:
     )
     parser.add_argument("--tasks", help="with commas (all)")
     parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (all)")
+    parser.add_argument(
+        "--jobs", type=positive, default=os.cpu_count() or 1, help="processes (one a core)"
+    )
     parser.add_argument("--json", type=Path, help="write the counts here")
     arguments = parser.parse_args(list(argv))
     tasks = tuple(arguments.tasks.split(",")) if arguments.tasks else None
-    choice = Choice(tasks, arguments.seeds)
-    counts = imagine_all(arguments.episodes, arguments.store, arguments.checkpoint, choice)
+    counts = imagine_in_parts(
+        arguments.episodes,
+        arguments.store,
+        arguments.checkpoint,
+        Choice(tasks, arguments.seeds),
+        arguments.jobs,
+    )
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
     if arguments.json:
         arguments.json.write_text(json.dumps(counts, indent=2), encoding="utf-8")

@@ -10,7 +10,7 @@ from dextouch.clients.rollouts import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
-from services.cli.imagined_data import WORLD, Choice, judged_steps, main, seed_range
+from services.cli.imagined_data import WORLD, Choice, judged_steps, main, positive, seed_range
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
 from services.twin.episodes import TakeOptions, record, write_episode
@@ -47,7 +47,7 @@ def test_judged_steps_are_three_at_every_end(truth):
 def test_a_judge_sees_what_it_would_have_seen_of_all_images(truth, checkpoint, tmp_path):
     report = tmp_path / "counts.json"
     flags = ["--episodes", truth.root, "--store", tmp_path / "few", "--checkpoint", checkpoint]
-    assert main([*map(str, flags), "--json", str(report)]) == 0
+    assert main([*map(str, flags), "--json", str(report), "--jobs", "2"]) == 0
     assert json.loads(report.read_text()) == {"imagined": 1}
     few, every = EpisodeStore(tmp_path / "few"), EpisodeStore(tmp_path / "every")
     world = open_world(checkpoint)
@@ -83,3 +83,13 @@ def test_a_choice_takes_its_tasks_and_seeds():
     assert Choice(("stack_bowls",), range(5, 6)).takes("stack_bowls", 5)
     assert not Choice(("stand_bottle",)).takes("stack_bowls", 5)
     assert not Choice(seeds=range(6, 9)).takes("stack_bowls", 5)
+
+
+def test_processes_share_the_seeds_and_leave_none_out():
+    parts = [Choice(part=part, num_parts=3) for part in range(3)]
+    for seed in range(7):
+        assert [part.takes("stack_bowls", seed) for part in parts].count(True) == 1
+    assert positive("2") == 2
+    for wrong in ("0", "-1", "a", ""):
+        with pytest.raises(argparse.ArgumentTypeError, match="at least 1"):
+            positive(wrong)
