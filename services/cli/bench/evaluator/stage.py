@@ -23,6 +23,7 @@ from services.cli.bench.evaluator.plan import (
     StudyPlan,
     trained_seeds,
 )
+from services.cli.bench.evaluator.repetition import read_lines, repetition
 from services.cli.bench.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
 from services.cli.bench.machine import describe_machine
 from services.cli.bench.report import ResultTable, StageReport
@@ -87,6 +88,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default=Path("runs/evaluator"),
         help="folder of results; what is there is not computed again (%(default)s)",
     )
+    parser.add_argument(
+        "--repeats",
+        type=Path,
+        metavar="FILE",
+        help="evaluator.json of an earlier run: also say which figures are apart from it",
+    )
     parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="%(default)s")
 
 
@@ -97,6 +104,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         InvalidInputError: options that do not fit.
     """
     del folder
+    earlier = read_lines(options.repeats) if options.repeats else {}
     plan = _plan(options)
     study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")
     units = [
@@ -140,7 +148,10 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
             row_table("Chunks of scripts, each figure beside its rival", chunks),
         ],
         panels=[],
-        requirements=[line.requirement() for line in lines],
+        requirements=[
+            *(line.requirement() for line in lines),
+            *repetition(lines, earlier),
+        ],
         data={name: content[name] for name in ("about", "lines", "policies", "rivals", "chunks")},
         notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
     )
