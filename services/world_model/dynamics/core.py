@@ -48,9 +48,9 @@ class SceneStart:
 class SceneFuture:
     """What the core says of every latent step.
 
-    `touch`, `contact` (log odds of each pad) and `pattern` (what `RecurrentCore.taxels` makes log
-    odds of each taxel of) are of the four steps that end at the latent;
-    `success` are log odds that the task is done at it, a training target.
+    `touch`, `pattern` (which `RecurrentCore.taxels` turns into log odds of each taxel) and
+    `contact` (log odds of each pad) are of the four steps that end at the latent; `success` are
+    log odds that the task is done at it. The last two are training targets only.
     """
 
     objects: ObjectPoses
