@@ -172,5 +172,12 @@ def parse(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
 
 
 def command_line(word: str, arguments: list[str]) -> str:
-    """A command of this service as it would be typed; kept in checkpoints."""
-    return shlex.join(["python", "-m", "services.evaluation", word, *arguments])
+    """A command of this service as it would be typed; kept in checkpoints.
+
+    Files and folders go by their last name, since others have other folders.
+    """
+    named = [
+        f"{flag}{separator}{value.rstrip('/').rsplit('/', 1)[-1]}"
+        for flag, separator, value in (one.rpartition("=") for one in arguments)
+    ]
+    return shlex.join(["python", "-m", "services.evaluation", word, *named])
