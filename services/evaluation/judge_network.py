@@ -45,7 +45,8 @@ class ProbeShape(BaseModel):
 class ProbeBatch:
     """Inputs of the network: last images as bytes, touch, features of object poses, task index.
 
-    What an ending does not have is zero, and marked in `has_image` and `has_objects`.
+    What an ending does not have is zero, and marked in `has_image` and `has_objects`. `imagined`
+    is for training; the network does not see it.
     """
 
     images: UInt8[torch.Tensor, "n 3 h w"]
@@ -54,6 +55,7 @@ class ProbeBatch:
     task: Int64[torch.Tensor, " n"]
     has_image: Bool[torch.Tensor, " n"]
     has_objects: Bool[torch.Tensor, " n"]
+    imagined: Bool[torch.Tensor, " n"]
 
     def __getitem__(self, index: torch.Tensor) -> "ProbeBatch":
         """Some of the endings."""
@@ -166,6 +168,7 @@ def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
         torch.tensor([shape.tasks.index(e.task) for e in endings]),
         torch.tensor([e.images is not None for e in endings]),
         torch.tensor([e.object_poses is not None for e in endings]),
+        torch.tensor([e.imagined for e in endings]),
     )
 
 

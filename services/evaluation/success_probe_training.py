@@ -50,12 +50,16 @@ class ProbeSettings(BaseModel):
     brightness: float = Field(default=0.05, ge=0)
     # At 64 pixels one is about 10 mm on the table, which is what decides success.
     shift_px: int = Field(default=1, ge=0)
-    # Of the endings that have both: how many are learned from without poses, without images.
-    without_poses: float = Field(default=0.4, ge=0, le=1)
-    without_images: float = Field(default=0.3, ge=0, le=1)
+    # Of true endings with both, how many are learned from without poses, without images: what is
+    # really seen comes without poses, and with them nobody would look at the image.
+    true_without_poses: float = Field(default=0.85, ge=0, le=1)
+    true_without_images: float = Field(default=0.1, ge=0, le=1)
+    # The same of imagined endings: worlds that imagine poses do so always, images when asked.
+    imagined_without_poses: float = Field(default=0.3, ge=0, le=1)
+    imagined_without_images: float = Field(default=0.3, ge=0, le=1)
     # In standard deviations of each feature of the poses.
     pose_noise: float = Field(default=0.03, ge=0)
-    imagined_share: float = Field(default=0.5, gt=0, lt=1)
+    imagined_share: float = Field(default=0.4, gt=0, lt=1)
     milestone_weight: float = Field(default=0.3, ge=0)
     development_share: float = Field(default=0.15, gt=0, lt=1)
     held_out_share: float = Field(default=0.2, gt=0, lt=1)
@@ -235,7 +239,7 @@ def _optimize(
             index = torch.multinomial(
                 learned.weight, settings.batch_size, replacement=True, generator=generator
             )
-            batch = _some_parts(learned.batch[index], network.object_std, settings, generator)
+            batch = some_parts(learned.batch[index], network.object_std, settings, generator)
             images = _disturb(unit_images(batch.images), settings, generator)
             loss = _loss(
                 network(images, batch), learned.outcome[index], learned.known[index], settings
@@ -258,14 +262,27 @@ def _loss(
     return success + settings.milestone_weight * milestones
 
 
-def _some_parts(
+def some_parts(
     batch: ProbeBatch, object_std: torch.Tensor, settings: ProbeSettings, generator: torch.Generator
 ) -> ProbeBatch:
-    """The batch with noise on the poses, and without poses or without images here and there."""
+    """The batch with noise on the poses, and without poses or without images here and there.
+
+    Args:
+        batch: of one task.
+        object_std: [features], of the task's poses; noise is measured in it.
+        settings: how often, and how much noise.
+        generator: of everything that is drawn.
+    """
     drawn = torch.rand(len(batch.task), generator=generator)
     both = batch.has_image & batch.has_objects
-    no_poses = both & (drawn < settings.without_poses)
-    no_image = both & ~no_poses & (drawn < settings.without_poses + settings.without_images)
+    without_poses = torch.where(
+        batch.imagined, settings.imagined_without_poses, settings.true_without_poses
+    )
+    without_images = torch.where(
+        batch.imagined, settings.imagined_without_images, settings.true_without_images
+    )
+    no_poses = both & (drawn < without_poses)
+    no_image = both & ~no_poses & (drawn < without_poses + without_images)
     noise = torch.randn(batch.objects.shape, generator=generator) * settings.pose_noise
     return replace(
         batch,

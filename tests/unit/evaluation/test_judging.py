@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+import torch
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.rollouts import Doubt, Observation
@@ -14,7 +15,11 @@ from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.judge_network import ProbeShape
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
-from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
+from services.evaluation.success_probe_training import (
+    ProbeSettings,
+    some_parts,
+    train_success_probe,
+)
 from tests.unit.evaluation import toy
 
 NEAR_M = 0.02
@@ -200,3 +205,19 @@ def test_true_and_imagined_endings_weigh_as_asked():
     # In the middle only milestones are known.
     assert labelled.known[3].tolist() == [False, True, True, True]
     assert labelled.known[0].all()
+
+
+def test_true_endings_are_learned_without_poses_and_imagined_ones_with_them():
+    episodes = _episodes(range(30))
+    shape = ProbeShape(tasks=toy.TASKS, image_size_px=toy.SIZE)
+    batch = labelled_endings(episodes, shape).batch
+    settings = ProbeSettings(
+        true_without_poses=1, true_without_images=0,
+        imagined_without_poses=0, imagined_without_images=1,
+    )  # fmt: skip
+    seen = some_parts(batch, torch.ones(105), settings, torch.Generator().manual_seed(0))
+    assert not seen.has_objects[~batch.imagined].any()
+    assert seen.has_image[~batch.imagined].all()
+    assert seen.has_objects[batch.imagined].all()
+    assert not seen.has_image[batch.imagined].any()
+    assert batch.imagined.float().mean() == 0.5
