@@ -26,8 +26,8 @@ SIX = (
     "stand_bottle",
 )
 MAX_POLICY_BYTES = 1_000_000
-# Least AUC and balanced accuracy on true endings; of bowls less than the 0.97 and 0.90 we want.
-LEAST = {"stack_bowls": (0.92, 0.84), "stand_bottle": (0.97, 0.90)}
+# Least AUC and balanced accuracy on true endings.
+LEAST = {"stack_bowls": (0.97, 0.90), "stand_bottle": (0.97, 0.90)}
 
 
 @pytest.mark.parametrize(
@@ -113,8 +113,8 @@ def test_an_unknown_task_is_refused(twin):
 @pytest.mark.parametrize("task", SIX)
 def test_the_probe_says_what_it_was_measured_on(task):
     metrics = SuccessProbe.load(DEFAULT_PROBE).metadata.metrics
-    assert metrics[f"held_out_auc_{task}"] >= 0.89
-    assert metrics[f"held_out_balanced_accuracy_{task}"] >= 0.84
+    assert metrics[f"held_out_auc_{task}"] >= 0.97
+    assert metrics[f"held_out_balanced_accuracy_{task}"] >= 0.90
     for outcome in ("successes", "failures"):
         assert metrics[f"num_held_out_{outcome}_{task}"] >= 10
     assert metrics["num_imagined_training_episodes"] >= 500
