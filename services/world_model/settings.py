@@ -139,7 +139,7 @@ class StateTrainSettings(BaseModel):
     reader: ReaderSettings = ReaderSettings()
     core: CoreSettings = CoreSettings()
     renderer: RendererConfig = RendererConfig()
-    drawing: RendererTraining = RendererTraining(cpu_budget_s=420.0)
+    drawing: RendererTraining = RendererTraining(cpu_budget_s=700.0)
 
 
 class TrainStateCommand(BaseSettings, StateTrainSettings):
