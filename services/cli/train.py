@@ -22,7 +22,7 @@ USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe|di
   state        the state model: start readers and recurrent cores on whole episodes
   imagined     those episodes as the world model imagines them
   policy       a closed-loop policy that imitates the demonstrations
-  probe        the judge of imagined success; give it data made with --ladder
+  probe        the judge of imagined success, from true and imagined episodes
   direct-judge its rival, which imagines nothing: for `dextouch bench evaluator --direct`
 
 Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`

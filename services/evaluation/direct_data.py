@@ -135,6 +135,8 @@ def attempts_hash(items: Iterable[LabelledAttempt]) -> str:
         arrays: Mapping[str, np.ndarray] = {
             "actions": item.attempt.actions,
             "touch": item.attempt.tactile_kpa,
+            "anchor": np.stack(item.attempt.anchor.as_tuple()),
+            "K_head": item.attempt.K_head,
             "images": np.stack([view.image for view in item.views]),
             "poses": np.stack([view.object_poses for view in item.views]),
         }

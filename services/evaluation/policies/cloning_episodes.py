@@ -134,7 +134,8 @@ def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> l
         for episode_id in names:
             reader = store.open(episode_id)
             about = reader.attributes
-            is_wanted = about.domain == "robot" and (not tasks or about.task in tasks)
+            is_wanted = about.domain == "robot" and about.origin != "imagined"
+            is_wanted &= not tasks or about.task in tasks
             if not is_wanted or not about.success:
                 continue
             if episode_id in found:

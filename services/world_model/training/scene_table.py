@@ -235,7 +235,7 @@ def _check(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> None:
     if list(first.image_steps[:1]) != [0] or not later:
         raise InvalidInputError(
             f"episode {first.episode_id}: has images of steps {list(first.image_steps)[:4]} …, "
-            "expected step 0 and a later multiple of 4; record with --images 1, 2 or 4"
+            "expected step 0 and a later multiple of 4; record with --images 4"
         )
     num_steps, size = len(first.tactile_kpa), (config.image_px, config.image_px, 3)
     for episode in episodes:

@@ -31,7 +31,7 @@ class Policy(Protocol):
 
     A policy with an attribute `looks` that is False gets no images after the first step, so that
     worlds need not make them. With `looks = "last"` it may get nothing but the last step of each
-    chunk. `tasks` (names) are what it can do; studies leave it out of others.
+    chunk. `tasks` (names) are what it can do; `dextouch bench evaluator` leaves it out of others.
     """
 
     def reset(self, start: PolicyStart) -> None:

@@ -71,7 +71,7 @@ def test_a_line_that_was_cut_off_is_skipped(tmp_path):
 
 
 def test_arrays_come_back_or_are_refused(tmp_path):
-    path = array_path(tmp_path, **_row(1), world="0123456789abcdef")
+    path = array_path(tmp_path, digests=("0123456789abcdef", "ab"), **_row(1))
     write_arrays(path, {"touch": np.arange(3.0)})
     assert read_arrays(path)["touch"].tolist() == [0, 1, 2]
     path.write_bytes(b"no arrays")

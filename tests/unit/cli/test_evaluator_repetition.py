@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from dextouch.errors import CorruptDataError, NotFoundError
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.cli.bench.evaluator.drawn import Line
 from services.cli.bench.evaluator.repetition import read_lines, repetition
 
@@ -53,3 +53,8 @@ def test_other_files_are_refused(path):
     path.write_text('{"lines": 3}')
     with pytest.raises(CorruptDataError, match=r"no evaluator\.json"):
         read_lines(path)
+
+
+def test_a_run_of_other_tasks_is_no_repetition(path):
+    with pytest.raises(InvalidInputError, match="none of 1 lines"):
+        repetition([_line("something else", 0.5)], read_lines(path))

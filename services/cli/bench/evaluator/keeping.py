@@ -6,7 +6,7 @@ file. A line that a killed run left unfinished is skipped.
 """
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -82,9 +82,9 @@ def _parsed(line: str) -> Row | None:
     return row if isinstance(row, dict) and "kind" in row else None
 
 
-def array_path(keep: Path, **about: object) -> Path:
-    """Where the arrays of a rollout lie."""
-    digest = str(about.get("world") or about["twin"])[:12]
+def array_path(keep: Path, *, digests: Sequence[str], **about: object) -> Path:
+    """Where the arrays of a rollout lie; `digests` are of every world that they come from."""
+    digest = "-".join(one[:12] for one in digests)
     policy = str(about["policy"]).replace(" ", "_").replace("'", "")
     name = f"{about['task']}-{about['seed']}-{policy}.npz"
     return keep / "arrays" / str(about["kind"]) / digest / name

@@ -172,7 +172,7 @@ def _wrong_action_figures(sampling: Sampling, everything: Sequence[Rolled]) -> l
     psnr = np.array([row["psnr"] for row in rows]).mean(axis=1)
     gain = sampling.mean(image, psnr[:, 0] - psnr[:, 1], mine, ("at least", 2.0))
     return [
-        Drawn(touch, float(ratios[0]), ratios[1], len(mine), ("at least", 2.0)),
+        Drawn(touch, float(ratios[0]), ratios[1], len(mine), ("at least", 2.0), "times"),
         Drawn(image, gain.value, gain.draws, len(mine), gain.bound, "dB"),
     ]
 

@@ -7,11 +7,12 @@ from typing import Final
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from dextouch.errors import CorruptDataError, NotFoundError
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from services.cli.bench.evaluator.drawn import Line
 from services.cli.bench.figures import Requirement
 
-# Of areas under the curve, correlations, success rates and the like, and of decibels.
+# Of areas under the curve, correlations, success rates and the like, and of decibels. Figures in
+# other units scatter too much to be compared.
 TOLERANCES: Final = {"": 0.08, "dB": 1.0}
 
 
@@ -57,7 +58,15 @@ def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
     Args:
         lines: of this run.
         earlier: from `read_lines`.
+
+    Raises:
+        InvalidInputError: not one line in common.
     """
+    if not any((line.task, line.what) in earlier for line in lines):
+        raise InvalidInputError(
+            f"evaluator: none of {len(lines)} lines is among the {len(earlier)} of the earlier "
+            "run; compare runs of the same tasks"
+        )
     found: list[Requirement] = []
     for line in lines:
         other = earlier.get((line.task, line.what))

@@ -5,7 +5,14 @@ from typing import Any, Final
 
 import numpy as np
 
-from services.cli.bench.evaluator.drawn import Drawn, Rolled, Sampling, having, lines_over_seeds
+from services.cli.bench.evaluator.drawn import (
+    Drawn,
+    Rolled,
+    Sampling,
+    having,
+    lines_over_seeds,
+    undefined,
+)
 
 # Who judges what: the name in tables, by the kind of row.
 JUDGES: Final = {
@@ -38,10 +45,14 @@ def rival_figures(
         mine = having(kind, rollouts)[0]
         if not mine:
             continue
+        what = f"AUC of imagined endings less {_LESS[kind]}, {where}"
+        if all(one.rows["imagined verdict"] == one.rows[kind] for one in mine):
+            # Nothing that the rival lacks was there to be judged, so nothing is compared.
+            found.append(undefined(what, ("at least", 0.0)))
+            continue
         ours, theirs = (
             sampling.area("", each, mine, 0.0, None) for each in ("imagined verdict", kind)
         )
-        what = f"AUC of imagined endings less {_LESS[kind]}, {where}"
         found.append(ours.less(theirs, what, 0.0))
     return found
 

@@ -118,7 +118,7 @@ class PolicyRollout:
         return self._imagined_by(member.world)
 
     def _imagined_by(self, world: BatchWorld[Any]) -> ImaginedRollout:
-        path = self._path("imagined", world.description.digest)
+        path = self._path("imagined", self._twin.description.digest, world.description.digest)
         if path.is_file():
             kept = read_arrays(path)
             poses, doubted = kept.pop("object_poses", None), str(kept.pop("doubted"))
@@ -128,8 +128,8 @@ class PolicyRollout:
         write_arrays(path, arrays | {"doubted": np.array(imagined.doubted or "")})
         return imagined
 
-    def _path(self, kind: str, digest: str) -> Path:
-        return array_path(self._keep, kind=kind, twin=digest, **self._about)
+    def _path(self, kind: str, *digests: str) -> Path:
+        return array_path(self._keep, kind=kind, digests=digests, **self._about)
 
     @property
     def _first_image(self) -> np.ndarray:
@@ -174,7 +174,7 @@ class PolicyRollout:
         return {"contact": contact, "moves": moves.tolist()}
 
     def _still_row(self, member: Member) -> Row:
-        """Of hands that are told to stay where they are seen to be, as the hold policy does."""
+        """Of hands that are told to stay where they are seen to be, whatever was last commanded."""
         row = self._started.observation.action_reached[-1]
         path = self._path("held_still", self._twin.description.digest)
         if not path.is_file():

@@ -150,7 +150,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
         panels=[],
         requirements=[
             *(line.requirement() for line in lines),
-            *repetition(lines, earlier),
+            *(repetition(lines, earlier) if options.repeats else ()),
         ],
         data={name: content[name] for name in ("about", "lines", "policies", "rivals", "chunks")},
         notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
