@@ -11,6 +11,7 @@ from services.cli.bench.evaluator.drawn import (
     Sampling,
     having,
     lines_over_seeds,
+    probabilities,
     undefined,
 )
 
@@ -46,7 +47,7 @@ def rival_figures(
         if not mine:
             continue
         what = f"AUC of imagined endings less {_LESS[kind]}, {where}"
-        if all(one.rows["imagined verdict"] == one.rows[kind] for one in mine):
+        if np.array_equal(probabilities(mine, "imagined verdict"), probabilities(mine, kind)):
             # Nothing that the rival lacks was there to be judged, so nothing is compared.
             found.append(undefined(what, ("at least", 0.0)))
             continue
