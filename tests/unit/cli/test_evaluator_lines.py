@@ -5,10 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
 from services.cli.bench.evaluator.drawn import Rolled
 from services.cli.bench.evaluator.lines import TaskFigures
 from services.cli.bench.evaluator.measuring import sharpness_of_chunks, wrong_action_figures
+from services.cli.bench.evaluator.members import refuse_unequal_tasks
 from services.cli.bench.evaluator.page import write_page
 from services.cli.bench.evaluator.playing import ImaginedRollout, TrueRollout
 from services.cli.bench.evaluator.restarts import chunks_that_move
@@ -231,3 +233,10 @@ def test_without_direct_judge_there_is_no_line_of_it(rolled):
     figures = TaskFigures("a", [rolled], SCRIPTS)
     assert not [line for line in figures.lines() if "direct" in line.what]
     assert {row["judge"] for row in figures.rival_rows()} == {"imagined ending"}
+
+
+def test_rivals_of_different_tasks_are_refused():
+    refuse_unequal_tasks("--direct", [])
+    refuse_unequal_tasks("--direct", [("a", "b"), ("b", "a")])
+    with pytest.raises(InvalidInputError, match="--direct"):
+        refuse_unequal_tasks("--direct", [("a", "b"), ("a",)])

@@ -1,11 +1,13 @@
 """The networks of each training seed, opened once in a process."""
 
 import hashlib
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from dextouch.errors import InvalidInputError
 from dextouch.worlds.world import BatchWorld
 from services.cli.bench.evaluator.plan import Trained
 from services.evaluation.direct_judge import DirectJudge
@@ -58,3 +60,27 @@ def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
 def file_digest(path: Path) -> str:
     """sha256 of a file."""
     return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def refuse_unequal_rivals(members: Sequence[Member]) -> None:
+    """Refuse rivals of the training seeds that do not know the same tasks.
+
+    Raises:
+        InvalidInputError: direct judges, or worlds without touch, of different tasks.
+    """
+    refuse_unequal_tasks("--direct", [m.direct.shape.tasks for m in members if m.direct])
+    worlds = [m.untouched.description.tasks for m in members if m.untouched]
+    refuse_unequal_tasks("--without-touch", worlds)
+
+
+def refuse_unequal_tasks(flag: str, known: Sequence[Collection[str]]) -> None:
+    """Refuse networks that are compared over training seeds and know different tasks.
+
+    Raises:
+        InvalidInputError: different tasks.
+    """
+    if any(set(tasks) != set(known[0]) for tasks in known):
+        raise InvalidInputError(
+            f"evaluator: {flag}: got networks of {[sorted(tasks) for tasks in known]}, "
+            "expected the same tasks of all; train them on the same ones"
+        )

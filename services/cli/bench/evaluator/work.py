@@ -9,7 +9,7 @@ import torch
 from dextouch.clients.policy import Policy
 from dextouch.errors import DexTouchError
 from services.cli.bench.evaluator.keeping import KeptRows, Row, row_key
-from services.cli.bench.evaluator.members import Member, open_members
+from services.cli.bench.evaluator.members import Member, open_members, refuse_unequal_rivals
 from services.cli.bench.evaluator.plan import CAMERA, ELSEWHERE, HOLD, StudyPlan, script_name
 from services.cli.bench.evaluator.playing import Actions, scripted_actions, start_in_twin
 from services.cli.bench.evaluator.rollouts import DEPENDS_ON, PolicyRollout
@@ -36,6 +36,7 @@ class Study:
         self.plan = plan
         self.twin = TwinWorld(TwinSettings(cameras=(CAMERA,)))
         self.members = open_members(plan.trained)
+        refuse_unequal_rivals(self.members)
         self.cloned = {one.key: BehaviourCloningPolicy.load(one.path) for one in plan.cloned}
         outside = {one.key: one.source.load({}) for one in plan.outside}
         self.actors: dict[str, Policy] = {**self.cloned, **outside}
