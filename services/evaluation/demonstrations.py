@@ -1,4 +1,4 @@
-"""An episode store in; robot episodes as plain arrays on the model grid out."""
+"""Robot episodes of stores as plain arrays on the model grid."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError
+from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
 CAMERA = "camera_head"
@@ -82,37 +83,7 @@ def read_demonstrations(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> lis
         NotFoundError: not one such episode, or a store without any.
         ConflictError: two stores hold an episode of the same id.
     """
-    found: dict[str, Demonstration] = {}
-    for place, store in enumerate(stores, 1):
-        names = sorted(store.list(kind="episode"))
-        if not names:
-            raise NotFoundError(
-                f"store {place} of the {len(stores)} given holds no episode; check its path"
-            )
-        for episode_id in names:
-            reader = store.open(episode_id)
-            attributes = reader.attributes
-            if attributes.domain != "robot" or (tasks and attributes.task not in tasks):
-                continue
-            if episode_id in found:
-                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
-            found[episode_id] = read_demonstration(reader)
-    if not found:
-        raise NotFoundError(
-            f"no robot episode of {', '.join(tasks) or 'any task'} in the store; "
-            "record some with the twin first"
-        )
-    return list(found.values())
-
-
-def data_hash(demonstrations: Iterable[Demonstration]) -> str:
-    """sha256 over everything that training sees, in the order of the episode ids."""
-    digest = hashlib.sha256()
-    for item in sorted(demonstrations, key=lambda d: d.episode_id):
-        digest.update(repr((item.episode_id, item.task, item.instruction, item.success)).encode())
-        for array in (item.images, item.tactile_kpa, item.measured, item.commanded):
-            digest.update(np.ascontiguousarray(array).tobytes())
-    return digest.hexdigest()
+    return [read_demonstration(reader) for reader in robot_episodes(stores, tasks=tasks)]
 
 
 @runtime_checkable

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.direct_network import NUM_STEPS, Attempt
 from services.evaluation.endings import OBJECT_POSES
+from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
 # Where objects lie is learned from the images of these steps.
@@ -58,28 +59,18 @@ def read_attempts(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[Labe
         tasks: only these; empty for all.
 
     Raises:
-        NotFoundError: not one such episode.
+        NotFoundError: not one such episode, or a store without any.
+        ConflictError: two stores hold an episode of the same id.
         InvalidInputError: an episode of unknown outcome, of another length or without object
             poses.
     """
-    found = []
-    for store in stores:
-        for episode_id in sorted(store.list(kind="episode")):
-            reader = store.open(episode_id)
-            about = reader.attributes
-            if (
-                about.domain != "robot"
-                or about.origin != "twin"
-                or (tasks and about.task not in tasks)
-            ):
-                continue
-            found.append(read_attempt(reader))
-    if not found:
-        raise NotFoundError(
-            f"no robot episode of {', '.join(tasks) or 'any task'} in the stores; "
-            "record some with `dextouch train data` first"
-        )
-    return found
+    readers = robot_episodes(
+        stores,
+        tasks=tasks,
+        wanted=lambda about: about.origin == "twin",
+        what="robot episode of the twin",
+    )
+    return [read_attempt(reader) for reader in readers]
 
 
 def read_attempt(reader: EpisodeReader) -> LabelledAttempt:

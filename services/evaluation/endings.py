@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError
 from dextouch.schemas.rollouts import Observation
 from services.evaluation.demonstrations import CAMERA, Demonstration
+from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
 NUM_SEEN_STEPS: Final = 3
@@ -226,27 +227,7 @@ def read_ending_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> li
         NotFoundError: not one such episode, or a store without any.
         ConflictError: two stores hold an episode of the same id.
     """
-    found: dict[str, EndingEpisode] = {}
-    for place, store in enumerate(stores, 1):
-        names = sorted(store.list(kind="episode"))
-        if not names:
-            raise NotFoundError(
-                f"store {place} of the {len(stores)} given holds no episode; check its path"
-            )
-        for episode_id in names:
-            reader = store.open(episode_id)
-            about = reader.attributes
-            if about.domain != "robot" or (tasks and about.task not in tasks):
-                continue
-            if episode_id in found:
-                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
-            found[episode_id] = read_ending_episode(reader)
-    if not found:
-        raise NotFoundError(
-            f"no robot episode of {', '.join(tasks) or 'any task'} in the store; "
-            "record some with `dextouch train data` first"
-        )
-    return list(found.values())
+    return [read_ending_episode(reader) for reader in robot_episodes(stores, tasks=tasks)]
 
 
 def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...]]:

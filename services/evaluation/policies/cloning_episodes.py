@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
+from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from services.evaluation.demonstrations import CAMERA, Demonstration
+from services.evaluation.demonstrations import CAMERA
 from services.evaluation.policies.cloning_network import SLOT_STEPS
+from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
 # Decisions are learned at these steps; an evaluation with chunks of 16 decides at every second.
@@ -54,24 +55,6 @@ class CloningEpisode:
     def start_digest(self) -> str:
         """Digest of the first observation."""
         return start_digest(self.moments[0].image, self.moments[0].tactile_kpa)
-
-    @classmethod
-    def of(cls, item: Demonstration, anchor: AnchorPoses) -> "CloningEpisode":
-        """An episode that is in memory with all its images."""
-        return cls(
-            item.episode_id,
-            item.task,
-            item.instruction,
-            item.seed,
-            item.success,
-            anchor,
-            {
-                step: Moment(item.images[step], item.tactile_kpa[step])
-                for step in range(0, item.num_steps, DECISION_STRIDE)
-            },
-            item.measured,
-            item.commanded,
-        )
 
 
 def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
@@ -124,29 +107,13 @@ def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> l
         NotFoundError: not one such episode, or a store without any episode.
         ConflictError: two stores hold an episode of the same id.
     """
-    found: dict[str, CloningEpisode] = {}
-    for place, store in enumerate(stores, 1):
-        names = sorted(store.list(kind="episode"))
-        if not names:
-            raise NotFoundError(
-                f"store {place} of the {len(stores)} given holds no episode; check its path"
-            )
-        for episode_id in names:
-            reader = store.open(episode_id)
-            about = reader.attributes
-            is_wanted = about.domain == "robot" and about.origin != "imagined"
-            is_wanted &= not tasks or about.task in tasks
-            if not is_wanted or not about.success:
-                continue
-            if episode_id in found:
-                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
-            found[episode_id] = read_cloning_episode(reader)
-    if not found:
-        raise NotFoundError(
-            f"no robot episode of {', '.join(tasks) or 'any task'} in the store succeeded; "
-            "record some with `dextouch train data` first"
-        )
-    return list(found.values())
+    readers = robot_episodes(
+        stores,
+        tasks=tasks,
+        wanted=lambda about: bool(about.success) and about.origin != "imagined",
+        what="true robot episode that succeeded",
+    )
+    return [read_cloning_episode(reader) for reader in readers]
 
 
 def cloning_hash(episodes: Sequence[CloningEpisode]) -> str:

@@ -4,7 +4,6 @@ import pytest
 import torch
 
 from services.evaluation.endings import EndingEpisode
-from services.evaluation.policies.cloning_episodes import CloningEpisode
 from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
 from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
 from tests.unit.evaluation import toy
@@ -23,7 +22,7 @@ def demonstrations():
 @pytest.fixture(scope="session")
 def trained_policies(demonstrations):
     settings = CloningSettings(num_training_steps=250, batch_size=32, learning_rate=3e-3)
-    episodes = [CloningEpisode.of(item, toy.ANCHOR) for item in demonstrations]
+    episodes = [toy.cloning_episode(item) for item in demonstrations]
     return train_cloned_policy(episodes, settings, command="a test", early_at=0.02)
 
 

@@ -33,7 +33,7 @@ def start(task: str, seed: int) -> PolicyStart:
 
 
 def episodes(seeds: range, **changed: object) -> list[CloningEpisode]:
-    items = [CloningEpisode.of(item, toy.ANCHOR) for item in toy.demonstrations(seeds)]
+    items = [toy.cloning_episode(item) for item in toy.demonstrations(seeds)]
     return [toy.replace(item, **changed) for item in items]
 
 

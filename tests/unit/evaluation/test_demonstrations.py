@@ -15,7 +15,6 @@ from services.evaluation.demonstrations import instructions_of, read_demonstrati
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import (
-    CloningEpisode,
     cloning_hash,
     read_cloning_episodes,
 )
@@ -184,7 +183,7 @@ def test_policies_learn_from_images_of_every_eighth_step(tmp_path):
         np.testing.assert_allclose(moment.tactile_kpa, item.tactile_kpa[step])
     for name in ("measured", "commanded"):
         np.testing.assert_allclose(getattr(episode, name), getattr(item, name), atol=1e-12)
-    whole = CloningEpisode.of(item, toy.ANCHOR)
+    whole = toy.cloning_episode(item)
     assert cloning_hash([episode]) == cloning_hash([whole])
     moved = toy.replace(whole, commanded=whole.commanded + 1e-9)
     assert cloning_hash([moved]) != cloning_hash([whole])

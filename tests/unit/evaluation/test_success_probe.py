@@ -6,8 +6,8 @@ import torch
 from scipy.stats import mannwhitneyu
 
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.evaluation.demonstrations import data_hash, split_by_seed
-from services.evaluation.endings import EndingEpisode, final_ending
+from services.evaluation.demonstrations import split_by_seed
+from services.evaluation.endings import EndingEpisode, endings_hash, final_ending
 from services.evaluation.judge_network import ProbeShape
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
@@ -117,7 +117,9 @@ def test_early_endings_do_not_crowd_out_near_misses(demonstrations):
 
 def test_data_hash_sees_every_change(demonstrations):
     few = demonstrations[:3]
-    assert data_hash(few) == data_hash(few[::-1])
+    whole = endings_hash(_episodes(few))
+    assert endings_hash(_episodes(few[::-1])) == whole
     touched = few[0].tactile_kpa.copy()
-    touched[40, 1, 5] += 0.5
-    assert data_hash([toy.replace(few[0], tactile_kpa=touched), *few[1:]]) != data_hash(few)
+    touched[48, 1, 5] += 0.5
+    changed = [toy.replace(few[0], tactile_kpa=touched), *few[1:]]
+    assert endings_hash(_episodes(changed)) != whole

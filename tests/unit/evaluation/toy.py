@@ -17,6 +17,11 @@ from dextouch.worlds.world import (
     WorldDescription,
 )
 from services.evaluation.demonstrations import Demonstration
+from services.evaluation.policies.cloning_episodes import (
+    DECISION_STRIDE,
+    CloningEpisode,
+    Moment,
+)
 
 SIZE = 32
 STEPS = 81
@@ -78,6 +83,15 @@ def demonstration(task: str, seed: int, *, noise_m: float = 0.0, name: str = "")
 
 def demonstrations(seeds: range, *, noise_m: float = 0.0) -> list[Demonstration]:
     return [demonstration(t, s, noise_m=noise_m * (s % 3)) for t in TASKS for s in seeds]
+
+
+def cloning_episode(item: Demonstration) -> CloningEpisode:
+    moments = {
+        step: Moment(item.images[step], item.tactile_kpa[step])
+        for step in range(0, item.num_steps, DECISION_STRIDE)
+    }
+    about = (item.episode_id, item.task, item.instruction, item.seed, item.success)
+    return CloningEpisode(*about, ANCHOR, moments, item.measured, item.commanded)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,51 @@
+"""Selection of the robot episodes from which networks of the evaluation learn."""
+
+from collections.abc import Callable, Iterator, Sequence
+
+from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.errors import ConflictError, NotFoundError
+from dextouch.schemas.episodes import EpisodeAttributes
+
+
+def robot_episodes(
+    stores: Sequence[EpisodeStore],
+    *,
+    tasks: Sequence[str] = (),
+    wanted: Callable[[EpisodeAttributes], bool] | None = None,
+    what: str = "robot episode",
+) -> Iterator[EpisodeReader]:
+    """Robot episodes, store by store in the order of their ids, opened one at a time.
+
+    Args:
+        stores: where to read.
+        tasks: only these; empty for all.
+        wanted: whether an episode of these attributes is taken; without it all are.
+        what: is looked for, for messages.
+
+    Raises:
+        NotFoundError: not one such episode, or a store without any episode.
+        ConflictError: two stores hold an episode of the same id.
+    """
+    found: set[str] = set()
+    for place, store in enumerate(stores, 1):
+        names = sorted(store.list(kind="episode"))
+        if not names:
+            raise NotFoundError(
+                f"store {place} of the {len(stores)} given holds no episode; check its path"
+            )
+        for episode_id in names:
+            reader = store.open(episode_id)
+            about = reader.attributes
+            if about.domain != "robot" or (tasks and about.task not in tasks):
+                continue
+            if wanted is not None and not wanted(about):
+                continue
+            if episode_id in found:
+                raise ConflictError(f"episode {episode_id!r}: in two stores; give it only once")
+            found.add(episode_id)
+            yield reader
+    if not found:
+        raise NotFoundError(
+            f"no {what} of {', '.join(tasks) or 'any task'} in the stores; "
+            "record some with `dextouch train data` first"
+        )
