@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from dextouch.clocks import LookAheadClock, OnlineClock
+from dextouch.clocks import CountingClock, OnlineClock
 from dextouch.errors import InvalidInputError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.health_blocks import Block, Rolling
@@ -211,7 +211,7 @@ class CountingJudge:
         self._restart()
 
     def _restart(self) -> None:
-        self._clock = LookAheadClock(self._period_ns)
+        self._clock = CountingClock(self._period_ns)
         self._undated: deque[int] = deque()
 
     def judge(self, block: Block, now_ns: int) -> Verdict:

@@ -11,7 +11,7 @@ import structlog
 
 from dextouch.clocks import PathLatency
 from dextouch.episodes.files import disk_errors
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError
 from dextouch.schemas.episodes import Matrix
 from dextouch.schemas.recordings import RecordingAttributes

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.episodes.batch_log import LOG_FILE
 from dextouch.episodes.files import disk_errors
+from dextouch.episodes.spool_log import LOG_FILE
 from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, fields, replace
 
 import structlog
 
-from dextouch.episodes.log import SpoolWriter, StreamRecord
+from dextouch.episodes.spool import SpoolWriter, StreamRecord
 from dextouch.errors import StorageError
 from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.samples import Sample, SampleBatch

@@ -11,7 +11,7 @@ import structlog
 from pydantic import ValidationError
 
 from dextouch.episodes.files import disk_errors, replace_file
-from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
     ConflictError,
     DexTouchError,

@@ -12,9 +12,9 @@ from dextouch.errors import DexTouchError
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
 from services.episode_store.app import create_app
+from services.episode_store.commands import delete, inspect, repair
+from services.episode_store.commands.context import Context, Outcome, seconds_of
 from services.episode_store.settings import EpisodeStoreSettings
-from services.episode_store.words import look, mend, remove
-from services.episode_store.words.context import Context, Outcome, seconds_of
 
 EXIT_REFUSED = 3
 
@@ -38,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         # With the result itself on stdout, what is said goes beside it.
         out = sys.stderr if options.json == "-" else sys.stdout
         context = Context(EpisodeStore(url), url, options, lambda line: print(line, file=out))
-        result, status = _WORDS[options.word](context)
+        result, status = _COMMANDS[options.command](context)
     except DexTouchError as error:
         print(f"dextouch store: {error.message}", file=sys.stderr)
         return EXIT_REFUSED
@@ -58,15 +58,15 @@ def _serve(arguments: list[str]) -> int:
     return 0
 
 
-_WORDS: dict[str, Callable[[Context], Outcome]] = {
-    "list": look.list_items,
-    "show": look.show,
-    "verify": look.verify,
-    "delete": remove.delete,
-    "restore": remove.restore,
-    "purge": remove.purge,
-    "repair": mend.repair,
-    "migrate": mend.migrate,
+_COMMANDS: dict[str, Callable[[Context], Outcome]] = {
+    "list": inspect.list_items,
+    "show": inspect.show,
+    "verify": inspect.verify,
+    "delete": delete.delete,
+    "restore": delete.restore,
+    "purge": delete.purge,
+    "repair": repair.repair,
+    "migrate": repair.migrate,
 }
 
 
@@ -80,7 +80,7 @@ def _parser() -> argparse.ArgumentParser:
     shared.add_argument("--json", metavar="PATH", help="write the result there too; - for stdout")
     kind = argparse.ArgumentParser(add_help=False, parents=[shared])
     kind.add_argument("--kind", choices=("episode", "recording"), help="both when not given")
-    words = parser.add_subparsers(dest="word", required=True)
+    words = parser.add_subparsers(dest="command", required=True)
     words.add_parser("serve", help="answer over HTTP", add_help=False)
     listing = words.add_parser("list", parents=[kind], help="what is in the store")
     listing.add_argument("--task")

@@ -15,8 +15,8 @@ from services.episode_store.catalog import Catalog
 from services.episode_store.commit_process import CommitProcess
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import Intake
-from services.episode_store.ledger import UploadLedger
 from services.episode_store.metrics import StoreMetrics
+from services.episode_store.quotas import StationQuotas
 from services.episode_store.reading import StoreReader
 from services.episode_store.routes import (
     catalog_router,
@@ -97,12 +97,12 @@ def _intake(
     settings: EpisodeStoreSettings, store: EpisodeStore, ingest: Ingest, catalog: Catalog
 ) -> tuple[Intake, StoreMetrics]:
     reserve = DiskReserve(store.root, min_free_bytes=settings.min_free_bytes)
-    ledger = UploadLedger(
+    quotas = StationQuotas(
         ingest.folder,
         recordings=catalog.bytes_by_station,
         quota_bytes=settings.quota_bytes_per_station,
     )
-    metrics = StoreMetrics(open_uploads=lambda: ledger.num_open, free_bytes=reserve.free_bytes)
+    metrics = StoreMetrics(open_uploads=lambda: quotas.num_open, free_bytes=reserve.free_bytes)
     admission = Admission(
         max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
     )
@@ -110,7 +110,7 @@ def _intake(
         ingest,
         admission=admission,
         reserve=reserve,
-        ledger=ledger,
+        quotas=quotas,
         metrics=metrics,
         num_threads=settings.max_batches_in_flight,
     )

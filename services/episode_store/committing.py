@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from dextouch.episodes import EpisodeStore, WriteOptions
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.checks import ENCODED_UNITS
 

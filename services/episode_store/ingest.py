@@ -12,7 +12,7 @@ import structlog
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import check_id
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas.recordings import (
     ID_TAKEN,
@@ -22,8 +22,8 @@ from dextouch.schemas.recordings import (
     RecordingStatus,
 )
 from services.episode_store.committing import Commit, commit_spool
-from services.episode_store.ledger import idle_seconds
 from services.episode_store.locks import KeyedLocks
+from services.episode_store.quotas import idle_seconds
 from services.episode_store.upload import Upload
 
 logger = structlog.get_logger(__name__)

@@ -19,8 +19,8 @@ from dextouch.schemas.recordings import (
 from dextouch.streams.wire import MAX_BATCH_BYTES
 from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.ingest import Ingest
-from services.episode_store.ledger import UploadLedger
 from services.episode_store.metrics import StoreMetrics
+from services.episode_store.quotas import StationQuotas
 
 # What an upload's attributes and empty files may take.
 CREATE_BYTES = 1 << 16
@@ -33,7 +33,7 @@ class Intake:
         ingest: keeps what is let in.
         admission: bounds what is here at once.
         reserve: bounds what the disk takes.
-        ledger: bounds what a station may have.
+        quotas: limits what a station may store.
         metrics: told of everything.
         num_threads: that write batches; reading and finishing have others.
     """
@@ -44,12 +44,12 @@ class Intake:
         *,
         admission: Admission,
         reserve: DiskReserve,
-        ledger: UploadLedger,
+        quotas: StationQuotas,
         metrics: StoreMetrics,
         num_threads: int,
     ) -> None:
         self._ingest = ingest
-        self._admission, self._reserve, self._ledger = admission, reserve, ledger
+        self._admission, self._reserve, self._quotas = admission, reserve, quotas
         self._metrics = metrics
         self._threads = anyio.CapacityLimiter(num_threads)
 
@@ -57,10 +57,10 @@ class Intake:
         """Begin an upload, or say where it stands; raises as `Ingest.create` and when full."""
         with self._counting_refusals():
             self._reserve.check_upload(CREATE_BYTES)
-            self._ledger.check_station(attributes.station, CREATE_BYTES)
+            self._quotas.check_station(attributes.station, CREATE_BYTES)
         status = self._ingest.create(attributes)
         if status.state == "open":
-            self._ledger.begin(attributes)
+            self._quotas.begin(attributes)
         return status
 
     def status(self, recording_id: str) -> RecordingStatus:
@@ -100,29 +100,29 @@ class Intake:
         self._metrics.batches.labels(str(receipt.replayed).lower()).inc()
         if not receipt.replayed:
             self._metrics.bytes.inc(len(data))
-            self._ledger.add(recording_id, len(data))
+            self._quotas.add(recording_id, len(data))
         return receipt
 
     def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
         """Move a complete upload into the store; raises as `Ingest.finish` and when full."""
         started = time.perf_counter()
         with self._counting_refusals():
-            self._reserve.check_commit(self._ledger.bytes_of(recording_id))
+            self._reserve.check_commit(self._quotas.bytes_of(recording_id))
         status = self._ingest.finish(recording_id, body)
-        self._ledger.end(recording_id)
+        self._quotas.end(recording_id)
         self._metrics.finish_seconds.observe(time.perf_counter() - started)
         return status
 
     def idle(self, *, idle_s: float) -> UploadList:
         """Unfinished uploads for which nothing has come for so long."""
-        return self._ledger.idle(idle_s=idle_s)
+        return self._quotas.idle(idle_s=idle_s)
 
     def expire(self, wanted: ExpireUploads) -> UploadList:
         """Drop unfinished uploads for which nothing has come for so long; those that went."""
         gone = []
-        for upload in self._ledger.idle(idle_s=wanted.idle_s).uploads:
+        for upload in self._quotas.idle(idle_s=wanted.idle_s).uploads:
             if self._ingest.expire(upload.recording_id, idle_s=wanted.idle_s):
-                self._ledger.end(upload.recording_id)
+                self._quotas.end(upload.recording_id)
                 gone.append(upload)
         return UploadList(uploads=tuple(gone))
 
@@ -136,7 +136,7 @@ class Intake:
         try:
             with self._counting_refusals():
                 self._reserve.check_upload(num_bytes)
-                self._ledger.check_upload(recording_id, num_bytes)
+                self._quotas.check_upload(recording_id, num_bytes)
             yield
         finally:
             admission.__exit__(None, None, None)

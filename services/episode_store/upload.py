@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, UnknownNameError
 from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams.samples import SampleBatch

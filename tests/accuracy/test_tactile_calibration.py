@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS, expand_taxels, raw_indices, select_taxels

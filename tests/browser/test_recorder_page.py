@@ -5,7 +5,7 @@ from fastapi import FastAPI
 from fastapi.responses import JSONResponse
 from playwright.sync_api import expect
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.dashboard.app import create_app as create_dashboard
 from services.dashboard.settings import DashboardSettings
 

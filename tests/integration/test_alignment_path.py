@@ -5,7 +5,7 @@ import sys
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.replay import ReplayStream

@@ -10,7 +10,7 @@ import pytest
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.images.jpeg import decode_jpeg
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor

@@ -6,7 +6,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition import path_latency
 from services.acquisition.clock import RealClock

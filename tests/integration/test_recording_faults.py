@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.acquisition.clock import VirtualClock
 from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.clocks import fit_clock
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.tactile.layout import select_taxels
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript

@@ -7,7 +7,7 @@ import httpx
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.streams.packing import unpack
 from services.acquisition.app import create_app
 from services.acquisition.settings import AcquisitionSettings

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import LimitExceededError, StorageFullError
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dextouch.clients.episode_store import EpisodeStoreClient
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError
 from services.acquisition.app import create_app as create_station
 from services.acquisition.clock import VirtualClock

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.episodes import EpisodeStore, video
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from tests.system import take_source
 
 SAVED, SAVED_SECONDS = ("saved-0", "saved-1"), 0.6

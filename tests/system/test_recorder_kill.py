@@ -11,7 +11,7 @@ import pytest
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.acquisition.uploader import Uploader, recover_spool
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings

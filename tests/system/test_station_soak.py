@@ -15,7 +15,7 @@ import pytest
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
 from tests.unit.worlds.running import served

@@ -15,8 +15,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore, log
+from dextouch.episodes import EpisodeStore
 from dextouch.episodes.image_queue import MAX_WAITING_IMAGES
+from dextouch.episodes.spool import SpoolReader, recover
 from tests.system import take_source
 from tests.system.crash_child import (
     APPENDED,
@@ -307,7 +308,7 @@ def test_a_recovery_that_died_with_a_shard_back_in_the_log(
     assert not victims.run(**commit_order(tmp_path / "store", counters_path, late))
     store = EpisodeStore(tmp_path / "store")
     with monkeypatch.context() as patch:
-        patch.setattr("dextouch.episodes.stage_recovery.shutil.rmtree", killed)
+        patch.setattr("dextouch.episodes.staging_recovery.shutil.rmtree", killed)
         with pytest.raises(KilledHereError):
             store.recover()
     check_flight(store, counters, expected)
@@ -324,8 +325,8 @@ def kill_spool(victims, root, counters_path, jpegs, delay_s):
         mode="spool", root=str(root), counters=str(counters_path), seed=SEED,
         seconds=60.0, kill_after_s=delay_s,
     )  # fmt: skip
-    counts = log.recover(root / FLIGHT).num_samples
-    spool = log.SpoolReader(root / FLIGHT)
+    counts = recover(root / FLIGHT).num_samples
+    spool = SpoolReader(root / FLIGHT)
     for name in STREAM_NAMES:
         acknowledged, count = counters.get(APPENDED, name), counts[name]
         # A block goes to the log in one write, so a kill does not part it either.

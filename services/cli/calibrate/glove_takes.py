@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dextouch.episodes import EpisodeStore, RecordingReader
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.streams.samples import SampleBatch
 from services.alignment.calibration.tactile_gain import TaxelPress

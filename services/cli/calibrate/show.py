@@ -8,7 +8,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from dextouch.episodes.log import read_attributes
+from dextouch.episodes.spool import read_attributes
 from dextouch.schemas.episodes import Matrix
 from services.cli.calibrate.record import Finding, judge, read_matrices
 

@@ -29,8 +29,8 @@ from services.cli.demo.recording import (
     upload,
 )
 from services.cli.demo.settings import DemoPlan, parse
-from services.cli.demo.stages import Stages
 from services.cli.demo.table import show
+from services.cli.demo.timing import Stages
 from services.cli.demo.truth import Truth, make_truth
 from services.evaluation.reporting import write_report
 

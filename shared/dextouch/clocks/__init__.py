@@ -2,11 +2,11 @@
 
 from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock, lateness_ns
 from dextouch.clocks.counters import TickCounter
-from dextouch.clocks.look_ahead import (
+from dextouch.clocks.counting_clock import (
     CountedSample,
     CountedTake,
-    LookAheadClock,
-    LookAheadUpdate,
+    CountingClock,
+    CountingUpdate,
     date_by_counting,
 )
 from dextouch.clocks.online_clock import OnlineClock
@@ -25,9 +25,9 @@ __all__ = [
     "ClockSegment",
     "CountedSample",
     "CountedTake",
+    "CountingClock",
+    "CountingUpdate",
     "KnownSkew",
-    "LookAheadClock",
-    "LookAheadUpdate",
     "OnlineClock",
     "PathLatency",
     "RoundTrip",

@@ -14,7 +14,7 @@ class OnlineClock:
     The line under the (device time, apparent offset) points of the last minute, as in
     `fit_clock`, but looking back only (`RunningEnvelope`). Without device time, or where it is
     very coarse, the sequence number times the nominal period is the device's clock; without
-    either the arrival itself is returned (`LookAheadClock` dates such samples better, a little
+    either the arrival itself is returned (`CountingClock` dates such samples better, a little
     later).
 
     Args:

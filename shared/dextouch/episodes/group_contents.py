@@ -28,7 +28,7 @@ from dextouch.episodes.format import (
 from dextouch.episodes.journal import journal_path, part_path, read_rows
 from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
-from dextouch.episodes.stage import read_stage
+from dextouch.episodes.staged_group import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
 from dextouch.schemas.episodes import EpisodeAttributes, Verification
 from dextouch.schemas.recordings import RecordingAttributes

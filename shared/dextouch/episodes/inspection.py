@@ -13,7 +13,6 @@ from pathlib import Path
 import google_crc32c
 import numpy as np
 
-from dextouch.episodes.batch_log import body_at, find_records, open_log
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     COMMIT_FILE,
@@ -30,8 +29,9 @@ from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.episodes.journal import journal_path, part_path, read_payloads, read_rows
 from dextouch.episodes.shard_reader import decode_rows
 from dextouch.episodes.sources import GroupFiles, LocalGroup
+from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
-from dextouch.episodes.stage import kind_of, read_stage
+from dextouch.episodes.staged_group import kind_of, read_stage
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.images.jpeg import jpeg_size
 from dextouch.schemas.episodes import EpisodeAttributes

@@ -11,15 +11,15 @@ from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
 from dextouch.episodes.format import COMMIT_FILE, Kind
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.sources import LocalGroup
-from dextouch.episodes.stage import Attributes, attributes_id
-from dextouch.episodes.stage_recovery import (
+from dextouch.episodes.staged_group import Attributes, attributes_id
+from dextouch.episodes.staging import STAGING, abandoned_stages, new_stage, sweep_stages
+from dextouch.episodes.staging_recovery import (
     RecoveredGroup,
     ids_below,
     raise_first,
     recover_all,
     recover_stage,
 )
-from dextouch.episodes.staging import STAGING, abandoned_stages, new_stage, sweep_stages
 from dextouch.episodes.trash import put_into_trash, remove_for_good
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter

@@ -14,15 +14,15 @@ from dextouch.episodes.migration import is_current
 from dextouch.episodes.object_address import ObjectAddress, parse_address
 from dextouch.episodes.object_bucket import Bucket
 from dextouch.episodes.object_files import CachedBucket, ObjectGroup
-from dextouch.episodes.stage import Attributes, attributes_id, read_committed, write_stage
-from dextouch.episodes.stage_recovery import (
+from dextouch.episodes.staged_group import Attributes, attributes_id, read_committed, write_stage
+from dextouch.episodes.staging import abandoned_stages, new_stage, sweep_stages, unheld_folders
+from dextouch.episodes.staging_recovery import (
     RecoveredGroup,
     raise_first,
     recover_all,
     recover_stage,
     samples_of,
 )
-from dextouch.episodes.staging import abandoned_stages, new_stage, sweep_stages, unheld_folders
 from dextouch.episodes.uploads import delete_group, group_key, sweep_orphans, upload_group
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter

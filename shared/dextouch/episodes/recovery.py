@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes.batch_log import LOG_FILE, BatchLogWriter, body_at, open_log, read_records
+from dextouch.episodes.spool_log import LOG_FILE, BatchLogWriter, body_at, open_log, read_records
 from dextouch.episodes.spool_reader import read_attributes
 from dextouch.errors import ConflictError
 

@@ -44,9 +44,9 @@ from dextouch.episodes.salvage import (
 )
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_reader import read_attributes
-from dextouch.episodes.stage import Attributes, attributes_id, kind_of, read_stage
-from dextouch.episodes.stage_recovery import recover_stage
+from dextouch.episodes.staged_group import Attributes, attributes_id, kind_of, read_stage
 from dextouch.episodes.staging import unheld_folders
+from dextouch.episodes.staging_recovery import recover_stage
 from dextouch.episodes.trash import TrashKind, put_into_trash
 from dextouch.errors import (
     ConflictError,

@@ -13,7 +13,6 @@ import google_crc32c
 import numpy as np
 
 from dextouch.episodes.batch_bytes import batch_of_bytes
-from dextouch.episodes.batch_log import body_at, find_records, open_log, read_bodies
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     GOP_IMAGES,
@@ -31,7 +30,8 @@ from dextouch.episodes.journal import JOURNAL_MAGIC, JOURNAL_ROW, journal_path, 
 from dextouch.episodes.shard_index import salvaged_index
 from dextouch.episodes.shard_reader import ShardReader, decode_rows
 from dextouch.episodes.sources import LocalFile
-from dextouch.episodes.stage import Attributes, attributes_id, kind_of
+from dextouch.episodes.spool_log import body_at, find_records, open_log, read_bodies
+from dextouch.episodes.staged_group import Attributes, attributes_id, kind_of
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError

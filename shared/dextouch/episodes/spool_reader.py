@@ -7,8 +7,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from dextouch.episodes.batch_bytes import batch_of_bytes
-from dextouch.episodes.batch_log import read_bodies, read_records
 from dextouch.episodes.files import disk_errors
+from dextouch.episodes.spool_log import read_bodies, read_records
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.samples import SampleBatch

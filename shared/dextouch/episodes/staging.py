@@ -9,7 +9,7 @@ from pathlib import Path
 
 from dextouch.episodes.files import is_folder_at
 from dextouch.episodes.format import Kind
-from dextouch.episodes.stage_recovery import IsTaken, is_recoverable
+from dextouch.episodes.staging_recovery import IsTaken, is_recoverable
 
 STAGING = ".staging"
 # Names of stages end in a uuid4 in hexadecimal.

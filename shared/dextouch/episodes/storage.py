@@ -6,8 +6,8 @@ from typing import Protocol, runtime_checkable
 
 from dextouch.episodes.format import Kind
 from dextouch.episodes.sources import GroupFiles
-from dextouch.episodes.stage import Attributes
-from dextouch.episodes.stage_recovery import RecoveredGroup
+from dextouch.episodes.staged_group import Attributes
+from dextouch.episodes.staging_recovery import RecoveredGroup
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 

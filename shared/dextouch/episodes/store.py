@@ -8,9 +8,9 @@ from dextouch.episodes.group_contents import read_group, read_live
 from dextouch.episodes.local_storage import LocalStorage, local_folder
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.sources import GroupFiles
-from dextouch.episodes.stage import Attributes, attributes_id
-from dextouch.episodes.stage_recovery import RecoveredGroup
+from dextouch.episodes.staged_group import Attributes, attributes_id
 from dextouch.episodes.staging import stages_of
+from dextouch.episodes.staging_recovery import RecoveredGroup
 from dextouch.episodes.storage import Storage
 from dextouch.episodes.trash import (
     TrashEntry,

@@ -14,7 +14,7 @@ from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
 from dextouch.episodes.inspection import STAGING, UPLOADS
 from dextouch.episodes.spool_reader import RECORDING_FILE
-from dextouch.episodes.stage import STAGE_FILE
+from dextouch.episodes.staged_group import STAGE_FILE
 from dextouch.episodes.trash import TRASH
 
 # Where things lie, and the kind of group that lies there.

@@ -10,14 +10,14 @@ import numpy as np
 
 from dextouch.episodes.files import disk_errors, make_held_folder
 from dextouch.episodes.format import STAMPS, stream_arrays
-from dextouch.episodes.stage import (
+from dextouch.episodes.staged_group import (
     Attributes,
     attributes_id,
     commit_stage,
     kind_of,
     write_stage,
 )
-from dextouch.episodes.stage_recovery import RecoveredGroup, recover_stage
+from dextouch.episodes.staging_recovery import RecoveredGroup, recover_stage
 from dextouch.episodes.stream_writer import StreamWriter
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import (

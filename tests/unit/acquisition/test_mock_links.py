@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
 from services.acquisition.app import create_app
 from services.acquisition.clock import RealClock, VirtualClock

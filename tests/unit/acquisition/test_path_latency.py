@@ -6,7 +6,7 @@ from prometheus_client import CollectorRegistry, generate_latest
 from structlog.testing import capture_logs
 
 from dextouch.clocks import PathLatency, RoundTrip
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import RealClock, VirtualClock

@@ -6,7 +6,7 @@ import weakref
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import VirtualClock

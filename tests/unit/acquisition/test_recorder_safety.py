@@ -9,7 +9,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, StorageFullError
 from dextouch.streams.samples import Sample
 from services.acquisition import supervisor

@@ -5,7 +5,7 @@ import shutil
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, StorageFullError, UnavailableError
 from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
 from dextouch.streams.descriptors import StreamDescriptor

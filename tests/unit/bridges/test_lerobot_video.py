@@ -8,7 +8,6 @@ import pytest
 
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
 from dextouch.bridges.lerobot.exporting import stored_units
-from dextouch.bridges.lerobot.frames import frames_of
 from dextouch.bridges.lerobot.h264 import (
     decode_entry_points,
     encode_images,
@@ -17,6 +16,7 @@ from dextouch.bridges.lerobot.h264 import (
     nal_units,
     parameter_sets,
 )
+from dextouch.bridges.lerobot.rows import frames_of
 from dextouch.bridges.lerobot.video import CameraVideo
 from dextouch.bridges.lerobot.video_reader import VideoSpan, read_images, read_units
 from dextouch.episodes import EpisodeStore

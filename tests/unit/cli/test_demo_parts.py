@@ -10,7 +10,7 @@ from fastapi import FastAPI
 
 from dextouch.clients.policy import PolicyStart
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
 from dextouch.schemas.episodes import LineageEntry
 from services.cli.demo.background import served
@@ -18,8 +18,8 @@ from services.cli.demo.command import worst_errors
 from services.cli.demo.judging import ladder
 from services.cli.demo.recording import forget_take
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
-from services.cli.demo.stages import Stages
 from services.cli.demo.table import rate, show
+from services.cli.demo.timing import Stages
 from tests.unit.bridges.takes import write_episode, write_recording
 from tests.unit.worlds.fakes import anchor, observation
 

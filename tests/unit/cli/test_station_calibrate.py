@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,

@@ -18,8 +18,8 @@ from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.app import create_app
 from services.episode_store.ingest import Ingest
 from services.episode_store.intake import CREATE_BYTES
-from services.episode_store.ledger import UploadLedger
 from services.episode_store.locks import KeyedLocks
+from services.episode_store.quotas import StationQuotas
 
 PATH = "/v1/recordings/take-1/streams/glove_left/batches/0"
 
@@ -192,10 +192,10 @@ def test_a_station_keeps_to_its_quota(start, attributes, batch_of, settings):
     client.create(attributes.model_copy(update={"recording_id": "take-2", "station": "other"}))
     send("take-2", 0)
     store = EpisodeStore(settings.store_url)
-    ledger = UploadLedger(store.root / ".uploads", recordings=dict, quota_bytes=quota)
+    quotas = StationQuotas(store.root / ".uploads", recordings=dict, quota_bytes=quota)
     with pytest.raises(StorageFullError):
-        ledger.check_upload("take-1", 45_000)
-    ledger.check_upload("take-2", 45_000)
+        quotas.check_upload("take-1", 45_000)
+    quotas.check_upload("take-2", 45_000)
     # Finished recordings count, too, until they are deleted.
     client.finish("take-1", {"glove_left": 4, "wrist_left": 0})
     used = client.recordings(station="bench").recordings[0].num_bytes

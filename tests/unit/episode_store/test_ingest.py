@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolReader, SpoolWriter
+from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
     ConflictError,
     InvalidInputError,

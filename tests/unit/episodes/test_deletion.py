@@ -8,8 +8,8 @@ import pytest
 
 from dextouch.episodes import deletion
 from dextouch.episodes.deletion import DeletionRequest, delete_for_good, plan_deletion
-from dextouch.episodes.log import SpoolWriter
 from dextouch.episodes.repair import repair_group
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.schemas.episodes import LineageEntry

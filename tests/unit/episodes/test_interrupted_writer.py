@@ -11,7 +11,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore, WriteOptions, stage
+from dextouch.episodes import EpisodeStore, WriteOptions, staged_group
 from dextouch.episodes.journal import JournalWriter
 from dextouch.episodes.shard_writer import ShardWriter
 from dextouch.errors import (
@@ -318,16 +318,16 @@ def test_an_id_that_is_taken_at_the_last_moment_costs_nothing(store, monkeypatch
     late, first = (store.writer(kind="recording", attributes=take(FORCE)) for _ in range(2))
     record(late, 0, 17)
     record(first, 0, 4)
-    forget = stage.forget_journal
+    forget = staged_group.forget_journal
 
     def commit_first(*arguments):
-        monkeypatch.setattr(stage, "forget_journal", forget)
+        monkeypatch.setattr(staged_group, "forget_journal", forget)
         first.__exit__(None, None, None)
         forget(*arguments)
 
     if how == "was killed":
         _die_before_its_move(late, monkeypatch)
-    monkeypatch.setattr(stage, "forget_journal", commit_first)
+    monkeypatch.setattr(staged_group, "forget_journal", commit_first)
     end = store.recover if how == "was killed" else lambda: late.__exit__(None, None, None)
     with pytest.raises(ConflictError, match="exists already"):
         end()
@@ -341,7 +341,7 @@ def test_an_id_that_is_taken_at_the_last_moment_costs_nothing(store, monkeypatch
 def _die_before_its_move(writer, monkeypatch):
     """As a kill would, once the commit record is written."""
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "publish_stage", lambda *_: None)
+        patch.setattr(staged_group, "publish_stage", lambda *_: None)
         writer._commit()
     os.close(writer._lock)
 
@@ -363,7 +363,7 @@ def test_the_attributes_of_a_whole_take_are_those_of_its_end(store, monkeypatch)
 @pytest.mark.parametrize("file", ["zarr.json", "commit.json"])
 def test_a_recovery_that_dies_while_it_changes_the_id_is_repeated(store, monkeypatch, file):
     """Even where the first id is free again by then."""
-    real = stage.replace_file
+    real = staged_group.replace_file
 
     def die(path, data):
         if path.name == file:
@@ -376,7 +376,7 @@ def test_a_recovery_that_dies_while_it_changes_the_id_is_repeated(store, monkeyp
     with first:
         record(first, 0, 4)
     with monkeypatch.context() as patch:
-        patch.setattr(stage, "replace_file", die)
+        patch.setattr(staged_group, "replace_file", die)
         with pytest.raises(KeyboardInterrupt):
             store.recover()
     store.delete("take-1", kind="recording")

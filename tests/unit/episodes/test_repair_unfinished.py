@@ -5,10 +5,10 @@ import shutil
 import numpy as np
 import pytest
 
-from dextouch.episodes.batch_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
 from dextouch.episodes.inspection import inspect_stage, inspect_upload
-from dextouch.episodes.log import SpoolWriter
 from dextouch.episodes.repair import repair_unfinished
+from dextouch.episodes.spool import SpoolWriter
+from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
 from dextouch.episodes.video import GopEncoder, VideoSettings
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import CorruptDataError

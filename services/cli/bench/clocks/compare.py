@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from dextouch.clocks import LookAheadClock, OnlineClock, date_by_counting
+from dextouch.clocks import CountingClock, OnlineClock, date_by_counting
 from services.cli.bench.clocks.rivals import OFFLINE, ONLINE, descriptor
 from services.cli.bench.clocks.scenes import STAMPLESS_SCENES, Scene, Take, simulate
 from services.cli.bench.clocks.scores import Score, score
@@ -110,7 +110,7 @@ def _counted(take: Take) -> np.ndarray:
 
 
 def _provisional(take: Take) -> np.ndarray:
-    clock = LookAheadClock(descriptor(take.scene).period_ns())
+    clock = CountingClock(descriptor(take.scene).period_ns())
     return np.array([clock.update(host).provisional_ns for host in take.t_host_ns.tolist()])
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.samples import NO_DEVICE_TIME, SampleBatch
 from services.cli.bench.figures import Figure

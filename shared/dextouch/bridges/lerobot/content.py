@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.frames import WORLD
 from dextouch.bridges.lerobot.mapping import FeatureMap
+from dextouch.bridges.lerobot.rows import WORLD
 from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
 from dextouch.bridges.lerobot.video_reader import VideoSpan

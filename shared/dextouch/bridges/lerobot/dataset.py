@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dextouch.bridges.lerobot import layout
-from dextouch.bridges.lerobot.frames import EpisodeFrames
+from dextouch.bridges.lerobot.rows import EpisodeFrames
 from dextouch.bridges.lerobot.sidecar import Sidecar, write_sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, combine, value_statistics
 from dextouch.bridges.lerobot.tables import DataFiles, EpisodeRows, write_tasks

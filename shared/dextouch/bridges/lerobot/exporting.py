@@ -11,13 +11,13 @@ from typing import Literal
 import numpy as np
 
 from dextouch.bridges.lerobot.dataset import DatasetWriter
-from dextouch.bridges.lerobot.frames import frames_of, images_at
 from dextouch.bridges.lerobot.h264 import (
     decode_entry_points,
     encode_images,
     is_entry_point,
 )
 from dextouch.bridges.lerobot.layout import IMAGES
+from dextouch.bridges.lerobot.rows import frames_of, images_at
 from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
 from dextouch.episodes import EpisodeReader

@@ -6,8 +6,8 @@ from typing import Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from dextouch.bridges.lerobot.frames import Grid
 from dextouch.bridges.lerobot.layout import SIDECAR_PATH, confined, fill_path
+from dextouch.bridges.lerobot.rows import Grid
 from dextouch.episodes.files import disk_errors
 from dextouch.errors import CorruptDataError
 from dextouch.schemas.episodes import EpisodeAttributes

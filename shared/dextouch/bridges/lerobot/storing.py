@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.content import CameraContent, EpisodeContent
-from dextouch.bridges.lerobot.frames import BLOCK_IMAGES
 from dextouch.bridges.lerobot.h264 import holds_idr
+from dextouch.bridges.lerobot.rows import BLOCK_IMAGES
 from dextouch.bridges.lerobot.video_reader import read_images, read_units
 from dextouch.episodes import EpisodeStore, EpisodeWriter
 from dextouch.episodes.format import GOP_IMAGES

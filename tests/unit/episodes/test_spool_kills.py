@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from dextouch.episodes import log
+from dextouch.episodes import spool
 from tests.unit.episodes.spooled_batches import ATTRIBUTES, assert_same, glove_batch
 
 CHILD = """
 import sys
 from pathlib import Path
 import numpy as np
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.samples import SampleBatch
 
@@ -51,9 +51,9 @@ def check_kills(folder: Path, count: int, seed: int):
     for trial in range(count):
         path = folder / f"take-{trial}"
         acknowledged = kill_in_the_middle(path, rng.randint(1, 200))
-        count = log.recover(path).num_samples["glove_left"]
+        count = spool.recover(path).num_samples["glove_left"]
         assert acknowledged <= count <= acknowledged + 1
-        got = log.SpoolReader(path).read("glove_left")
+        got = spool.SpoolReader(path).read("glove_left")
         assert_same(got, glove_batch(0, count))
 
 

@@ -7,7 +7,7 @@ from dextouch.episodes.format import Kind
 from dextouch.episodes.repair import LEFT, RepairReport, repair_group, repair_unfinished
 from dextouch.episodes.sources import GroupFiles
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
-from services.episode_store.words.context import EXIT_DAMAGED, Context, Outcome
+from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome
 
 
 def repair(context: Context) -> Outcome:

@@ -8,7 +8,7 @@ from pathlib import Path
 from dextouch.episodes.deletion import DeletionRequest, delete_for_good, plan_deletion
 from dextouch.episodes.trash import TrashKind
 from dextouch.errors import InvalidInputError
-from services.episode_store.words.context import EXIT_DAMAGED, Context, Outcome, readable_size
+from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome, readable_size
 
 
 def delete(context: Context) -> Outcome:

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.log import SpoolWriter
+from dextouch.episodes.spool import SpoolWriter
 from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from services.episode_store import __main__ as command_line
-from services.episode_store.words.context import readable_size, seconds_of, table
+from services.episode_store.commands.context import readable_size, seconds_of, table
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
 FORCE = StreamDescriptor(

@@ -92,7 +92,7 @@ class Context:
         root = self.local_root()
         if root is None:
             raise InvalidInputError(
-                f"{self.options.word}: got the store {self.url}, expected one in a folder; copy "
+                f"{self.options.command}: got the store {self.url}, expected one in a folder; copy "
                 "it to a folder first, or use the versions of the bucket"
             )
         return root

@@ -42,14 +42,14 @@ class CountedSample(NamedTuple):
     t_host_ns: int
 
 
-class LookAheadUpdate(NamedTuple):
+class CountingUpdate(NamedTuple):
     """What an arrival brings: its own provisional time, and final ones of older samples."""
 
     provisional_ns: int
     final: tuple[CountedSample, ...]
 
 
-class LookAheadClock:
+class CountingClock:
     """Dates the samples of a steady device that sends neither time nor sequence numbers.
 
     Final times come `look_ahead` samples later, or once a queue has drained; a provisional one
@@ -63,7 +63,7 @@ class LookAheadClock:
     def __init__(self, period_ns: int, *, look_ahead: int = LOOK_AHEAD) -> None:
         if period_ns < 1 or look_ahead < 1:
             raise InvalidInputError(
-                f"look-ahead clock: got a period of {period_ns} ns and {look_ahead} samples, "
+                f"counting clock: got a period of {period_ns} ns and {look_ahead} samples, "
                 "expected at least 1 each"
             )
         self._period_ns = period_ns
@@ -101,14 +101,14 @@ class LookAheadClock:
             and self.num_steps <= MAX_STEPS_PER_SAMPLE * num_arrived
         )
 
-    def update(self, t_host_ns: int) -> LookAheadUpdate:
+    def update(self, t_host_ns: int) -> CountingUpdate:
         """Take in one arrival on the host's monotonic clock.
 
         Raises:
             InvalidInputError: it lies before the one before.
         """
         final = self.advance(t_host_ns)
-        return LookAheadUpdate(self._provisional_ns(t_host_ns), final)
+        return CountingUpdate(self._provisional_ns(t_host_ns), final)
 
     def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
         """As `update`, for those who need final times only.
@@ -118,7 +118,7 @@ class LookAheadClock:
         """
         if self._waiting and t_host_ns < self._waiting[-1]:
             raise InvalidInputError(
-                f"look-ahead clock: got an arrival at {t_host_ns} ns after one at "
+                f"counting clock: got an arrival at {t_host_ns} ns after one at "
                 f"{self._waiting[-1]} ns, expected the order of arrival"
             )
         if self._start_ns is None:
@@ -224,7 +224,7 @@ def date_by_counting(
     Raises:
         InvalidInputError: arrivals out of order.
     """
-    clock = LookAheadClock(period_ns, look_ahead=look_ahead)
+    clock = CountingClock(period_ns, look_ahead=look_ahead)
     counted: list[CountedSample] = []
     for arrival_ns in np.asarray(t_host_ns, dtype=np.int64).tolist():
         counted.extend(clock.advance(arrival_ns))

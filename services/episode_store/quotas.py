@@ -9,7 +9,7 @@ from pathlib import Path
 import structlog
 
 from dextouch.episodes.files import disk_errors, folder_bytes
-from dextouch.episodes.log import read_attributes
+from dextouch.episodes.spool import read_attributes
 from dextouch.errors import NotFoundError, StorageError, StorageFullError
 from dextouch.schemas.recordings import RecordingAttributes, UploadList, UploadSummary
 from services.episode_store.admission import FULL_RETRY_S
@@ -26,7 +26,7 @@ class _Account:
     num_bytes: int
 
 
-class UploadLedger:
+class StationQuotas:
     """What unfinished uploads take, by station. Thread-safe.
 
     Args:

@@ -11,9 +11,9 @@ from pathlib import Path
 from types import TracebackType
 
 from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
-from dextouch.episodes.batch_log import BatchLogWriter, RecordBody, read_bodies, read_records
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
 from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
+from dextouch.episodes.spool_log import BatchLogWriter, RecordBody, read_bodies, read_records
 from dextouch.episodes.spool_reader import (
     CLOSED_FILE,
     RECORDING_FILE,

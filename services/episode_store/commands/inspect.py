@@ -25,7 +25,7 @@ from dextouch.episodes.inspection import (
     unfinished,
 )
 from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.stage import (
+from dextouch.episodes.staged_group import (
     STAGE_FILE,
     Attributes,
     attributes_id,
@@ -36,7 +36,7 @@ from dextouch.errors import InvalidInputError, NotFoundError, StorageError
 from dextouch.schemas.episodes import EpisodeSummary, json_ready
 from dextouch.schemas.recordings import RecordingSummary
 from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
-from services.episode_store.words.context import (
+from services.episode_store.commands.context import (
     EXIT_DAMAGED,
     Context,
     Outcome,

@@ -31,7 +31,7 @@ from dextouch.episodes.journal import (
 )
 from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows
 from dextouch.episodes.shard_writer import finish_shard
-from dextouch.episodes.stage import (
+from dextouch.episodes.staged_group import (
     STAGE_FILE,
     Attributes,
     attributes_id,

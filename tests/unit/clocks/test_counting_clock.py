@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dextouch.clocks import LookAheadClock, date_by_counting
-from dextouch.clocks.look_ahead import LOOK_AHEAD
+from dextouch.clocks import CountingClock, date_by_counting
+from dextouch.clocks.counting_clock import LOOK_AHEAD
 from dextouch.errors import InvalidInputError
 
 PERIOD_NS = 10_000_000
@@ -18,7 +18,7 @@ def arrivals(numbers, late=()):
 
 
 def test_final_times_come_ten_samples_later_and_in_order():
-    clock = LookAheadClock(PERIOD_NS)
+    clock = CountingClock(PERIOD_NS)
     final = []
     for k, arrival_ns in enumerate(arrivals(range(100)).tolist()):
         final.extend(clock.update(arrival_ns).final)
@@ -47,7 +47,7 @@ def test_a_draining_queue_is_waited_for():
 
 
 def test_provisional_times_take_out_short_delays():
-    clock = LookAheadClock(PERIOD_NS)
+    clock = CountingClock(PERIOD_NS)
     times_ns = arrivals(range(100), [(60, 6_000_000)])
     provisional = [clock.update(t).provisional_ns for t in times_ns.tolist()]
     np.testing.assert_allclose(provisional, arrivals(range(100)), atol=1000)
@@ -55,9 +55,9 @@ def test_provisional_times_take_out_short_delays():
 
 
 def test_arrivals_out_of_order_are_refused():
-    clock = LookAheadClock(PERIOD_NS)
+    clock = CountingClock(PERIOD_NS)
     clock.update(100)
     with pytest.raises(InvalidInputError, match="order of arrival"):
         clock.update(99)
     with pytest.raises(InvalidInputError, match="period"):
-        LookAheadClock(0)
+        CountingClock(0)

@@ -8,8 +8,8 @@ import google_crc32c
 import numpy as np
 import pytest
 
-from dextouch.episodes import log
-from dextouch.episodes.batch_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
+from dextouch.episodes import spool
+from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
@@ -37,7 +37,7 @@ def path(tmp_path):
 
 
 def fill(path, count=10):
-    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         for first in range(count):
             writer.append("glove_left", glove_batch(first))
         writer.append("camera_head", camera_batch(0, 3))
@@ -46,7 +46,7 @@ def fill(path, count=10):
 
 def test_batches_come_back_and_are_the_same_whoever_cuts_them(path):
     fill(path)
-    reader = log.SpoolReader(path)
+    reader = spool.SpoolReader(path)
     assert reader.attributes == ATTRIBUTES
     assert reader.closed
     assert_same(reader.read("glove_left"), glove_batch(0, 10))
@@ -74,51 +74,51 @@ def record(place, batch, *, first_sample, stream=0):
 
 @pytest.mark.parametrize("first_sample", [0, 1, 2, 3, 2**63])
 def test_a_log_written_by_hand_is_read_if_its_samples_follow_each_other(path, first_sample):
-    log.SpoolWriter(path, ATTRIBUTES).close()
+    spool.SpoolWriter(path, ATTRIBUTES).close()
     data = b"DXTBLOG\x01"
     data += record(len(data), glove_batch(0, 2), first_sample=0)
     data += record(len(data), glove_batch(2, 3), first_sample=first_sample)
     (path / LOG_FILE).write_bytes(data)
     if first_sample == 2:
-        assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
+        assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 5))
         return
-    for read in (lambda: log.SpoolReader(path).read("glove_left"), lambda: log.recover(path)):
+    for read in (lambda: spool.SpoolReader(path).read("glove_left"), lambda: spool.recover(path)):
         with pytest.raises(CorruptDataError, match="stream number 0 do not follow each other"):
             read()
 
 
 def test_a_living_spool_shows_full_batches_only(path):
-    writer = log.SpoolWriter(path, ATTRIBUTES)
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
     writer.append("glove_left", glove_batch(0, 6))
-    reader = log.SpoolReader(path)
+    reader = spool.SpoolReader(path)
     assert not reader.closed
     assert [len(b) for b in reader.batches("glove_left", num_samples=4)] == [4]
     with pytest.raises(ConflictError, match="another process"):
-        log.recover(path)
+        spool.recover(path)
     writer.close()
     writer.close()
 
 
 def test_resume_goes_on_where_it_stopped(path):
     fill(path)
-    with log.SpoolWriter.resume(path) as writer:
+    with spool.SpoolWriter.resume(path) as writer:
         assert not (path / "closed").exists()
         assert writer.num_samples("glove_left") == 10
         with pytest.raises(InvalidInputError, match="goes back"):
             writer.append("glove_left", glove_batch(8))
         writer.append("glove_left", glove_batch(10, 2))
         assert (writer.num_samples("glove_left"), writer.num_batches("glove_left")) == (12, 11)
-    reader = log.SpoolReader(path)
+    reader = spool.SpoolReader(path)
     assert_same(reader.read("glove_left"), glove_batch(0, 12))
     assert_same(reader.read("camera_head"), camera_batch(0, 3))
 
 
 def test_samples_come_back_by_place_and_by_append(path):
-    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         for first, count in ((0, 3), (3, 1), (4, 5)):
             writer.append("glove_left", glove_batch(first, count))
             writer.append("camera_head", camera_batch(first, count))
-    reader = log.SpoolReader(path)
+    reader = spool.SpoolReader(path)
     for start in range(10):
         for stop in range(start, 10):
             assert_same(reader.read("glove_left", start, stop), glove_batch(start, stop - start))
@@ -137,7 +137,7 @@ GLOVE_RECORD = HEADER_BYTES + GLOVE_BODY
 @pytest.fixture
 def gloves(path):
     """A spool whose log is ten records of the same length."""
-    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         for first in range(10):
             writer.append("glove_left", glove_batch(first))
     assert (path / LOG_FILE).stat().st_size == len(LOG_MAGIC) + 10 * GLOVE_RECORD
@@ -148,12 +148,12 @@ def test_torn_ends_are_cut_and_counted(path):
     fill(path)
     with (path / LOG_FILE).open("ab") as file:
         file.write(b"\x01" * 1234)
-    assert log.SpoolReader(path).num_samples("glove_left") == 10
-    report = log.recover(path)
+    assert spool.SpoolReader(path).num_samples("glove_left") == 10
+    report = spool.recover(path)
     assert report.num_samples == {"glove_left": 10, "camera_head": 3}
     assert report.dropped_bytes == 1234
-    assert log.recover(path).dropped_bytes == 0
-    assert_same(log.SpoolReader(path).read("camera_head"), camera_batch(0, 3))
+    assert spool.recover(path).dropped_bytes == 0
+    assert_same(spool.SpoolReader(path).read("camera_head"), camera_batch(0, 3))
 
 
 @pytest.mark.parametrize("lost_bytes", [1, 20, 720, GLOVE_RECORD - 1, GLOVE_RECORD, 3000, 7800])
@@ -162,22 +162,22 @@ def test_a_log_cut_off_anywhere_ends_with_its_last_whole_record(gloves, lost_byt
     whole = file.read_bytes()
     file.write_bytes(whole[:-lost_bytes])
     expected = max(0, 10 * GLOVE_RECORD - lost_bytes) // GLOVE_RECORD
-    assert log.recover(gloves).num_samples["glove_left"] == expected
-    assert_same(log.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected))
-    with log.SpoolWriter.resume(gloves) as writer:
+    assert spool.recover(gloves).num_samples["glove_left"] == expected
+    assert_same(spool.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected))
+    with spool.SpoolWriter.resume(gloves) as writer:
         writer.append("glove_left", glove_batch(expected))
     assert (
         file.read_bytes()[: len(LOG_MAGIC) + expected * GLOVE_RECORD]
         == (whole[: len(LOG_MAGIC) + expected * GLOVE_RECORD])
     )
-    assert_same(log.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected + 1))
+    assert_same(spool.SpoolReader(gloves).read("glove_left"), glove_batch(0, expected + 1))
 
 
 def test_zeroed_bytes_at_the_end_are_dropped(gloves):
     # Power loss: the length of the file reached the disk, its last bytes did not.
     file = gloves / LOG_FILE
     file.write_bytes(file.read_bytes()[:-1000] + bytes(1000))
-    report = log.recover(gloves)
+    report = spool.recover(gloves)
     assert report.num_samples["glove_left"] == 8
     assert report.dropped_bytes == 2 * GLOVE_RECORD
 
@@ -189,10 +189,10 @@ def test_a_damaged_header_in_the_middle_is_refused_and_changes_nothing(gloves, p
     whole[len(LOG_MAGIC) + 3 * GLOVE_RECORD + place] ^= 1
     file.write_bytes(whole)
     with pytest.raises(CorruptDataError, match="no record, yet whole ones follow"):
-        log.recover(gloves)
+        spool.recover(gloves)
     assert file.read_bytes() == bytes(whole)
     with pytest.raises(CorruptDataError, match="restore the file"):
-        log.SpoolReader(gloves).num_samples("glove_left")
+        spool.SpoolReader(gloves).num_samples("glove_left")
 
 
 def test_a_record_that_is_missing_is_refused(gloves):
@@ -201,10 +201,10 @@ def test_a_record_that_is_missing_is_refused(gloves):
     start = len(LOG_MAGIC) + 3 * GLOVE_RECORD
     file.write_bytes(whole[:start] + whole[start + GLOVE_RECORD :])
     # Every record behind lies where it does not say; none holds.
-    assert log.SpoolReader(gloves).num_samples("glove_left") == 3
+    assert spool.SpoolReader(gloves).num_samples("glove_left") == 3
     file.write_bytes(whole[:start] + bytes(GLOVE_RECORD) + whole[start + GLOVE_RECORD :])
     with pytest.raises(CorruptDataError, match="no record"):
-        log.SpoolReader(gloves).num_samples("glove_left")
+        spool.SpoolReader(gloves).num_samples("glove_left")
 
 
 def test_a_flipped_bit_of_a_body_is_refused(gloves):
@@ -212,7 +212,7 @@ def test_a_flipped_bit_of_a_body_is_refused(gloves):
     whole = bytearray(file.read_bytes())
     whole[len(LOG_MAGIC) + GLOVE_RECORD + 700] ^= 4
     file.write_bytes(whole)
-    reader = log.SpoolReader(gloves)
+    reader = spool.SpoolReader(gloves)
     assert_same(reader.read("glove_left", 0, 1), glove_batch(0))
     with pytest.raises(CorruptDataError, match="does not match its checksum"):
         reader.read("glove_left")
@@ -222,21 +222,21 @@ def test_a_log_inside_an_image_is_not_read_as_one(path):
     """A station may well film a screen, or send anything: records are found by their place."""
     video = CAMERA.model_copy(update={"unit": "h264"})
     attributes = ATTRIBUTES.model_copy(update={"streams": (video,)})
-    with log.SpoolWriter(path, attributes) as writer:
+    with spool.SpoolWriter(path, attributes) as writer:
         one = SampleBatch(*np.zeros((3, 1), dtype=np.int64), encoded_values([b"\0\0\1\x65"]))
         writer.append("camera_head", one)
     forged = b"\0\0\1\x65" + (path / LOG_FILE).read_bytes() * 3
-    with log.SpoolWriter.resume(path) as writer:
+    with spool.SpoolWriter.resume(path) as writer:
         writer.append(
             "camera_head", SampleBatch(*np.ones((3, 1), np.int64), encoded_values([forged]))
         )
     file = path / LOG_FILE
     whole = bytearray(file.read_bytes())
     second = len(whole) - len(forged) - 4 - 24 - HEADER_BYTES
-    assert log.SpoolReader(path).read("camera_head").values[1] == forged
+    assert spool.SpoolReader(path).read("camera_head").values[1] == forged
     whole[second] ^= 1
     file.write_bytes(whole)
-    assert log.recover(path).num_samples == {"camera_head": 1}
+    assert spool.recover(path).num_samples == {"camera_head": 1}
 
 
 def test_a_foreign_or_missing_log_is_refused(path):
@@ -244,12 +244,12 @@ def test_a_foreign_or_missing_log_is_refused(path):
     file = path / LOG_FILE
     file.write_bytes(b"DXTBLOG\x02" + file.read_bytes()[8:])
     with pytest.raises(CorruptDataError, match="expected"):
-        log.recover(path)
+        spool.recover(path)
     file.unlink()
     with pytest.raises(CorruptDataError, match="missing"):
-        log.SpoolReader(path).num_samples("glove_left")
+        spool.SpoolReader(path).num_samples("glove_left")
     # The process died before it made its log: nothing was acknowledged.
-    assert log.recover(path).num_samples == {"glove_left": 0, "camera_head": 0}
+    assert spool.recover(path).num_samples == {"glove_left": 0, "camera_head": 0}
 
 
 def test_a_log_of_other_streams_is_refused(path):
@@ -259,11 +259,11 @@ def test_a_log_of_other_streams_is_refused(path):
         attributes = ATTRIBUTES.model_copy(update={"streams": streams})
         (path / "recording.json").write_text(attributes.model_dump_json())
         with pytest.raises(CorruptDataError, match="stream"):
-            log.SpoolReader(path).read("glove_left")
+            spool.SpoolReader(path).read("glove_left")
 
 
 def test_a_batch_that_cannot_be_flushed_is_not_there(path, monkeypatch):
-    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         writer.append("glove_left", glove_batch(0), flush=True)
         with monkeypatch.context() as patch:
             patch.setattr("os.fdatasync", _fail)
@@ -271,7 +271,7 @@ def test_a_batch_that_cannot_be_flushed_is_not_there(path, monkeypatch):
                 writer.append("glove_left", glove_batch(1), flush=True)
         assert writer.num_batches("glove_left") == 1
         writer.append("glove_left", glove_batch(1, 2), flush=True)
-    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
+    assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
 
 
 def _fail(_descriptor):
@@ -279,7 +279,7 @@ def _fail(_descriptor):
 
 
 def test_a_full_disk_keeps_what_was_recorded(path, file_size_limit):
-    writer = log.SpoolWriter(path, ATTRIBUTES)
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
     with file_size_limit(5000):
         for first in range(6):
             writer.append("glove_left", glove_batch(first))
@@ -289,7 +289,7 @@ def test_a_full_disk_keeps_what_was_recorded(path, file_size_limit):
     # Space is free again: recording goes on without a gap in the files.
     writer.append("glove_left", glove_batch(7))
     writer.close()
-    got = log.SpoolReader(path).read("glove_left")
+    got = spool.SpoolReader(path).read("glove_left")
     assert got.sequence.tolist() == [0, 1, 2, 3, 4, 5, 7]
 
 
@@ -304,25 +304,25 @@ def test_short_writes_go_on_where_they_ended(path, monkeypatch, portion):
         return whole(descriptor, [first, rest[0][: portion - len(first)]])
 
     monkeypatch.setattr(os, "writev", some)
-    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         for first in range(3):
             writer.append("glove_left", glove_batch(first))
-    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
+    assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 3))
 
 
 def test_an_encoded_batch_is_written_later_and_must_follow(path):
-    with log.SpoolWriter(path, ATTRIBUTES) as writer:
+    with spool.SpoolWriter(path, ATTRIBUTES) as writer:
         records = [writer.encode("glove_left", glove_batch(first)) for first in (0, 1)]
         assert writer.num_samples("glove_left") == 0
         for record in records:
             writer.append_record(record)
         with pytest.raises(InvalidInputError, match="goes back to 0 from 16666667"):
             writer.append_record(records[0])
-    assert_same(log.SpoolReader(path).read("glove_left"), glove_batch(0, 2))
+    assert_same(spool.SpoolReader(path).read("glove_left"), glove_batch(0, 2))
 
 
 def test_what_does_not_fit_is_refused(path, tmp_path):
-    writer = log.SpoolWriter(path, ATTRIBUTES)
+    writer = spool.SpoolWriter(path, ATTRIBUTES)
     with pytest.raises(UnknownNameError, match="camera_head"):
         writer.append("glove", glove_batch(0))
     good = glove_batch(0, 2)
@@ -339,9 +339,9 @@ def test_what_does_not_fit_is_refused(path, tmp_path):
     with pytest.raises(ShapeError, match="bytes, one an image"):
         writer.append("camera_head", glove_batch(0))
     with pytest.raises(ConflictError, match="exists"):
-        log.SpoolWriter(path, ATTRIBUTES)
+        spool.SpoolWriter(path, ATTRIBUTES)
     with pytest.raises(NotFoundError):
-        log.SpoolReader(tmp_path / "none")
+        spool.SpoolReader(tmp_path / "none")
     with pytest.raises(InvalidInputError, match="without a stream"):
-        log.SpoolWriter(tmp_path / "x", ATTRIBUTES.model_copy(update={"streams": ()}))
+        spool.SpoolWriter(tmp_path / "x", ATTRIBUTES.model_copy(update={"streams": ()}))
     writer.close()
