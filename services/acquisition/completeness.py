@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 from dextouch.schemas.recordings import LedgerEntry
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.packets import DecoderStatistics
 from services.acquisition.health_taxels import TaxelCounts, count_taxels
@@ -59,9 +60,14 @@ class StreamFacts:
         return max(self.counters.largest_gap_ns, *edges) / 1e9
 
     def taxels(self) -> TaxelCounts | None:
-        """Dead, stuck and saturated taxels of the take; None of streams that have none."""
+        """Dead, stuck and saturated taxels of the take; None of streams that are no glove of ours.
+
+        Cells of other gloves are judged by the health, whose findings the check takes over.
+        """
         side, extremes = self.descriptor.side, self.counters.extremes
         if side is None or extremes is None or self.descriptor.kind != "tactile":
+            return None
+        if self.descriptor.shape != (NUM_RAW_TAXELS,):
             return None
         return count_taxels(extremes.low_counts, extremes.high_counts, side=side)
 

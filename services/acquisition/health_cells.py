@@ -15,9 +15,7 @@ from jaxtyping import Bool, Float64, Shaped
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import Matrix
-from services.acquisition.drivers.base import Decoder
-from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
-from services.acquisition.drivers.glove_wuji import GRID, WujiGloveDecoder
+from services.acquisition.drivers.base import Decoder, TellsCells
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_levels import Verdict, above
 from services.acquisition.schemas import Code, HealthFinding
@@ -139,28 +137,34 @@ class Cells:
 
 
 def cells_of(decoder: Decoder, calibration: Mapping[str, Matrix]) -> Cells | None:
-    """What is known of the cells that a decoder reads; None of other devices.
+    """What is known of the cells that a decoder reads; None where it tells of none.
 
     Args:
         decoder: of a device with one stream.
-        calibration: of the station; `tactile_<side>_cells` (1 x 320) gives for each taxel the
-            number of its cell, -1 for none.
+        calibration: of the station; `<stream>_cells` (1 x 320) gives for each taxel the number of
+            its cell, -1 for none.
 
     Raises:
-        InvalidInputError: the map names a cell that the glove has not.
+        InvalidInputError: the grid is not that of a sample, or the map names a cell that the glove
+            has not.
     """
-    if isinstance(decoder, WujiGloveDecoder):
-        return Cells(1.0, GRID, _used_cells(decoder, calibration))
-    if isinstance(decoder, JustFloatGloveDecoder):
-        return Cells(decoder.full_scale, None, _used_cells(decoder, calibration))
-    return None
+    if not isinstance(decoder, TellsCells):
+        return None
+    (descriptor,) = decoder.descriptors
+    layout, num_cells = decoder.cells, math.prod(descriptor.shape)
+    if layout.grid is not None and math.prod(layout.grid) != num_cells:
+        raise InvalidInputError(
+            f"{descriptor.device}: got cells on a grid of {layout.grid} in a sample of {num_cells} "
+            "numbers, expected as many; mend the driver of this glove"
+        )
+    return Cells(layout.full_scale, layout.grid, _used_cells(decoder, calibration))
 
 
 def _used_cells(
     decoder: Decoder, calibration: Mapping[str, Matrix]
 ) -> Bool[np.ndarray, " cells"] | None:
     (descriptor,) = decoder.descriptors
-    num_cells, name = math.prod(descriptor.shape), f"tactile_{descriptor.side}_cells"
+    num_cells, name = math.prod(descriptor.shape), f"{descriptor.name}_cells"
     if name not in calibration:
         return None
     cells = np.array(calibration[name], dtype=np.float64).ravel()

@@ -10,6 +10,7 @@ import numpy as np
 
 from dextouch.schemas.episodes import Matrix
 from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.health_levels import Verdict
 from services.acquisition.schemas import HealthFinding
 from services.acquisition.supervisor import DeviceSupervisor
@@ -153,4 +154,6 @@ def needed_matrices(descriptors: Sequence[StreamDescriptor]) -> list[str]:
             needed.append("K_head")
         if descriptor.kind == "tactile" and descriptor.unit == "counts":
             needed += [f"{descriptor.name}_tare_counts", f"{descriptor.name}_gain_counts_per_kpa"]
+            if descriptor.shape != (NUM_RAW_TAXELS,):
+                needed.append(f"{descriptor.name}_cells")
     return needed

@@ -46,6 +46,7 @@ class LiveView:
             # Without a calibration the station starts all the same: it records the takes for one.
             if d.kind == "tactile"
             and d.unit == "counts"
+            and d.shape == (NUM_RAW_TAXELS,)
             and {f"{name}_tare_counts", f"{name}_gain_counts_per_kpa"} <= calibration.keys()
         }
 

@@ -1,5 +1,6 @@
-"""What every driver shares: a transport and a decoder come in, stamped samples by stream go out."""
+"""The base of every driver: reads a transport, stamps what arrives and has it decoded."""
 
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
@@ -32,6 +33,30 @@ class Decoder(Protocol):
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Samples completed by `data`, which arrived at `t_host_ns`."""
+        ...
+
+
+@dataclass(frozen=True)
+class CellLayout:
+    """What a glove's cells can show, for the judgement of their health.
+
+    Attributes:
+        full_scale: the largest reading, in the unit of the stream.
+        grid: rows and columns in which the cells of a sample lie, row by row; None where nothing
+            tells which cells are neighbours. Cells that read NaN from the start do not exist.
+    """
+
+    full_scale: float
+    grid: tuple[int, int] | None
+
+
+@runtime_checkable
+class TellsCells(Protocol):
+    """A glove's decoder that knows what its cells can show; it gives one stream."""
+
+    @property
+    def cells(self) -> CellLayout:
+        """Full scale and grid of the cells."""
         ...
 
 

@@ -13,7 +13,7 @@ from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import Readings
+from services.acquisition.drivers.base import CellLayout, Readings
 from services.acquisition.drivers.frames import DecoderStatistics, PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
@@ -140,7 +140,7 @@ class JustFloatGloveDecoder:
 
     def __init__(self, side: Side, *, num_values: int, full_scale: float, rate_hz: float) -> None:
         self._frames = JustFloatFrames(num_values, full_scale)
-        self.full_scale = full_scale
+        self.cells = CellLayout(full_scale, grid=None)
         self._descriptor = justfloat_descriptor(side, num_values=num_values, rate_hz=rate_hz)
 
     @property

@@ -12,7 +12,7 @@ from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import Readings
+from services.acquisition.drivers.base import CellLayout, Readings
 from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
 
 MARK = b"\xaa\x55"
@@ -106,6 +106,11 @@ class WujiGloveDecoder:
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The raw stream (named for the left hand when the side is open)."""
         return (self._descriptor,)
+
+    @property
+    def cells(self) -> CellLayout:
+        """Shares of full scale on the glove's grid."""
+        return CellLayout(1.0, GRID)
 
     def reset(self) -> None:
         """Forget half a packet."""

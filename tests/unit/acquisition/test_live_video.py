@@ -9,8 +9,8 @@ from dextouch.images.jpeg import decode_jpeg
 from dextouch.streams.samples import Sample, encoded_values
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
+from services.acquisition.devices.camera.settings import CameraSettings
 from services.acquisition.live import LiveView
-from services.acquisition.settings import CameraSettings
 
 CAMERA = CameraSettings(stream="camera_head", port=1, height_px=48, width_px=64, encoding="h264")
 

@@ -1,0 +1,41 @@
+"""Device kinds of a station, and everything that a lab's own kind of device is written with.
+
+A device that this project does not know comes from a package of its own, found by the entry point
+`dextouch.devices`: docs/tutorials/add_a_device.md builds one.
+"""
+
+from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams.samples import Sample
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import DeviceKind, DeviceSettings
+from services.acquisition.devices.registry import ENTRY_POINT_GROUP, device_kind, kind_names
+from services.acquisition.devices.serial_line import SerialLineSettings, serial_transport
+from services.acquisition.devices.station_drivers import build_drivers, load_calibration
+from services.acquisition.drivers.base import CellLayout, Decoder, Driver, Readings
+from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
+from services.acquisition.transports.base import Transport, TransportInfo
+
+__all__ = [
+    "ENTRY_POINT_GROUP",
+    "CellLayout",
+    "ClockCapabilities",
+    "Decoder",
+    "DecoderStatistics",
+    "DeviceKind",
+    "DeviceSettings",
+    "Driver",
+    "FrameSearch",
+    "Readings",
+    "Sample",
+    "SequenceCounter",
+    "SerialLineSettings",
+    "StationClock",
+    "StreamDescriptor",
+    "Transport",
+    "TransportInfo",
+    "build_drivers",
+    "device_kind",
+    "kind_names",
+    "load_calibration",
+    "serial_transport",
+]

@@ -1,0 +1,1 @@
+"""Cameras whose images come over a TCP bridge."""

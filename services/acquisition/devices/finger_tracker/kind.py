@@ -1,0 +1,23 @@
+"""The kind `finger_tracker`."""
+
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.finger_tracker.settings import FingerTrackerSettings
+from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.tracker_links import bridge_transport, report_transport
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.bridge_tracker import BridgeDriver, BridgeFingerTrackerDecoder
+from services.acquisition.drivers.finger_tracker import FingerTracker
+
+
+def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:
+    """The driver of one tracker, by its link."""
+    name = f"finger_tracker_{settings.side}"
+    if settings.link == "bridge":
+        decoder = BridgeFingerTrackerDecoder(settings.side, serial_number=settings.serial_number)
+        return BridgeDriver(
+            name, transport=bridge_transport(settings), decoder=decoder, clock=clock
+        )
+    return FingerTracker(name, settings.side, transport=report_transport(settings), clock=clock)
+
+
+KIND = DeviceKind(name="finger_tracker", settings=FingerTrackerSettings, build=build)

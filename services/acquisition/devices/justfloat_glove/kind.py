@@ -1,0 +1,23 @@
+"""The kind `justfloat_glove`."""
+
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.justfloat_glove.settings import JustFloatGloveSettings
+from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.serial_line import serial_transport
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
+
+
+def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
+    """The driver of one glove."""
+    transport = serial_transport(settings, device=f"glove {settings.side}")
+    decoder = JustFloatGloveDecoder(
+        settings.side,
+        num_values=settings.num_values,
+        full_scale=settings.full_scale,
+        rate_hz=settings.rate_hz,
+    )
+    return Driver(f"glove_{settings.side}", transport=transport, decoder=decoder, clock=clock)
+
+
+KIND = DeviceKind(name="justfloat_glove", settings=JustFloatGloveSettings, build=build)

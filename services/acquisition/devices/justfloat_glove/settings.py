@@ -1,0 +1,24 @@
+"""Settings of a glove that sends bare float32s."""
+
+from typing import Literal
+
+from pydantic import Field
+
+from dextouch.tactile.layout import Side
+from services.acquisition.devices.serial_line import SerialLineSettings
+
+
+class JustFloatGloveSettings(SerialLineSettings):
+    """A glove on a serial line that tells nothing of itself.
+
+    Attributes:
+        num_values: float32s of a packet.
+        full_scale: the largest reading.
+        rate_hz: nominal rate.
+    """
+
+    kind: Literal["justfloat_glove"] = "justfloat_glove"
+    side: Side
+    num_values: int = Field(ge=1, le=4096)
+    full_scale: float = Field(gt=0, le=1e30)
+    rate_hz: float = Field(gt=0, le=10_000)

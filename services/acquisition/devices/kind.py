@@ -1,0 +1,49 @@
+"""What a station must know of one kind of device, and the base class of its settings."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+from pydantic import BaseModel, ConfigDict
+
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver
+
+
+class DeviceSettings(BaseModel):
+    """Settings of one device of a station; every kind derives its own class.
+
+    `kind` names the kind. A derived class narrows it to that name and makes it the default:
+    `kind: Literal["wuji_glove"] = "wuji_glove"`. Unknown keys are refused.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    kind: str
+
+
+SettingsT = TypeVar("SettingsT", bound=DeviceSettings)
+
+
+@dataclass(frozen=True)
+class DeviceKind(Generic[SettingsT]):
+    """One kind of device: how it is called, configured, read and simulated.
+
+    Our own kinds and those of other packages are found by the entry point `dextouch.devices`, whose
+    name is that of the kind. Which cells a glove has is told by its decoder (`TellsCells`), so that
+    the health judges real and simulated gloves alike.
+
+    Attributes:
+        name: what stands under `kind` in a station's settings: a-z, 0-9 and `_`.
+        settings: the class that validates the rest of them.
+        build: makes the driver, not opened yet, from the settings and the station's clock. It
+            raises InvalidInputError where the settings do not say where the device is.
+        mock: where a function is that simulates the device, as "module:function"; None if nothing
+            does. It takes a `MockPlace` and gives a `MockPair` (`services.acquisition.mocks`). It
+            is imported in mock stations only: drivers never import mocks.
+    """
+
+    name: str
+    settings: type[SettingsT]
+    build: Callable[[SettingsT, StationClock], Driver]
+    mock: str | None = None

@@ -1,0 +1,1 @@
+"""A robot's state server on a TCP socket."""

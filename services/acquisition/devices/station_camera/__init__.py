@@ -1,0 +1,1 @@
+"""Cameras on the station's own bus, captured by V4L2."""

@@ -1,0 +1,20 @@
+"""The kind `tactile_glove`: our own glove."""
+
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.serial_line import serial_transport
+from services.acquisition.devices.tactile_glove.settings import TactileGloveSettings
+from services.acquisition.drivers.glove_driver import TactileGlove
+
+
+def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
+    """The driver of one glove."""
+    return TactileGlove(
+        settings.side,
+        transport=serial_transport(settings, device=f"glove {settings.side}"),
+        clock=clock,
+        serial_number=settings.serial_number,
+    )
+
+
+KIND = DeviceKind(name="tactile_glove", settings=TactileGloveSettings, build=build)

@@ -1,0 +1,1 @@
+"""Wuji's tactile glove on a serial line: 24 × 32 cells, no commands."""

@@ -1,0 +1,18 @@
+"""The kind `wuji_glove`."""
+
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.serial_line import serial_transport
+from services.acquisition.devices.wuji_glove.settings import WujiGloveSettings
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
+
+
+def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
+    """The driver of one glove."""
+    transport = serial_transport(settings, device=f"glove {settings.side}")
+    decoder = WujiGloveDecoder(settings.side)
+    return Driver(f"glove_{settings.side}", transport=transport, decoder=decoder, clock=clock)
+
+
+KIND = DeviceKind(name="wuji_glove", settings=WujiGloveSettings, build=build)
