@@ -4,19 +4,19 @@ It sees images, touch and, of imagined endings, the imagined object poses; never
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float64
+from jaxtyping import Float32, Float64
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import Calibration, sigmoid
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
 from services.evaluation.endings import Ending
-from services.evaluation.judge_network import ProbeNetwork, ProbeShape, probe_batch
+from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, probe_batch
 
 # Version 4 of the network, one a task; checkpoints of earlier ones are refused by this name.
 KIND = "success-probe-4"
@@ -92,8 +92,21 @@ class SuccessProbe:
             raise InvalidInputError("success probe: got no endings, expected at least one")
         parts = [endings[at : at + _BATCH] for at in range(0, len(endings), _BATCH)]
         with torch.no_grad():
-            odds = [self._network(probe_batch(part, self.shape)) for part in parts]
+            odds = [self._seen(probe_batch(part, self.shape)) for part in parts]
         return torch.cat(odds).double().numpy()
+
+    def _seen(self, batch: ProbeBatch) -> Float32[torch.Tensor, "n outputs"]:
+        """Log odds; of endings with images and poses the mean with and without the images.
+
+        Where poses are known, what is drawn of them adds as much error as it adds sight.
+        """
+        odds: torch.Tensor = self._network(batch)
+        both = batch.has_image & batch.has_objects
+        if bool(both.any()):
+            unseen = batch[torch.nonzero(both)[:, 0]]
+            unseen = replace(unseen, has_image=torch.zeros_like(unseen.has_image))
+            odds[both] = (odds[both] + self._network(unseen)) / 2
+        return odds
 
     def probabilities(self, endings: Sequence[Ending]) -> Float64[np.ndarray, " n"]:
         """Calibrated probability of success of each ending; raises as `log_odds`."""

@@ -135,11 +135,17 @@ class StateTrainSettings(BaseModel):
     num_members: int = Field(default=2, ge=1, le=16, description="of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="of scenes, to measure on")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained at the same time")
+    labelled_share: float = Field(
+        default=1.0,
+        gt=0,
+        le=1,
+        description="of scenes whose object poses are learned from; touch and success: from all",
+    )
     width: int = Field(default=192, ge=8, le=1024, description="of the recurrent cores")
     reader: ReaderSettings = ReaderSettings()
     core: CoreSettings = CoreSettings()
     renderer: RendererConfig = RendererConfig()
-    drawing: RendererTraining = RendererTraining(cpu_budget_s=700.0)
+    drawing: RendererTraining = RendererTraining(cpu_budget_s=1400.0)
 
 
 class TrainStateCommand(BaseSettings, StateTrainSettings):

@@ -103,7 +103,8 @@ def train_core(
 @torch.no_grad()
 def fit_features(core: RecurrentCore, table: SceneTable) -> None:
     """Mean and deviation of command features over the training episodes."""
-    rows = torch.arange(0, len(table), max(1, len(table) // _FIT_EPISODES))
+    known = torch.nonzero(table.labelled)[:, 0]
+    rows = known[:: max(1, len(known) // _FIT_EPISODES)]
     commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
     objects = table.objects_at(rows, 0)
     features = command_features(
@@ -144,7 +145,7 @@ def _draw(
     measured = chance(settings.measured_fraction) | ~table.commanded[rows]
     commands = table.commands(rows, start_step, measured)
     held = chance(settings.held_fraction * (1 if start_step == 0 else _LATER_HELD))
-    held &= _is_settled(table, rows, start_step)
+    held &= _is_settled(table, rows, start_step) & table.labelled[rows]
     objects = _start_objects(data, rows, start_step, settings, generator)
     return _Batch(
         rows=rows,
@@ -177,13 +178,14 @@ def _start_objects(
     settings: CoreSettings,
     generator: torch.Generator,
 ) -> ObjectPoses:
-    """A reader's objects, or true ones with an error, half and half."""
+    """A reader's objects, or, where they are known, true ones with an error half of the time."""
     true, read = data.table.objects_at(rows, start_step), data.readings[start_step][rows]
     size = settings.pose_noise_m * 2 * torch.rand((len(rows), 1, 1), generator=generator)
     shift = torch.randn(true.position_m.shape, generator=generator) * size
     shift[..., 2] *= 0.3
     turn = torch.randn(true.axes.shape, generator=generator) * size[..., None] * 5.0
     use_read = torch.rand((len(rows), 1), generator=generator) < 0.5
+    use_read |= ~data.table.labelled[rows, None]
     return ObjectPoses(
         torch.where(use_read[..., None], read.position_m, true.position_m + shift),
         torch.where(use_read[..., None, None], read.axes, true.axes + turn),
@@ -228,7 +230,8 @@ def core_loss(
     success = table.success[rows] * moves
     weights = settings.weights
     return (
-        weights.objects * _object_error(future.objects, true, start.objects.present)
+        weights.objects
+        * _object_error(future.objects, true, start.objects.present * table.labelled[rows, None])
         + weights.touch * (future.touch[:, 1:] - touch).square().sum(-1).mean()
         + weights.contact
         * functional.binary_cross_entropy_with_logits(future.contact[:, 1:], contact.float())

@@ -43,7 +43,7 @@ def train_reader(
     """A reader of objects from single steps: first ones, and ones from amid episodes.
 
     Args:
-        table: training episodes.
+        table: training episodes, of which the labelled ones are learned from.
         config: of the dynamics model.
         settings: number of steps and the like.
         seed: of weights and of everything that is drawn.
@@ -59,8 +59,9 @@ def train_reader(
     )
     average = WeightAverage(reader, settings.ema_decay)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
+    known = torch.nonzero(table.labelled)[:, 0]
     for step in range(settings.num_steps):
-        rows = torch.randint(len(table), (settings.batch,), generator=generator)
+        rows = known[torch.randint(len(known), (settings.batch,), generator=generator)]
         amid = torch.tensor(later)[torch.randint(len(later), rows.shape, generator=generator)]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
         steps = torch.where(is_first, 0, amid)
@@ -83,7 +84,7 @@ def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig)
     for task, count in enumerate(config.num_objects):
         for slot in range(count):
             first = table.objects.position_m[:, 0, slot, 2]
-            there = (table.task == task) & (table.objects.present[:, 0, slot] > 0)
+            there = (table.task == task) & (table.objects.present[:, 0, slot] > 0) & table.labelled
             if there.any():
                 reader.height_mean[task, slot] = first[there].median()
 

@@ -224,12 +224,16 @@ def _object_poses(
     return pose_from_transform(np.stack(each, axis=1)).astype(np.float32)
 
 
+def place_of_scene(episode: SceneEpisode) -> float:
+    """A number in 0 … 1 from a hash of task and seed: it never changes when episodes are added."""
+    digest = hashlib.sha256(f"{episode.task}/{episode.seed}".encode()).digest()
+    return int.from_bytes(digest[:8], "big") / 2**64
+
+
 def split_by_scene(
     episodes: Iterable[SceneEpisode], *, held_out_share: float
 ) -> tuple[list[SceneEpisode], list[SceneEpisode]]:
     """Training and held-out episodes; all of a task and seed fall on the same side.
-
-    The side is decided by a hash of task and seed: it never changes when episodes are added.
 
     Raises:
         InvalidInputError: a share outside 0 … 1, or an empty side.
@@ -237,9 +241,7 @@ def split_by_scene(
     training: list[SceneEpisode] = []
     held_out: list[SceneEpisode] = []
     for episode in episodes:
-        digest = hashlib.sha256(f"{episode.task}/{episode.seed}".encode()).digest()
-        share = int.from_bytes(digest[:8], "big") / 2**64
-        (held_out if share < held_out_share else training).append(episode)
+        (held_out if place_of_scene(episode) < held_out_share else training).append(episode)
     if not training or not held_out:
         raise InvalidInputError(
             f"split: {len(training)} episodes to train on and {len(held_out)} held out with a "

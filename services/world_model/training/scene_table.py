@@ -50,7 +50,7 @@ class SceneTable:
 
     `images` are of the steps `image_steps`; `in_contact` says which pads touch something;
     `sent` are commanded hands where an episode has them, measured ones elsewhere, and `commanded`
-    says which.
+    says which. `labelled` says of which episodes the object poses may be learned from.
     """
 
     sent: HandTable
@@ -66,6 +66,7 @@ class SceneTable:
     K_head: Float32[Tensor, "episodes 3 3"]
     success: Float32[Tensor, " episodes"]
     task: Int64[Tensor, " episodes"]
+    labelled: Bool[Tensor, " episodes"]
 
     def __len__(self) -> int:
         return len(self.success)
@@ -185,8 +186,15 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
     return tasks, tuple(len(*names[task]) for task in tasks)
 
 
-def scene_table(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> SceneTable:
+def scene_table(
+    episodes: Sequence[SceneEpisode], config: DynamicsConfig, *, labelled: Sequence[bool] = ()
+) -> SceneTable:
     """Tensors of episodes.
+
+    Args:
+        episodes: at least one.
+        config: of the dynamics model.
+        labelled: for each episode, whether its object poses may be learned from; without it all.
 
     Raises:
         InvalidInputError: lengths or image steps differ, a length is not 1 + 4k, or a task or an
@@ -218,6 +226,7 @@ def scene_table(episodes: Sequence[SceneEpisode], config: DynamicsConfig) -> Sce
         K_head=torch.from_numpy(np.stack([e.K_head for e in episodes]).astype(np.float32)),
         success=torch.tensor([float(episode.success) for episode in episodes]),
         task=torch.tensor([config.tasks.index(episode.task) for episode in episodes]),
+        labelled=torch.tensor(list(labelled) or [True] * len(episodes)),
     )
 
 

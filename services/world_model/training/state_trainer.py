@@ -21,7 +21,8 @@ from torch import Tensor, nn
 
 from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.rendering.network import RendererNetwork
 from services.world_model.rendering.training import RendererProgress, train_renderer
@@ -42,6 +43,7 @@ from services.world_model.training.scene_clips import scene_clips
 from services.world_model.training.scene_episodes import (
     SceneEpisode,
     load_scene_episodes,
+    place_of_scene,
     refuse_shared_scenes,
     split_by_scene,
 )
@@ -86,7 +88,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     parts.mkdir(parents=True, exist_ok=True)
     data_hash = _data_hash(training)
     # Before training, so that episodes that do not fit are found at once.
-    heldout_table, table = scene_table(heldout, config), scene_table(training, config)
+    heldout_table = scene_table(heldout, config)
+    table = scene_table(training, config, labelled=_labelled(training, settings))
     codec = TouchCodec(config.touch_channels)
     codec.fit(
         table.tactile_kpa[:, ::4].float().flatten(0, 2), peak_kpa=float(table.tactile_kpa.max())
@@ -144,9 +147,13 @@ class _Work:
     parts: Path
     data_hash: str
 
-    def file_of(self, member: int) -> Path:
-        """Where a finished member is kept; other settings or data have other names."""
-        return self.parts / f"member-{self._key('width', 'reader', 'core')}-{member}.safetensors"
+    def reader_file(self, member: int) -> Path:
+        """Where a member's finished reader is kept; other settings or data have other names."""
+        return self.parts / f"reader-{self._key('reader')}-{member}.safetensors"
+
+    def core_file(self, member: int) -> Path:
+        """Where a member's finished core is kept, which has learned with that member's reader."""
+        return self.parts / f"core-{self._key('width', 'reader', 'core')}-{member}.safetensors"
 
     @property
     def renderer_file(self) -> Path:
@@ -155,7 +162,9 @@ class _Work:
 
     def _key(self, *names: str) -> str:
         """A digest of the data and of those settings that make other weights."""
-        chosen = self.settings.model_dump_json(include={"seed", "heldout_share", *names})
+        chosen = self.settings.model_dump_json(
+            include={"seed", "heldout_share", "labelled_share", *names}
+        )
         text = f"{TRAINING_VERSION} {chosen} {self.data_hash}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
@@ -186,6 +195,21 @@ def _data_hash(episodes: list[SceneEpisode]) -> str:
     return hashlib.sha256("\n".join(digests).encode()).hexdigest()
 
 
+def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> list[bool]:
+    """Of which episodes object poses are learned from: all takes of a scene, or none."""
+    # Training scenes lie above the held-out share.
+    share = settings.heldout_share + (1 - settings.heldout_share) * settings.labelled_share
+    labelled = [place_of_scene(episode) <= share for episode in episodes]
+    known = {episode.task for episode, yes in zip(episodes, labelled, strict=True) if yes}
+    without = {episode.task for episode in episodes} - known
+    if without:
+        raise InvalidInputError(
+            f"--labelled_share {settings.labelled_share:g}: leaves no scene of "
+            f"{', '.join(sorted(without))} whose object poses are learned from; give a larger one"
+        )
+    return labelled
+
+
 def _seed_ranges(episodes: list[SceneEpisode]) -> dict[str, tuple[int, int]]:
     """First and last seed of every task."""
     seeds: dict[str, list[int]] = {}
@@ -200,7 +224,7 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
 
 def _train_parts(work: _Work) -> float:
     """Train the parts that are not there yet, several at a time; the CPU seconds of all parts."""
-    missing = [m for m in range(work.settings.num_members) if not work.file_of(m).exists()]
+    missing = [m for m in range(work.settings.num_members) if not work.core_file(m).exists()]
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
         orders = [pool.submit(_train_member, work, member) for member in missing]
@@ -208,7 +232,8 @@ def _train_parts(work: _Work) -> float:
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
             done.result()
-    parts = [work.file_of(member) for member in range(work.settings.num_members)]
+    members = range(work.settings.num_members)
+    parts = [part for m in members for part in (work.reader_file(m), work.core_file(m))]
     return sum(_cpu_s_of(part) for part in (*parts, work.renderer_file))
 
 
@@ -217,6 +242,9 @@ def _train_renderer(work: _Work) -> None:
     settings = work.settings
     episodes, _ = split_by_scene(_episodes(settings), held_out_share=settings.heldout_share)
     rng = np.random.default_rng(settings.seed)
+    episodes = [
+        e for e, known in zip(episodes, _labelled(episodes, settings), strict=True) if known
+    ]
     chosen = rng.permutation(len(episodes))[:MAX_CLIPS]
     clips = scene_clips([episodes[index] for index in sorted(chosen)])
     trained = train_renderer(
@@ -254,7 +282,6 @@ def _trained_renderer(work: _Work) -> RendererNetwork:
 
 def _train_member(work: _Work, member: int) -> None:
     torch.set_num_threads(1)
-    started_s = time.process_time()
     flat = load_file(work.parts / "table.safetensors")
     codec = TouchCodec(work.config.touch_channels)
     codec.load_state_dict(
@@ -262,15 +289,21 @@ def _train_member(work: _Work, member: int) -> None:
     )
     table = SceneTable.from_tensors(flat)
     seed = work.settings.seed * _SEED_STRIDE + member
-    made = DynamicsMember(work.config)
     log = _Log(member)
-    made.reader = train_reader(
-        table, work.config, work.settings.reader, seed=seed, on_step=log.reader
-    )
-    readings = {step: read_objects(made.reader, table, step) for step in start_steps(table)}
+    started_s = time.process_time()
+    if not work.reader_file(member).exists():
+        trained = train_reader(
+            table, work.config, work.settings.reader, seed=seed, on_step=log.reader
+        )
+        _keep(trained, work.reader_file(member), time.process_time() - started_s)
+    reader = StartReader(work.config)
+    reader.load_state_dict(load_file(work.reader_file(member)))
+    reader.eval()
+    started_s = time.process_time()
+    readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
     data = CoreData(table, touch_latents(codec, table), readings)
-    made.core = train_core(data, work.config, work.settings.core, seed=seed, on_step=log.core)
-    _keep(made, work.file_of(member), time.process_time() - started_s)
+    core = train_core(data, work.config, work.settings.core, seed=seed, on_step=log.core)
+    _keep(core, work.core_file(member), time.process_time() - started_s)
 
 
 class _Log:
@@ -298,7 +331,8 @@ def _assembled(work: _Work, codec: TouchCodec) -> DynamicsModel:
     dynamics = DynamicsModel(work.config, work.settings.num_members)
     dynamics.codec.load_state_dict(codec.state_dict())
     for index, member in enumerate(dynamics.members):
-        member.load_state_dict(load_file(work.file_of(index)))
+        member.reader.load_state_dict(load_file(work.reader_file(index)))
+        member.core.load_state_dict(load_file(work.core_file(index)))
     return dynamics.eval().requires_grad_(requires_grad=False)
 
 

@@ -39,10 +39,10 @@ from services.world_model.training.reader_training import (
     reader_errors,
     train_reader,
 )
-from services.world_model.training.scene_episodes import SceneEpisode
+from services.world_model.training.scene_episodes import SceneEpisode, split_by_scene
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
-from services.world_model.training.state_trainer import _command
+from services.world_model.training.state_trainer import _command, _labelled
 
 PX, NUM_STEPS = 32, 17
 K_HEAD = pinhole_matrix(width_px=PX, height_px=PX, fovy_rad=np.deg2rad(60))
@@ -144,6 +144,41 @@ def test_a_core_feels_what_it_touches_and_nothing_elsewhere(reader, table, held_
     assert measured.disagreement_m == 0.0
     assert measured.figures["object_mm_chunk_1"] < 25
     assert StateBounds(distance=measured.distance).distance > 0
+
+
+def test_object_poses_without_labels_are_never_looked_at(config):
+    episodes = [episode(seed) for seed in range(8)]
+    lies = [dataclasses.replace(e, object_poses=e.object_poses + 0.07) for e in episodes]
+    known = [seed < 4 for seed in range(8)]
+    settings = CoreSettings(num_steps=12, batch=8, bfloat16=False, held_fraction=0.5)
+    trained = []
+    for few in (episodes, episodes[:4] + lies[4:], lies):
+        table = scene_table(few, config, labelled=known)
+        reader = train_reader(
+            table, config, ReaderSettings(num_steps=5, batch=8, bfloat16=False), seed=0
+        )
+        readings = {step: read_objects(reader, table, step) for step in (0, 4)}
+        data = CoreData(table, touch_latents(TouchCodec(8), table), readings)
+        core = train_core(data, config, settings, seed=0)
+        trained.append([*reader.state_dict().values(), *core.state_dict().values()])
+    assert all(torch.equal(a, b) for a, b in zip(trained[0], trained[1], strict=True))
+    assert not all(torch.equal(a, b) for a, b in zip(trained[0], trained[2], strict=True))
+
+
+def test_all_takes_of_a_scene_are_labelled_or_none():
+    takes = [
+        dataclasses.replace(episode(seed), episode_id=f"{take}-{seed}", seed=seed)
+        for seed in range(100)
+        for take in "ab"
+    ]
+    settings = TrainStateCommand(episodes=("takes",), labelled_share=0.3)
+    training, _ = split_by_scene(takes, held_out_share=settings.heldout_share)
+    known = _labelled(training, settings)
+    chosen = {e.seed for e, one in zip(training, known, strict=True) if one}
+    assert sum(known) == 2 * len(chosen)
+    assert 0.15 < len(chosen) / len({e.seed for e in training}) < 0.45
+    with pytest.raises(InvalidInputError, match="labelled_share"):
+        _labelled(training, settings.model_copy(update={"labelled_share": 1e-6}))
 
 
 def test_cores_begin_anywhere_up_to_the_last_latent_step(config):

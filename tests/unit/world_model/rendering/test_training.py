@@ -47,9 +47,26 @@ def test_the_same_generator_gives_the_same_weights(trained, clips, small, settin
 def test_the_loss_of_a_bright_column_by_hand():
     drawn, true = torch.zeros(1, 3, 4, 5), torch.zeros(1, 3, 4, 5)
     true[..., 2] = 1.0
+
+    def loss(**weights: float) -> float:
+        settings = RendererTraining(**{"gradient_weight": 0, "sharpness_weight": 0, **weights})
+        return drawing_loss(drawn, true, settings).item()
+
     # A fifth of the pixels is wrong by 1; of four differences across, two; of those down, none.
-    loss = drawing_loss(drawn, true, gradient_weight=0.5)
-    assert loss.item() == pytest.approx(0.2 + 0.5 * 0.5)
+    assert loss() == pytest.approx(0.2)
+    assert loss(gradient_weight=0.5) == pytest.approx(0.2 + 0.5 * 0.5)
+    # Laplacians inside the border are 1, -2, 1; the window is as large as they are, 2 by 3, cut to
+    # the shorter side: 1 and -2.
+    assert loss(sharpness_weight=0.5) == pytest.approx(0.2 + 0.5 * 1.5)
+
+
+def test_edges_count_wherever_they_are_in_their_window():
+    true = torch.zeros(1, 3, 12, 12)
+    true[..., 5:] = 1.0
+    settings = RendererTraining(gradient_weight=0, sharpness_weight=1.0)
+    elsewhere = drawing_loss(true.roll(1, -1), true, settings)
+    nowhere = drawing_loss(torch.full_like(true, 0.5), true, settings)
+    assert elsewhere < 0.4 * nowhere
 
 
 def test_clips_of_other_numbers_of_objects_share_a_batch(clips):
