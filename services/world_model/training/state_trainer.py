@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import structlog
@@ -21,7 +22,7 @@ from torch import Tensor, nn
 
 from dextouch.errors import InvalidInputError
 from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.rendering.network import RendererNetwork
@@ -330,7 +331,8 @@ class _Log:
 def _assembled(work: _Work, codec: TouchCodec) -> DynamicsModel:
     dynamics = DynamicsModel(work.config, work.settings.num_members)
     dynamics.codec.load_state_dict(codec.state_dict())
-    for index, member in enumerate(dynamics.members):
+    for index, module in enumerate(dynamics.members):
+        member = cast("DynamicsMember", module)
         member.reader.load_state_dict(load_file(work.reader_file(index)))
         member.core.load_state_dict(load_file(work.core_file(index)))
     return dynamics.eval().requires_grad_(requires_grad=False)
