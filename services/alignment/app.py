@@ -8,7 +8,7 @@ from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
 from dextouch.serving.app import create_service_app
-from services.alignment.job_table import JobTable
+from services.alignment.job_runner import JobRunner
 from services.alignment.new_recordings import NewRecordings
 from services.alignment.routes import alignments_router
 from services.alignment.settings import AlignmentSettings
@@ -17,7 +17,7 @@ from services.alignment.settings import AlignmentSettings
 def create_app(settings: AlignmentSettings) -> FastAPI:
     """The service; it reads recordings from and writes episodes to the store's folder."""
     store = EpisodeStore(settings.store_url)
-    jobs = JobTable(store, settings)
+    jobs = JobRunner(store, settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:

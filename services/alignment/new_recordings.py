@@ -15,7 +15,7 @@ from dextouch.errors import (
     LimitExceededError,
     NotFoundError,
 )
-from services.alignment.job_table import JobTable
+from services.alignment.job_runner import JobRunner
 from services.alignment.jobs import MAX_STEM
 from services.alignment.schemas import AlignmentRequest
 
@@ -43,7 +43,7 @@ class NewRecordings:
         jobs: where alignments are asked for.
     """
 
-    def __init__(self, store: EpisodeStore, jobs: JobTable) -> None:
+    def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:
         self._store, self._jobs = store, jobs
         self._seen: set[str] = set()
         self._deleted: set[str] = set()
@@ -93,7 +93,7 @@ class NewRecordings:
         there = set(listed)
         self._deleted |= self._seen - there
         self._seen &= there
-        self._seen |= (self._jobs.book.recording_ids & there) - self._deleted
+        self._seen |= (self._jobs.queue.recording_ids & there) - self._deleted
         self._unreadable = {k: found for k, found in self._unreadable.items() if k in there}
         since_s = time.monotonic() - RETRY_S
         just_now = {k for k, (_, found_s) in self._unreadable.items() if found_s > since_s}

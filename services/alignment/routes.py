@@ -7,7 +7,7 @@ from fastapi import APIRouter, Depends, Query, Response, status
 from dextouch.schemas.problems import error_from_problem
 from dextouch.serving.access import RequireScope
 from dextouch.serving.bodies import JSON, KIB, takes
-from services.alignment.job_table import JobTable
+from services.alignment.job_runner import JobRunner
 from services.alignment.schemas import (
     ENDED,
     MAX_BATCH,
@@ -21,7 +21,7 @@ SCOPE = "align"
 PAGE = 100
 
 
-def alignments_router(jobs: JobTable) -> APIRouter:
+def alignments_router(jobs: JobRunner) -> APIRouter:
     """Routes under /v1/alignments."""
     router = APIRouter(
         prefix="/v1/alignments", tags=["alignments"], dependencies=[Depends(RequireScope(SCOPE))]
@@ -58,12 +58,12 @@ def alignments_router(jobs: JobTable) -> APIRouter:
         limit: Annotated[int, Query(ge=1, le=MAX_BATCH)] = PAGE,
     ) -> AlignmentList:
         """Alignments, oldest first, a page at a time; `after` is the last id of the page before."""
-        return jobs.book.page(state=state, after=after, limit=limit)
+        return jobs.queue.page(state=state, after=after, limit=limit)
 
     @router.get("/{alignment_id}")
     async def one(alignment_id: str) -> AlignmentJob:
         """Where one alignment stands."""
-        return jobs.book.get(alignment_id)
+        return jobs.queue.get(alignment_id)
 
     @router.post("/{alignment_id}/cancel")
     async def cancel(alignment_id: str) -> AlignmentJob:

@@ -1,17 +1,21 @@
-"""Bodies of the alignment service: what is asked, and where an alignment stands."""
+"""Request and response bodies of the alignment service, and the states of an alignment job."""
 
+from datetime import UTC, datetime
 from typing import Literal
 
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from dextouch.errors import DexTouchError, UnavailableError
 from dextouch.schemas.episodes import StoreId
-from dextouch.schemas.problems import Problem
+from dextouch.schemas.problems import Problem, problem_from_error
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport
-from services.alignment.synchronization.progress import Stage
+from services.alignment.synchronization.progress import Progress, Stage
 
 MAX_BATCH = 1000
 JobState = Literal["waiting", "running", "done", "failed", "cancelled"]
+# Progress below this share is too little to estimate the remaining time from.
+MIN_ETA_SHARE = 0.05
 ENDED: frozenset[JobState] = frozenset({"done", "failed", "cancelled"})
 
 
@@ -65,6 +69,82 @@ class AlignmentJob(BaseModel):
     report: AlignmentReport | None = None
     problem: Problem | None = None
 
+    @classmethod
+    def new(cls, alignment_id: str, recording_id: str, options: AlignmentOptions) -> "AlignmentJob":
+        """A job that waits."""
+        return cls(
+            alignment_id=alignment_id,
+            recording_id=recording_id,
+            options=options,
+            state="waiting",
+            progress=0.0,
+            submitted_at=_now(),
+        )
+
+    def started(self) -> "AlignmentJob":
+        """A worker begins the next attempt."""
+        return self._with(state="running", attempts=self.attempts + 1, started_at=_now())
+
+    def with_progress(self, progress: Progress) -> "AlignmentJob":
+        """Further along; progress never decreases."""
+        share = max(self.progress, progress.share)
+        return self._with(progress=share, stage=progress.stage, stream=progress.stream)
+
+    def done(self, report: AlignmentReport) -> "AlignmentJob":
+        """Its episode is in the store."""
+        return self._ended("done", progress=1.0, report=report)
+
+    def failed(self, error: DexTouchError) -> "AlignmentJob":
+        """It ended without an episode, for this reason."""
+        problem = problem_from_error(error, instance=self.alignment_id, request_id="")
+        return self._ended("failed", problem=problem)
+
+    def cancelled(self) -> "AlignmentJob":
+        """Somebody cancelled it."""
+        return self._ended("cancelled")
+
+    def interrupted(self) -> "AlignmentJob":
+        """The service was stopped during this attempt, which therefore does not count."""
+        return self._waiting(attempts=self.attempts - 1)
+
+    def crashed(self, *, max_attempts: int) -> "AlignmentJob":
+        """The service died during this attempt: wait for the next one, or fail if it was the last.
+
+        The job itself may be what kills the service, so it is not tried for ever.
+        """
+        if self.attempts < max_attempts:
+            return self._waiting(attempts=self.attempts)
+        error = UnavailableError(
+            f"recording {self.recording_id!r}: the alignment service died {self.attempts} times "
+            "while it was aligned, so it is not tried again by itself; look into the service's log "
+            "(out of memory?), then ask for it again",
+            attempts=self.attempts,
+        )
+        return self.failed(error)
+
+    def with_eta(self) -> "AlignmentJob":
+        """Estimates the remaining time from the time that the progress took so far."""
+        if self.state != "running" or self.started_at is None or self.progress < MIN_ETA_SHARE:
+            return self
+        elapsed_s = max((_now() - self.started_at).total_seconds(), 0.0)
+        return self._with(eta_s=elapsed_s * (1 - self.progress) / self.progress)
+
+    def _waiting(self, *, attempts: int) -> "AlignmentJob":
+        return self._with(
+            state="waiting",
+            attempts=attempts,
+            progress=0.0,
+            stage=None,
+            stream=None,
+            started_at=None,
+        )
+
+    def _ended(self, state: JobState, **changes: object) -> "AlignmentJob":
+        return self._with(state=state, ended_at=_now(), stage=None, stream=None, **changes)
+
+    def _with(self, **changes: object) -> "AlignmentJob":
+        return self.model_copy(update=changes)
+
 
 class AlignmentList(BaseModel):
     """One page of the alignments, oldest first, and how many match in all.
@@ -77,3 +157,7 @@ class AlignmentList(BaseModel):
     alignments: tuple[AlignmentJob, ...]
     num_matching: int = Field(ge=0)
     next_after: str | None = None
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)

@@ -11,9 +11,9 @@ from structlog.testing import capture_logs
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageFullError
-from services.alignment import job_table, new_recordings
+from services.alignment import job_runner, new_recordings
 from services.alignment.app import create_app
-from services.alignment.job_log import JobLog
+from services.alignment.job_queue import JobDatabase
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.settings import AlignmentSettings
@@ -31,7 +31,7 @@ def worker(monkeypatch):
     kind.held.wait = lambda _: True
     run = kind.run
     kind.run = lambda self, name, *more: kind.started.append(name) or run(self, name, *more)
-    monkeypatch.setattr(job_table, "AlignmentWorker", kind)
+    monkeypatch.setattr(job_runner, "AlignmentWorker", kind)
     return kind
 
 
@@ -189,14 +189,14 @@ async def test_the_watcher_goes_on_after_an_error_that_nobody_expected(store, wo
 
 async def test_a_job_that_cannot_be_kept_is_asked_for_again(store, worker, monkeypatch):
     write_recording(store, "take")
-    append, failures = JobLog.append, [StorageFullError("jobs: no space left")] * 3
+    commit, failures = JobDatabase.commit, [StorageFullError("jobs: no space left")] * 3
 
-    def append_later(*args):
+    def commit_later(*args):
         if failures:
             raise failures.pop()
-        return append(*args)
+        return commit(*args)
 
-    monkeypatch.setattr(JobLog, "append", append_later)
+    monkeypatch.setattr(JobDatabase, "commit", commit_later)
     async with served(store) as jobs:
         await looked(store, jobs)
         assert sorted(await jobs()) == ["last", "take"]

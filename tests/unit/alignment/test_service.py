@@ -8,7 +8,7 @@ from httpx import ASGITransport, AsyncClient
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, UnavailableError
-from services.alignment import job_table
+from services.alignment import job_runner
 from services.alignment.app import create_app
 from services.alignment.jobs import align_recording
 from services.alignment.settings import AlignmentSettings
@@ -50,7 +50,7 @@ class FakeWorker:
 def worker(monkeypatch):
     kind = type("Worker", (FakeWorker,), {"held": threading.Event()})
     kind.held.set()
-    monkeypatch.setattr(job_table, "AlignmentWorker", kind)
+    monkeypatch.setattr(job_runner, "AlignmentWorker", kind)
     return kind
 
 

@@ -51,7 +51,7 @@ def test_the_same_recording_comes_out(ingest, store, commit, batch_of):
         assert recording.attributes.success is True
         assert recording.read("glove_left").sequence.tolist() == list(range(600))
     commit.close()
-    assert child.returncode == 0
+    assert child.close() == 0
 
 
 def test_its_errors_are_ours(ingest, store):
@@ -67,7 +67,7 @@ def test_its_errors_are_ours(ingest, store):
 
 def test_its_death_is_survived(ingest, store, commit):
     ingest.finish("take-1", COUNTS)
-    child = commit._child
+    child = commit._child._process
     # It dies with the next order in its hands.
     os.kill(child.pid, signal.SIGSTOP)
     child.stdin.flush()
@@ -91,8 +91,8 @@ def _order_before_the_death_is_seen(ingest, child):
 
 def test_it_ends_with_the_service(commit, ingest):
     ingest.finish("take-1", COUNTS)
-    child = commit._child
+    child = commit._child._process
     child.stdin.close()
     assert child.wait(timeout=30) == 0
-    child.stdin = None
     assert child.stdout.read() == b""
+    child.stdout.close()

@@ -1,8 +1,4 @@
-"""Requests in, alignments that run in worker processes and tell where they stand out.
-
-Jobs outlive the service: each step of a job is kept in its log before it is acknowledged, and what
-waited or ran when the service died goes on when it starts again.
-"""
+"""Runs the alignment jobs of a service in worker processes, and resumes them after a restart."""
 
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
@@ -18,8 +14,7 @@ from dextouch.errors import (
     StorageError,
     UnavailableError,
 )
-from services.alignment import job_steps
-from services.alignment.job_book import RETRY_AFTER_S, JobBook
+from services.alignment.job_queue import RETRY_AFTER_S, JobQueue
 from services.alignment.jobs import check_recordings, episode_id_of
 from services.alignment.schemas import ENDED, AlignmentJob, AlignmentRequest
 from services.alignment.settings import AlignmentSettings
@@ -32,10 +27,10 @@ JOBS_FOLDER = ".alignments"
 STOP_PERIOD_S = 0.05
 
 
-class JobTable:
+class JobRunner:
     """The alignments of one store; asking again for the same one gives the same job.
 
-    Open between `start` and `close`. All methods belong to one event loop. `book` holds the jobs.
+    Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs.
 
     Args:
         store: of recordings and episodes.
@@ -45,7 +40,7 @@ class JobTable:
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:
         self._store, self._settings = store, settings
         max_open = settings.num_workers + settings.max_waiting
-        self.book = JobBook(max_open=max_open, max_kept=settings.max_kept)
+        self.queue = JobQueue(max_open=max_open, max_kept=settings.max_kept)
         self._changed = asyncio.Condition()
         self._workers = [
             AlignmentWorker(settings.store_url, settings.log_level)
@@ -57,44 +52,44 @@ class JobTable:
         self.is_warm = False
 
     async def start(self) -> None:
-        """Take over the jobs of the service before, and go to work.
+        """Load the jobs on disk and start working on them.
 
         Raises:
-            ConflictError: another service has them.
-            CorruptDataError: their log is damaged.
+            ConflictError: another service uses them.
+            CorruptDataError: they are damaged.
         """
         folder = self._settings.jobs_folder or Path(self._store.root) / JOBS_FOLDER
-        for job in await self.book.open(folder):
-            once_more = job_steps.interrupted(job, max_attempts=self._settings.max_attempts)
-            async with self.book.step:
-                await self.book.note(once_more)
+        for job in await self.queue.open(folder):
+            resumed = job.crashed(max_attempts=self._settings.max_attempts)
+            async with self.queue.lock:
+                await self.queue.save_if_possible(resumed)
         await asyncio.to_thread(self._store.sweep)
         work = [self._warm_up(), *(self._work(worker) for worker in self._workers)]
         self._tasks = [asyncio.create_task(one) for one in work]
 
     async def close(self) -> None:
-        """Stop at once; what runs or waits goes on when a service starts again."""
+        """Stop at once; unfinished jobs continue when a service starts again."""
         for task in self._tasks:
             task.cancel()
         at_work = list(self._at_work)
         await asyncio.to_thread(self._stop_workers)
         await asyncio.gather(*self._tasks, return_exceptions=True)
         for alignment_id in at_work:
-            job = self.book.get(alignment_id)
+            job = self.queue.get(alignment_id)
             if job.state == "running":
-                async with self.book.step:
-                    await self.book.note(job_steps.put_back(job))
+                async with self.queue.lock:
+                    await self.queue.save_if_possible(job.interrupted())
         ended = asyncio.ensure_future(asyncio.to_thread(self._threads.shutdown))
         while not ended.done():
-            # Again: a worker may have been about to start when it was stopped.
+            # Repeated: a worker may have been about to start when it was stopped.
             await asyncio.to_thread(self._stop_workers)
             await asyncio.wait([ended], timeout=STOP_PERIOD_S)
-        self.book.close()
+        self.queue.close()
 
     async def submit(self, request: AlignmentRequest) -> tuple[AlignmentJob, ...]:
-        """Start alignments, or find those that run or are done; failed ones start again.
+        """Submit alignments, or find those that run or are done; failed ones are submitted again.
 
-        All of them or none are taken.
+        All of them are accepted or none.
 
         Raises:
             NotFoundError: no such recording.
@@ -104,13 +99,13 @@ class JobTable:
         options = request.options or self._settings.options
         ids = await asyncio.to_thread(check_recordings, self._store, request.wanted, options)
         jobs = [
-            job_steps.submitted(alignment_id, recording_id, options)
+            AlignmentJob.new(alignment_id, recording_id, options)
             for recording_id, alignment_id in ids.items()
         ]
-        async with self.book.step:
-            await self.book.add(jobs)
+        async with self.queue.lock:
+            await self.queue.add(jobs)
         await self._announce()
-        return tuple(self.book.get(alignment_id) for alignment_id in ids.values())
+        return tuple(self.queue.get(alignment_id) for alignment_id in ids.values())
 
     async def refuse(self, recording_id: str, error: InvalidInputError) -> None:
         """Keep a failed job of a recording that cannot be aligned, so that its reason is listed.
@@ -121,62 +116,62 @@ class JobTable:
         """
         recording = await asyncio.to_thread(self._store.recording, recording_id)
         options = self._settings.options
-        job = job_steps.submitted(episode_id_of(recording, options), recording_id, options)
-        async with self.book.step:
-            await self.book.add([job_steps.failed(job, error)])
+        job = AlignmentJob.new(episode_id_of(recording, options), recording_id, options)
+        async with self.queue.lock:
+            await self.queue.add([job.failed(error)])
         logger.warning("alignment_failed", recording_id=recording_id, reason=error.message)
 
     async def wait(self, alignment_id: str) -> AlignmentJob:
         """The job once it has ended."""
         async with self._changed:
-            await self._changed.wait_for(lambda: self.book.get(alignment_id).state in ENDED)
-        return self.book.get(alignment_id)
+            await self._changed.wait_for(lambda: self.queue.get(alignment_id).state in ENDED)
+        return self.queue.get(alignment_id)
 
     async def cancel(self, alignment_id: str) -> AlignmentJob:
-        """End an alignment that waits or runs; nothing of it is written.
+        """Cancel an alignment that waits or runs; nothing of it is written.
 
         Raises:
             NotFoundError: not known here.
             ConflictError: it is done or has failed.
         """
-        async with self.book.step:
-            job = self.book.get(alignment_id)
+        async with self.queue.lock:
+            job = self.queue.get(alignment_id)
             if job.state in {"done", "failed"}:
                 raise ConflictError(
                     f"alignment {alignment_id!r}: is {job.state}, expected one that waits or runs"
                 )
             if job.state != "cancelled":
-                await self.book.change(job_steps.cancelled(job))
+                await self.queue.save(job.cancelled())
             worker = self._at_work.get(alignment_id)
             if worker is not None:
-                # Within the step: else the worker could have begun the next job already.
+                # While holding the lock: otherwise the worker could have started the next job.
                 await asyncio.to_thread(worker.stop)
         await self._announce()
-        return self.book.get(alignment_id)
+        return self.queue.get(alignment_id)
 
     def waiting_for(self) -> list[str]:
-        """What is missing before work may be sent."""
+        """What the service still waits for before it is ready."""
         return [] if self.is_warm else ["solver"]
 
     async def _warm_up(self) -> None:
-        """Start the first worker, so that the first recording need not wait for its solver."""
+        """Start the first worker early, because compiling its solver takes long."""
         loop = asyncio.get_running_loop()
         try:
             await loop.run_in_executor(self._threads, self._workers[0].start)
         except UnavailableError as error:
-            logger.warning("worker_does_not_start", reason=error.message)
+            logger.warning("worker_not_started", reason=error.message)
             return
         self.is_warm = True
 
     async def _work(self, worker: AlignmentWorker) -> None:
-        """One slot: a job after the other."""
+        """Run one job after another on one worker."""
         while True:
             async with self._changed:
-                await self._changed.wait_for(lambda: self.book.next() is not None)
+                await self._changed.wait_for(lambda: self.queue.next() is not None)
             try:
                 job = await self._take(worker)
             except StorageError as error:
-                logger.warning("job_cannot_begin", reason=error.message)
+                logger.warning("job_not_started", reason=error.message)
                 await asyncio.sleep(RETRY_AFTER_S)
                 continue
             if job is None:
@@ -189,44 +184,44 @@ class JobTable:
             await self._announce()
 
     async def _take(self, worker: AlignmentWorker) -> AlignmentJob | None:
-        """Let the job that waits longest begin; None if another worker was faster."""
-        async with self.book.step:
-            waiting = self.book.next()
+        """Start the job that has waited longest; None if another worker was faster."""
+        async with self.queue.lock:
+            waiting = self.queue.next()
             if waiting is None:
                 return None
-            job = job_steps.begun(waiting)
-            await self.book.change(job)
+            job = waiting.started()
+            await self.queue.save(job)
             self._at_work[job.alignment_id] = worker
             return job
 
     async def _carry_out(self, job: AlignmentJob, worker: AlignmentWorker) -> None:
         loop = asyncio.get_running_loop()
 
-        def tell(progress: Progress) -> None:
-            loop.call_soon_threadsafe(self.book.progressed, job, progress)
+        def on_progress(progress: Progress) -> None:
+            loop.call_soon_threadsafe(self.queue.set_progress, job, progress)
 
         try:
             report = await loop.run_in_executor(
-                self._threads, worker.run, job.recording_id, job.options, tell
+                self._threads, worker.run, job.recording_id, job.options, on_progress
             )
-            ended = job_steps.done(job, report)
+            ended = job.done(report)
         except DexTouchError as error:
-            ended = job_steps.failed(job, error)
+            ended = job.failed(error)
             if isinstance(error, UnavailableError):
-                # What the process was writing; it lies beside the store's episodes.
+                # Remove what the process was writing beside the store's episodes.
                 await asyncio.to_thread(self._store.sweep)
         except Exception:
             # The job's supervisor: one broken recording must not end the service.
             logger.exception("alignment_broke", recording_id=job.recording_id)
-            broken = DexTouchError("unexpected error; the service's log tells more")
-            ended = job_steps.failed(job, broken)
-        async with self.book.step:
-            if not self.book.runs(job):
+            broken = DexTouchError("unexpected error; see the service's log")
+            ended = job.failed(broken)
+        async with self.queue.lock:
+            if not self.queue.is_current(job):
                 return
             if ended.problem is not None:
                 reason = ended.problem.detail
                 logger.warning("alignment_failed", recording_id=job.recording_id, reason=reason)
-            await self.book.note(ended)
+            await self.queue.save_if_possible(ended)
 
     async def _announce(self) -> None:
         async with self._changed:

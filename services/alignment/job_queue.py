@@ -1,0 +1,372 @@
+"""Alignment jobs of one service, kept in SQLite so that they outlive a crash or a power failure.
+
+Every step of a job is committed to disk before anyone hears of it; only progress is kept in memory.
+"""
+
+import asyncio
+import fcntl
+import json
+import os
+import sqlite3
+import threading
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import google_crc32c
+import structlog
+from pydantic import ValidationError
+
+from dextouch.episodes.files import disk_errors
+from dextouch.errors import (
+    ConflictError,
+    CorruptDataError,
+    LimitExceededError,
+    NotFoundError,
+    StorageError,
+    StorageFullError,
+    UnavailableError,
+)
+from services.alignment.schemas import ENDED, AlignmentJob, AlignmentList, JobState
+from services.alignment.synchronization.progress import Progress
+
+logger = structlog.get_logger(__name__)
+
+DATABASE_FILE = "jobs.sqlite3"
+LOCK_FILE = "lock"
+# Where earlier versions kept jobs, and its name once they have been imported.
+JSON_LINES_FILE = "jobs.jsonl"
+IMPORTED_FILE = "jobs.jsonl.imported"
+SCHEMA_VERSION = 1
+SCHEMA = """
+CREATE TABLE jobs (
+    position INTEGER PRIMARY KEY AUTOINCREMENT,
+    alignment_id TEXT NOT NULL UNIQUE,
+    crc32c INTEGER NOT NULL,
+    job TEXT NOT NULL
+) STRICT
+"""
+UPSERT = """
+INSERT INTO jobs (alignment_id, crc32c, job) VALUES (?, ?, ?)
+ON CONFLICT (alignment_id) DO UPDATE SET crc32c = excluded.crc32c, job = excluded.job
+"""
+DAMAGED = (sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB)
+MOVE_AWAY = (
+    "episodes are not affected: move the file away and ask for the alignments that are missing"
+)
+RETRY_AFTER_S = 5
+
+
+class JobQueue:
+    """All jobs of one service, in the order in which they were submitted.
+
+    Change jobs only while holding `lock`. Belongs to one event loop.
+
+    Args:
+        max_open: jobs that may wait or run.
+        max_kept: jobs that are remembered; the oldest ended ones are forgotten first.
+    """
+
+    def __init__(self, *, max_open: int, max_kept: int) -> None:
+        self.lock = asyncio.Lock()
+        self._max_open, self._max_kept = max_open, max_kept
+        self._jobs: dict[str, AlignmentJob] = {}
+        self._database: JobDatabase | None = None
+
+    async def open(self, folder: Path) -> list[AlignmentJob]:
+        """Load the jobs kept in a folder; returns those that were running when it was left.
+
+        Raises:
+            ConflictError: another service uses the folder.
+            CorruptDataError: the jobs on disk are damaged.
+        """
+        self._database = await asyncio.to_thread(JobDatabase, folder)
+        self._jobs = await asyncio.to_thread(self._database.load)
+        return [job for job in self._jobs.values() if job.state == "running"]
+
+    def close(self) -> None:
+        """Release the folder."""
+        if self._database is not None:
+            self._database.close()
+            self._database = None
+
+    def get(self, alignment_id: str) -> AlignmentJob:
+        """The current state of a job.
+
+        Raises:
+            NotFoundError: never submitted, or ended long ago.
+        """
+        if alignment_id not in self._jobs:
+            raise NotFoundError(
+                f"alignment {alignment_id!r}: not known here; POST /v1/alignments starts one"
+            )
+        return self._jobs[alignment_id].with_eta()
+
+    def page(self, *, state: JobState | None, after: str | None, limit: int) -> AlignmentList:
+        """Some of the jobs, oldest first.
+
+        Args:
+            state: only jobs in this state; None for all.
+            after: id of the last job of the page before.
+            limit: number of jobs on the page.
+
+        Raises:
+            NotFoundError: there is no job `after`.
+        """
+        ids = list(self._jobs)
+        start = 0 if after is None else ids.index(self.get(after).alignment_id) + 1
+        rest = [i for i in ids[start:] if state is None or self._jobs[i].state == state]
+        shown = rest[:limit]
+        return AlignmentList(
+            alignments=tuple(self.get(alignment_id) for alignment_id in shown),
+            num_matching=sum(state is None or job.state == state for job in self._jobs.values()),
+            next_after=shown[-1] if len(rest) > limit else None,
+        )
+
+    @property
+    def recording_ids(self) -> set[str]:
+        """Recordings that have a job."""
+        return {job.recording_id for job in self._jobs.values()}
+
+    def next(self) -> AlignmentJob | None:
+        """The job that has waited longest."""
+        return next((job for job in self._jobs.values() if job.state == "waiting"), None)
+
+    def is_current(self, job: AlignmentJob) -> bool:
+        """Whether this attempt still runs: the job was neither cancelled nor started again."""
+        known = self._jobs.get(job.alignment_id)
+        return known is not None and known.state == "running" and known.started_at == job.started_at
+
+    async def add(self, jobs: Sequence[AlignmentJob]) -> None:
+        """Append new jobs; those that wait, run or are done stay as they are. Needs `lock`.
+
+        Raises:
+            LimitExceededError: too many would be open; none is added.
+            StorageError: they cannot be saved; none is added.
+        """
+        again = {None, "failed", "cancelled"}
+        states = {key: job.state for key, job in self._jobs.items()}
+        new = {j.alignment_id: j for j in jobs if states.get(j.alignment_id) in again}
+        num_open = sum(job.state not in ENDED for job in self._jobs.values())
+        if new and num_open + len(new) > self._max_open:
+            raise LimitExceededError(
+                f"alignments: {num_open} are running or waiting and {len(new)} more were asked "
+                f"for, expected at most {self._max_open} in all; try again later",
+                retry_after_s=RETRY_AFTER_S,
+            )
+        kept = {key: job for key, job in self._jobs.items() if key not in new} | new
+        ended = [key for key, job in kept.items() if job.state in ENDED]
+        forgotten = ended[: max(0, len(kept) - self._max_kept)]
+        # Those submitted again are removed first, so that they go to the end of the queue.
+        await self._commit([*new, *forgotten], [j for k, j in new.items() if k not in forgotten])
+        self._jobs = {key: job for key, job in kept.items() if key not in forgotten}
+
+    async def save(self, job: AlignmentJob) -> None:
+        """Replace a job by its next state. Needs `lock`.
+
+        Raises:
+            StorageError: it cannot be saved; the job stays as it was.
+        """
+        await self._commit([], [job])
+        self._jobs[job.alignment_id] = job
+
+    async def save_if_possible(self, job: AlignmentJob) -> None:
+        """Replace a job by a state that is a fact, even if the disk is full. Needs `lock`."""
+        try:
+            await self._commit([], [job])
+        except StorageError as error:
+            # After a restart the job runs once more and finds its episode in the store.
+            logger.warning("job_not_saved", alignment_id=job.alignment_id, reason=error.message)
+        self._jobs[job.alignment_id] = job
+
+    def set_progress(self, job: AlignmentJob, progress: Progress) -> None:
+        """Record how far a job is, in memory only."""
+        if self.is_current(job):
+            self._jobs[job.alignment_id] = self._jobs[job.alignment_id].with_progress(progress)
+
+    async def _commit(self, removed: Sequence[str], saved: Sequence[AlignmentJob]) -> None:
+        if self._database is None:
+            raise UnavailableError("alignments: the service has not started or is stopping")
+        await asyncio.to_thread(self._database.commit, removed, saved)
+
+
+class JobDatabase:
+    """The table of jobs in SQLite; one process at a time may open it.
+
+    Every commit is on disk when it returns (write-ahead log, synchronous=FULL).
+
+    Args:
+        folder: of the database, created if needed.
+
+    Raises:
+        ConflictError: another process has it open.
+        CorruptDataError: the database, or the file of an earlier version, is damaged.
+        StorageError: it cannot be read or written.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / DATABASE_FILE
+        with disk_errors(f"open the jobs in {folder}"):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._lock_file = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o644)
+        self._guard = threading.Lock()
+        self._connection: sqlite3.Connection | None = None
+        try:
+            self._acquire_lock()
+            with self._errors("open"):
+                self._connection = sqlite3.connect(
+                    self._path, isolation_level=None, check_same_thread=False, timeout=0
+                )
+                self._prepare(self._connection)
+        except BaseException:
+            self.close()
+            raise
+
+    def load(self) -> dict[str, AlignmentJob]:
+        """Jobs by id, in the order in which they were submitted.
+
+        Raises:
+            CorruptDataError: a row does not match its checksum or is not a job.
+        """
+        select = "SELECT position, crc32c, CAST(job AS BLOB) FROM jobs ORDER BY position"
+        with self._errors("read"), self._guard:
+            rows = self._open.execute(select).fetchall()
+        jobs = [_checked(body, crc, f"{self._path}, job {place}") for place, crc, body in rows]
+        return {job.alignment_id: job for job in jobs}
+
+    def commit(self, removed: Iterable[str], saved: Iterable[AlignmentJob]) -> None:
+        """Remove jobs, then insert or update others, in one transaction.
+
+        Raises:
+            StorageFullError: no space is left; nothing changed.
+        """
+        with self._errors("write"), self._guard, _transaction(self._open) as connection:
+            connection.executemany(
+                "DELETE FROM jobs WHERE alignment_id = ?", [(key,) for key in removed]
+            )
+            connection.executemany(UPSERT, [_row(job) for job in saved])
+
+    def close(self) -> None:
+        """Close the database and release the lock."""
+        with self._guard:
+            if self._connection is not None:
+                self._connection.close()
+                self._connection = None
+            if self._lock_file >= 0:
+                os.close(self._lock_file)
+                self._lock_file = -1
+
+    @property
+    def _open(self) -> sqlite3.Connection:
+        if self._connection is None:
+            raise UnavailableError(f"{self._path}: closed; the service is stopping")
+        return self._connection
+
+    def _acquire_lock(self) -> None:
+        # Held by earlier versions as well, so that two versions never share jobs.
+        try:
+            fcntl.flock(self._lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ConflictError(
+                f"alignment jobs in {self._path.parent}: another alignment service uses them; stop "
+                "it, or give this one a --jobs_folder of its own"
+            ) from error
+
+    def _prepare(self, connection: sqlite3.Connection) -> None:
+        """Create the table, or check it; import the jobs of an earlier version once."""
+        # One process has the database, so the log's index need not be in shared memory, which
+        # network file systems lack.
+        connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = FULL")
+        (version,) = connection.execute("PRAGMA user_version").fetchone()
+        earlier = self._path.with_name(JSON_LINES_FILE)
+        if version == 0:
+            jobs = _read_json_lines(earlier)
+            with _transaction(connection):
+                connection.execute(SCHEMA)
+                connection.executemany(UPSERT, [_row(job) for job in jobs])
+                connection.execute(f"PRAGMA user_version = {SCHEMA_VERSION}")
+            logger.info("job_database_created", path=str(self._path), num_imported=len(jobs))
+        elif version != SCHEMA_VERSION:
+            raise CorruptDataError(
+                f"{self._path}: got schema version {version}, expected {SCHEMA_VERSION}; use the "
+                "version of DexTouch that wrote it, or move the file away"
+            )
+        else:
+            (found,) = connection.execute("PRAGMA quick_check(1)").fetchone()
+            if found != "ok":
+                raise CorruptDataError(f"{self._path}: damaged ({found}); {MOVE_AWAY}")
+        if earlier.is_file():
+            earlier.replace(earlier.with_name(IMPORTED_FILE))
+
+    @contextmanager
+    def _errors(self, verb: str) -> Iterator[None]:
+        """Turn errors of SQLite and of the disk into ours."""
+        what = f"{verb} {self._path}"
+        try:
+            with disk_errors(what):
+                yield
+        except sqlite3.Error as error:
+            # Extended codes carry the primary one in their lowest byte.
+            code = getattr(error, "sqlite_errorcode", 0) & 0xFF
+            if code == sqlite3.SQLITE_FULL:
+                raise StorageFullError(
+                    f"{what}: no space left; free space and try again"
+                ) from error
+            if code in DAMAGED:
+                raise CorruptDataError(f"{what}: damaged ({error}); {MOVE_AWAY}") from error
+            raise StorageError(f"{what}: {error}") from error
+
+
+@contextmanager
+def _transaction(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
+    connection.execute("BEGIN IMMEDIATE")
+    try:
+        yield connection
+        connection.execute("COMMIT")
+    except BaseException:
+        # A full disk may have rolled back already.
+        if connection.in_transaction:
+            connection.execute("ROLLBACK")
+        raise
+
+
+def _row(job: AlignmentJob) -> tuple[str, int, str]:
+    body = job.model_dump_json(exclude_none=True)
+    return job.alignment_id, google_crc32c.value(body.encode()), body
+
+
+def _checked(body: bytes, crc32c: int, where: str) -> AlignmentJob:
+    if google_crc32c.value(body) != crc32c:
+        raise CorruptDataError(f"{where}: does not match its checksum; {MOVE_AWAY}")
+    try:
+        return AlignmentJob.model_validate_json(body)
+    except ValidationError as error:
+        raise CorruptDataError(
+            f"{where}: not a job of this version ({error.error_count()} fields do not fit); "
+            f"{MOVE_AWAY}"
+        ) from error
+
+
+def _read_json_lines(path: Path) -> list[AlignmentJob]:
+    """The jobs of an earlier version, which appended each state to a file; a torn end is ignored.
+
+    Raises:
+        CorruptDataError: a line before the end is damaged.
+    """
+    *lines, _torn = path.read_bytes().split(b"\n") if path.is_file() else [b""]
+    jobs: dict[str, AlignmentJob] = {}
+    for number, line in enumerate(lines, start=1):
+        where = f"{path}, line {number} of {len(lines)}"
+        try:
+            crc32c = int(json.loads(line)["crc32c"])
+            body = line[line.index(b'"job":') + 6 : -1]
+        except (ValueError, KeyError, TypeError, RecursionError) as error:
+            raise CorruptDataError(f"{where}: not a line of jobs; {MOVE_AWAY}") from error
+        job = _checked(body, crc32c, where)
+        if job.alignment_id in jobs and jobs[job.alignment_id].state in ENDED:
+            # Submitted again: it goes to the end of the queue.
+            del jobs[job.alignment_id]
+        jobs[job.alignment_id] = job
+    return list(jobs.values())

@@ -1,0 +1,114 @@
+"""A Python module in a process of its own that takes orders and answers them in lines of JSON.
+
+For work that must not hold up a service or take it along when it is killed. The parent holds a
+`ChildProcess`; the module calls `serve_parent`, and ends when its standard input does, so it never
+outlives the parent by more than the order it is at.
+"""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from typing import Any
+
+from dextouch.errors import UnavailableError
+
+STOP_TIMEOUT_S = 30.0
+
+Answer = Callable[[Mapping[str, object]], None]
+
+
+class ChildProcess:
+    """A running child; `kill` may be called from any thread, the rest from one at a time.
+
+    Args:
+        module: to run, such as `services.alignment.worker_process`.
+        arguments: of its command line.
+        environment: variables to add to this process's own.
+    """
+
+    def __init__(
+        self, module: str, *arguments: str, environment: Mapping[str, str] | None = None
+    ) -> None:
+        # The child finds the same packages, wherever this process found them.
+        python_path = os.pathsep.join(path for path in sys.path if path)
+        self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
+            [sys.executable, "-m", module, *arguments],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            env=os.environ | {"PYTHONPATH": python_path} | dict(environment or {}),
+        )
+
+    @property
+    def pid(self) -> int:
+        """Process id, also after the process has ended."""
+        return self._process.pid
+
+    @property
+    def is_running(self) -> bool:
+        """Whether the process has not ended yet."""
+        return self._process.poll() is None
+
+    def send(self, order: Mapping[str, object]) -> None:
+        """Send an order; if the process has ended, `receive` says so."""
+        assert self._process.stdin is not None  # noqa: S101 - it is a pipe
+        with suppress(BrokenPipeError):
+            self._process.stdin.write(json.dumps(order).encode() + b"\n")
+            self._process.stdin.flush()
+
+    def receive(self) -> dict[str, Any]:
+        """Wait for the next answer.
+
+        Raises:
+            UnavailableError: the process ended instead; `details` has its `exit_status`.
+        """
+        assert self._process.stdout is not None  # noqa: S101 - it is a pipe
+        line = self._process.stdout.readline()
+        if line.endswith(b"\n"):
+            answer: dict[str, Any] = json.loads(line)
+            return answer
+        status = self.close()
+        if status == -signal.SIGKILL:
+            how = "killed; if nobody did that, memory ran out"
+        else:
+            how = f"signal {-status}" if status < 0 else f"exit status {status}; see its log"
+        raise UnavailableError(f"the process ended ({how})", exit_status=status)
+
+    def kill(self) -> None:
+        """End the process at once, whatever it is at; `close` it afterwards."""
+        self._process.kill()
+        self._process.wait(STOP_TIMEOUT_S)
+
+    def close(self) -> int:
+        """Wait until the process has finished its order and ended; returns its exit status."""
+        if self._process.stdin is not None and not self._process.stdin.closed:
+            try:
+                self._process.communicate(timeout=STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.communicate()
+        return self._process.wait(STOP_TIMEOUT_S)
+
+
+def serve_parent(*, niceness: int) -> tuple[Iterator[dict[str, Any]], Answer]:
+    """Orders of the parent, in the child, and the function that answers them.
+
+    What the child prints goes to standard error, so that it cannot get between the answers.
+
+    Args:
+        niceness: added to this process's, so that the parent goes first when cores are short.
+    """
+    # The parent decides when to end; a Ctrl-C at the terminal reaches both.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(niceness)
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)
+
+    def answer(message: Mapping[str, object]) -> None:
+        answers.write(json.dumps(message).encode() + b"\n")
+        answers.flush()
+
+    return (json.loads(line) for line in sys.stdin.buffer), answer
