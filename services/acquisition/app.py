@@ -44,9 +44,9 @@ class _MockStation:
     """A station whose mock devices play round and round."""
 
     def __init__(self, settings: AcquisitionSettings) -> None:
+        from services.acquisition.mock_station import MockStation
         from services.acquisition.mocks.faults import FaultScript
         from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
-        from services.acquisition.mocks.station import MockStation
 
         streams, calibration = pattern_streams(), load_calibration(settings.calibration)
         calibration = {**pattern_calibration(), **calibration}

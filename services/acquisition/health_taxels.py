@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float64
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
-from services.acquisition.drivers.tactile_glove import FULL_SCALE_COUNTS
+from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_cells import (
     SATURATED_SHARE,

@@ -9,10 +9,10 @@ import numpy as np
 
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.glove_devices import mock_glove
+from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.tactile_glove import GloveCalibration
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -91,12 +91,8 @@ class Glove:
             skew_ppm=float(rng.uniform(-80, 80)),
         )
         pair = mock_glove(
-            "left",
-            truth(),
+            MockPlace("left", truth(), self.faults, seed, self.host),
             calibration=GloveCalibration.seeded("left", seed),
-            faults=self.faults,
-            seed=seed,
-            clock=self.host,
         )
         self.device = pair.device
         self.device.port.plug()

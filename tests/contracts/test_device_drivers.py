@@ -22,11 +22,11 @@ from services.acquisition.drivers.bridge_tracker import (
     BridgePoseTrackerDecoder,
 )
 from services.acquisition.drivers.robot_state import STREAM_SIZES
+from services.acquisition.mock_devices import MockFactory
+from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
-from services.acquisition.mocks.devices import MockFactory
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
 

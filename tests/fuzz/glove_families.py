@@ -5,13 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from services.acquisition.drivers.glove_commands import COMMAND_MAGIC, REQUEST, encode_request
-from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
-from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
+from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
+from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.tactile_glove.commands import (
+    COMMAND_MAGIC,
+    REQUEST,
+    encode_request,
+)
+from services.acquisition.devices.tactile_glove.packets import MAGIC, TactileGloveDecoder
+from services.acquisition.devices.wuji_glove.mock import encode_wuji
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.drivers.packets import Packet, PacketDecoder, encode_packet
-from services.acquisition.drivers.tactile_glove import MAGIC, TactileGloveDecoder
-from services.acquisition.mocks.glove_justfloat import encode_justfloat
-from services.acquisition.mocks.glove_wuji import encode_wuji
 
 NUM_VALUES = 401
 FULL_SCALE = 4095.0

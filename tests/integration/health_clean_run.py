@@ -10,10 +10,10 @@ from services.acquisition.drivers.finger_tracker import DESCRIPTOR_REPORT
 from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.health import TICK_NS, HealthMonitor
 from services.acquisition.live import LiveView
-from services.acquisition.mocks.devices import MockFactory
+from services.acquisition.mock_devices import MockFactory
+from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.finger_tracker import FingerTrackerSource
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -121,7 +121,7 @@ def run(names, links, minutes):
         list(streams.values()), faults=FaultScript(), seed=3, clock=clock, links=links
     )
     pairs = factory.build()
-    calibration = {**pattern_calibration(), **factory.calibration()}
+    calibration = {**pattern_calibration(), **factory.calibration(pairs)}
     live = LiveView([pair.driver for pair in pairs], calibration)
     devices = [Played(pair, clock, live, seed) for seed, pair in enumerate(pairs)]
     monitor = HealthMonitor([d.supervisor for d in devices], live=live, clock=clock, station="s")

@@ -11,13 +11,13 @@ from services.acquisition.clock import VirtualClock
 from services.acquisition.drivers.station_camera import StationCamera
 from services.acquisition.health import STATION
 from services.acquisition.health_station import DiskJudge
+from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate, Ledger
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import HealthEvent, TakePrompt
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")

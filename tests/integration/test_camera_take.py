@@ -18,10 +18,10 @@ from dextouch.streams.samples import SampleBatch
 from services.acquisition.clock import VirtualClock
 from services.acquisition.drivers.image_encoding import begin_take, take_gates
 from services.acquisition.drivers.station_camera import CameraTiming
+from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.mocks.video_camera import video_camera
 from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.station import Station

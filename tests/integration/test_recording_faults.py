@@ -9,10 +9,10 @@ import pytest
 from dextouch.episodes.spool import SpoolReader
 from services.acquisition.clock import VirtualClock
 from services.acquisition.drivers.robot_state import STREAM_SIZES
+from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.links import MockLinks
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 from tests.integration.recording_streams import human_streams, robot_streams, stream
 

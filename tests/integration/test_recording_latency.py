@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from services.acquisition.clock import RealClock
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 from tests.integration.recording_streams import human_streams
 

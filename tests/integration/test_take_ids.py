@@ -12,9 +12,9 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError
 from services.acquisition.app import create_app as create_station
 from services.acquisition.clock import VirtualClock
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks import pattern
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.uploader import Uploader

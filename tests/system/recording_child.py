@@ -4,9 +4,9 @@ import sys
 from pathlib import Path
 
 from services.acquisition.clock import RealClock
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 
 

@@ -11,9 +11,9 @@ import structlog
 from dextouch.clients.episode_store import EpisodeStoreClient
 from services.acquisition.clock import VirtualClock
 from services.acquisition.heap import keep_for_life
+from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.links import MockLinks
-from services.acquisition.mocks.station import MockStation
 from services.acquisition.schemas import TakePrompt
 from services.acquisition.uploader import Uploader, recover_spool
 from tests.integration.recording_streams import human_streams, robot_streams

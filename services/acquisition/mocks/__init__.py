@@ -1,1 +1,27 @@
-"""Mock devices: an episode's streams come in, the bytes that real devices would send go out."""
+"""Simulated devices that speak real bytes, and what the mock of a lab's own device is made of."""
+
+from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.faults import DeviceFaults, FaultScript
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import MockPlace, serial_mock
+from services.acquisition.mocks.ports import HidPort, MockPort, PtyPort, SocketPort
+from services.acquisition.mocks.replay import MockDevice, PacketSource, ReplayStream, at_rate
+
+__all__ = [
+    "DeviceFaults",
+    "FaultScript",
+    "HidPort",
+    "MockDevice",
+    "MockPair",
+    "MockPlace",
+    "MockPort",
+    "PacketEdits",
+    "PacketSource",
+    "Pinned",
+    "PtyPort",
+    "ReplayStream",
+    "SocketPort",
+    "at_rate",
+    "serial_mock",
+    "without_first",
+]

@@ -1,10 +1,10 @@
-"""Units of one packet come in, of any family; the same packet with something else in it goes out.
+"""What a fault script makes wrong inside packets: pinned cells, NaN, another hand or version.
 
-What a family cannot say (a hand, a version) cannot be said wrongly either: such a fault is refused.
+Each family of packets has its own `PacketEdits`. What a family cannot say (a hand, a version)
+cannot be said wrongly either: such a fault is refused.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -12,16 +12,6 @@ import numpy as np
 from dextouch.errors import InvalidInputError
 from services.acquisition.drivers.bridge_tracker import POSE_MAGIC as BRIDGE_POSE_MAGIC
 from services.acquisition.drivers.finger_tracker import MAGIC as FINGER_MAGIC
-from services.acquisition.drivers.glove_justfloat import TAIL
-from services.acquisition.drivers.glove_wuji import CRC as WUJI_CRC
-from services.acquisition.drivers.glove_wuji import (
-    CRC_OFFSET,
-    HEAD,
-    MARK,
-    NUM_CELLS,
-    PACKET_BYTES,
-    crc16,
-)
 from services.acquisition.drivers.packets import (
     CRC,
     HEADER,
@@ -37,14 +27,8 @@ from services.acquisition.drivers.reports import (
     ReportReassembler,
     split_into_reports,
 )
-from services.acquisition.drivers.tactile_glove import MAGIC as GLOVE_MAGIC
 
 OUR_MAGIC = b"DX"
-# What pinned cells show: counts of our glove, shares of full scale, counts of a justfloat glove.
-PINNED = {
-    "stuck": {GLOVE_MAGIC: 1_000.0, MARK: 0.25, TAIL: 1_000.0},
-    "saturated": {GLOVE_MAGIC: 65_535.0, MARK: 1.0, TAIL: 4_095.0},
-}
 # Where the numbers of a payload begin, and what they are.
 FLOATS = {
     FINGER_MAGIC: (4, "<f4"),
@@ -55,26 +39,94 @@ FLOATS = {
 OTHER_SIDE = {SOURCES["left"]: SOURCES["right"], SOURCES["right"]: SOURCES["left"]}
 
 Edit = Callable[[bytes], bytes]
+Pinned = Literal["stuck", "saturated"]
 
 
-def edit_units(units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
-    """The units of one packet after some edits.
+class PacketEdits:
+    """Faults inside one packet; a family overrides those that its devices can have.
 
-    Raises:
-        InvalidInputError: reports that are no whole packet, or an edit its family cannot have.
+    The last four methods take the bytes of one whole packet and give those of the changed one, its
+    checksum right. Those that are not overridden raise InvalidInputError.
     """
-    if not edits:
-        return list(units)
-    if not _is_report(units[0]):
+
+    def apply(self, units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
+        """The units that a port sends for one packet, after edits of the packet."""
         # Behind a glove's packet may stand the reply to a command.
-        return [_edited(units[0], edits), *units[1:]]
-    reports = ReportReassembler()
-    messages = [m for m in map(reports.feed, units) if m is not None]
-    if len(messages) != 1:
-        raise InvalidInputError(f"mock fault: got {len(units)} reports, expected one whole packet")
-    report_id, data = messages[0]
-    counter = REPORT_HEADER.unpack_from(units[0])[1]
-    return split_into_reports(report_id, counter, _edited(data, edits))
+        return [_edited(units[0], edits), *units[1:]] if edits else list(units)
+
+    def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
+        """Whether a driver records a NaN as a missing part of a sample, and refuses no packet."""
+        del units
+        return False
+
+    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
+        """Raw cells of a glove that show the same whatever presses them."""
+        del data, cells, how
+        raise _cannot("a taxel that is pinned")
+
+    def put_nan(self, data: bytes) -> bytes:
+        """The first number that is one is none."""
+        del data
+        raise _cannot("a number that can be NaN")
+
+    def other_side(self, data: bytes) -> bytes:
+        """The packet of the other hand's device."""
+        del data
+        raise _cannot("a hand")
+
+    def other_version(self, data: bytes) -> bytes:
+        """The packet of a device with newer firmware."""
+        del data
+        raise _cannot("a version")
+
+
+class OurPacketEdits(PacketEdits):
+    """Faults inside the packets of our documented devices (docs/device_packets.md)."""
+
+    def apply(self, units: Sequence[bytes], edits: Sequence[Edit]) -> list[bytes]:
+        """Joins the reports of a packet for the edits, and splits it again.
+
+        Raises:
+            InvalidInputError: reports that are no whole packet.
+        """
+        if not edits or not _is_report(units[0]):
+            return super().apply(units, edits)
+        reports = ReportReassembler()
+        messages = [m for m in map(reports.feed, units) if m is not None]
+        if len(messages) != 1:
+            raise InvalidInputError(
+                f"mock fault: got {len(units)} reports, expected one whole packet"
+            )
+        report_id, data = messages[0]
+        counter = REPORT_HEADER.unpack_from(units[0])[1]
+        return split_into_reports(report_id, counter, _edited(data, edits))
+
+    def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
+        """Finger trackers alone say of single nodes that they are not seen."""
+        start = REPORT_HEADER.size if _is_report(units[0]) else 0
+        return units[0].startswith(FINGER_MAGIC, start)
+
+    def put_nan(self, data: bytes) -> bytes:
+        """The first number of a payload of floats."""
+
+        def change(magic: bytes, packet: Packet) -> Packet:
+            if magic not in FLOATS:
+                raise _cannot("a number that can be NaN")
+            start, dtype = FLOATS[magic]
+            values = without_first(np.frombuffer(packet.payload, dtype=dtype, offset=start))
+            return changed(packet, payload=packet.payload[:start] + values.tobytes())
+
+        return edit_ours(data, change)
+
+    def other_side(self, data: bytes) -> bytes:
+        """Left says right, and any other left."""
+        return edit_ours(
+            data, lambda _, p: changed(p, source=OTHER_SIDE.get(p.source, SOURCES["left"]))
+        )
+
+    def other_version(self, data: bytes) -> bytes:
+        """The next version."""
+        return edit_ours(data, lambda _, p: changed(p, version=VERSION + 1))
 
 
 def halve_units(units: Sequence[bytes]) -> list[bytes]:
@@ -85,96 +137,14 @@ def halve_units(units: Sequence[bytes]) -> list[bytes]:
     return [whole[: len(whole) // 2]]
 
 
-def family_of(units: Sequence[bytes]) -> bytes:
-    """What kind of packet the units are: our magic, or the mark of another family."""
-    first = units[0][REPORT_HEADER.size :] if _is_report(units[0]) else units[0]
-    if first.startswith(OUR_MAGIC):
-        return first[:MAGIC_SIZE]
-    return MARK if first.startswith(MARK) else TAIL
-
-
-def is_marked_when_nan(family: bytes) -> bool:
-    """Whether a driver records a NaN as a missing part of a sample, and refuses no packet."""
-    return family in {FINGER_MAGIC, MARK}
-
-
-def other_version(data: bytes) -> bytes:
-    """The packet of a device with newer firmware."""
-    return _edit_ours(data, lambda _, packet: _with(packet, version=VERSION + 1), "a version")
-
-
-def other_side(data: bytes) -> bytes:
-    """The packet of the other hand's device."""
-    if family_of([data]) == MARK:
-        return _edit_wuji(data, lambda hand, cells: (1 - hand, cells))
-    return _edit_ours(
-        data,
-        lambda _, p: _with(p, source=OTHER_SIDE.get(p.source, SOURCES["left"])),
-        "a hand",
-    )
-
-
-def pin_taxels(cells: Sequence[int], how: Literal["stuck", "saturated"]) -> Edit:
-    """Raw cells of a glove that show the same whatever presses them."""
-    return partial(_pin, cells=list(cells), shown=PINNED[how])
-
-
-def put_nan(data: bytes) -> bytes:
-    """The first number that is one is none."""
-    family = family_of([data])
-    if family == MARK:
-        return _edit_wuji(data, lambda hand, cells: (hand, _without_first(cells)))
-    if family == TAIL:
-        return _without_first(np.frombuffer(data[: -len(TAIL)], "<f4")).tobytes() + TAIL
-
-    def change(magic: bytes, packet: Packet) -> Packet:
-        if magic not in FLOATS:
-            raise InvalidInputError(f"mock fault: a {magic!r} packet has no number that can be NaN")
-        start, dtype = FLOATS[magic]
-        values = _without_first(np.frombuffer(packet.payload, dtype=dtype, offset=start))
-        return _with(packet, payload=packet.payload[:start] + values.tobytes())
-
-    return _edit_ours(data, change, "a number")
-
-
-def _is_report(unit: bytes) -> bool:
-    return len(unit) == REPORT_BYTES and not unit.startswith((OUR_MAGIC, MARK))
-
-
-def _edited(data: bytes, edits: Sequence[Edit]) -> bytes:
-    for edit in edits:
-        data = edit(data)
-    return data
-
-
-def _pin(data: bytes, *, cells: list[int], shown: dict[bytes, float]) -> bytes:
-    family = family_of([data])
-    if family not in shown:
-        raise InvalidInputError(f"mock fault: pinned taxels on a {family!r}, expected a glove")
-
-    def pinned(values: np.ndarray) -> np.ndarray:
-        values = values.copy()
-        values[cells] = shown[family]
-        return values
-
-    if family == MARK:
-        return _edit_wuji(data, lambda hand, grid: (hand, pinned(grid)))
-    if family == TAIL:
-        return pinned(np.frombuffer(data[: -len(TAIL)], "<f4")).tobytes() + TAIL
-    return _edit_ours(
-        data,
-        lambda _, p: _with(p, payload=pinned(np.frombuffer(p.payload, "<u2")).tobytes()),
-        "a taxel",
-    )
-
-
-def _with(
+def changed(
     packet: Packet,
     *,
     version: int | None = None,
     source: int | None = None,
     payload: bytes | None = None,
 ) -> Packet:
+    """The packet with something else in it."""
     return Packet(
         packet.version if version is None else version,
         packet.source if source is None else source,
@@ -184,27 +154,42 @@ def _with(
     )
 
 
-def _without_first(values: np.ndarray) -> np.ndarray:
+def without_first(values: np.ndarray) -> np.ndarray:
+    """The numbers with NaN in place of the first that is finite."""
     values = values.copy()
     values[np.flatnonzero(np.isfinite(values))[0]] = np.nan
     return values
 
 
-def _edit_ours(data: bytes, change: Callable[[bytes, Packet], Packet], word: str) -> bytes:
+def edit_ours(data: bytes, change: Callable[[bytes, Packet], Packet]) -> bytes:
+    """A packet of our documented devices after a change of its content.
+
+    Raises:
+        InvalidInputError: no such packet, or a fault that this one cannot have.
+    """
     magic = data[:MAGIC_SIZE]
     if not magic.startswith(OUR_MAGIC):
-        raise InvalidInputError(f"mock fault: packets of this family do not tell {word}")
+        raise InvalidInputError(
+            f"mock fault: got a packet that begins with {magic!r}, expected one of ours; give its "
+            "source PacketEdits of its family"
+        )
     _, version, source, length, sequence, t_device_ns = HEADER.unpack_from(data)
     payload = data[HEADER.size : len(data) - CRC.size]
     packet = Packet(version, source, sequence, t_device_ns, payload[:length])
     return encode_packet(magic, change(magic, packet))
 
 
-def _edit_wuji(data: bytes, change: Callable[[int, np.ndarray], tuple[int, np.ndarray]]) -> bytes:
-    hand = HEAD.unpack_from(data)[2]
-    hand, cells = change(hand, np.frombuffer(data, "<f4", NUM_CELLS, HEAD.size))
-    packet = bytearray(data)
-    HEAD.pack_into(packet, 0, MARK, PACKET_BYTES, hand)
-    packet[HEAD.size : HEAD.size + cells.nbytes] = cells.tobytes()
-    WUJI_CRC.pack_into(packet, CRC_OFFSET, crc16(bytes(packet[len(MARK) : CRC_OFFSET])))
-    return bytes(packet)
+def _cannot(what: str) -> InvalidInputError:
+    return InvalidInputError(
+        f"mock fault: packets of this family do not tell {what}; leave the fault out of the script"
+    )
+
+
+def _is_report(unit: bytes) -> bool:
+    return len(unit) == REPORT_BYTES and not unit.startswith(OUR_MAGIC)
+
+
+def _edited(data: bytes, edits: Sequence[Edit]) -> bytes:
+    for edit in edits:
+        data = edit(data)
+    return data

@@ -3,6 +3,7 @@
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -13,14 +14,10 @@ from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.mocks.edits import (
     Edit,
-    edit_units,
-    family_of,
+    OurPacketEdits,
+    PacketEdits,
+    Pinned,
     halve_units,
-    is_marked_when_nan,
-    other_side,
-    other_version,
-    pin_taxels,
-    put_nan,
 )
 from services.acquisition.mocks.faults import (
     DeviceFaults,
@@ -86,6 +83,16 @@ class LabelledSource(Protocol):
         ...
 
 
+@runtime_checkable
+class OtherFamilySource(Protocol):
+    """A source of packets that are not ours, which knows how faults inside them look."""
+
+    @property
+    def edits(self) -> PacketEdits:
+        """Faults inside its packets."""
+        ...
+
+
 class _Event(NamedTuple):
     """Something a device does at a time counted from the start of the take."""
 
@@ -116,11 +123,16 @@ class MockDevice:
         self._boot_ns = boot_time_ns(self._rng)
         self._bit_error_rate = faults.bit_error_rate if port.has_bit_errors else 0.0
         self._byte_loss_rate = faults.byte_loss_rate if port.has_bit_errors else 0.0
-        self._taxel_edits: list[Edit] = []
-        if faults.stuck_taxels:
-            self._taxel_edits.append(pin_taxels(faults.stuck_taxels, "stuck"))
-        if faults.saturated_taxels:
-            self._taxel_edits.append(pin_taxels(faults.saturated_taxels, "saturated"))
+        self._edits: PacketEdits = OurPacketEdits()
+        if isinstance(source, OtherFamilySource):
+            self._edits = source.edits
+        pinned: dict[Pinned, tuple[int, ...]] = {
+            "stuck": faults.stuck_taxels,
+            "saturated": faults.saturated_taxels,
+        }
+        self._taxel_edits: list[Edit] = [
+            partial(self._edits.pin, cells=cells, how=how) for how, cells in pinned.items() if cells
+        ]
         self._next_sequence = faults.first_sequence
         # The place in the ledger and the units of a packet that the next one overtakes.
         self._held: tuple[int, list[bytes]] | None = None
@@ -260,18 +272,18 @@ class MockDevice:
         faults = self.faults
         edits = list(self._taxel_edits)
         for from_s, edit in (
-            (faults.version_from_s, other_version),
-            (faults.wrong_side_from_s, other_side),
+            (faults.version_from_s, self._edits.other_version),
+            (faults.wrong_side_from_s, self._edits.other_side),
         ):
             if from_s is not None and t_true_ns >= from_s * 1e9:
                 edits.append(edit)
                 fate = Fate.REFUSED
         if self._happens(faults.nan_probability):
-            edits.append(put_nan)
+            edits.append(self._edits.put_nan)
             if fate is Fate.SENT:
-                is_marked = is_marked_when_nan(family_of(units))
+                is_marked = self._edits.is_marked_when_nan(units)
                 fate = Fate.MARKED if is_marked else Fate.REFUSED
-        return edit_units(units, edits), fate
+        return self._edits.apply(units, edits), fate
 
     def _new_ledger(self) -> DeviceLedger:
         return DeviceLedger(
@@ -283,3 +295,17 @@ class MockDevice:
 def device_rng(seed: int, name: str) -> np.random.Generator:
     """The same random numbers for the same seed and device, whatever other devices there are."""
     return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def at_rate(stream: ReplayStream, rate_hz: float) -> ReplayStream:
+    """The stream as a device of another rate shows it: interpolated between its samples."""
+    ratio = rate_hz / stream.descriptor.nominal_rate_hz
+    index = np.arange(round(len(stream.t_ns) * ratio)) / ratio
+    # Behind the last sample the last value stands until the round begins again.
+    before = np.minimum(index.astype(np.int64), len(stream.t_ns) - 1)
+    after = np.minimum(before + 1, len(stream.t_ns) - 1)
+    share = (index - before)[:, None]
+    values = (1.0 - share) * stream.values[before] + share * stream.values[after]
+    t_ns = stream.t_ns[0] + np.rint(index * (1e9 / stream.descriptor.nominal_rate_hz))
+    descriptor = stream.descriptor.model_copy(update={"nominal_rate_hz": rate_hz})
+    return ReplayStream(descriptor, t_ns.astype(np.int64), values.astype(stream.values.dtype))

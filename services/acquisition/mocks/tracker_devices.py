@@ -2,6 +2,7 @@
 
 import threading
 from dataclasses import dataclass
+from typing import Literal
 
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock, VirtualClock
@@ -22,7 +23,6 @@ from services.acquisition.mocks.bridge_sources import (
 )
 from services.acquisition.mocks.faults import DeviceFaults, Schedule
 from services.acquisition.mocks.finger_tracker import FingerTrackerSource
-from services.acquisition.mocks.links import TrackerLink
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.pose_tracker import PoseTrackerSource
@@ -34,6 +34,7 @@ from services.acquisition.mocks.replay import (
 )
 from services.acquisition.mocks.usb_backend import UsbPort
 
+TrackerLink = Literal["hid", "usb", "bridge"]
 REPORT_PORTS = {"hid": HidPort, "usb": UsbPort}
 
 

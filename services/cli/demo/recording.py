@@ -23,7 +23,7 @@ from services.acquisition.clock import VirtualClock
 from services.acquisition.mocks.episode import replay_calibration, replay_streams
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.station import MockStation, MockTake
+from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.uploader import Uploader
 from services.alignment.schemas import AlignmentJob

@@ -8,23 +8,21 @@ import pytest
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import RealClock
-from services.acquisition.drivers.glove_commands import (
+from services.acquisition.devices.justfloat_glove.mock import mock_justfloat_glove
+from services.acquisition.devices.tactile_glove.commands import (
     encode_identity,
     parse_identity,
     parse_reply,
     parse_tare,
 )
-from services.acquisition.drivers.glove_driver import TactileGlove
+from services.acquisition.devices.tactile_glove.driver import TactileGlove
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
+from services.acquisition.devices.wuji_glove.mock import mock_wuji_glove
 from services.acquisition.drivers.packets import Packet
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.glove_devices import (
-    mock_glove,
-    mock_justfloat_glove,
-    mock_wuji_glove,
-)
+from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.tactile_glove import GloveCalibration
 
 
 def pressures(count=20):
@@ -42,12 +40,8 @@ def pressures(count=20):
 
 def make(side="left", **options):
     return mock_glove(
-        side,
-        pressures(),
+        MockPlace(side, pressures(), DeviceFaults(), 1, RealClock()),
         calibration=GloveCalibration.seeded(side, 1),
-        faults=DeviceFaults(),
-        seed=1,
-        clock=RealClock(),
         **options,
     )
 
@@ -220,7 +214,7 @@ def test_commands_with_bit_errors_are_asked_again(glove, monkeypatch):
 
 @pytest.mark.parametrize("make_glove", [mock_wuji_glove, mock_justfloat_glove])
 def test_vendor_gloves_speak_over_a_terminal(make_glove):
-    pair = make_glove("left", pressures(), faults=DeviceFaults(), seed=1, clock=RealClock())
+    pair = make_glove(MockPlace("left", pressures(), DeviceFaults(), 1, RealClock()))
     pair.device.port.plug()
     pair.driver.open()
     for index in range(6):

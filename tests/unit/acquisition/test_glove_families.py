@@ -5,16 +5,15 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.drivers.glove_justfloat import (
+from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
+from services.acquisition.devices.justfloat_glove.packets import (
     TAIL,
     JustFloatGloveDecoder,
     are_readings,
     bits_of,
 )
-from services.acquisition.drivers.glove_protocols import vendor_glove_decoder
-from services.acquisition.drivers.glove_wuji import WujiGloveDecoder, are_pressures, crc16
-from services.acquisition.mocks.glove_justfloat import encode_justfloat
-from services.acquisition.mocks.glove_wuji import encode_wuji
+from services.acquisition.devices.wuji_glove.mock import encode_wuji
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder, are_pressures, crc16
 
 
 def cells(rng):
@@ -191,13 +190,6 @@ def test_readings_are_the_plain_check():
         assert are_readings(value, bits_of(4095.0)) == plain, hex(pattern)
 
 
-def test_protocols_by_name():
-    assert isinstance(vendor_glove_decoder("wuji", "left"), WujiGloveDecoder)
-    decoder = vendor_glove_decoder(
-        "justfloat", "right", num_values=10, full_scale=1.0, rate_hz=50.0
-    )
-    assert decoder.descriptors[0].shape == (10,)
-    with pytest.raises(InvalidInputError, match="rate_hz=None"):
-        vendor_glove_decoder("justfloat", "right", num_values=10, full_scale=1.0)
+def test_packets_without_a_number_are_refused():
     with pytest.raises(InvalidInputError, match="num_values"):
         justfloat(0)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
 from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import DeviceFaults
@@ -13,7 +14,6 @@ from services.acquisition.mocks.finger_tracker import FingerTrackerSource
 from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.mocks.robot_state import RobotStateSource
-from services.acquisition.mocks.tactile_glove import GloveCalibration, TactileGloveSource
 
 FLAT = GloveCalibration(np.full(360, 120.0), np.full(360, 40.0))
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
-from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
+from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.health_cells import CellJudge, Cells, cells_of
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes
 

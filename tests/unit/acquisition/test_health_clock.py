@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.streams.descriptors import StreamDescriptor
-from services.acquisition.drivers.tactile_glove import glove_descriptor
+from services.acquisition.devices.tactile_glove.packets import glove_descriptor
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_clock import ClockJudge, CountingJudge
 from tests.unit.acquisition.health_blocks_made import NONE, SECOND_NS, block, codes

@@ -12,9 +12,9 @@ HEAVY = ("torch", "cv2", "zarr", "scipy", "mujoco", "serial", "hidraw")
     "module",
     [
         "services.acquisition",
-        "services.acquisition.drivers.tactile_glove",
+        "services.acquisition.devices.tactile_glove.packets",
         "services.acquisition.station",
-        "services.acquisition.mocks.station",
+        "services.acquisition.mock_station",
         "services.acquisition.app",
     ],
 )

@@ -11,11 +11,12 @@ from services.acquisition.drivers.bridge_tracker import BridgeDriver
 from services.acquisition.drivers.camera import CameraDriver
 from services.acquisition.drivers.finger_tracker import FingerTracker
 from services.acquisition.drivers.station_camera import StationCamera
-from services.acquisition.mocks.devices import MockFactory, at_rate
+from services.acquisition.mock_devices import MockFactory
+from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.station import MockStation
+from services.acquisition.mocks.replay import at_rate
 from services.acquisition.schemas import TakePrompt
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.transports.usb import UsbTransport
@@ -36,7 +37,8 @@ def build(names, clock=None, **links):
         clock=clock or VirtualClock(),
         links=MockLinks(**links),
     )
-    return factory, [pair.driver for pair in factory.build()]
+    pairs = factory.build()
+    return factory.calibration(pairs), [pair.driver for pair in pairs]
 
 
 def test_by_default_they_are_linked_as_ever():
@@ -75,9 +77,9 @@ def test_trackers_may_give_the_wrists_beside_a_robot():
 
 @pytest.mark.parametrize(("gloves", "num_values"), [("wuji", 768), ("justfloat", 401)])
 def test_gloves_of_others_come_without_our_calibration(gloves, num_values):
-    factory, (glove,) = build(("tactile_left",), gloves=gloves)
+    calibration, (glove,) = build(("tactile_left",), gloves=gloves)
     assert glove.descriptors[0].shape == (num_values,)
-    assert factory.calibration() == {}
+    assert calibration == {}
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, InvalidInputError
+from services.acquisition.devices.tactile_glove.packets import (
+    MAGIC,
+    PAYLOAD_BYTES,
+    TactileGloveDecoder,
+)
 from services.acquisition.drivers.frames import SequenceCounter
 from services.acquisition.drivers.packets import (
     SOURCES,
@@ -14,7 +19,6 @@ from services.acquisition.drivers.packets import (
     PacketDecoder,
     encode_packet,
 )
-from services.acquisition.drivers.tactile_glove import MAGIC, PAYLOAD_BYTES, TactileGloveDecoder
 
 
 def glove_packet(sequence, rng, *, version=1, source=SOURCES["left"]):

@@ -10,8 +10,8 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
 from services.acquisition.health import HealthMonitor
 from services.acquisition.health_metrics import HealthCollector
 from services.acquisition.health_path import PathJudge

@@ -8,7 +8,7 @@ from dextouch.serving.settings import ServiceSettings, load_settings
 from services.acquisition.app import create_app
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
-from services.acquisition.mocks.links import MockLinks
+from services.acquisition.mock_links import MockLinks
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.supervisor import SpoolSafety
 

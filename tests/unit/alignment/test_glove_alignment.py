@@ -11,10 +11,10 @@ from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import expand_taxels, raw_indices
 from dextouch.tactile.refused import measured_taxels
-from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
-from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
-from services.acquisition.mocks.glove_justfloat import COUNTS_PER_KPA, JustFloatGloveSource
-from services.acquisition.mocks.glove_wuji import FULL_SCALE_KPA, WujiGloveSource, grid_of
+from services.acquisition.devices.justfloat_glove.mock import COUNTS_PER_KPA, JustFloatGloveSource
+from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.wuji_glove.mock import FULL_SCALE_KPA, WujiGloveSource, grid_of
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.mocks.replay import ReplayStream
 from services.alignment.__main__ import main
 from services.alignment.jobs import align_recording

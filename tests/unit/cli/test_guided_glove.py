@@ -12,11 +12,11 @@ from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, Unk
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
 from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import PtyPort
-from services.acquisition.mocks.tactile_glove import GloveCalibration
 from services.acquisition.recorder import Recorder
 from services.acquisition.schemas import SaveTake, TakeName, TakePrompt
 from services.alignment.calibration.tactile_baseline import TactileCalibration

@@ -23,7 +23,7 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from services.acquisition.devices import load_calibration
-from services.acquisition.mocks.tactile_glove import GloveCalibration
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.cli import main as command_line

@@ -3,7 +3,8 @@
 import numpy as np
 
 from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS
-from services.acquisition.drivers import finger_tracker, pose_tracker, tactile_glove
+from services.acquisition.devices.tactile_glove import packets as tactile_glove
+from services.acquisition.drivers import finger_tracker, pose_tracker
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import (
     DATA_REPORT,

@@ -1,11 +1,11 @@
 """The kind `justfloat_glove`."""
 
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
 from services.acquisition.devices.justfloat_glove.settings import JustFloatGloveSettings
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.serial_line import serial_transport
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
 
 
 def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
@@ -20,4 +20,9 @@ def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
     return Driver(f"glove_{settings.side}", transport=transport, decoder=decoder, clock=clock)
 
 
-KIND = DeviceKind(name="justfloat_glove", settings=JustFloatGloveSettings, build=build)
+KIND = DeviceKind(
+    name="justfloat_glove",
+    settings=JustFloatGloveSettings,
+    build=build,
+    mock="services.acquisition.devices.justfloat_glove.mock:mock_justfloat_glove",
+)

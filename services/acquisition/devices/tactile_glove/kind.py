@@ -3,8 +3,8 @@
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.serial_line import serial_transport
+from services.acquisition.devices.tactile_glove.driver import TactileGlove
 from services.acquisition.devices.tactile_glove.settings import TactileGloveSettings
-from services.acquisition.drivers.glove_driver import TactileGlove
 
 
 def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
@@ -17,4 +17,9 @@ def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
     )
 
 
-KIND = DeviceKind(name="tactile_glove", settings=TactileGloveSettings, build=build)
+KIND = DeviceKind(
+    name="tactile_glove",
+    settings=TactileGloveSettings,
+    build=build,
+    mock="services.acquisition.devices.tactile_glove.mock:mock_glove",
+)

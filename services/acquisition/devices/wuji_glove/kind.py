@@ -3,9 +3,9 @@
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.serial_line import serial_transport
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.devices.wuji_glove.settings import WujiGloveSettings
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
 
 
 def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
@@ -15,4 +15,9 @@ def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
     return Driver(f"glove_{settings.side}", transport=transport, decoder=decoder, clock=clock)
 
 
-KIND = DeviceKind(name="wuji_glove", settings=WujiGloveSettings, build=build)
+KIND = DeviceKind(
+    name="wuji_glove",
+    settings=WujiGloveSettings,
+    build=build,
+    mock="services.acquisition.devices.wuji_glove.mock:mock_wuji_glove",
+)

@@ -9,6 +9,9 @@ import numpy as np
 
 from dextouch.hands.skeleton import NUM_KEYPOINTS
 from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.drivers.base import Decoder
 from services.acquisition.drivers.bridge_tracker import (
     BridgeFingerTrackerDecoder,
@@ -16,8 +19,6 @@ from services.acquisition.drivers.bridge_tracker import (
 )
 from services.acquisition.drivers.camera import CameraDecoder, ImageEncoding, camera_descriptor
 from services.acquisition.drivers.finger_tracker import FingerTrackerDecoder, keypoints_descriptor
-from services.acquisition.drivers.glove_justfloat import JustFloatGloveDecoder
-from services.acquisition.drivers.glove_wuji import WujiGloveDecoder
 from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
 from services.acquisition.drivers.robot_state import (
@@ -25,7 +26,6 @@ from services.acquisition.drivers.robot_state import (
     RobotStateDecoder,
     robot_descriptor,
 )
-from services.acquisition.drivers.tactile_glove import TactileGloveDecoder
 from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
 from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import DeviceFaults

@@ -7,8 +7,15 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from dextouch.streams.samples import Sample
-from services.acquisition.drivers.glove_justfloat import TAIL, JustFloatGloveDecoder
-from services.acquisition.drivers.glove_wuji import (
+from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
+from services.acquisition.devices.justfloat_glove.packets import TAIL, JustFloatGloveDecoder
+from services.acquisition.devices.tactile_glove.packets import (
+    MAGIC,
+    PAYLOAD_BYTES,
+    TactileGloveDecoder,
+)
+from services.acquisition.devices.wuji_glove.mock import encode_wuji
+from services.acquisition.devices.wuji_glove.packets import (
     CRC_OFFSET,
     HEAD,
     MARK,
@@ -19,9 +26,6 @@ from services.acquisition.drivers.glove_wuji import (
 )
 from services.acquisition.drivers.packets import HEADER, OVERHEAD, SOURCES, VERSION, Packet
 from services.acquisition.drivers.packets import encode_packet as encode_ours
-from services.acquisition.drivers.tactile_glove import MAGIC, PAYLOAD_BYTES, TactileGloveDecoder
-from services.acquisition.mocks.glove_justfloat import encode_justfloat
-from services.acquisition.mocks.glove_wuji import encode_wuji
 
 NUM_VALUES = 401
 FULL_SCALE = 4095.0

@@ -17,8 +17,8 @@ import numpy as np
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import RealClock
+from services.acquisition.devices.tactile_glove.packets import MAGIC, TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.tactile_glove import MAGIC, TactileGloveDecoder
 from services.acquisition.transports.serial import SerialTransport
 
 NUM_STREAMS = 8

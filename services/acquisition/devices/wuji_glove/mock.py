@@ -1,30 +1,76 @@
-"""Pressures of one hand come in; a Wuji glove's data packets go out."""
+"""A simulated Wuji glove: its packets with pressures on a grid of its own choice."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float32, Int64
 
 from dextouch.tactile.layout import NUM_TAXELS, Side, split_pads
-from services.acquisition.drivers.glove_wuji import (
+from services.acquisition.devices.wuji_glove.packets import (
     CRC,
+    CRC_OFFSET,
     GRID,
     HANDS,
     HEAD,
     MARK,
+    NOMINAL_RATE_HZ,
+    NUM_CELLS,
     PACKET_BYTES,
     SEQUENCE_BITS,
     STAMPS,
     TICK_NS,
     TIME_BITS,
+    WujiGloveDecoder,
     crc16,
 )
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import MockPlace, serial_mock
+from services.acquisition.mocks.replay import ReplayStream, at_rate
 
 FULL_SCALE_KPA = 100.0
+# What pinned cells show, in parts of full scale.
+PINNED = {"stuck": 0.25, "saturated": 1.0}
 # Which cells the real glove has is not public: the mock's grid is its own choice.
 _FINGER_ROWS = slice(0, 4)
 _PALM_ROWS, _PALM_COLUMNS = slice(6, 21), slice(8, 24)
+
+
+def mock_wuji_glove(place: MockPlace) -> MockPair:
+    """A Wuji glove: CRC-16, a number of 16 bits, milliseconds."""
+    source = WujiGloveSource(
+        at_rate(place.stream, NOMINAL_RATE_HZ),
+        side=place.side,
+        dead_taxels=place.faults.dead_taxels,
+    )
+    return serial_mock(place, source=source, decoder=WujiGloveDecoder(place.side))
+
+
+class WujiPacketEdits(PacketEdits):
+    """Faults inside a Wuji glove's packet."""
+
+    def is_marked_when_nan(self, units: Sequence[bytes]) -> bool:
+        """A cell may be NaN."""
+        del units
+        return True
+
+    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
+        """Cells of the grid, row by row."""
+
+        def pinned(hand: int, grid: np.ndarray) -> tuple[int, np.ndarray]:
+            grid = grid.copy()
+            grid[list(cells)] = PINNED[how]
+            return hand, grid
+
+        return _edited(data, pinned)
+
+    def put_nan(self, data: bytes) -> bytes:
+        """The first cell."""
+        return _edited(data, lambda hand, cells: (hand, without_first(cells)))
+
+    def other_side(self, data: bytes) -> bytes:
+        """The other hand's number."""
+        return _edited(data, lambda hand, cells: (1 - hand, cells))
 
 
 class WujiGloveSource:
@@ -36,6 +82,8 @@ class WujiGloveSource:
         scale_kpa: the pressure that reads 1.
         dead_taxels: cells of the grid, row by row, that read zero.
     """
+
+    edits = WujiPacketEdits()
 
     def __init__(
         self,
@@ -77,3 +125,13 @@ def encode_wuji(hand: int, sequence: int, time_ms: int, cells: bytes) -> bytes:
     packet = HEAD.pack(MARK, PACKET_BYTES, hand) + cells
     packet += STAMPS.pack(sequence % (1 << SEQUENCE_BITS), time_ms % (1 << TIME_BITS))
     return packet + CRC.pack(crc16(packet[len(MARK) :]))
+
+
+def _edited(data: bytes, change: Callable[[int, np.ndarray], tuple[int, np.ndarray]]) -> bytes:
+    hand = HEAD.unpack_from(data)[2]
+    hand, cells = change(hand, np.frombuffer(data, "<f4", NUM_CELLS, HEAD.size))
+    packet = bytearray(data)
+    HEAD.pack_into(packet, 0, MARK, PACKET_BYTES, hand)
+    packet[HEAD.size : HEAD.size + cells.nbytes] = cells.tobytes()
+    CRC.pack_into(packet, CRC_OFFSET, crc16(bytes(packet[len(MARK) : CRC_OFFSET])))
+    return bytes(packet)

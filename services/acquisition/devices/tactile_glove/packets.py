@@ -1,4 +1,4 @@
-"""Tactile glove: bytes of our glove packet come in, 360 raw counts a sample go out."""
+"""Data packets of our tactile glove: the decoder of their 360 raw counts, and their stream."""
 
 from collections.abc import Callable
 
@@ -7,9 +7,9 @@ import numpy as np
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
+from services.acquisition.devices.tactile_glove.commands import MAX_REPLY, MIN_REPLY, REPLY_MAGIC
 from services.acquisition.drivers.base import Readings, check_packet
 from services.acquisition.drivers.frames import DecoderStatistics
-from services.acquisition.drivers.glove_commands import MAX_REPLY, MIN_REPLY, REPLY_MAGIC
 from services.acquisition.drivers.packets import Packet, PacketDecoder
 
 MAGIC = b"DXTG"

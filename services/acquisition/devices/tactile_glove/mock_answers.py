@@ -1,4 +1,4 @@
-"""Requests of the host come in as bytes; what our glove answers goes out as bytes."""
+"""The replies of a simulated glove of ours to the requests of the host."""
 
 import threading
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from jaxtyping import UInt16
 
 from dextouch.errors import PacketError
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.glove_commands import (
+from services.acquisition.devices.tactile_glove.commands import (
     COMMAND_MAGIC,
     DIAGNOSTICS,
     MAX_TARE_PACKETS,

@@ -1,4 +1,4 @@
-"""Streams of an episode, faults and a clock come in; a whole station recording them goes out."""
+"""A station whose devices are simulated and play one episode, through the real drivers."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -12,10 +12,10 @@ import structlog
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.schemas.episodes import Matrix
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
-from services.acquisition.mocks.devices import MockFactory, duration_ns
+from services.acquisition.mock_devices import MockFactory, duration_ns
+from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Ledger
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.schemas import SaveTake, TakeCheck, TakePrompt
@@ -79,7 +79,7 @@ class MockStation:
             spool_root=spool_root,
             clock=clock,
             calibration={
-                **factory.calibration(),
+                **factory.calibration(self.pairs),
                 **factory.latencies(self.pairs),
                 **(calibration or {}),
             },

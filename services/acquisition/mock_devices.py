@@ -1,26 +1,20 @@
-"""Streams of an episode come in; mock devices and the drivers that read them go out."""
+"""The simulated devices of a mock station, made to play the streams of an episode."""
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.schemas.episodes import Matrix
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.mocking import mock_of
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.camera import CameraDecoder, CameraDriver
-from services.acquisition.drivers.glove_wuji import NOMINAL_RATE_HZ as WUJI_RATE_HZ
 from services.acquisition.drivers.robot_state import STREAM_SIZES, RobotStateDecoder
+from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.mocks.glove_devices import (
-    mock_glove,
-    mock_justfloat_glove,
-    mock_wuji_glove,
-)
-from services.acquisition.mocks.links import MockLinks
 from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.ports import MockPort, SocketPort
 from services.acquisition.mocks.replay import (
     MockDevice,
@@ -29,7 +23,6 @@ from services.acquisition.mocks.replay import (
     device_rng,
 )
 from services.acquisition.mocks.robot_state import RobotStateSource
-from services.acquisition.mocks.tactile_glove import GloveCalibration
 from services.acquisition.mocks.tracker_devices import (
     TrackerPlace,
     mock_finger_tracker,
@@ -68,7 +61,7 @@ class MockFactory:
         self._seed = seed
         self._clock = clock
         self._links = links or MockLinks()
-        self._gloves = {side: GloveCalibration.seeded(side, seed) for side in SIDES}
+        self._make_glove = mock_of(self._links.glove_kind)
 
     def build(self) -> list[MockPair]:
         """One pair a device.
@@ -105,21 +98,9 @@ class MockFactory:
         by_trackers = self._links.wrists == "trackers"
         return [name for name in STREAM_SIZES if not (by_trackers and name in WRISTS)]
 
-    def calibration(self) -> dict[str, Matrix]:
-        """What a calibrated station knows of its gloves: tare and gain of the 360 cells.
-
-        Gloves of others have no such record.
-        """
-        record: dict[str, Matrix] = {}
-        if self._links.gloves != "dextouch":
-            return record
-        for side in SIDES:
-            if f"tactile_{side}" in self._streams:
-                glove = self._gloves[side]
-                gain = glove.gain_counts_per_kpa
-                record[f"tactile_{side}_tare_counts"] = matrix_rows(glove.tare_counts[None])
-                record[f"tactile_{side}_gain_counts_per_kpa"] = matrix_rows(gain[None])
-        return record
+    def calibration(self, pairs: Sequence[MockPair]) -> dict[str, Matrix]:
+        """What a calibrated station knows of these devices, as each of them says."""
+        return {name: matrix for pair in pairs for name, matrix in pair.calibration.items()}
 
     def latencies(self, pairs: Sequence[MockPair]) -> dict[str, Matrix]:
         """Path delay of each stream, wrong by about its sigma as a measured one would be."""
@@ -149,23 +130,8 @@ class MockFactory:
 
     def _glove(self, side: Side) -> MockPair:
         stream, faults = self._streams[f"tactile_{side}"], self._faults.of(f"glove_{side}")
-        if self._links.gloves == "wuji":
-            fast = at_rate(stream, WUJI_RATE_HZ)
-            glove = mock_wuji_glove(side, fast, faults=faults, seed=self._seed, clock=self._clock)
-        elif self._links.gloves == "justfloat":
-            glove = mock_justfloat_glove(
-                side, stream, faults=faults, seed=self._seed, clock=self._clock
-            )
-        else:
-            glove = mock_glove(
-                side,
-                stream,
-                calibration=self._gloves[side],
-                faults=faults,
-                seed=self._seed,
-                clock=self._clock,
-            )
-        return MockPair(*glove)
+        place = MockPlace(side, stream, faults, self._seed, self._clock)
+        return self._make_glove(place)
 
     def _camera(self, stream: str) -> MockPair:
         replay, images = self._streams[stream], self._links.images
@@ -187,20 +153,6 @@ class MockFactory:
     def _device(self, name: str, source: PacketSource, port: MockPort) -> MockDevice:
         faults = self._faults.of(name)
         return MockDevice(name, source=source, port=port, faults=faults, seed=self._seed)
-
-
-def at_rate(stream: ReplayStream, rate_hz: float) -> ReplayStream:
-    """The stream as a device of another rate shows it: interpolated between its samples."""
-    ratio = rate_hz / stream.descriptor.nominal_rate_hz
-    index = np.arange(round(len(stream.t_ns) * ratio)) / ratio
-    # Behind the last sample the last value stands until the round begins again.
-    before = np.minimum(index.astype(np.int64), len(stream.t_ns) - 1)
-    after = np.minimum(before + 1, len(stream.t_ns) - 1)
-    share = (index - before)[:, None]
-    values = (1.0 - share) * stream.values[before] + share * stream.values[after]
-    t_ns = stream.t_ns[0] + np.rint(index * (1e9 / stream.descriptor.nominal_rate_hz))
-    descriptor = stream.descriptor.model_copy(update={"nominal_rate_hz": rate_hz})
-    return ReplayStream(descriptor, t_ns.astype(np.int64), values.astype(stream.values.dtype))
 
 
 def duration_ns(streams: Mapping[str, ReplayStream]) -> int:

@@ -1,4 +1,4 @@
-"""Requests to our glove and its replies: numbers and names in, bytes out, and the way back."""
+"""Requests that our glove answers, and its replies: their layout in bytes."""
 
 import struct
 from dataclasses import dataclass

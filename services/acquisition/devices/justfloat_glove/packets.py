@@ -1,4 +1,4 @@
-"""Gloves that send bare float32s: bytes come in, N readings a sample go out, judged by form alone.
+"""Packets of gloves that send bare float32s, which can be told by their form alone.
 
 The family (VOFA's "justfloat") has neither checksum nor sequence nor time: N float32s, then the
 tail 00 00 80 7f, which is +infinity. A packet is released only between two tails exactly one

@@ -1,4 +1,4 @@
-"""Pressures of one hand come in; a glove that sends bare float32s and a tail goes out."""
+"""A simulated glove that sends bare float32s and a tail."""
 
 from collections.abc import Sequence
 
@@ -7,10 +7,48 @@ from jaxtyping import Float32, Int64
 
 from dextouch.errors import InvalidInputError
 from dextouch.tactile.layout import NUM_TAXELS
-from services.acquisition.drivers.glove_justfloat import TAIL
+from services.acquisition.devices.justfloat_glove.packets import TAIL, JustFloatGloveDecoder
+from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import MockPlace, serial_mock
 from services.acquisition.mocks.replay import ReplayStream
 
 COUNTS_PER_KPA = 40.0
+NUM_VALUES = 401
+FULL_SCALE = 4095.0
+# What pinned cells show.
+PINNED = {"stuck": 1_000.0, "saturated": FULL_SCALE}
+
+
+def mock_justfloat_glove(place: MockPlace) -> MockPair:
+    """A glove that sends bare float32s at the rate of the stream."""
+    source = JustFloatGloveSource(
+        place.stream,
+        num_values=NUM_VALUES,
+        full_scale=FULL_SCALE,
+        dead_taxels=place.faults.dead_taxels,
+    )
+    decoder = JustFloatGloveDecoder(
+        place.side,
+        num_values=NUM_VALUES,
+        full_scale=FULL_SCALE,
+        rate_hz=place.stream.descriptor.nominal_rate_hz,
+    )
+    return serial_mock(place, source=source, decoder=decoder)
+
+
+class JustFloatPacketEdits(PacketEdits):
+    """Faults inside a packet of bare numbers, which tells neither hand nor version."""
+
+    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
+        """Numbers by their place."""
+        values = _values(data).copy()
+        values[list(cells)] = PINNED[how]
+        return encode_justfloat(values)
+
+    def put_nan(self, data: bytes) -> bytes:
+        """The first number."""
+        return encode_justfloat(without_first(_values(data)))
 
 
 class JustFloatGloveSource:
@@ -22,6 +60,8 @@ class JustFloatGloveSource:
         full_scale: the largest reading.
         dead_taxels: places in the packet that read zero.
     """
+
+    edits = JustFloatPacketEdits()
 
     def __init__(
         self,
@@ -54,3 +94,7 @@ class JustFloatGloveSource:
 def encode_justfloat(values: Float32[np.ndarray, " n"]) -> bytes:
     """Bytes of one packet."""
     return values.astype("<f4").tobytes() + TAIL
+
+
+def _values(data: bytes) -> Float32[np.ndarray, " n"]:
+    return np.frombuffer(data[: -len(TAIL)], "<f4")

@@ -1,4 +1,4 @@
-"""Our glove as a device: a transport comes in, samples go out, and commands are answered."""
+"""Driver of our tactile glove, which also asks it for its identity, its time and a tare."""
 
 import itertools
 import threading
@@ -10,8 +10,7 @@ from dextouch.clocks import RoundTrip
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.glove_commands import (
+from services.acquisition.devices.tactile_glove.commands import (
     MAX_TARE_PACKETS,
     Command,
     GloveDiagnostics,
@@ -25,8 +24,9 @@ from services.acquisition.drivers.glove_commands import (
     parse_round_trip,
     parse_tare,
 )
+from services.acquisition.devices.tactile_glove.packets import NOMINAL_RATE_HZ, TactileGloveDecoder
+from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.packets import SEQUENCE_MODULUS, Packet
-from services.acquisition.drivers.tactile_glove import NOMINAL_RATE_HZ, TactileGloveDecoder
 from services.acquisition.transports.base import Transport
 
 ANSWER_TIMEOUT_NS = 300_000_000

@@ -1,4 +1,4 @@
-"""Wuji tactile glove: bytes of its data packet come in, 24 × 32 pressures of full scale go out."""
+"""Data packets of the Wuji tactile glove: 24 × 32 cells in parts of full scale, CRC-16."""
 
 import math
 import struct

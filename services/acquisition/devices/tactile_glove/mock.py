@@ -1,0 +1,172 @@
+"""A simulated glove of ours, with offsets and gains of its own, that answers commands."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, Int64
+
+from dextouch.errors import ShapeError
+from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.tactile_glove.driver import TactileGlove
+from services.acquisition.devices.tactile_glove.mock_answers import GloveAnswers
+from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS, MAGIC
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.mocks.edits import OurPacketEdits, Pinned, changed, edit_ours
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.place import MockPlace
+from services.acquisition.mocks.ports import PtyPort
+from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+
+OFFSET_COUNTS = 120.0
+GAIN_COUNTS_PER_KPA = 40.0
+OFFSET_SPREAD_COUNTS = 10.0
+GAIN_SPREAD = 0.05
+# What pinned cells show.
+PINNED = {"stuck": 1_000, "saturated": FULL_SCALE_COUNTS}
+
+
+@dataclass(frozen=True)
+class GloveCalibration:
+    """counts = tare + gain · pressure, cell by cell in raw scan order."""
+
+    tare_counts: Float64[np.ndarray, "360"]
+    gain_counts_per_kpa: Float64[np.ndarray, "360"]
+
+    @staticmethod
+    def seeded(side: Side, seed: int) -> "GloveCalibration":
+        """A glove as it comes from the factory: no two cells alike."""
+        rng = device_rng(seed, f"calibration_{side}")
+        spread = rng.uniform(-1.0, 1.0, (2, NUM_RAW_TAXELS))
+        return GloveCalibration(
+            OFFSET_COUNTS + OFFSET_SPREAD_COUNTS * spread[0],
+            GAIN_COUNTS_PER_KPA * (1.0 + GAIN_SPREAD * spread[1]),
+        )
+
+    def matrices(self, side: Side) -> dict[str, Matrix]:
+        """What the calibration of a station says of this glove."""
+        return {
+            f"tactile_{side}_tare_counts": matrix_rows(self.tare_counts[None]),
+            f"tactile_{side}_gain_counts_per_kpa": matrix_rows(self.gain_counts_per_kpa[None]),
+        }
+
+    def counts(self, taxels_kpa: np.ndarray, *, side: Side) -> np.ndarray:
+        """Raw counts (uint16 [..., 360]) of pressures [..., 320]; clipped at full scale."""
+        raw_kpa = expand_taxels(np.asarray(taxels_kpa, dtype=np.float64), side=side)
+        counts = np.rint(self.tare_counts + self.gain_counts_per_kpa * raw_kpa)
+        return np.clip(counts, 0, FULL_SCALE_COUNTS).astype("<u2")
+
+
+def mock_glove(
+    place: MockPlace,
+    *,
+    calibration: GloveCalibration | None = None,
+    worn_side: Side | None = None,
+) -> MockPair:
+    """Our own glove, which answers commands.
+
+    Args:
+        place: where it stands; its serial number is its name.
+        calibration: of this glove; made from the seed if None.
+        worn_side: which hand it says it is, if it is the wrong one.
+    """
+    name, side = place.name, place.side
+    glove = calibration or GloveCalibration.seeded(side, place.seed)
+    told: Side = worn_side or side
+    clock_of: list[_DeviceClock] = []
+    answers = GloveAnswers(
+        told, serial_number=name, device_time_ns=lambda: clock_of[0].now_ns() if clock_of else 0
+    )
+    source = TactileGloveSource(
+        place.stream,
+        side=told,
+        calibration=glove,
+        dead_taxels=place.faults.dead_taxels,
+        answers=answers,
+    )
+    port = PtyPort(name, answer=answers.answer)
+    device = MockDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
+    clock_of.append(_DeviceClock(device, place.clock))
+    driver = TactileGlove(side, transport=port.transport, clock=place.clock, serial_number=name)
+    return MockPair(device, driver, glove.matrices(side))
+
+
+class GlovePacketEdits(OurPacketEdits):
+    """Faults inside our glove's packet: pinned cells besides what all of ours can have."""
+
+    def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
+        """Raw cells in scan order."""
+
+        def pinned(_: bytes, packet: Packet) -> Packet:
+            counts = np.frombuffer(packet.payload, "<u2").copy()
+            counts[list(cells)] = PINNED[how]
+            return changed(packet, payload=counts.tobytes())
+
+        return edit_ours(data, pinned)
+
+
+class TactileGloveSource:
+    """Packets of one glove.
+
+    Args:
+        stream: float32 [n, 320] in kPa.
+        side: which hand.
+        calibration: of this glove.
+        dead_taxels: raw cells that read zero.
+        answers: to the host's requests; without it the glove hears nothing.
+    """
+
+    edits = GlovePacketEdits()
+
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        side: Side,
+        calibration: GloveCalibration,
+        dead_taxels: Sequence[int] = (),
+        answers: GloveAnswers | None = None,
+    ) -> None:
+        if stream.descriptor.shape != (NUM_TAXELS,):
+            raise ShapeError(
+                f"{stream.descriptor.name}: got {stream.descriptor.shape}, expected ({NUM_TAXELS},)"
+            )
+        self._stream = stream
+        self._side = side
+        self._answers = answers
+        self._counts = calibration.counts(stream.values, side=side)
+        self._counts[:, list(dead_taxels)] = 0
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each sample is taken."""
+        return self._stream.t_ns
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet, and the reply that waited for it, if any."""
+        counts = self._counts[index]
+        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, counts.tobytes())
+        replies = [] if self._answers is None else self._answers.note_packet(counts)
+        return [encode_packet(MAGIC, packet), *replies]
+
+
+class _DeviceClock:
+    """What a mock device's clock shows now, told from the last packet that it made."""
+
+    def __init__(self, device: MockDevice, clock: StationClock) -> None:
+        self._device = device
+        self._clock = clock
+
+    def now_ns(self) -> int:
+        """Device time; before the first packet, time since an origin of its own."""
+        ledger = self._device.ledger
+        now_ns = self._clock.now_ns()
+        if not ledger.t_device_ns:
+            return now_ns
+        # The ledger is written by the player's thread: a column may be one row ahead.
+        last = len(ledger.flipped_bits) - 1
+        since_ns = now_ns - ledger.t_true_ns[last]
+        skew_ns = round(since_ns * self._device.faults.skew_ppm * 1e-6)
+        return ledger.t_device_ns[last] + since_ns + skew_ns

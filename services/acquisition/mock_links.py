@@ -1,0 +1,50 @@
+"""How a mock station's devices are connected, and which protocols they speak."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, field_validator
+
+from services.acquisition.devices.registry import kind_names
+
+# How the kinds of gloves of this package were called before they were kinds.
+GLOVE_PROTOCOLS = {
+    "dextouch": "tactile_glove",
+    "wuji": "wuji_glove",
+    "justfloat": "justfloat_glove",
+}
+
+
+class MockLinks(BaseModel):
+    """Which of the ways that real stations know the mock devices of a station take.
+
+    Attributes:
+        gloves: the kind of both gloves, ours (`dextouch`, `wuji` and `justfloat` are short for
+            them) or one that another package brings. Each says what a calibrated station knows of
+            it.
+        trackers: finger and pose trackers by HID, by USB, or behind an SDK's bridge.
+        cameras: images over a socket, or from a camera on the station's own bus.
+        wrists: whether a robot or pose trackers give the wrists where there is a robot's state; its
+            packets hold them in any case.
+        images: how images are encoded: by the bridge, or by the station for a camera of its own.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    gloves: str = "tactile_glove"
+    trackers: Literal["hid", "usb", "bridge"] = "hid"
+    wrists: Literal["robot", "trackers"] = "robot"
+    cameras: Literal["bridge", "station"] = "bridge"
+    images: Literal["rgb8", "jpeg", "h264"] = "rgb8"
+
+    @field_validator("gloves")
+    @classmethod
+    def _is_known(cls, gloves: str) -> str:
+        known = sorted({*GLOVE_PROTOCOLS, *kind_names()})
+        if gloves not in known:
+            raise ValueError(f"got {gloves!r}, expected a kind of glove: {', '.join(known)}")
+        return gloves
+
+    @property
+    def glove_kind(self) -> str:
+        """The name of the kind of both gloves."""
+        return GLOVE_PROTOCOLS.get(self.gloves, self.gloves)
