@@ -20,10 +20,10 @@ from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas.problems import Problem, error_from_problem
 from dextouch.schemas.recordings import RecordingAttributes
 from services.acquisition.clock import VirtualClock
+from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.episode import replay_calibration, replay_streams
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.uploader import Uploader
 from services.alignment.schemas import AlignmentJob

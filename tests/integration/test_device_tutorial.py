@@ -1,0 +1,96 @@
+"""docs/tutorials/add_a_device.md followed literally: built, installed, recorded and judged."""
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from dextouch.episodes.spool_reader import SpoolReader
+
+ROOT = Path(__file__).parents[2]
+PAGE = (ROOT / "docs/tutorials/add_a_device.md").read_text(encoding="utf-8")
+FILES = re.findall(r"\*\*`([\w./-]+)`\*\*\n\n```\w+\n(.*?)```", PAGE, re.DOTALL)
+COMMANDS = [
+    line for text in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in text.splitlines()
+]
+OUTPUT = re.search(r"```text\n(.*?)```", PAGE, re.DOTALL)[1]
+# Reads the flags of the page's stations as they do, and builds the drivers of the devices.
+STATIONS = """
+import sys
+from dextouch.serving.settings import load_settings
+from services.acquisition.clock import RealClock
+from services.acquisition.devices import build_drivers
+from services.acquisition.settings import AcquisitionSettings
+
+for flags in {flags!r}:
+    settings = load_settings(AcquisitionSettings, flags)
+    drivers = build_drivers(settings.devices, RealClock()) if settings.devices else ()
+    print(settings.mock_links.gloves, *(f"{{d.name}} {{d.descriptors[0].shape}}" for d in drivers))
+print(*(m for m in sys.modules if m == "t64_glove.mock" or ".mocks" in m))
+"""
+
+
+@pytest.fixture(scope="module")
+def lab(tmp_path_factory):
+    """A folder with the page's files and its package installed below `installed`."""
+    folder = tmp_path_factory.mktemp("lab")
+    for path, text in FILES:
+        (folder / path).parent.mkdir(parents=True, exist_ok=True)
+        (folder / path).write_text(text, encoding="utf-8")
+    install = [line for line in COMMANDS if line.startswith("pip install ")]
+    assert len(install) == 1
+    # Without a network: the build backend and what the package needs are here already.
+    offline = ("--no-build-isolation", "--no-deps", "--no-index", "--no-compile", "--quiet")
+    flags = (*offline, "--disable-pip-version-check", "--target", "installed")
+    run(folder, "-m", *shlex.split(install[0]), *flags)
+    return folder
+
+
+def run(folder, *arguments):
+    paths = (folder / "installed", ROOT, ROOT / "shared")
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-3000:]
+    return done.stdout
+
+
+def test_the_page_names_every_file_of_a_package():
+    names = [Path(path).name for path, _ in FILES]
+    assert names == [
+        *("pyproject.toml", "__init__.py", "settings.py", "packets.py", "kind.py", "mock.py"),
+        "record_t64.py",
+    ]
+
+
+def test_a_take_is_recorded_and_the_dead_cell_is_found(lab):
+    (command,) = (line for line in COMMANDS if line.startswith("python "))
+    assert run(lab, *shlex.split(command)[1:]) == OUTPUT
+    (take,) = (lab / "takes").iterdir()
+    spool = SpoolReader(take)
+    descriptor = spool.streams["tactile_left"]
+    assert (descriptor.shape, descriptor.nominal_rate_hz, descriptor.unit) == ((64,), 100, "counts")
+    counts = spool.read("tactile_left").values
+    # By the page's own table: about 200 without load, at most 4095; the dead cell shows nothing.
+    assert counts.shape == (400, 64)
+    assert set(counts[:, 30]) == {0}
+    others = counts[:, [cell for cell in range(64) if cell != 30]]
+    assert others.min() == 200
+    assert 1000 < others.max() <= 4095
+    assert "taxels_dead" in {entry.event for entry in spool.attributes.ledger}
+
+
+def test_stations_take_its_settings_and_import_no_mock(lab):
+    stations = [shlex.split(line)[2:] for line in COMMANDS if line.startswith("dextouch station ")]
+    assert len(stations) == 2
+    output = run(lab, "-c", STATIONS.format(flags=stations)).splitlines()
+    assert output == ["t64_glove", "tactile_glove glove_left (64,)", ""]
