@@ -24,7 +24,7 @@ from dextouch.hands.actions import (
 from services.alignment.calibration.hand_eye import solve_hand_eye
 from services.alignment.calibration.robot_base import solve_robot_base
 from services.alignment.calibration.twists import move
-from services.alignment.retargeting.wrist import pose_difference, poses_in_base, wrist_motion_9d
+from services.alignment.retargeting.wrist import pose_difference
 from services.cli.bench.calibration.scenes import make_scene
 from tests.accuracy.test_robot_base import pairs
 
@@ -145,8 +145,8 @@ def test_actions_do_not_see_any_global_transform(capsys):
 def test_relative_motion_does_not_see_where_the_world_is(new_world, poses):
     T_new_world, Ts = pose_of(new_world), np.stack([pose_of(pose) for pose in poses])
     mount = Ts[-1]
-    motion = wrist_motion_9d(Ts, T_tracker_wrist=mount)
-    again = wrist_motion_9d(T_new_world @ Ts, T_tracker_wrist=mount)
+    motion = relative_pose_9d(Ts @ mount)
+    again = relative_pose_9d(T_new_world @ Ts @ mount)
     np.testing.assert_allclose(again, motion, atol=1e-9)
     np.testing.assert_array_equal(again[0], IDENTITY_POSE_9D)
 
@@ -231,17 +231,7 @@ def test_the_wrist_comes_to_the_robots_base(capsys):
             rng.normal(size=(50, 6)) * ([0.2] * 3 + [0.05] * 3)
         )
         Ts_world_tracker = noisy(T_world_base @ Ts_base_wrist @ T_effector_tracker, rng)
-        got = poses_in_base(
-            Ts_world_tracker,
-            T_world_base=found.T_world_base,
-            T_tracker_body=invert(found.T_effector_tracker),
-        )
-        exact = poses_in_base(
-            T_world_base @ Ts_base_wrist @ T_effector_tracker,
-            T_world_base=T_world_base,
-            T_tracker_body=invert(T_effector_tracker),
-        )
-        np.testing.assert_allclose(exact, Ts_base_wrist, atol=1e-9)
+        got = invert(found.T_world_base) @ Ts_world_tracker @ invert(found.T_effector_tracker)
         distance_m, angle_rad = pose_difference(got, Ts_base_wrist)
         errors.append((np.median(distance_m) * 1e3, np.rad2deg(np.median(angle_rad))))
     errors = np.array(errors)
@@ -268,11 +258,8 @@ def test_the_heads_camera_comes_to_the_robots_base(capsys):
         # Within a metre of the base, as a head above the table is.
         Ts_base_tracker = move(rng.normal(size=(50, 6)) * ([0.3] * 3 + [0.3] * 3))
         truth = Ts_base_tracker @ scene.T_tracker_camera
-        got = poses_in_base(
-            noisy(T_world_base @ Ts_base_tracker, rng),
-            T_world_base=base.T_world_base,
-            T_tracker_body=mount.T_tracker_camera,
-        )
+        Ts_world_tracker = noisy(T_world_base @ Ts_base_tracker, rng)
+        got = invert(base.T_world_base) @ Ts_world_tracker @ mount.T_tracker_camera
         distance_m, angle_rad = pose_difference(got, truth)
         errors.append((np.median(distance_m) * 1e3, np.rad2deg(np.median(angle_rad))))
     middle = np.median(errors, axis=0)

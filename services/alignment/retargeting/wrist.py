@@ -1,4 +1,4 @@
-"""Wrist and head poses over time in; their 9-D motion, or their poses in a robot's base, out."""
+"""Checks and comparisons of rigid transforms, such as those that a calibration holds."""
 
 from typing import Final
 
@@ -8,7 +8,6 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry.rotations import rotation_angle
 from dextouch.geometry.transforms import invert
-from dextouch.hands.actions import relative_pose_9d
 
 # How far R Rᵀ of a stored transform may be from the identity.
 RIGID_TOLERANCE: Final = 1e-6
@@ -40,41 +39,6 @@ def rigid_transform(matrix: object, *, what: str) -> Float64[np.ndarray, "4 4"]:
             "again"
         )
     return T
-
-
-def poses_in_base(
-    Ts_world_tracker: np.ndarray, *, T_world_base: np.ndarray, T_tracker_body: np.ndarray
-) -> Float64[np.ndarray, "time 4 4"]:
-    """Poses of a tracked body in the robot's base: T_base_world · T_world_tracker · T_tracker_body.
-
-    Args:
-        Ts_world_tracker: [T, 4, 4] poses of the tracker in the tracked world.
-        T_world_base: of `calibration.robot_base.solve_robot_base`.
-        T_tracker_body: where the wrist or the head's camera sits on its tracker.
-
-    Raises:
-        ShapeError, NonFiniteError, InvalidInputError: what is no [T, 4, 4], or a calibration that
-            is no rigid transform.
-    """
-    Ts = np.asarray(Ts_world_tracker, dtype=np.float64)
-    if Ts.ndim != 3 or Ts.shape[1:] != (4, 4):
-        raise ShapeError(f"poses of the tracker: got shape {Ts.shape}, expected [T, 4, 4]")
-    if not np.isfinite(Ts).all():
-        raise NonFiniteError("poses of the tracker: hold NaN or infinity; leave those samples out")
-    T_base_world = invert(rigid_transform(T_world_base, what="T_world_base"))
-    return T_base_world @ Ts @ rigid_transform(T_tracker_body, what="T_tracker_body")
-
-
-def wrist_motion_9d(
-    Ts_world_tracker: np.ndarray, *, T_tracker_wrist: np.ndarray
-) -> Float64[np.ndarray, "time 9"]:
-    """Relative wrist motion from the poses of a tracker that is strapped on somewhere else.
-
-    Args:
-        Ts_world_tracker: [T ≥ 1, 4, 4].
-        T_tracker_wrist: where the wrist sits in the tracker's frame.
-    """
-    return relative_pose_9d(np.asarray(Ts_world_tracker, dtype=np.float64) @ T_tracker_wrist)
 
 
 def pose_difference(

@@ -1,1 +1,1 @@
-"""What services stand on: the application factory, settings, logs, keys, bus and state."""
+"""Building blocks of every service: application factory, settings, logs, API keys and state."""

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import matrix_rows
 from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import expand_taxels, raw_indices
-from dextouch.tactile.refused import measured_taxels
 from services.acquisition.devices.justfloat_glove.mock import COUNTS_PER_KPA, JustFloatGloveSource
 from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
 from services.acquisition.devices.wuji_glove.mock import FULL_SCALE_KPA, WujiGloveSource, grid_of
@@ -156,11 +155,11 @@ def test_refused_taxels_are_zero_named_and_counted(tmp_path):
     assert report.quality["tactile_left_num_dead_taxels"] == 2
     assert "tactile_left_num_unproven_taxels" not in report.quality
     pressures = episode.read("tactile_left").values
-    measured = measured_taxels(episode.attributes.calibration)
-    assert np.flatnonzero(~measured[0]).tolist() == [4, 17, 90, 300]
-    assert measured[1].all()
-    np.testing.assert_allclose(pressures[:, measured[0]], TRUE_KPA[:, measured[0]], atol=0.02)
-    assert (pressures[:, ~measured[0]] == 0).all()
+    (states,) = np.array(episode.attributes.calibration["tactile_left_refused_taxels"])
+    measured = states == 0
+    assert np.flatnonzero(~measured).tolist() == [4, 17, 90, 300]
+    np.testing.assert_allclose(pressures[:, measured], TRUE_KPA[:, measured], atol=0.02)
+    assert (pressures[:, ~measured] == 0).all()
 
 
 def test_the_line_of_an_alignment_names_refused_taxels(tmp_path, capsys):
@@ -216,9 +215,3 @@ def test_cameras_keep_their_distortion_and_must_be_of_the_recorded_size(tmp_path
         align(tmp_path / "other", camera, batch, lens | {"image_size_head_px": ((8.0, 16.0),)})
     with pytest.raises(InvalidInputError, match="distortion_head"):
         align(tmp_path / "wrong", camera, batch, lens | {"distortion_head": ((0.0,),)})
-
-
-def test_masks_of_episodes_without_refusals_and_of_broken_ones():
-    assert measured_taxels({}).all()
-    with pytest.raises(ShapeError, match="tactile_right_refused_taxels"):
-        measured_taxels({"tactile_right_refused_taxels": ((0.0,) * 360,)})
