@@ -116,8 +116,8 @@ def _refuse_axes(R: np.ndarray, off_rad: float, side: Side, *, is_calibrated: bo
         f"the calibration {calibration_name(side)!r} does not fit this recording: lay the hand "
         "flat and calibrate again, the glove may have slipped"
         if is_calibrated
-        else f"calibrate from a take of the flat hand (calibrate_wrist) and give its result as "
-        f"calibration {calibration_name(side)!r}"
+        else f"record the flat hand and run dextouch station calibrate wrist --side {side}, which "
+        f"makes the calibration {calibration_name(side)!r}"
     )
     raise InvalidInputError(
         f"keypoints_{side}: got keypoints that are turned by {np.rad2deg(off_rad):.0f} degrees "

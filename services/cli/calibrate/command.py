@@ -1,4 +1,4 @@
-"""The words after `dextouch station calibrate` in; matrices, pictures and an exit status out."""
+"""Command line of `dextouch station calibrate`: its commands, their options and their help."""
 
 import argparse
 import json
@@ -34,6 +34,12 @@ A whole calibration:
   4. show      age and sigma of everything; warns after seven days
                dextouch station calibrate show calibration
 
+Where the station needs them:
+  wrist        gloves whose keypoints are not in wrist axes: a take of the flat hand
+  profile      once a person: a take in which the hand opens, closes and spreads
+  robot-base   robots that report poses in their base: pairs of poses of tracker and effector
+  latency      streams whose path delay nobody states: a take of brisk motion, or of taps
+
 More: docs/calibration_guide.md"""
 
 _CAMERA = """\
@@ -65,6 +71,40 @@ wanted sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds from t
   spool/bladder-10,10,0.1,all
   spool/bladder-30,30,0.3,all
 Without presses only the tare is measured, which may be done every day; the gain stays."""
+
+_WRIST = """\
+Record one second or more of the flat hand, fingers straight; once for each person and glove.
+
+example:
+  dextouch station calibrate wrist --side left --take spool/flat-left --to calibration"""
+
+_PROFILE = """\
+Record ten seconds in which the hand opens, closes and spreads its fingers. Without a profile every
+recording's own motion is used, which shows less of the hand.
+
+example:
+  dextouch station calibrate profile --side left --take spool/fist-left --to calibration"""
+
+_ROBOT_BASE = """\
+Fix a tracker to the robot's effector and stop at 20 places all over the workspace, turned by 30
+degrees and more about all axes. The file holds a pair of 4x4 matrices for each:
+  [[T_world_tracker, T_base_effector], ...]
+Where the tracker sits on the effector is found too, unless --same-frame says that both series
+are poses of the same frame.
+
+example:
+  dextouch station calibrate robot-base --poses pairs.json --to calibration"""
+
+_LATENCY = """\
+Two pose streams: hold both trackers together and turn them briskly and irregularly for ten
+seconds. A pose stream and a glove: tap a hard table with the flat hand, ten times, half a second
+and more apart. The result is relative to the latency that the reference has.
+
+examples:
+  dextouch station calibrate latency --stream wrist_left --reference wrist_right \\
+    --take spool/shake --to calibration
+  dextouch station calibrate latency --stream wrist_left --reference tactile_left \\
+    --take spool/taps --to calibration"""
 
 
 def main(argv: Sequence[str]) -> int:
@@ -110,6 +150,30 @@ def _glove(options: argparse.Namespace) -> Report:
     return glove.calibrate(options)
 
 
+def _wrist(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import hands
+
+    return hands.calibrate_wrist_axes(options)
+
+
+def _profile(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import hands
+
+    return hands.measure_person(options)
+
+
+def _robot_base(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import robot_base
+
+    return robot_base.calibrate(options)
+
+
+def _latency(options: argparse.Namespace) -> Report:
+    from services.cli.calibrate import latency
+
+    return latency.calibrate(options)
+
+
 def _show(options: argparse.Namespace) -> Report:
     from services.cli.calibrate import show
 
@@ -120,6 +184,10 @@ _WORDS: dict[str, Callable[[argparse.Namespace], Report]] = {
     "camera": _camera,
     "hand-eye": _hand_eye,
     "glove": _glove,
+    "wrist": _wrist,
+    "profile": _profile,
+    "robot-base": _robot_base,
+    "latency": _latency,
     "show": _show,
 }
 
@@ -134,6 +202,12 @@ def _parser() -> argparse.ArgumentParser:
     _add_camera(_word(words, "camera", "photos of a board → K and distortion of a camera", _CAMERA))
     _add_hand_eye(_word(words, "hand-eye", "photos and poses → camera on its tracker", _HAND_EYE))
     _add_glove(_word(words, "glove", "rest and known pressures → tare, gain, faults", _GLOVE))
+    _add_hand(_word(words, "wrist", "flat hand → wrist axes of a glove's keypoints", _WRIST))
+    _add_hand(_word(words, "profile", "moving hand → the person's bones and knuckles", _PROFILE))
+    _add_robot_base(
+        _word(words, "robot-base", "pairs of poses → the robot's base in the world", _ROBOT_BASE)
+    )
+    _add_latency(_word(words, "latency", "common motion or taps → path delay", _LATENCY))
     shown = _word(words, "show", "what a calibration holds, how old and how good it is", "")
     shown.add_argument("folder", type=Path, help="calibration folder or file, or a spooled take")
     return parser
@@ -214,4 +288,36 @@ def _add_glove(parser: argparse.ArgumentParser) -> None:
         default=65535.0,
         metavar="COUNTS",
         help="largest count of the glove (%(default)g)",
+    )
+
+
+def _add_take(parser: argparse.ArgumentParser) -> None:
+    _add_common(parser)
+    parser.add_argument(
+        "--take", required=True, metavar="TAKE", help="spool folder, or id of a recording"
+    )
+    parser.add_argument("--store", metavar="URL", help="where recordings named by id are")
+
+
+def _add_hand(parser: argparse.ArgumentParser) -> None:
+    _add_take(parser)
+    parser.add_argument("--side", required=True, choices=("left", "right"))
+
+
+def _add_robot_base(parser: argparse.ArgumentParser) -> None:
+    _add_common(parser)
+    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="JSON of pairs")
+    parser.add_argument(
+        "--same-frame", action="store_true", help="tracker and effector are the same frame"
+    )
+
+
+def _add_latency(parser: argparse.ArgumentParser) -> None:
+    _add_take(parser)
+    parser.add_argument("--stream", required=True, metavar="STREAM", help="to be calibrated")
+    parser.add_argument(
+        "--reference",
+        required=True,
+        metavar="STREAM",
+        help="whose latency is known, or counts as 0",
     )

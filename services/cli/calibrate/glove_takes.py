@@ -1,4 +1,4 @@
-"""Takes of a glove and a list of presses in; readings and known pressures out."""
+"""Takes of a glove and the pressures in them: the list of presses as CSV, and its readings."""
 
 import argparse
 import csv
@@ -6,12 +6,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dextouch.episodes import EpisodeStore, RecordingReader
-from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.streams.samples import SampleBatch
 from services.alignment.calibration.tactile_gain import TaxelPress
 from services.alignment.calibration.tactile_glove_calibration import pad_taxels
+from services.cli.calibrate.takes import read_stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
 COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads", "mass_kg", "area_cm2", "start_s", "stop_s")
@@ -74,25 +73,13 @@ def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
         NotFoundError: no such take, or without this glove.
         InvalidInputError: the stream holds pressures, not counts.
     """
-    name = f"tactile_{options.side}"
-    reader: SpoolReader | RecordingReader
-    if Path(take).is_dir():
-        reader = SpoolReader(Path(take))
-    elif options.store:
-        reader = EpisodeStore(options.store).recording(take)
-    else:
-        raise NotFoundError(
-            f"take {take!r}: no such folder; name a take of the station's spool, or add --store "
-            "URL for the id of a recording"
-        )
-    streams = reader.streams
-    if name not in streams:
-        raise NotFoundError(f"take {take!r}: has no {name!r}, only {', '.join(sorted(streams))}")
-    if streams[name].unit != "counts":
+    taken = read_stream(take, f"tactile_{options.side}", options.store)
+    if taken.descriptor.unit != "counts":
         raise InvalidInputError(
-            f"take {take!r}: {name} is in {streams[name].unit}, expected raw counts"
+            f"take {take!r}: {taken.descriptor.name} is in {taken.descriptor.unit}, expected raw "
+            "counts"
         )
-    return reader.read(name)
+    return taken.batch
 
 
 def press_row(row: dict[str, str], relative_sigma: float, folder: Path) -> PressRow:

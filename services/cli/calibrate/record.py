@@ -28,7 +28,12 @@ MAX_AGE_S = 7 * 86_400.0
 _MATRICES: TypeAdapter[dict[str, Matrix]] = TypeAdapter(dict[str, Matrix])
 
 # What may be known to no better than this (relative or absolute) before `show` warns.
-SIGMA_LIMITS = {"focal": 0.003, "rotation_rad": np.deg2rad(0.06), "translation_m": 0.8e-3}
+MAX_FOCAL_SIGMA = 0.003
+# Column of a hand profile that holds the sigma of the knuckles, in metres.
+PROFILE_SIGMA = 7
+# Degrees and millimetres.
+MOUNT_LIMITS = (0.06, 0.8)
+BASE_LIMITS = (0.2, 2.0)
 MAX_GAIN_SIGMA = 0.05
 MAX_TAXEL_FAULTS = (0.01, 0.05)
 # Matrices of a glove that are no measurement of their own, or that an episode brings with it.
@@ -214,8 +219,8 @@ def _where_from(name: str) -> str:
     """What to do about a matrix of unknown age: not every one is measured by this command."""
     if name.endswith("_latency_ns"):
         return (
-            "not of this command: a device's path is measured by the station, a camera's is its "
-            "settings' latency_ms"
+            "measured by the station where the device answers time requests, a camera's is its "
+            "settings' latency_ms; else: dextouch station calibrate latency"
         )
     if name.startswith("T_tracker_") and "_wrist_" in name:
         return "not of this command: measure where the wrist sits on its tracker"
@@ -229,29 +234,39 @@ def _sigma(name: str, matrices: Mapping[str, Matrix]) -> tuple[str, list[str]]:
         for suffix in ("px", "rad", "m", "counts", "counts_per_kpa", "ns")
         if f"{entry_of(name)}_sigma_{suffix}" in matrices
     }
+    if name.startswith("hand_profile_"):
+        return f"knuckles {np.array(matrices[name])[:, PROFILE_SIGMA].max() * 1e3:.1f} mm", []
     if not found:
         return "unknown", ["sigma unknown"]
     if "px" in found:
         relative = float((found["px"][0, :2] / np.diag(matrices[name])[:2]).max())
-        limit = SIGMA_LIMITS["focal"]
+        limit = MAX_FOCAL_SIGMA
         wrong = f"focal length known to {relative:.2%}, expected {limit:.1%}; add views"
         return f"focal length {relative:.2%}", [wrong] if relative > limit else []
     if "rad" in found and "m" in found:
-        return _mount_sigma(float(found["rad"].max()), float(found["m"].max()))
+        limits = BASE_LIMITS if name == "T_world_base" else MOUNT_LIMITS
+        return _pose_sigma(float(found["rad"].max()), float(found["m"].max()), limits)
     if "counts_per_kpa" in found:
         return _gain_sigma(name, found["counts_per_kpa"], matrices)
+    return _plain_sigma(found), []
+
+
+def _plain_sigma(found: Mapping[str, np.ndarray]) -> str:
     if "ns" in found:
-        return f"{found['ns'].max() * 1e-6:.2f} ms", []
-    return f"{np.median(found['counts']):.2f} counts", []
+        return f"{found['ns'].max() * 1e-6:.2f} ms"
+    if "rad" in found:
+        return f"{np.rad2deg(found['rad'].max()):.2f}°"
+    return f"{np.median(found['counts']):.2f} counts"
 
 
-def _mount_sigma(rotation_rad: float, translation_m: float) -> tuple[str, list[str]]:
+def _pose_sigma(
+    rotation_rad: float, translation_m: float, limits: tuple[float, float]
+) -> tuple[str, list[str]]:
     told = f"{np.rad2deg(rotation_rad):.3f}°, {translation_m * 1e3:.2f} mm"
-    good = (
-        rotation_rad <= SIGMA_LIMITS["rotation_rad"]
-        and translation_m <= SIGMA_LIMITS["translation_m"]
-    )
-    return told, [] if good else ["expected 0.06° and 0.8 mm; add views, turned further"]
+    max_deg, max_mm = limits
+    good = np.rad2deg(rotation_rad) <= max_deg and translation_m * 1e3 <= max_mm
+    reason = f"expected {max_deg:g}° and {max_mm:g} mm; add views, turned further"
+    return told, [] if good else [reason]
 
 
 def _gain_sigma(

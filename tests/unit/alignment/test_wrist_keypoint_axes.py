@@ -44,7 +44,7 @@ def test_keypoints_in_other_axes_need_a_calibration(side):
     keypoints[5, 3] = np.nan
     keypoints[6, 4, 0] = np.inf
     tracked = keypoints @ R.T + offset if side == "left" else keypoints @ R.T
-    with pytest.raises(InvalidInputError, match="calibrate from a take of the flat hand") as e:
+    with pytest.raises(InvalidInputError, match=f"calibrate wrist --side {side}") as e:
         hand_axes_check(tracked[:5], side, {})
     assert e.value.details["fault"] == "axes"
 
@@ -64,7 +64,7 @@ def test_keypoints_in_other_axes_need_a_calibration(side):
     assert np.abs(checked.keypoints_m - keypoints)[seen].max() < 2e-3
     # The other hand's calibration is not taken for this one's.
     other = "right" if side == "left" else "left"
-    with pytest.raises(InvalidInputError, match="calibrate from a take"):
+    with pytest.raises(InvalidInputError, match="record the flat hand"):
         hand_axes_check(
             tracked[:5], side, {name.replace(side, other): m for name, m in record.items()}
         )

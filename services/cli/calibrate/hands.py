@@ -1,0 +1,96 @@
+"""`dextouch station calibrate wrist` and `profile`: how a glove sits on a hand, and whose it is."""
+
+import argparse
+from datetime import UTC, datetime
+
+import numpy as np
+
+from dextouch.errors import InvalidInputError
+from services.alignment.retargeting.hand_profile import profile_name
+from services.alignment.retargeting.keypoint_axes import (
+    calibration_name,
+    calibration_record,
+    hand_axes_check,
+)
+from services.alignment.retargeting.wrist_frame import calibrate_wrist
+from services.cli.calibrate.record import MATRICES_FILE, read_matrices, write_entry
+from services.cli.calibrate.takes import TakenStream, read_stream
+
+FINGERS = ("thumb", "index", "middle", "ring", "little")
+
+
+def calibrate_wrist_axes(options: argparse.Namespace) -> dict[str, object]:
+    """Measure the wrist frame in the axes of a glove's keypoints, from a take of the flat hand.
+
+    Raises:
+        NotFoundError: no such take, or it has no keypoints of this hand.
+        InvalidInputError: the hand is not flat, not this one, or its nodes are no hand.
+    """
+    taken = _keypoints(options)
+    frame = calibrate_wrist(taken.batch.values, options.side, where=f"take {options.take!r}")
+    name = calibration_name(options.side)
+    facts: dict[str, object] = {
+        "side": options.side,
+        "take": options.take,
+        "sigma_deg": float(np.rad2deg(frame.sigma_rad)),
+        "hand_size": frame.size,
+        "misfit_mm": frame.misfit_m * 1e3,
+        "num_samples": frame.num_samples,
+    }
+    record = calibration_record(frame, options.side)
+    write_entry(
+        options.to,
+        entry=name,
+        matrices={key: np.array(matrix) for key, matrix in record.items()},
+        facts=facts,
+        now=_now(),
+    )
+    print(
+        f"{name}: known to {facts['sigma_deg']:.1f}°; hand of size {frame.size:.2f} (1 is the mean "
+        f"adult), nodes {facts['misfit_mm']:.1f} mm off the mean hand"
+    )
+    return facts
+
+
+def measure_person(options: argparse.Namespace) -> dict[str, object]:
+    """Measure bones and knuckles of the person who wears a glove, from a take of moving fingers.
+
+    Keypoints are turned to wrist axes by the calibration in `--to`, else by the take's own.
+
+    Raises:
+        NotFoundError: no such take, or it has no keypoints of this hand.
+        InvalidInputError: keypoints in other axes than the wrist's, or a finger that is never seen.
+    """
+    from services.alignment.retargeting.hand_retargeter import HandRetargeter
+
+    taken = _keypoints(options)
+    calibration = taken.calibration
+    if (options.to / MATRICES_FILE).exists():
+        calibration = calibration | read_matrices(options.to)
+    axes = hand_axes_check(taken.batch.values, options.side, calibration)
+    profile = HandRetargeter(options.side).measure(axes.keypoints_m)
+    name = profile_name(options.side)
+    bones_mm = dict(zip(FINGERS, (profile.bone_m * 1e3).round(1).tolist(), strict=True))
+    facts: dict[str, object] = {
+        "side": options.side,
+        "take": options.take,
+        "bones_mm": bones_mm,
+        "is_rigid": profile.is_rigid,
+        "num_samples": len(taken.batch),
+    }
+    write_entry(options.to, entry=name, matrices={name: profile.to_rows()}, facts=facts, now=_now())
+    for finger, bones in bones_mm.items():
+        print(f"  {finger:6} " + ", ".join(f"{bone:.1f}" for bone in bones) + " mm")
+    print(f"{name}: bones from the knuckle outwards, from {facts['num_samples']} samples")
+    return facts
+
+
+def _keypoints(options: argparse.Namespace) -> TakenStream:
+    taken = read_stream(options.take, f"keypoints_{options.side}", options.store)
+    if not len(taken.batch):
+        raise InvalidInputError(f"take {options.take!r}: keypoints_{options.side} has no sample")
+    return taken
+
+
+def _now() -> datetime:
+    return datetime.now(UTC)

@@ -1,0 +1,141 @@
+"""`dextouch station calibrate latency`: the path delay of one stream, relative to another one.
+
+Either two pose streams see the same brisk motion (trackers held together), or a glove and a tracker
+see a hand that taps a table.
+"""
+
+import argparse
+from datetime import UTC, datetime
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int64
+
+from dextouch.errors import InvalidInputError
+from dextouch.geometry.rotations import vector_from_rotation
+from dextouch.geometry.transforms import transform_from_pose
+from dextouch.tactile.layout import Side
+from services.alignment.calibration.motion import DegenerateMotionError
+from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tap_offset import estimate_tap_offset
+from services.alignment.calibration.time_offset import TimeOffset, estimate_time_offset
+from services.cli.calibrate.record import write_entry
+from services.cli.calibrate.takes import TakenStream, read_stream
+
+# Norm of a quaternion below which a tracker has lost its target and sends zeros.
+MIN_NORM = 0.5
+HEIGHT = 2
+
+
+def calibrate(options: argparse.Namespace) -> dict[str, object]:
+    """Measure how much later one stream arrives than another, beyond what is calibrated already.
+
+    Raises:
+        DegenerateMotionError: too little, too slow or too regular motion, or no taps.
+        InvalidInputError: two streams that share no motion.
+        NotFoundError: no such take or stream.
+    """
+    stream = read_stream(options.take, options.stream, options.store)
+    reference = read_stream(options.take, options.reference, options.store)
+    kinds = (reference.descriptor.kind, stream.descriptor.kind)
+    if kinds == ("pose", "pose"):
+        found, method = _from_motion(reference, stream), "motion"
+    elif kinds == ("tactile", "pose"):
+        found, method = _from_taps(reference, stream), "taps"
+    elif kinds == ("pose", "tactile"):
+        reverse = _from_taps(stream, reference)
+        found, method = TimeOffset(-reverse.offset_ns, reverse.sigma_ns), "taps"
+    else:
+        raise InvalidInputError(
+            f"latency of {options.stream!r} against {options.reference!r}: got streams of kind "
+            f"{kinds[1]} and {kinds[0]}, expected two poses, or a pose and a glove"
+        )
+    # The offset is what must be added to the stream's times: it arrives later by its negative.
+    name = f"{options.stream}_latency"
+    latency_ns = (stream.number(f"{name}_ns") or 0.0) - found.offset_ns
+    known_ns = reference.number(f"{options.reference}_latency_sigma_ns") or 0.0
+    sigma_ns = float(np.hypot(found.sigma_ns, known_ns))
+    facts: dict[str, object] = {
+        "stream": options.stream,
+        "reference": options.reference,
+        "reference_latency_ms": (reference.number(f"{options.reference}_latency_ns") or 0.0) * 1e-6,
+        "method": method,
+        "take": options.take,
+        "latency_ms": latency_ns * 1e-6,
+        "sigma_ms": sigma_ns * 1e-6,
+    }
+    write_entry(
+        options.to,
+        entry=name,
+        matrices={
+            f"{name}_ns": np.array([[float(latency_ns)]]),
+            f"{name}_sigma_ns": np.array([[sigma_ns]]),
+        },
+        facts=facts,
+        now=datetime.now(UTC),
+    )
+    print(
+        f"{name}: {facts['latency_ms']:.2f} ± {facts['sigma_ms']:.2f} ms by {method}, where "
+        f"{options.reference} has {facts['reference_latency_ms']:.2f} ms"
+    )
+    return facts
+
+
+def _from_motion(a: TakenStream, b: TakenStream) -> TimeOffset:
+    (t_a_ns, a_rad_s), (t_b_ns, b_rad_s) = _angular_velocity(a), _angular_velocity(b)
+    try:
+        return estimate_time_offset(t_a_ns, a_rad_s, t_b_ns, b_rad_s)
+    except DegenerateMotionError:
+        # Two tracking systems may have worlds that are turned to each other: speeds are the same.
+        speeds = np.linalg.norm(a_rad_s, axis=1), np.linalg.norm(b_rad_s, axis=1)
+        return estimate_time_offset(t_a_ns, speeds[0], t_b_ns, speeds[1])
+
+
+def _from_taps(glove: TakenStream, tracker: TakenStream) -> TimeOffset:
+    t_ns, readings = glove.timed()
+    side = glove.descriptor.side
+    if side is None:
+        raise InvalidInputError(f"stream {glove.descriptor.name!r}: has no side")
+    pressure_kpa = readings.astype(np.float64)
+    if glove.descriptor.unit != "kPa":
+        pressure_kpa = _calibrated(glove, side).to_kpa(readings).astype(np.float64)
+    whole = np.isfinite(pressure_kpa).all(axis=1)
+    t_pose_ns, poses, seen = _poses(tracker)
+    return estimate_tap_offset(
+        t_ns[whole], pressure_kpa[whole].max(axis=1), t_pose_ns[seen], poses[seen, HEIGHT]
+    )
+
+
+def _calibrated(glove: TakenStream, side: Side) -> TactileCalibration:
+    return TactileCalibration.from_record(
+        glove.calibration, side, num_cells=glove.descriptor.shape[0]
+    )
+
+
+def _angular_velocity(
+    stream: TakenStream,
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 3"]]:
+    """Angular velocity in the world (rad/s), which is the same for all parts of a rigid body."""
+    t_ns, poses, seen = _poses(stream)
+    t_ns, Rs = t_ns[seen], transform_from_pose(poses[seen])[:, :3, :3]
+    turns_rad = vector_from_rotation(Rs[1:] @ np.swapaxes(Rs[:-1], -1, -2))
+    steps_ns = np.diff(t_ns)
+    return t_ns[:-1] + steps_ns // 2, turns_rad / (steps_ns[:, None] * 1e-9)
+
+
+def _poses(
+    stream: TakenStream,
+) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"], Bool[np.ndarray, " n"]]:
+    """Times, poses, and where the tracker saw its target.
+
+    Raises:
+        InvalidInputError: it hardly ever did.
+    """
+    t_ns, values = stream.timed()
+    poses = values.astype(np.float64)
+    seen = np.isfinite(poses).all(axis=1) & (np.linalg.norm(poses[:, 3:], axis=1) > MIN_NORM)
+    if np.count_nonzero(seen) < 2:
+        raise InvalidInputError(
+            f"take {stream.take!r}: {stream.descriptor.name} has {np.count_nonzero(seen)} valid "
+            "poses, expected two seconds of them; was the tracker visible?"
+        )
+    return t_ns, poses, seen

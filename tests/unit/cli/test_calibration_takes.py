@@ -1,0 +1,213 @@
+"""`dextouch station calibrate` from takes of known truth: wrist, profile, robot base, latency."""
+
+import json
+from argparse import Namespace
+
+import numpy as np
+import pytest
+
+from dextouch.episodes.spool import SpoolWriter
+from dextouch.errors import InvalidInputError, NotFoundError, ShapeError
+from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.transforms import pose_from_transform, transform
+from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams.samples import SampleBatch
+from services.acquisition.devices import load_calibration
+from services.alignment.calibration.hand_eye import mount_difference
+from services.alignment.calibration.motion import DegenerateMotionError
+from services.cli import main as command_line
+from services.cli.calibrate.command import main
+from services.cli.calibrate.show import load, show
+from tests.accuracy.test_robot_base import pairs
+from tests.accuracy.test_time_offset import taps
+from tests.unit.alignment.tracked_hands import any_rotation, flat_hand, moving_hand
+
+START_NS = 10**12
+
+
+def write_take(path, streams, calibration=None):
+    """A spooled take; `streams` are name: (kind, unit, times in ns, values)."""
+    descriptors = {
+        name: StreamDescriptor(
+            name=name,
+            kind=kind,
+            side="left" if kind == "tactile" else None,
+            shape=values.shape[1:],
+            dtype="float64",
+            unit=unit,
+            nominal_rate_hz=round(1e9 / np.median(np.diff(t_ns))),
+        )
+        for name, (kind, unit, t_ns, values) in streams.items()
+    }
+    attributes = RecordingAttributes(
+        recording_id="take",
+        task="calibrate-takes",
+        instruction="",
+        domain="human",
+        station="test",
+        calibration=calibration or {},
+        streams=tuple(descriptors.values()),
+    )
+    with SpoolWriter(path, attributes, sync=False) as spool:
+        for name, (_, _, t_ns, values) in streams.items():
+            number = np.arange(len(t_ns), dtype=np.int64)
+            t_host_ns = t_ns + START_NS
+            spool.append(name, SampleBatch(t_host_ns, t_host_ns, number, values))
+    return path
+
+
+def run(*arguments, to):
+    report = to.parent / "report.json"
+    words = [str(argument) for argument in arguments]
+    assert main([*words, "--to", str(to), "--json", str(report)]) == 0
+    return json.loads(report.read_text()), load_calibration(to / "calibration.json")
+
+
+def hand_take(path, keypoints_m, side="left"):
+    t_ns = np.arange(len(keypoints_m), dtype=np.int64) * 10_000_000
+    return write_take(path, {f"keypoints_{side}": ("keypoints", "m", t_ns, keypoints_m)})
+
+
+def test_wrist_axes_from_a_flat_hand_and_the_person_in_them(tmp_path):
+    rng = np.random.default_rng(0)
+    R = any_rotation(rng)
+    flat = hand_take(tmp_path / "flat", flat_hand("left", rng) @ R.T)
+    to = tmp_path / "to"
+    report, matrices = run("wrist", "--side", "left", "--take", flat, to=to)
+    found = np.array(matrices["T_keypoints_left_wrist_left"])[:3, :3]
+    np.testing.assert_allclose(found, R, atol=0.01)
+    assert report["hand_size"] == pytest.approx(1.0, abs=0.02)
+
+    keypoints_m = moving_hand("left", rng, num_samples=300)
+    moving = hand_take(tmp_path / "moving", keypoints_m @ R.T)
+    _, matrices = run("profile", "--side", "left", "--take", moving, to=to)
+    profile = np.array(matrices["hand_profile_left"])
+    # Nodes 1 to 4 are the thumb's; its bones keep their lengths.
+    bones_m = np.linalg.norm(np.diff(keypoints_m[0, 1:5], axis=0), axis=-1)
+    np.testing.assert_allclose(profile[0, :3], bones_m, atol=1e-6)
+    levels = {f["name"]: (f["level"], f["sigma"]) for f in show(argument(to))["findings"]}
+    assert levels["T_keypoints_left_wrist_left"][0] == "OK"
+    assert levels["hand_profile_left"][1].startswith("knuckles ")
+
+
+def argument(folder):
+    return Namespace(folder=folder)
+
+
+def test_hands_that_do_not_serve_are_refused(tmp_path):
+    rng = np.random.default_rng(1)
+    bent = hand_take(tmp_path / "bent", moving_hand("left", rng))
+    with pytest.raises(InvalidInputError, match="lay the hand flat"):
+        main(["wrist", "--side", "left", "--take", str(bent), "--to", str(tmp_path / "to")])
+    turned = hand_take(tmp_path / "turned", moving_hand("left", rng) @ any_rotation(rng).T)
+    with pytest.raises(InvalidInputError, match="dextouch station calibrate wrist --side left"):
+        main(["profile", "--side", "left", "--take", str(turned), "--to", str(tmp_path / "to")])
+    with pytest.raises(NotFoundError, match="only keypoints_left"):
+        main(["wrist", "--side", "right", "--take", str(bent), "--to", str(tmp_path / "to")])
+    assert not (tmp_path / "to").exists()
+
+
+@pytest.mark.parametrize("has_mount", [True, False])
+def test_robot_base_from_pairs_of_poses(tmp_path, has_mount):
+    tracker, effector, T_world_base, mount = pairs(3, has_mount=has_mount)
+    file = tmp_path / "pairs.json"
+    file.write_text(json.dumps(np.stack([tracker, effector], axis=1).tolist()))
+    flags = [] if has_mount else ["--same-frame"]
+    report, matrices = run("robot-base", "--poses", file, *flags, to=tmp_path / "to")
+    angle_rad, distance_m = mount_difference(np.array(matrices["T_world_base"]), T_world_base)
+    assert np.rad2deg(angle_rad) < 0.2
+    assert distance_m < 2e-3
+    assert mount_difference(np.array(report["T_effector_tracker"]), mount)[0] < 5e-3
+    (finding,) = show(argument(tmp_path / "to"))["findings"]
+    assert finding["level"] == "OK"
+    file.write_text(json.dumps(tracker.tolist()))
+    with pytest.raises(ShapeError, match="T_base_effector"):
+        main(["robot-base", "--poses", str(file), "--to", str(tmp_path / "to")])
+
+
+def shaken(t_s):
+    """Irregular rotation about all axes, from whole formulas."""
+    rng = np.random.default_rng(5)
+    rates_hz, phases = rng.uniform(0.3, 2.5, (3, 5)), rng.uniform(0, 2 * np.pi, (3, 5))
+    waves = np.sin(2 * np.pi * rates_hz * t_s[:, None, None] + phases)
+    return rotation_from_vector(0.25 * waves.sum(axis=2))
+
+
+@pytest.mark.parametrize("same_world", [True, False])
+def test_latency_from_trackers_that_are_held_together(tmp_path, same_world):
+    rng = np.random.default_rng(2)
+    t_s = {"wrist_left": np.arange(0, 10, 1 / 100), "wrist_right": np.arange(0, 10, 1 / 90)}
+    delays_ms = {"wrist_left": 37.0, "wrist_right": 12.0}
+    streams = {}
+    for name, at_s in t_s.items():
+        Rs = shaken(at_s) @ any_rotation(rng)
+        if not same_world and name == "wrist_left":
+            Rs = any_rotation(rng) @ Rs
+        poses = pose_from_transform(transform(Rs, rng.normal(scale=1e-4, size=(len(at_s), 3))))
+        t_ns = np.rint(at_s * 1e9 + delays_ms[name] * 1e6).astype(np.int64)
+        streams[name] = ("pose", "pose_m_wxyz", t_ns, poses)
+    known = {
+        "wrist_right_latency_ns": ((12e6,),),
+        "wrist_right_latency_sigma_ns": ((0.5e6,),),
+        # Of a former calibration, which was wrong.
+        "wrist_left_latency_ns": ((20e6,),),
+    }
+    take = write_take(tmp_path / "take", streams, known)
+    arguments = ["--stream", "wrist_left", "--reference", "wrist_right", "--take", take]
+    report, matrices = run("latency", *arguments, to=tmp_path / "to")
+    assert matrices["wrist_left_latency_ns"][0][0] * 1e-6 == pytest.approx(37.0, abs=1.0)
+    assert report["method"] == "motion"
+    assert 0.5 <= report["sigma_ms"] < 2
+
+
+@pytest.mark.parametrize("stream", ["wrist_left", "tactile_left"])
+def test_latency_from_taps(tmp_path, stream):
+    (t_glove_ns, kpa, t_tracker_ns, height_m), offset_s = taps(1)
+    start_ns = min(t_glove_ns[0], t_tracker_ns[0])
+    pressures = np.zeros((len(kpa), 320))
+    pressures[:, 7] = kpa
+    poses = np.zeros((len(height_m), 7))
+    poses[:, 2], poses[:, 3] = height_m, 1.0
+    # Times that the tracker lost its target.
+    poses[5:9] = 0.0
+    streams = {
+        "tactile_left": ("tactile", "kPa", t_glove_ns - start_ns, pressures),
+        "wrist_left": ("pose", "pose_m_wxyz", t_tracker_ns - start_ns, poses),
+    }
+    take = write_take(tmp_path / "take", streams)
+    reference = ({"wrist_left", "tactile_left"} - {stream}).pop()
+    arguments = ["--stream", stream, "--reference", reference, "--take", take]
+    report, _ = run("latency", *arguments, to=tmp_path / "to")
+    # `offset_s` is to be added to the tracker's times: they are early by it.
+    late_ms = -offset_s * 1e3 if stream == "wrist_left" else offset_s * 1e3
+    assert report["latency_ms"] == pytest.approx(late_ms, abs=6)
+    assert report["method"] == "taps"
+
+
+def test_streams_without_common_motion_are_refused(tmp_path):
+    t_ns = np.arange(400, dtype=np.int64) * 10_000_000
+    still = np.tile([0.0, 0, 0, 1, 0, 0, 0], (400, 1))
+    streams = dict.fromkeys(("wrist_left", "head"), ("pose", "pose_m_wxyz", t_ns, still))
+    streams["joints_measured"] = ("robot_state", "rad", t_ns, np.zeros((400, 40)))
+    take = str(write_take(tmp_path / "take", streams))
+    common = ["latency", "--take", take, "--to", str(tmp_path / "to"), "--stream", "wrist_left"]
+    with pytest.raises(DegenerateMotionError, match="brisk"):
+        main([*common, "--reference", "head"])
+    with pytest.raises(InvalidInputError, match="two poses, or a pose and a glove"):
+        main([*common, "--reference", "joints_measured"])
+    assert command_line.main(["station", "calibrate", *common, "--reference", "none"]) == 3
+    assert not load_or_none(tmp_path / "to")
+
+
+def load_or_none(folder):
+    return load(folder) if (folder / "calibration.json").exists() else None
+
+
+@pytest.mark.parametrize("command", ["wrist", "profile", "robot-base", "latency"])
+def test_each_command_has_help_with_an_example(command, capsys):
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    said = capsys.readouterr().out
+    assert f"dextouch station calibrate {command} " in said
+    assert "--json" in said
