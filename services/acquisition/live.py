@@ -1,24 +1,36 @@
-"""Readings come in; the newest pressures and images go out for viewers, blocks for the health."""
+"""The newest pressures and images of a station for viewers, and its samples for its health."""
 
+import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
-from jaxtyping import Float32
+from jaxtyping import Float32, Float64, Int64
 
-from dextouch.errors import NotFoundError, StaleDataError
+from dextouch.errors import InvalidInputError, NotFoundError, StaleDataError
 from dextouch.schemas.episodes import Matrix
 from dextouch.streams.checks import H264_UNIT
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample
-from dextouch.tactile.layout import NUM_RAW_TAXELS, Side, select_taxels
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, raw_indices, select_taxels
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import GroupPreview
 from services.acquisition.health_blocks import SampleBlocks
+from services.acquisition.health_cells import NO_CELL
 from services.acquisition.health_taxels import GloveRecord
 from services.acquisition.schemas import CameraLive
 
 MAX_AGE_NS = 500_000_000
+
+
+@dataclass(frozen=True)
+class _LiveGlove:
+    """counts = tare + gain · pressure of each cell, and the cell of each of the 320 taxels."""
+
+    tare_counts: Float64[np.ndarray, " cells"]
+    gain_counts_per_kpa: Float64[np.ndarray, " cells"]
+    cells: Int64[np.ndarray, "320"]
 
 
 class LiveView:
@@ -37,17 +49,11 @@ class LiveView:
         }
         self.blocks = SampleBlocks(self._descriptors)
         self.calibration = dict(calibration)
+        # Without a calibration the station starts all the same: it records the takes for one.
         self._gloves = {
-            name: (
-                calibration_row(calibration, f"{name}_tare_counts"),
-                calibration_row(calibration, f"{name}_gain_counts_per_kpa"),
-            )
-            for name, d in self._descriptors.items()
-            # Without a calibration the station starts all the same: it records the takes for one.
-            if d.kind == "tactile"
-            and d.unit == "counts"
-            and d.shape == (NUM_RAW_TAXELS,)
-            and {f"{name}_tare_counts", f"{name}_gain_counts_per_kpa"} <= calibration.keys()
+            name: glove
+            for name, descriptor in self._descriptors.items()
+            if (glove := _live_glove(descriptor, calibration)) is not None
         }
 
     def accept(self, device: str, readings: Readings) -> None:
@@ -63,33 +69,36 @@ class LiveView:
 
     def glove(self, stream: str) -> GloveRecord | None:
         """Tare and gain of the 320 taxels of a glove of ours; None for other streams."""
-        if stream not in self._gloves:
+        glove = self._gloves.get(stream)
+        if glove is None or not _is_ours(self._descriptors[stream]):
             return None
         side = _side(self._descriptors[stream])
-        tare_counts, gain_counts_per_kpa = self._gloves[stream]
         sigma = np.array(self.calibration.get(f"{stream}_tare_sigma_counts", ()))
         sigma_counts = sigma.ravel() if sigma.size else np.zeros(NUM_RAW_TAXELS)
         return GloveRecord(
             side,
-            select_taxels(tare_counts, side=side),
-            select_taxels(gain_counts_per_kpa, side=side),
+            select_taxels(glove.tare_counts, side=side),
+            select_taxels(glove.gain_counts_per_kpa, side=side),
             select_taxels(sigma_counts.astype(np.float64), side=side),
         )
 
     def tactile_streams(self) -> list[str]:
-        """Names of the glove streams."""
+        """Names of the gloves' streams whose calibration makes pressures of their readings."""
         return sorted(self._gloves)
 
     def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, "320"]]:
-        """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones."""
+        """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones.
+
+        Taxels that the glove has not, or from which it has no reading, are 0.
+        """
         pressures: dict[str, np.ndarray] = {}
-        for name, (tare_counts, gain_counts_per_kpa) in self._gloves.items():
+        for name, glove in self._gloves.items():
             sample = self._newest.get(name)
             if sample is None or now_ns - sample.t_host_ns > MAX_AGE_NS:
                 continue
-            raw_kpa = (sample.values.astype(np.float64) - tare_counts) / gain_counts_per_kpa
-            taxels = select_taxels(raw_kpa, side=_side(self._descriptors[name]))
-            pressures[name] = np.maximum(taxels, 0.0).astype(np.float32)
+            cells_kpa = (sample.values.ravel() - glove.tare_counts) / glove.gain_counts_per_kpa
+            taxels = np.where(glove.cells == NO_CELL, 0.0, cells_kpa[glove.cells])
+            pressures[name] = np.maximum(np.nan_to_num(taxels), 0.0).astype(np.float32)
         return pressures
 
     def cameras(self, now_ns: int) -> list[CameraLive]:
@@ -132,16 +141,44 @@ class LiveView:
         return encode_jpeg(sample.values)
 
 
-def calibration_row(calibration: Mapping[str, Matrix], name: str) -> np.ndarray:
-    """360 numbers of a glove's calibration.
+def _is_ours(descriptor: StreamDescriptor) -> bool:
+    """Whether a stream is that of our own glove, whose cells need no map."""
+    return descriptor.unit == "counts" and descriptor.shape == (NUM_RAW_TAXELS,)
+
+
+def _live_glove(
+    descriptor: StreamDescriptor, calibration: Mapping[str, Matrix]
+) -> _LiveGlove | None:
+    """What makes pressures of a glove's readings; None where the calibration does not say it."""
+    tare, gain = (f"{descriptor.name}_{what}" for what in ("tare_counts", "gain_counts_per_kpa"))
+    if descriptor.kind != "tactile" or not {tare, gain} <= calibration.keys():
+        return None
+    num_cells = math.prod(descriptor.shape)
+    cells_name = f"{descriptor.name}_cells"
+    if cells_name in calibration:
+        cells = _row(calibration, cells_name, NUM_TAXELS).astype(np.int64)
+        if cells.min() < NO_CELL or cells.max() >= num_cells:
+            raise InvalidInputError(
+                f"calibration {cells_name!r}: got cells {cells.min()} … {cells.max()}, expected "
+                f"-1 … {num_cells - 1}"
+            )
+    elif _is_ours(descriptor):
+        cells = raw_indices(side=_side(descriptor))
+    else:
+        return None
+    return _LiveGlove(_row(calibration, tare, num_cells), _row(calibration, gain, num_cells), cells)
+
+
+def _row(calibration: Mapping[str, Matrix], name: str, size: int) -> np.ndarray:
+    """So many numbers of a glove's calibration.
 
     Raises:
-        NotFoundError: it is missing or of another size.
+        NotFoundError: they are missing or of another size.
     """
     row = np.array(calibration.get(name, ()), dtype=np.float64).ravel()
-    if row.shape != (NUM_RAW_TAXELS,):
+    if row.shape != (size,):
         raise NotFoundError(
-            f"calibration {name!r}: got {row.size} numbers, expected {NUM_RAW_TAXELS}; "
+            f"calibration {name!r}: got {row.size} numbers, expected {size}; "
             "calibrate the glove and give the station its record"
         )
     return row

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Annotated, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
+
+# Names of streams are ROLE_LABEL or ROLE_LABEL_SIDE; the role says what reads them.
+StreamName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
 
 class DeviceSettings(BaseModel):

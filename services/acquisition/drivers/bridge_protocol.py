@@ -37,7 +37,7 @@ class BridgedDevice(_Message):
 
     index: int = Field(ge=0, le=65535)
     serial_number: str = Field(min_length=1, max_length=128)
-    source: Literal["left", "right", "head"]
+    source: Literal["left", "right", "head", "none"]
 
 
 class FrameConvention(_Message):

@@ -152,7 +152,7 @@ class BridgePoseTrackerDecoder:
     set while a lost tracker drifts. A running pose that is flagged invalid is left out too.
 
     Args:
-        stream: `wrist_left`, `wrist_right` or `head`.
+        stream: `wrist_left`, `wrist_right`, `head`, or the name of another place.
         serial_number: of the tracker; the bridge's only one at this place if None.
     """
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
+from dextouch.tactile.layout import SIDES
 from services.acquisition.drivers.base import Readings, check_packet
 from services.acquisition.drivers.packets import SOURCES, DecoderStatistics, Packet, PacketDecoder
 from services.acquisition.drivers.reports import OrderFilter, ReportReassembler
@@ -179,8 +180,9 @@ class PoseStream:
 
 
 def pose_descriptor(stream: str) -> StreamDescriptor:
-    """The stream `wrist_left`, `wrist_right` or `head`."""
-    side = {"wrist_left": "left", "wrist_right": "right"}.get(stream)
+    """The stream of a tracker on a wrist, the head or anything else, by its name."""
+    last = stream.rpartition("_")[2]
+    side = last if last in SIDES else None
     return StreamDescriptor.model_validate(
         {
             "name": stream,
@@ -203,7 +205,7 @@ def are_finite(numbers: Sequence[float]) -> bool:
 
 
 def source_of(stream: str) -> str:
-    """Where the tracker of a stream sits, as packets call it: left, right, head or none."""
+    """Where the tracker of a stream sits, as packets call it: left, right, head, else none."""
     source = stream.removeprefix("wrist_")
     return source if source in SOURCES else "none"
 

@@ -1,12 +1,13 @@
 """Settings of a camera bridge."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
 from services.acquisition.devices.tcp import TcpSettings
 
-CameraStream = Literal["camera_head", "camera_wrist_left", "camera_wrist_right"]
+# `camera_head` is what episodes need; any number of others may stand beside it.
+CameraStream = Annotated[str, Field(pattern=r"^camera_[a-z0-9_]{1,57}$")]
 
 
 class CameraSettings(TcpSettings):
