@@ -1,1 +1,1 @@
-"""Alignment: recordings in, calibrated and synchronized episodes with 67-D actions out."""
+"""Alignment service: turns recordings into calibrated, synchronized episodes with 67-D actions."""

@@ -1,4 +1,4 @@
-"""`dextouch align`: recordings to episodes from the shell, or as a service."""
+"""Command line of `dextouch align`: align recordings, report on them, or serve over HTTP."""
 
 import argparse
 import json
@@ -16,8 +16,8 @@ from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.schemas.episodes import json_ready
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
+from services.alignment.batch import OnRecordingProgress, Outcome, align_batch, not_aligned
 from services.alignment.jobs import episode_id_of
-from services.alignment.many import Outcome, TellOne, align_many, not_aligned
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.report_page import report_line, report_page
@@ -25,20 +25,20 @@ from services.alignment.settings import AlignmentSettings, usable_cores
 from services.alignment.synchronization.progress import Progress
 
 EXIT_REFUSED = 3
-# Of a report that goes to a file or another program.
+# Width of a report that is not printed at a terminal.
 PAGE_WIDTH = 110
 EPILOG = """examples:
   dextouch align run take-7 take-8           align two recordings, side by side
   dextouch align run --all --workers 2       align whatever has no episode yet
   dextouch align report take-7               clocks, retargeting, what was left out and why
-  dextouch align serve --port 8082           answer POST /v1/alignments; settings: serve --help
+  dextouch align serve --port 8082           run the HTTP service
 
 An episode's id follows from the recording and the options: aligning again finds it and writes
 nothing, so a run that was interrupted is simply started again."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Serve, align some recordings, or tell what became of one.
+    """Run `dextouch align`: align recordings, report on one, or serve over HTTP.
 
     Returns:
         0, or 3 for a refusal with its reason on stderr.
@@ -61,19 +61,23 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     layout = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser(
         prog="dextouch align",
-        description="Recordings in; synchronized, retargeted episodes in the same store out.",
+        description="Make synchronized, retargeted episodes of recordings, in the same store.",
         epilog=EPILOG,
         formatter_class=layout,
     )
     shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("--store", default=settings.store_url, help="of recordings and episodes")
-    shared.add_argument("--json", type=Path, metavar="PATH", help="write the reports here too")
+    shared.add_argument(
+        "--store", default=settings.store_url, help="URL or folder of the episode store"
+    )
+    shared.add_argument(
+        "--json", type=Path, metavar="PATH", help="also write the reports to this file"
+    )
     words = parser.add_subparsers(dest="word", required=True, metavar="{run,report,serve}")
     running = words.add_parser(
         "run", parents=[shared], help="align recordings", epilog=EPILOG, formatter_class=layout
     )
     running.add_argument("recordings", nargs="*", metavar="RECORDING_ID")
-    running.add_argument("--all", action="store_true", help="all that have no episode yet")
+    running.add_argument("--all", action="store_true", help="all recordings without an episode")
     running.add_argument(
         "--workers",
         type=_positive,
@@ -81,9 +85,9 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
         metavar="N",
         help="recordings at once, each in a process of its own (default: one a processor)",
     )
-    report = words.add_parser("report", parents=[shared], help="what became of a recording")
+    report = words.add_parser("report", parents=[shared], help="report on an aligned recording")
     report.add_argument("id", metavar="ID", help="of a recording or of its episode")
-    words.add_parser("serve", help="answer over HTTP (its own --help lists the settings)")
+    words.add_parser("serve", help="run the HTTP service (serve --help lists its settings)")
     return parser
 
 
@@ -112,20 +116,24 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
         wanted, outcomes = not_aligned(EpisodeStore(parsed.store), settings.options)
     console = Console(highlight=False, soft_wrap=True)
     for outcome in outcomes:
-        _tell(outcome, console)
-    with _bars(console, len(wanted)) as tell:
-        for outcome in align_many(
-            parsed.store, wanted, settings.options, num_workers=parsed.workers, tell=tell
+        _print_outcome(outcome, console)
+    with _bars(console, len(wanted)) as on_progress:
+        for outcome in align_batch(
+            parsed.store,
+            wanted,
+            settings.options,
+            num_workers=parsed.workers,
+            on_progress=on_progress,
         ):
             outcomes.append(outcome)
-            _tell(outcome, console)
+            _print_outcome(outcome, console)
     if not outcomes:
         console.print("nothing to do: every recording has its episode")
     _write_json(parsed.json, [outcome.report for outcome in outcomes if outcome.report])
     return EXIT_REFUSED if any(outcome.error for outcome in outcomes) else 0
 
 
-def _tell(outcome: Outcome, console: Console) -> None:
+def _print_outcome(outcome: Outcome, console: Console) -> None:
     if outcome.report is not None:
         console.print(report_line(outcome.report), markup=False)
     elif outcome.error is not None:
@@ -133,8 +141,8 @@ def _tell(outcome: Outcome, console: Console) -> None:
 
 
 @contextmanager
-def _bars(console: Console, num_recordings: int) -> Iterator[TellOne]:
-    """A bar for each recording at work and one for all; nothing where no one watches."""
+def _bars(console: Console, num_recordings: int) -> Iterator[OnRecordingProgress]:
+    """A bar for each recording at work and one for all; nothing without a terminal."""
     columns = (
         TextColumn("{task.description}"),
         BarColumn(),
@@ -147,7 +155,7 @@ def _bars(console: Console, num_recordings: int) -> Iterator[TellOne]:
     with Bars(*columns, console=console, disable=not console.is_terminal, transient=True) as bars:
         whole = bars.add_task(f"{num_recordings} recordings", total=max(num_recordings, 1))
 
-        def tell(recording_id: str, progress: Progress) -> None:
+        def on_progress(recording_id: str, progress: Progress) -> None:
             if recording_id not in shown:
                 shown[recording_id] = bars.add_task(recording_id, total=1.0)
             where = f"{recording_id} {progress.stage} {progress.stream or ''}"
@@ -155,7 +163,7 @@ def _bars(console: Console, num_recordings: int) -> Iterator[TellOne]:
             bars.update(shown[recording_id], completed=progress.share, description=where)
             bars.update(whole, completed=sum(shares.values()))
 
-        yield tell
+        yield on_progress
 
 
 def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:

@@ -1,4 +1,4 @@
-"""Settings in, the alignment service's application out."""
+"""The FastAPI application of the alignment service."""
 
 import asyncio
 from collections.abc import AsyncIterator, Sequence

@@ -212,7 +212,7 @@ class JobRunner:
                 await asyncio.to_thread(self._store.sweep)
         except Exception:
             # The job's supervisor: one broken recording must not end the service.
-            logger.exception("alignment_broke", recording_id=job.recording_id)
+            logger.exception("alignment_crashed", recording_id=job.recording_id)
             broken = DexTouchError("unexpected error; see the service's log")
             ended = job.failed(broken)
         async with self.queue.lock:

@@ -1,4 +1,4 @@
-"""A recording's id in, its aligned episode in the same store out."""
+"""Alignment of one recording: builds its episode and writes it to the same store."""
 
 import hashlib
 from collections.abc import Sequence
@@ -14,22 +14,22 @@ from services.alignment.synchronization.episode_builder import (
     build_episode,
     check_complete,
 )
-from services.alignment.synchronization.progress import Progress, Tell, progress_within
+from services.alignment.synchronization.progress import OnProgress, Progress, progress_within
 
 logger = structlog.get_logger(__name__)
 
 # Raised whenever alignment gives other numbers for the same recording and options.
 ALIGNMENT_VERSION = 3
 MAX_STEM = 100
-# Refused recordings whose reason a message tells; its details have all.
-MAX_TOLD = 5
+# Refused recordings that a message lists; its details have all.
+MAX_LISTED = 5
 
 
 def align_recording(
     store: EpisodeStore,
     recording_id: str,
     options: AlignmentOptions,
-    tell: Tell | None = None,
+    on_progress: OnProgress | None = None,
 ) -> AlignmentReport:
     """Align one recording and write the episode.
 
@@ -40,7 +40,7 @@ def align_recording(
         store: where the recording lies and the episode goes.
         recording_id: of a finished recording.
         options: of the alignment.
-        tell: called with the progress, in the caller's thread.
+        on_progress: called with the progress, in the caller's thread.
 
     Raises:
         NotFoundError: no such recording.
@@ -51,12 +51,12 @@ def align_recording(
     episode_id = episode_id_of(recording, options)
     created = False
     if not store.exists(episode_id):
-        created = _write(store, recording, episode_id, options, tell or _silent)
+        created = _write(store, recording, episode_id, options, on_progress or _ignore)
     return report_of(store.open(episode_id), recording_id=recording_id, created=created)
 
 
 def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
-    """The id of the episode-to-be, after a look at what the recording says about itself.
+    """Check that a recording has what an episode needs; returns the id of its episode.
 
     Raises:
         NotFoundError: no such recording.
@@ -70,7 +70,7 @@ def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOp
 def check_recordings(
     store: EpisodeStore, recording_ids: Sequence[str], options: AlignmentOptions
 ) -> dict[str, str]:
-    """The episode that each recording becomes, after a look at all of them.
+    """Check several recordings; returns the id of each one's episode.
 
     Raises:
         NotFoundError: no such recording; of several, the message names all that are refused.
@@ -87,8 +87,8 @@ def check_recordings(
             refused[recording_id] = error
     if refused:
         reasons = {recording_id: error.message for recording_id, error in refused.items()}
-        told = "; ".join(list(reasons.values())[:MAX_TOLD])
-        more = f"; and {len(reasons) - MAX_TOLD} more" if len(reasons) > MAX_TOLD else ""
+        told = "; ".join(list(reasons.values())[:MAX_LISTED])
+        more = f"; and {len(reasons) - MAX_LISTED} more" if len(reasons) > MAX_LISTED else ""
         unknown = all(isinstance(error, NotFoundError) for error in refused.values())
         raise (NotFoundError if unknown else InvalidInputError)(
             f"alignments: {len(reasons)} of {len(recording_ids)} recordings cannot be aligned, so "
@@ -110,15 +110,17 @@ def _write(
     recording: RecordingReader,
     episode_id: str,
     options: AlignmentOptions,
-    tell: Tell,
+    on_progress: OnProgress,
 ) -> bool:
-    episode = build_episode(recording, episode_id=episode_id, options=options, tell=tell)
+    episode = build_episode(
+        recording, episode_id=episode_id, options=options, on_progress=on_progress
+    )
     try:
         with store.writer(kind="episode", attributes=episode.attributes) as writer:
-            _write_streams(writer, episode, tell)
+            _write_streams(writer, episode, on_progress)
             writer.set_attributes(episode.complete_attributes())
     except ConflictError:
-        # Another process was faster with the very same content.
+        # Another process has written the same episode meanwhile.
         return False
     logger.info(
         "recording_aligned", recording_id=recording.attributes.recording_id, episode_id=episode_id
@@ -126,7 +128,7 @@ def _write(
     return True
 
 
-def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, tell: Tell) -> None:
+def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: OnProgress) -> None:
     """Take the samples of every stream and write them; a stream without any is left out."""
     num_streams = len(episode.streams)
     for number, stream in enumerate(episode.streams):
@@ -136,8 +138,8 @@ def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, tell: Tell) -> 
                 writer.add_stream(stream.descriptor)
                 announced = True
             writer.append(name, values=block.values, t_ref_ns=block.t_ns)
-            tell(progress_within("writing", number / num_streams, name))
+            on_progress(progress_within("writing", number / num_streams, name))
 
 
-def _silent(_: Progress) -> None:
-    """Nobody asked for progress."""
+def _ignore(_: Progress) -> None:
+    """Default progress callback."""

@@ -1,4 +1,4 @@
-"""Alignment of recordings as they arrive, so that a saved take becomes an episode by itself."""
+"""Watcher that submits alignment jobs for recordings as they arrive in the store."""
 
 import asyncio
 import re
@@ -30,9 +30,9 @@ RETRY_S = 60.0
 
 
 class NewRecordings:
-    """Looks into a store and asks the job table for whatever has no episode yet, once each.
+    """Lists a store and submits a job for each recording that has no episode yet, once.
 
-    A recording is left alone when there is a job of it, whatever became of that; when an episode
+    A recording is skipped when it has a job, in whatever state; when an episode
     made from it is in the store or its trash, under any options; or when it is a calibration take.
     One that cannot be aligned becomes a failed job with the reason. One that cannot be read is
     logged and tried again after RETRY_S. One that comes back under the id of another that was
@@ -40,7 +40,7 @@ class NewRecordings:
 
     Args:
         store: of recordings and episodes.
-        jobs: where alignments are asked for.
+        jobs: where alignments are submitted.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:
@@ -51,7 +51,7 @@ class NewRecordings:
         self._unreadable: dict[str, tuple[str, float]] = {}
 
     async def watch(self, period_s: float) -> None:
-        """Look again and again, until cancelled; a failure is logged when it is a new one."""
+        """Look for new recordings until cancelled; the same failure is logged only once."""
         failure = ""
         while True:
             try:
@@ -62,14 +62,14 @@ class NewRecordings:
                     logger.warning("new_recordings_not_aligned", reason=error.message)
                 failure = error.message
             except Exception as error:
-                # The watcher's supervisor: what arrives after this must be aligned, too.
+                # Supervisor of the watcher: recordings that arrive later must be aligned, too.
                 if repr(error) != failure:
-                    logger.exception("watching_broke")
+                    logger.exception("watcher_failed")
                 failure = repr(error)
             await asyncio.sleep(period_s)
 
     async def look(self) -> None:
-        """Ask for what is new; a recording that finds no room in the queue is left for next time.
+        """Submit what is new; a recording that finds no room in the queue is left for next time.
 
         Raises:
             StorageError: the store cannot be listed, or jobs cannot be kept.
@@ -89,7 +89,7 @@ class NewRecordings:
                     self._deleted.discard(recording_id)
 
     def _new(self, listed: Sequence[str]) -> list[str]:
-        """Those that were neither asked for nor left alone, nor found unreadable just now."""
+        """Recordings neither submitted nor skipped before, nor found unreadable just now."""
         there = set(listed)
         self._deleted |= self._seen - there
         self._seen &= there
@@ -100,7 +100,7 @@ class NewRecordings:
         return [item for item in listed if item not in self._seen | just_now]
 
     async def _ask(self, recording_id: str, episode_ids: Sequence[str]) -> bool:
-        """Ask for a recording unless it is to be left alone; False if it cannot be read."""
+        """Submit a recording unless it is to be skipped; False if it cannot be read."""
         try:
             recording = await asyncio.to_thread(self._store.recording, recording_id)
         except DexTouchError as error:
@@ -125,7 +125,7 @@ class NewRecordings:
 
 
 def _aligned(store: EpisodeStore) -> dict[str, list[str]]:
-    """Episodes by the id of the recording, those that somebody deleted included."""
+    """Ids of episodes by the id of their recording, including episodes in the trash."""
     found: dict[str, list[str]] = {}
     for episode_id in _episode_ids(store):
         if match := EPISODE_ID.fullmatch(episode_id):
@@ -147,7 +147,7 @@ def _has_episode(
 
 
 def _episode_ids(store: EpisodeStore) -> list[str]:
-    """Of all episodes, and of those that somebody deleted and should not get back."""
+    """All episodes, and those in the trash, which must not be made again."""
     try:
         deleted = [entry.item_id for entry in store.trash_list() if entry.kind == "episode"]
     except InvalidInputError:

@@ -1,4 +1,4 @@
-"""What a person may choose about an alignment goes in; checked, frozen options come out."""
+"""Options of an alignment, such as the rate of its action grid."""
 
 from pydantic import BaseModel, ConfigDict, Field
 

@@ -1,4 +1,4 @@
-"""An aligned episode in, the short account of it that people and programs read out."""
+"""Report of an alignment: clocks, retargeting quality and what was left out of the episode."""
 
 from collections.abc import Mapping
 
@@ -28,7 +28,7 @@ class AlignmentReport(BaseModel):
     one has not; `refused_parts` the stretches of the recording that are not in the episode, and
     why; `retargeting` figures of each hand: tip error (mean and 95th percentile, mm) and the share
     of steps by status. `refused_taxels` names, by stream and reason, taxels (anatomical order) that
-    are zero since nobody measured them.
+    are zero because they were not measured.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,4 +1,4 @@
-"""Reports in, what a person reads at a terminal out: one line a recording, or a whole page."""
+"""Rendering of alignment reports for the terminal: one line each, or a whole page."""
 
 from collections.abc import Mapping, Sequence
 
@@ -10,8 +10,8 @@ from rich.text import Text
 from services.alignment.report import AlignmentReport
 from services.alignment.synchronization.refused_parts import RefusedPart
 
-# Taxels of one reason, and refused parts, that a page tells; the report has all.
-MAX_TOLD = 12
+# Taxels for each reason, and refused parts, that a page lists; the report has all.
+MAX_LISTED = 12
 WHY = {
     "late_start": "began later than the others",
     "early_end": "ended earlier than the others",
@@ -130,13 +130,13 @@ def _refused(parts: Sequence[RefusedPart]) -> Table | Text:
     for name in ("from s", "to s", "for s"):
         table.add_column(name, justify="right")
     table.add_column("why")
-    longest = sorted(parts, key=lambda part: part.start_s - part.stop_s)[:MAX_TOLD]
+    longest = sorted(parts, key=lambda part: part.start_s - part.stop_s)[:MAX_LISTED]
     for part in sorted(longest, key=lambda part: part.start_s):
         why = WHY[part.reason] if part.stream is None else f"{part.stream}: {WHY[part.reason]}"
         length_s = part.stop_s - part.start_s
         table.add_row(f"{part.start_s:.2f}", f"{part.stop_s:.2f}", f"{length_s:.2f}", why)
-    if len(parts) > MAX_TOLD:
-        table.caption = f"and {len(parts) - MAX_TOLD} shorter ones"
+    if len(parts) > MAX_LISTED:
+        table.caption = f"and {len(parts) - MAX_LISTED} shorter ones"
     return table
 
 
@@ -146,6 +146,6 @@ def _number(value: float | None, digits: int) -> str:
 
 def _by_reason(reasons: Mapping[str, Sequence[int]]) -> str:
     return ", ".join(
-        f"{reason} {' '.join(map(str, taxels[:MAX_TOLD]))}{' …' * (len(taxels) > MAX_TOLD)}"
+        f"{reason} {' '.join(map(str, taxels[:MAX_LISTED]))}{' …' * (len(taxels) > MAX_LISTED)}"
         for reason, taxels in reasons.items()
     )

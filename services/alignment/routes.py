@@ -1,4 +1,4 @@
-"""Alignments over HTTP: start some, see where they stand, cancel one."""
+"""HTTP routes of alignment jobs: submit, list, show and cancel."""
 
 from typing import Annotated
 

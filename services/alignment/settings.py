@@ -1,4 +1,4 @@
-"""Environment and flags in (DEXTOUCH_ALIGNMENT_…), store, workers and defaults out."""
+"""Settings of the alignment service, from flags and DEXTOUCH_ALIGNMENT_… variables."""
 
 import os
 from pathlib import Path
@@ -11,15 +11,15 @@ from services.alignment.options import AlignmentOptions
 
 
 def usable_cores() -> int:
-    """How many processors this process may use."""
+    """Number of processors that this process may use."""
     return len(os.sched_getaffinity(0))
 
 
 class AlignmentSettings(ServiceSettings):
-    """Which store is read and written, and what happens to recordings.
+    """Settings of the alignment service.
 
-    `store_url` is the folder that the episode store writes to; `jobs_folder` holds what was asked,
-    beside the store if not given; `options` are the defaults of a request; `num_workers`
+    `store_url` is the folder that the episode store writes to; `jobs_folder` holds the jobs,
+    `.alignments` in the store if not given; `options` are the defaults of a request; `num_workers`
     alignments run at once, each in a process of its own (as many as processors if not given),
     `max_waiting` more may wait, `max_kept` are remembered; a job whose process died `max_attempts`
     times is failed.
@@ -42,7 +42,7 @@ class AlignmentSettings(ServiceSettings):
 
     @property
     def period_s(self) -> float:
-        """Seconds between two looks for new recordings."""
+        """Seconds between two listings of the store."""
         if self.look_period_s is not None:
             return self.look_period_s
         # Listing a bucket takes a request for every thousand files in it.

@@ -8,7 +8,7 @@ from dextouch.schemas.problems import Problem, error_from_problem
 from dextouch.serving.child_process import ChildProcess
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport
-from services.alignment.synchronization.progress import Progress, Tell
+from services.alignment.synchronization.progress import OnProgress, Progress
 
 
 class AlignmentWorker:
@@ -52,13 +52,15 @@ class AlignmentWorker:
                 )
             _receive(child, "the alignment process does not start")
 
-    def run(self, recording_id: str, options: AlignmentOptions, tell: Tell) -> AlignmentReport:
+    def run(
+        self, recording_id: str, options: AlignmentOptions, on_progress: OnProgress
+    ) -> AlignmentReport:
         """Align a recording.
 
         Args:
             recording_id: of a finished recording.
             options: of the alignment.
-            tell: called with the progress, a few times a second.
+            on_progress: called with the progress, a few times a second.
 
         Raises:
             UnavailableError: the process was killed; the store is as it was.
@@ -74,7 +76,7 @@ class AlignmentWorker:
             while True:
                 answer = _receive(child, what)
                 if "progress" in answer:
-                    tell(Progress(*answer["progress"]))
+                    on_progress(Progress(*answer["progress"]))
                 elif "problem" in answer:
                     raise error_from_problem(Problem.model_validate(answer["problem"]))
                 else:

@@ -41,7 +41,7 @@ def carry_out(
         raise
     except Exception:
         # The job's supervisor: one broken recording must not end the worker.
-        logger.exception("alignment_broke", recording_id=recording_id)
+        logger.exception("alignment_crashed", recording_id=recording_id)
         broken = DexTouchError(
             f"recording {recording_id!r}: unexpected error in alignment; see the service's log. "
             "The recording is as it was"

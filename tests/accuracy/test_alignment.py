@@ -21,7 +21,7 @@ from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
-from services.alignment.truth import compare_with_truth
+from services.alignment.recording_error import compare_with_truth
 from services.twin.hands import HumanHand
 
 DURATION_S = 80 / 15

@@ -13,7 +13,7 @@ from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.schemas import TakePrompt
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
-from services.alignment.truth import compare_with_truth
+from services.alignment.recording_error import compare_with_truth
 from tests.accuracy.test_alignment import K_HEAD, write_truth
 
 

@@ -1,1 +1,1 @@
-"""Calibration: what turns counts, pixels and stamps into kPa, rays and one time base."""
+"""Calibration of cameras, gloves, trackers, robot bases and stream latencies."""

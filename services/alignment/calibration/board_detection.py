@@ -1,4 +1,4 @@
-"""Photos and the kind of board on them in; corners of the board by photo out."""
+"""Detection of chessboard and ChArUco corners in photos, for camera calibration."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Corners of a board on images in; what they say of the board's pose in the camera out."""
+"""Reprojection model of a calibration board seen by a calibrated camera."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

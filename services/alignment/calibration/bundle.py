@@ -1,4 +1,4 @@
-"""Poses, measurements and their noise in; mount, target pose and their covariance out.
+"""Bundle adjustment of hand-eye calibration: mount, target pose and their covariance.
 
 Every view says T_world_tracker · D · X · B = Z, with the mount X, the target's pose Z, the
 measured pose B of the target in the mounted frame, and a small correction D of the tracker's

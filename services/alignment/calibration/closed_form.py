@@ -1,4 +1,4 @@
-"""Paired poses in; a first mount by linear equations, and the views that agree with it, out.
+"""Closed-form hand-eye calibration, and the selection of views that agree with it.
 
 With X = T_tracker_camera and Z = T_world_board every view says T_world_tracker · X · T_camera_board
 = Z. Two views give A X = X B for their relative motions; the rotation vectors of A and B differ by

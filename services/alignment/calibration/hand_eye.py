@@ -1,4 +1,4 @@
-"""Poses of a tracker and of a board seen by its camera in, the camera's place on the tracker out.
+"""Hand-eye calibration: where a camera sits on its tracker, with standard deviations.
 
 A closed form starts it and a gate refuses motion that does not show the mount; then the noise of
 tracker and camera is estimated from what the views leave over, and a bundle weighted with it finds

@@ -1,4 +1,4 @@
-"""Photos of a flat board in, a camera's matrix and distortion with standard deviations out."""
+"""Camera intrinsics and distortion from photos of a flat board, with standard deviations."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +40,7 @@ class CameraCalibration:
     Attributes:
         K: the camera's matrix (px).
         distortion: k1 k2 p1 p2 k3.
-        sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they tell how good the calibration
+        sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they show how good the calibration
             is. `rms_px` does not: it is as small for 8 views as for 40.
         sigma_distortion: of the distortion.
         rms_px: of what is left between corners and model, both axes together.

@@ -1,4 +1,4 @@
-"""Cameras' matrices of a recording and the sizes of its images in; refusals out."""
+"""Consistency check of a recording's camera matrices with the sizes of its images."""
 
 from collections.abc import Mapping
 

@@ -1,4 +1,4 @@
-"""Poses of a body that was moved in; whether its turns show a mount, and what is missing, out."""
+"""Checks that the poses for a calibration rotate enough, about enough axes, to determine it."""
 
 from itertools import combinations
 
@@ -53,7 +53,7 @@ def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "
 
 
 def view_pairs(num_views: int) -> np.ndarray:
-    """Pairs of views [p, 2]: all of them, or every so manieth of very many."""
+    """Pairs of views [p, 2]: all of them, or every n-th of very many."""
     pairs = np.array(list(combinations(range(num_views), 2)))
     return pairs[:: max(1, len(pairs) // MAX_PAIRS)]
 

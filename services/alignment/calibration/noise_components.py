@@ -1,4 +1,4 @@
-"""What views leave unexplained in; how large each source of noise probably is out.
+"""Variance component estimation: how large each source of noise in a calibration is.
 
 Each source k has a known shape and an unknown variance: the twist left over in view i has the
 covariance Σ_k θ_k M_ki. The θ that fit best are found by Fisher scoring of the restricted

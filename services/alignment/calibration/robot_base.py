@@ -1,4 +1,4 @@
-"""Poses of one body in the tracked world and in the robot's base in, the base in the world out.
+"""Calibration of where a robot's base stands in the tracked world.
 
 A tracker on the robot's end effector says T_world_tracker = T_world_base · T_base_effector ·
 T_effector_tracker in every pose. Where the tracker sits on the effector is found too, unless it
@@ -146,7 +146,7 @@ def _checked_mount(T_effector_tracker: np.ndarray) -> Float64[np.ndarray, "4 4"]
 
 
 def _check_places(Ts_base_effector: np.ndarray) -> None:
-    """Refuse places along one line, or all the same: only noise would tell the base's turn."""
+    """Refuse places along one line, or all the same: they do not determine the base's rotation."""
     places = Ts_base_effector[:, :3, 3]
     places = places - places.mean(axis=0)
     _, spread_m, axes = np.linalg.svd(places / np.sqrt(len(places)), full_matrices=False)

@@ -1,4 +1,4 @@
-"""A photo and the corners of a board found on it in, how many pixels its edges are wide out.
+"""Blur measurement on photos of a board, to leave blurred ones out of a calibration.
 
 A photo taken while camera or board moves shifts all corners along the motion, by half a pixel at
 6 px of blur, and nothing that the corners leave over shows it: the board's pose takes it up. The
@@ -30,7 +30,7 @@ def edge_width_px(
 ) -> float:
     """Width over which the edges between dark and light squares rise.
 
-    The edges along each of the board's two axes are judged by their median; the wider counts.
+    The edges along each of the board's two axes are summarized by their median; the wider counts.
 
     Args:
         photo: grey.

@@ -1,4 +1,4 @@
-"""Raw counts of a glove and its calibration record in, pressures in kPa and refused taxels out."""
+"""Conversion of a glove's raw counts to pressures in kPa, and detection of unusable taxels."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Takes of a glove in, which taxels are dead, stuck or saturated out.
+"""Detection of dead, stuck and saturated taxels in takes with contact.
 
 A taxel is only called faulty on evidence: its neighbours (or the others under the same known
 pressure) moved, and it did not. Where nothing around it moved it stays `unproven`.

@@ -1,4 +1,4 @@
-"""Takes of a glove under known pressures in, counts a kPa of each taxel with sigma out."""
+"""Gain of each taxel in counts per kPa, fitted to takes under known pressures."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

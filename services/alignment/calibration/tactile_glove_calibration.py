@@ -1,4 +1,4 @@
-"""A rest take and pressed takes of one glove in; its calibration matrices with sigma out."""
+"""Complete calibration of one glove: tare, gain and taxel states, as recordings carry them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ def calibrate_glove(
         raise InvalidInputError(
             f"glove {tare.side}: of 320 taxels {told}; expected at most {MAX_FAULTY:.0%} not ok. "
             "Unproven: press them too. Imprecise: press harder, at least 5 kPa. Saturated: press "
-            "less. Nonlinear: let each press settle. Dead or stuck: mend the glove",
+            "less. Nonlinear: let each press settle. Dead or stuck: repair the glove",
             num_by_state=counted,
         )
     return found

@@ -1,4 +1,4 @@
-"""Counts of a glove that nothing touches in, each cell's zero with sigma and noise out."""
+"""Tare of a glove: the reading and noise of each cell without contact."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Taps seen by a glove and by a tracker in, what their stamps differ by out.
+"""Time offset between a glove and a tracker, estimated from taps on a table.
 
 The fallback where no motion is common to two streams: the hand taps a hard table. The glove's
 pressure starts between two samples; the tracker's height falls on a line and stops: a hinge, whose

@@ -1,4 +1,4 @@
-"""The same motion seen by two streams in, what their stamps differ by out.
+"""Time offset between two streams that measure the same motion.
 
 Both signals are low-passed without phase, correlated coarsely over all allowed offsets, and then
 fitted: b's cubic spline, moved by the offset, scaled and shifted, is brought onto a by

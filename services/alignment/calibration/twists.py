@@ -1,4 +1,4 @@
-"""Small motions (rotation vector, then shift) in; the matrices that calibration solvers need out.
+"""Twists (rotation vector, then translation) and the Jacobians that calibration solvers need.
 
 A twist is [..., 6]: rotation vector in rad, then translation in m. T · move(twist) turns T in its
 own frame about its own origin and shifts it along its own axes.

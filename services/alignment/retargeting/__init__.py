@@ -1,4 +1,4 @@
-"""Retargeting: tracked hands and wrists to the robot's joints and poses."""
+"""Retargeting of tracked human hands and wrists to the robot's joints and poses."""
 
 from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.hand_retargeter import (

@@ -1,4 +1,4 @@
-"""Keypoints of a tracked hand in, the four points of every finger and which are there out."""
+"""The four points of every finger (knuckle, PIP, DIP, tip) taken from tracked keypoints."""
 
 from typing import NamedTuple
 

@@ -1,4 +1,4 @@
-"""A robot hand in, the arrays out that the compiled solver reads."""
+"""Tables of a robot hand in the form that the compiled solver reads."""
 
 import numpy as np
 from jaxtyping import Bool, Float64

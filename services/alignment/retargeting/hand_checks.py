@@ -1,7 +1,8 @@
-"""Keypoints of a tracked hand in any axes come in; its size goes out, or why it is none.
+"""Checks that tracked keypoints are a human hand in metres, in our order of nodes.
 
-Distances that no posture changes tell the unit and the order of nodes. Other orders, which trackers
-and their users are known to produce, are compared with the mean hand as well: the best is named.
+Distances that no posture changes reveal the unit and the order of nodes. Other orders, which
+trackers and their users are known to produce, are compared with the mean hand as well: the best is
+named.
 """
 
 from functools import lru_cache

@@ -1,8 +1,8 @@
-"""Keypoints of a person's hand in, what stays the same of that hand out: bones and knuckles.
+"""Profile of a person's hand: bone lengths and knuckle positions, which no motion changes.
 
 Tracked points wobble by millimetres; bones do not. Bone lengths and the places of the knuckles in
 the wrist frame are therefore measured once a person, from calibration samples or from a whole
-recording, and later samples are judged by them and solved with them.
+recording, and later samples are checked against them and solved with them.
 """
 
 from collections.abc import Mapping, Sequence

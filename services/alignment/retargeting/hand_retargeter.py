@@ -1,4 +1,4 @@
-"""Keypoints of a tracked hand in, the robot hand's joint angles with an error and a status out."""
+"""`HandRetargeter`: joint angles of a robot hand that follow a tracked human hand."""
 
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -26,7 +26,7 @@ from services.alignment.retargeting.solver.arrays import (
     Memory,
     Output,
 )
-from services.alignment.retargeting.solver.samples import retarget_samples
+from services.alignment.retargeting.solver.solve import retarget_samples
 
 NOMINAL_PERIOD_S = arrays.NOMINAL_PERIOD_S
 ALL_TRUSTED = np.ones((1, NUM_KEYPOINTS), dtype=bool)

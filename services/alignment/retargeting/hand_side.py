@@ -1,4 +1,4 @@
-"""Keypoints of a tracked hand in any axes come in; which hand they are of goes out, or a refusal.
+"""Check that tracked keypoints belong to the left or right hand that they claim to be.
 
 A mirror image keeps all distances; the sense in which fingers curl tells left from right.
 """

@@ -1,4 +1,4 @@
-"""A recording's keypoints and calibration come in; keypoints in wrist axes go out, or a refusal.
+"""Conversion of a recording's keypoints to wrist axes, as its calibration says.
 
 To be called once for each hand of a recording, before retargeting. Keypoints in other axes are
 never turned by guess: only a calibration turns them, and what it gives is looked at.

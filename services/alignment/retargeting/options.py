@@ -1,4 +1,4 @@
-"""What a person may choose about retargeting goes in; checked numbers for the solver come out."""
+"""Options of retargeting: weights, limits and thresholds of the solver."""
 
 from dataclasses import dataclass
 

@@ -1,4 +1,4 @@
-"""Finger points of one person in, the person's bones and knuckles out."""
+"""Estimation of a person's hand profile from the finger points of a recording."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,7 +27,7 @@ from services.alignment.retargeting.solver.arrays import (
     Memory,
     Output,
 )
-from services.alignment.retargeting.solver.samples import retarget_samples
+from services.alignment.retargeting.solver.solve import retarget_samples
 
 # Samples that are looked at, spread over the recording: 240 know a bone to a tenth of the noise.
 NUM_SAMPLES = 240
@@ -112,7 +112,7 @@ def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
 
     Args:
         points: any samples of the hand; those with whole fingers count.
-        hand: the robot hand of the same side, whose axes tell how far fingers are bent.
+        hand: the robot hand of the same side, whose axes define how far fingers are bent.
 
     Raises:
         InvalidInputError: a finger is whole in no sample, or its bones are no bones (unit, order).

@@ -1,8 +1,8 @@
-"""Joint angles and touch in; joint angles whose touching fingertips are where the human's were out.
+"""Correction of retargeted joint angles that puts touching fingertips where the human's were.
 
 Bone directions make the robot's hand look like the human's, but larger: around an object its
 fingertips miss the places that the human's touched. Pinches are closed by the solver; with an
-object in between, only touch tells which fingertips matter. Those are led to the human's places,
+object in between, only touch shows which fingertips matter. Those are led to the human's places,
 each finger by its own four joints, staying near the retargeted angles. Fingers that touch nothing
 keep them.
 """

@@ -1,14 +1,14 @@
-"""Reached poses and touch in, the commands that make a position-controlled hand press as hard out.
+"""Commands that make a position-controlled hand press as hard as the human did.
 
 What a person does is recorded as it was reached: joint angles and wrists stop at the object,
-however hard they press. A servo that is told to go exactly there presses with nothing and drops
-it. It presses with stiffness × (commanded - reached); so the command must lead what was reached by
-the force that the glove felt, over the stiffness:
+however hard they press. A servo that is commanded to go exactly there presses with nothing and
+drops it. It presses with stiffness × (commanded - reached); so the command must lead what was
+reached by the force that the glove felt, over the stiffness:
 
     q_commanded = q + Jᵀ f / k,   wrist_commanded = wrist + (F / k_F, M / k_M)
 
 f is the force with which each place (fingertips, palm) presses; F and M are their sum and moment.
-Taxels tell how hard, not in which direction: pads are round. What a hand holds is pressed from
+Taxels measure how hard, not in which direction: pads are round. What a hand holds is pressed from
 several sides that balance each other, but for weight. So forces along the pads' normals are
 changed as little as balance asks. If little is left of them then, nothing in the hand balances
 them (a palm against the other hand, a finger on a button) and they stay along the normals.
@@ -58,7 +58,7 @@ class HandServos:
 
 @dataclass(frozen=True)
 class HandCommands:
-    """What one hand is told: wrist poses, and joint angles inside their limits."""
+    """Commands for one hand: wrist poses, and joint angles inside their limits."""
 
     Ts_world_wrist: Float64[np.ndarray, "time 4 4"]
     joints_rad: Float64[np.ndarray, "time 20"]

@@ -1,4 +1,4 @@
-"""Keypoints in a tracker's own axes come in; our wrist frame in those axes goes out, with sigma.
+"""Estimation of the wrist frame in a tracker's own axes, with standard deviation.
 
 Wrist, metacarpals and knuckles are laid over the mean hand's by a similarity transform (Umeyama
 1991). One transform serves the whole recording: a frame of its own for each sample would take

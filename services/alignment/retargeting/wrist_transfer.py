@@ -1,4 +1,4 @@
-"""Points of the human's and the robot's hand in, where the robot's wrist goes out.
+"""Placement of the robot's wrist such that its hand touches where the human's did.
 
 A robot hand is larger than the human's and its knuckles lie elsewhere. With the human's wrist pose
 copied, its fingertips and palm are centimetres beside those of the human, and so is its grasp.

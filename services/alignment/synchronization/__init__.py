@@ -1,1 +1,1 @@
-"""Synchronization: streams with clocks of their own to one reference clock and one grid."""
+"""Synchronization of streams with clocks of their own to one reference clock and one grid."""

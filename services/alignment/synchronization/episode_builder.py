@@ -1,4 +1,4 @@
-"""A recording in, an episode on one reference clock out, whose samples come while it is written."""
+"""Builds an episode on one reference clock from a recording, reading samples lazily."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ from services.alignment.synchronization.grid_actions import (
     make_actions,
     place_streams,
 )
-from services.alignment.synchronization.progress import Tell, progress_within
+from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
     DatedStream,
     LoadedStream,
@@ -76,7 +76,7 @@ def build_episode(
     *,
     episode_id: str,
     options: AlignmentOptions,
-    tell: Tell = lambda _: None,
+    on_progress: OnProgress = lambda _: None,
 ) -> BuiltEpisode:
     """Date all streams, find the longest stretch without a gap, and put actions on its grid.
 
@@ -92,14 +92,14 @@ def build_episode(
     check_complete(recording)
     streams = {}
     for number, name in enumerate(recording.streams):
-        tell(progress_within("dating", number / len(recording.streams), name))
+        on_progress(progress_within("dating", number / len(recording.streams), name))
         streams[name] = date_stream(recording, name)
-    stretch = _find_stretch(recording, streams, options, tell)
-    tell(progress_within("retargeting", 0.0))
+    stretch = _find_stretch(recording, streams, options, on_progress)
+    on_progress(progress_within("retargeting", 0.0))
     actions = make_actions(
         stretch.gridded, recording.attributes.domain, recording.attributes.calibration
     )
-    tell(progress_within("writing", 0.0))
+    on_progress(progress_within("writing", 0.0))
     origin_ns = stretch.origin_ns
     grid_ns = stretch.gridded.grid_ns - stretch.gridded.grid_ns[0]
     written = [
@@ -124,14 +124,14 @@ def _find_stretch(
     recording: Recording,
     streams: Mapping[str, DatedStream],
     options: AlignmentOptions,
-    tell: Tell,
+    on_progress: OnProgress,
 ) -> _Stretch:
     """Load the streams that actions are made of and choose the longest stretch that all share."""
     attributes = recording.attributes
     names = [n for n in (*REQUIRED[attributes.domain], *COMMANDED_STREAMS) if n in streams]
     parts = {}
     for number, name in enumerate(names):
-        tell(progress_within("placing", number / len(names), name))
+        on_progress(progress_within("placing", number / len(names), name))
         parts[name] = _seen(streams[name].load())
     origin_ns, gridded = _common_stretch(parts, options, attributes.recording_id)
     run = longest_run(gridded.valid)

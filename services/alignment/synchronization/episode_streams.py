@@ -1,4 +1,4 @@
-"""A dated stream and the time of the episode in, the samples that the episode holds of it out.
+"""Streams of an episode under construction, whose samples are produced while it is written.
 
 Images of `jpeg` and `h264` streams go over as the bytes that they are: nothing is decoded.
 """

@@ -1,4 +1,4 @@
-"""Aligned streams and the steps of the grid in, hand trajectories and 67-D actions out."""
+"""Hand trajectories and 67-D actions at the steps of the model's grid."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,7 +30,7 @@ REQUIRED: Mapping[Domain, tuple[str, ...]] = {
 class GriddedStreams:
     """Streams that actions are made of, and where the grid's steps fall among their samples.
 
-    `valid` tells at which steps every one of them can be read without reaching across a gap.
+    `valid` marks the steps at which every one of them can be read without reaching across a gap.
     """
 
     grid_ns: Int64[np.ndarray, " n"]

@@ -1,4 +1,4 @@
-"""Tracked keypoints at their own rate in, the robot's joint angles on the grid with figures out."""
+"""Retargeting of both tracked hands, resampled to the steps of the grid."""
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +20,7 @@ from services.alignment.synchronization.recorded_streams import LoadedStream
 from services.alignment.synchronization.resampling import GridPlacement, vectors_on_grid
 
 NS_PER_S = 1e9
-# Samples of a recording that are looked at to tell a hand's axes, side and unit.
+# Samples of a recording from which a hand's axes, side and unit are checked.
 MAX_CHECKED = 2000
 
 

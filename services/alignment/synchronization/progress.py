@@ -1,4 +1,4 @@
-"""How far an alignment is: the share of the work that is done, the stage, and the stream."""
+"""Progress of an alignment: share of the work done, current stage and stream."""
 
 from collections.abc import Callable
 from typing import Literal, NamedTuple
@@ -22,7 +22,7 @@ class Progress(NamedTuple):
     stream: str | None = None
 
 
-Tell = Callable[[Progress], None]
+OnProgress = Callable[[Progress], None]
 
 
 def progress_within(stage: Stage, done: float, stream: str | None = None) -> Progress:

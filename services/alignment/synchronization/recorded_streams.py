@@ -1,4 +1,4 @@
-"""A recording in, its streams dated on the host's clock and converted to episode units out.
+"""Streams of a recording on the host's clock, converted to the units of episodes.
 
 Stamps are read whole, values only where they are asked for, in pieces: an hour of images or
 pressures never lies in memory at once.
@@ -34,7 +34,7 @@ MOUNTS = {
     "wrist_right": "T_tracker_right_wrist_right",
     "head": "T_tracker_head_camera_head",
 }
-# A robot may tell its wrists in its own base; where that stands in the world is calibrated.
+# A robot may report its wrists in its own base, whose pose in the world is calibrated.
 BASE_FRAME = "base"
 BASE_NAME = "T_world_base"
 # Bytes of values that are read at once, as the episode holds them.

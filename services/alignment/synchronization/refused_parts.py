@@ -1,4 +1,4 @@
-"""A gridded recording and the stretch that was taken in, what is not in the episode and why out.
+"""Parts of a recording that are not in its episode, with the reason and the stream.
 
 An episode carries the refused parts as matrices beside its calibration, one a reason and stream:
 `refused_<reason>_<stream>_s`, rows of start and stop in seconds after the recording's start.

@@ -1,4 +1,4 @@
-"""Sample times of streams in, values at the steps of a common grid out, never across a gap."""
+"""Resampling of vectors and poses to a common time grid, never across a gap."""
 
 from dataclasses import dataclass
 

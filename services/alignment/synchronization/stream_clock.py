@@ -1,4 +1,4 @@
-"""Dates every sample of a recorded stream on the host's clock, and reports how well."""
+"""Clock fit of one recorded stream, which gives each sample a time on the host's clock."""
 
 from dataclasses import dataclass, replace
 

@@ -26,8 +26,8 @@ from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.uploader import Uploader
+from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
 from services.alignment.schemas import AlignmentJob
-from services.alignment.truth import NEAR_NS, compare_with_truth, match_samples
 
 ALIGNMENT_TIMEOUT_S = 300.0
 UPLOAD_PERIOD_S = 1.0

@@ -49,7 +49,7 @@ print(json.dumps({
 """
 SOLVER = """
 from services.alignment.retargeting import warm_up
-from services.alignment.retargeting.solver.samples import retarget_samples
+from services.alignment.retargeting.solver.solve import retarget_samples
 warm_up()
 print(json.dumps({"is_loaded": bool(retarget_samples.stats.cache_hits)}))
 """

@@ -183,7 +183,7 @@ async def test_the_watcher_goes_on_after_an_error_that_nobody_expected(store, wo
         async with served(store) as jobs:
             await looked(store, jobs)
     assert not failures
-    (logged,) = [entry for entry in logs if entry["event"] == "watching_broke"]
+    (logged,) = [entry for entry in logs if entry["event"] == "watcher_failed"]
     assert logged["exc_info"]
 
 

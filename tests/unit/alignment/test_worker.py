@@ -9,7 +9,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnavailableError
-from services.alignment.many import align_many, not_aligned
+from services.alignment.batch import align_batch, not_aligned
 from services.alignment.options import AlignmentOptions
 from services.alignment.worker import AlignmentWorker
 from tests.unit.alignment.recordings import write_recording
@@ -87,14 +87,18 @@ def test_stopping_from_another_thread_ends_it_at_once(store):
 
 @pytest.mark.usefixtures("no_process_is_left")
 def test_many_recordings_side_by_side(store):
-    wanted, hopeless = not_aligned(store, OPTIONS)
-    assert (wanted, [outcome.recording_id for outcome in hopeless]) == (
+    wanted, impossible = not_aligned(store, OPTIONS)
+    assert (wanted, [outcome.recording_id for outcome in impossible]) == (
         ["other", "take"],
         ["headless"],
     )
     outcomes = list(
-        align_many(
-            str(store.root), [*wanted, "headless"], OPTIONS, num_workers=2, tell=lambda *_: None
+        align_batch(
+            str(store.root),
+            [*wanted, "headless"],
+            OPTIONS,
+            num_workers=2,
+            on_progress=lambda *_: None,
         )
     )
     found = {outcome.recording_id: outcome for outcome in outcomes}

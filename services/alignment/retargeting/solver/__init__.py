@@ -1,1 +1,1 @@
-"""The compiled core of retargeting: samples of tracked fingers in, joint angles out."""
+"""Compiled retargeting solver, one small least-squares problem for each finger and sample."""

@@ -1,4 +1,4 @@
-"""What the compiled solver reads and writes: a hand, a person, options, memory, results.
+"""Record types that the compiled solver reads and writes: hand, person, options, results.
 
 Tables of fixed size are records: compiled functions hand on one pointer, and strides are constants.
 """

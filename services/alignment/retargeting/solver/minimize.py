@@ -1,4 +1,4 @@
-"""A group of fingers and where its joints may go in, the angles of least cost out.
+"""Levenberg–Marquardt with box constraints for one finger or a group of pinching fingers.
 
 Levenberg–Marquardt with an active set: a joint at a border whose gradient points outward is held
 there, a step is cut at the border, so that limits hold exactly. A group is one finger alone, or the

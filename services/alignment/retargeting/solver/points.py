@@ -1,4 +1,4 @@
-"""Joint angles of a finger in, the points of the virtual finger and their slopes out."""
+"""Forward kinematics of the virtual finger and its Jacobian."""
 
 from typing import no_type_check
 

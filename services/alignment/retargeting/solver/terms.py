@@ -1,4 +1,4 @@
-"""Points and slopes of a group of fingers in, its cost and normal equations out."""
+"""Cost, gradient and Gauss–Newton Hessian of a group of fingers."""
 
 from typing import no_type_check
 

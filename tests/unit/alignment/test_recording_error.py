@@ -8,7 +8,7 @@ import pytest
 from dextouch.episodes import StreamData
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.streams.descriptors import StreamDescriptor
-from services.alignment.truth import NEAR_NS, match_samples
+from services.alignment.recording_error import NEAR_NS, match_samples
 
 PERIOD_NS = 10_000_000
 EYE = matrix_rows(np.eye(4))

@@ -1,4 +1,4 @@
-"""Keypoints of one sample in, what of them can be believed and which fingers are near out."""
+"""Plausibility of tracked keypoints, sample by sample, and detection of pinches."""
 
 from typing import no_type_check
 

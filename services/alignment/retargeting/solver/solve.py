@@ -1,4 +1,4 @@
-"""Samples of a tracked hand in, joint angles out: the entry to the compiled code.
+"""Entry point of the compiled solver: joint angles for every sample of a tracked hand.
 
 Every finger is a small least-squares problem in a box: points of a *virtual hand* (the robot's
 axes, the person's bones) against measured points, plus a pull towards the sample before. Thumb and
@@ -10,7 +10,6 @@ from typing import no_type_check
 
 import numpy as np
 
-from services.alignment.retargeting.solver.apart import push_apart
 from services.alignment.retargeting.solver.arrays import (
     IMPLAUSIBLE,
     MISSING,
@@ -20,14 +19,15 @@ from services.alignment.retargeting.solver.arrays import (
     UNCONVERGED,
 )
 from services.alignment.retargeting.solver.compiled import compiled, compiled_once
+from services.alignment.retargeting.solver.finger_gaps import push_apart
 from services.alignment.retargeting.solver.minimize import (
     POSTURE_TOLERANCE_RAD,
     STEP_TOLERANCE_RAD,
     minimize,
     solve_cold,
 )
+from services.alignment.retargeting.solver.plausibility import find_pinches, read_sample, see_finger
 from services.alignment.retargeting.solver.points import linearize
-from services.alignment.retargeting.solver.seen import find_pinches, read_sample, see_finger
 
 # How often fingers are pushed apart in one sample.
 MAX_PUSHES = 4

@@ -1,4 +1,4 @@
-"""Many recordings in, one outcome each out, aligned side by side in worker processes."""
+"""Alignment of many recordings in parallel worker processes, as `dextouch align run` does it."""
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -14,34 +14,34 @@ from services.alignment.synchronization.progress import Progress
 from services.alignment.worker import AlignmentWorker
 
 # The recording, and how far it is.
-TellOne = Callable[[str, Progress], None]
+OnRecordingProgress = Callable[[str, Progress], None]
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one recording: a report, or the reason why there is none."""
+    """Result for one recording: its report, or the error that prevented it."""
 
     recording_id: str
     report: AlignmentReport | None
     error: DexTouchError | None = None
 
 
-def align_many(
+def align_batch(
     store_url: str,
     recording_ids: Sequence[str],
     options: AlignmentOptions,
     *,
     num_workers: int,
-    tell: TellOne,
+    on_progress: OnRecordingProgress,
 ) -> Iterator[Outcome]:
-    """Align recordings; outcomes come as they are known, and one failure hinders no other.
+    """Align recordings in parallel; yields outcomes as they complete. Failures do not stop others.
 
     Args:
         store_url: of recordings and episodes.
         recording_ids: of finished recordings.
         options: of all of them.
-        num_workers: how many at once, each in a process of its own.
-        tell: called with the progress of each, from several threads.
+        num_workers: recordings aligned at the same time, each in its own process.
+        on_progress: called with the progress of each, from several threads.
     """
     free: SimpleQueue[AlignmentWorker] = SimpleQueue()
     workers = [AlignmentWorker(store_url) for _ in range(min(num_workers, len(recording_ids)))]
@@ -51,7 +51,7 @@ def align_many(
     def align(recording_id: str) -> Outcome:
         worker = free.get()
         try:
-            report = worker.run(recording_id, options, lambda p: tell(recording_id, p))
+            report = worker.run(recording_id, options, lambda p: on_progress(recording_id, p))
             return Outcome(recording_id, report)
         except DexTouchError as error:
             return Outcome(recording_id, None, error)
@@ -71,16 +71,16 @@ def align_many(
 
 
 def not_aligned(store: EpisodeStore, options: AlignmentOptions) -> tuple[list[str], list[Outcome]]:
-    """Recordings of a store that have no episode under these options, and those that never will.
+    """Recordings of a store without an episode under these options.
 
     Returns:
-        Ids to align, and outcomes of recordings that lack what an episode needs.
+        Ids to align, and failed outcomes of recordings that cannot become an episode.
     """
-    wanted, hopeless = [], []
+    wanted, impossible = [], []
     for recording_id in store.list(kind="recording"):
         try:
             if not store.exists(check_recording(store, recording_id, options)):
                 wanted.append(recording_id)
         except InvalidInputError as error:
-            hopeless.append(Outcome(recording_id, None, error))
-    return wanted, hopeless
+            impossible.append(Outcome(recording_id, None, error))
+    return wanted, impossible

@@ -1,4 +1,4 @@
-"""Fingers that overlap in, their targets pushed apart out."""
+"""Gaps between neighbouring fingers: targets of fingers that overlap are moved apart."""
 
 from typing import no_type_check
 

@@ -1,4 +1,4 @@
-"""An aligned episode and the truth it was recorded from in, the errors of the whole way out."""
+"""Errors of an aligned episode against the true episode that mock devices replayed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
