@@ -2,8 +2,9 @@
 
 import argparse
 import json
+import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -11,14 +12,16 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
+from dextouch.hands.hand_files import load_hand
 from dextouch.schemas.episodes import json_ready
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
 from services.alignment.batch import OnRecordingProgress, Outcome, align_batch, not_aligned
 from services.alignment.jobs import episode_id_of
 from services.alignment.options import AlignmentOptions
+from services.alignment.other_hand import SOLVED, retarget_other_hand
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.report_page import report_line, report_page
 from services.alignment.settings import AlignmentSettings, usable_cores
@@ -31,6 +34,8 @@ EPILOG = """examples:
   dextouch align run take-7 take-8           align two recordings, side by side
   dextouch align run --all --workers 2       align whatever has no episode yet
   dextouch align report take-7               clocks, retargeting, what was left out and why
+  dextouch align retarget take-7 --model hand.urdf --mapping hand.toml --to joints.npz
+                                             joint angles of a robot hand of your own
   dextouch align serve --port 8082           run the HTTP service
 
 An episode's id follows from the recording and the options: aligning again finds it and writes
@@ -51,7 +56,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             return _serve(arguments)
         settings = load_settings(AlignmentSettings, [])
         parsed = _parser(settings).parse_args(arguments)
-        return _run(parsed, settings) if parsed.word == "run" else _report(parsed, settings)
+        return COMMANDS[parsed.command](parsed, settings)
     except DexTouchError as error:
         print(f"dextouch align: {error.message}", file=sys.stderr)
         return EXIT_REFUSED
@@ -72,8 +77,10 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
     shared.add_argument(
         "--json", type=Path, metavar="PATH", help="also write the reports to this file"
     )
-    words = parser.add_subparsers(dest="word", required=True, metavar="{run,report,serve}")
-    running = words.add_parser(
+    commands = parser.add_subparsers(
+        dest="command", required=True, metavar="{run,report,retarget,serve}"
+    )
+    running = commands.add_parser(
         "run", parents=[shared], help="align recordings", epilog=EPILOG, formatter_class=layout
     )
     running.add_argument("recordings", nargs="*", metavar="RECORDING_ID")
@@ -85,9 +92,26 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
         metavar="N",
         help="recordings at once, each in a process of its own (default: one a processor)",
     )
-    report = words.add_parser("report", parents=[shared], help="report on an aligned recording")
+    report = commands.add_parser("report", parents=[shared], help="report on an aligned recording")
     report.add_argument("id", metavar="ID", help="of a recording or of its episode")
-    words.add_parser("serve", help="run the HTTP service (serve --help lists its settings)")
+    other = commands.add_parser(
+        "retarget",
+        parents=[shared],
+        help="retarget an episode to a robot hand of your own",
+        description="Joint angles of any robot hand that follow the tracked hand of an episode, "
+        "written as NPZ: joint_names, t_ref_ns, joints_rad, status, tip_error_m.",
+        epilog="example:\n  dextouch align retarget take-7 --model allegro_right.urdf \\\n"
+        "    --mapping allegro_right.toml --to take-7_allegro.npz\n\n"
+        "The mapping is described in docs/hands.md.",
+        formatter_class=layout,
+    )
+    other.add_argument("id", metavar="ID", help="of an episode, or of its recording")
+    other.add_argument("--model", type=Path, required=True, metavar="FILE", help="URDF or MJCF")
+    other.add_argument(
+        "--mapping", type=Path, required=True, metavar="FILE", help="TOML: fingers, joints, wrist"
+    )
+    other.add_argument("--to", type=Path, required=True, metavar="FILE", help="NPZ to write")
+    commands.add_parser("serve", help="run the HTTP service (serve --help lists its settings)")
     return parser
 
 
@@ -174,18 +198,50 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     return 0
 
 
+def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
+    hand = load_hand(parsed.model, parsed.mapping)
+    episode = find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
+    motion = retarget_other_hand(episode, hand)
+    motion.save(parsed.to)
+    tip_error_mm = float(motion.tip_error_m[motion.status == SOLVED].mean() * 1e3)
+    facts = {
+        "episode_id": episode.attributes.episode_id,
+        "side": motion.side,
+        "num_samples": len(motion.t_ref_ns),
+        "joint_names": list(motion.joint_names),
+        "share_solved": motion.share_solved,
+        "tip_error_mm": tip_error_mm if math.isfinite(tip_error_mm) else None,
+        "path": str(parsed.to),
+    }
+    if parsed.json is not None:
+        parsed.json.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    print(
+        f"{parsed.to}: {len(motion.joint_names)} joints of the {motion.side} hand in "
+        f"{len(motion.t_ref_ns)} samples, {motion.share_solved:.1%} solved"
+    )
+    return 0
+
+
 def find_report(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> AlignmentReport:
     """The report of an episode, or of the one that a recording became under these options.
 
     Raises:
         NotFoundError: neither; or the recording is not aligned.
     """
+    episode = find_episode(store, item_id, options)
+    recordings = [entry.id for entry in episode.attributes.lineage if entry.kind == "recording"]
+    return report_of(episode, recording_id=(recordings or [item_id])[-1], created=False)
+
+
+def find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -> EpisodeReader:
+    """An episode by its id, or by the id of the recording that it was made from.
+
+    Raises:
+        NotFoundError: neither; or the recording is not aligned under these options.
+    """
     if store.exists(item_id):
-        episode = store.open(item_id)
-        recordings = [e.id for e in episode.attributes.lineage if e.kind == "recording"]
-        return report_of(episode, recording_id=(recordings or [item_id])[-1], created=False)
-    episode_id = episode_id_of(store.recording(item_id), options)
-    return report_of(store.open(episode_id), recording_id=item_id, created=False)
+        return store.open(item_id)
+    return store.open(episode_id_of(store.recording(item_id), options))
 
 
 def _write_json(path: Path | None, reports: Sequence[AlignmentReport]) -> None:
@@ -193,6 +249,12 @@ def _write_json(path: Path | None, reports: Sequence[AlignmentReport]) -> None:
         content = json.dumps([json_ready(report) for report in reports], indent=2)
         path.write_text(content + "\n", encoding="utf-8")
 
+
+COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {
+    "run": _run,
+    "report": _report,
+    "retarget": _retarget,
+}
 
 if __name__ == "__main__":
     sys.exit(main())

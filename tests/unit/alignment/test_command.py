@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from services.alignment import __main__ as command
-from services.alignment import many
+from services.alignment import batch
 from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
 
@@ -17,7 +17,7 @@ def worker(monkeypatch):
     """The same work in a thread; `test_worker.py` has real processes."""
     go_on = threading.Event()
     go_on.set()
-    monkeypatch.setattr(many, "AlignmentWorker", type("Worker", (FakeWorker,), {"held": go_on}))
+    monkeypatch.setattr(batch, "AlignmentWorker", type("Worker", (FakeWorker,), {"held": go_on}))
 
 
 @pytest.fixture
