@@ -27,8 +27,9 @@ $(VENV)/.dev: pyproject.toml constraints.txt
 demo: $(VENV)/.runtime   ## record, align, imagine and score, on this machine
 	$(BIN)/dextouch demo
 
+# Bytecode is kept, since tests start many processes that would each compile all modules anew.
 test: $(VENV)/.dev       ## the default test run (under ten minutes on two cores)
-	$(BIN)/python -m pytest -q -n logical --dist loadfile
+	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow

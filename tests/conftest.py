@@ -5,12 +5,13 @@ from pathlib import Path
 
 import pytest
 from hypothesis import settings
-from jaxtyping import install_import_hook
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # On the emulated processor of `make vm` these checks would take minutes.
 if "DEXTOUCH_VM_GUEST" not in os.environ:
-    install_import_hook(["dextouch", "services"], "beartype.beartype")
+    from tests import shape_checks
+
+    shape_checks.install(["dextouch", "services"])
 
 # The same examples in every run: a change is red because of the change, not because of the day.
 # No deadline: machines that are busy with other things are slow, not wrong.
