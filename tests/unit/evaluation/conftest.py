@@ -21,7 +21,7 @@ def demonstrations():
 
 @pytest.fixture(scope="session")
 def trained_policies(demonstrations):
-    settings = CloningSettings(num_training_steps=250, batch_size=32, learning_rate=3e-3)
+    settings = CloningSettings(num_training_steps=150, batch_size=32, learning_rate=3e-3)
     episodes = [toy.cloning_episode(item) for item in demonstrations]
     return train_cloned_policy(episodes, settings, command="a test", early_at=0.02)
 
@@ -33,7 +33,7 @@ def policy_checkpoint(trained_policies):
 
 @pytest.fixture(scope="session")
 def probe_checkpoint(demonstrations):
-    settings = ProbeSettings(num_training_steps=350, batch_size=32, shift_px=1, learning_rate=3e-3)
+    settings = ProbeSettings(num_training_steps=120, batch_size=32, shift_px=1, learning_rate=3e-3)
     return train_success_probe(
         [EndingEpisode.of(d) for d in demonstrations], settings, command="a test"
     )

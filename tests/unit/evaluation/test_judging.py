@@ -75,7 +75,7 @@ def _episodes(seeds: range) -> list[EndingEpisode]:
 
 @pytest.fixture(scope="module")
 def judge():
-    settings = ProbeSettings(num_training_steps=250, batch_size=32, learning_rate=3e-3)
+    settings = ProbeSettings(num_training_steps=150, batch_size=32, learning_rate=3e-3)
     return SuccessProbe(
         train_success_probe(
             _episodes(range(45)),
