@@ -1,5 +1,9 @@
 """A toy world for the model's tests: two hands over a table, one bright box, pressure by depth."""
 
+import shutil
+from copy import deepcopy
+from functools import cache
+
 import numpy as np
 import pytest
 import torch
@@ -57,6 +61,12 @@ def toy_episodes():
 
 
 def make_episode(seed, num_steps=41):
+    """A copy of its own, since tests change it; drawn once."""
+    return deepcopy(_drawn_episode(seed, num_steps))
+
+
+@cache
+def _drawn_episode(seed, num_steps):
     rng = np.random.default_rng(seed)
     commanded = _trajectory(rng, num_steps)
     measured = _lagging(commanded)
@@ -171,12 +181,19 @@ def write_episode(store, episode, image_every=1):
             writer.append(name, values=values[::every], t_ref_ns=stamps[::every])
 
 
-@pytest.fixture
-def toy_store(tmp_path, toy_episodes):
-    store = EpisodeStore(tmp_path / "store")
-    for episode in toy_episodes:
-        write_episode(store, episode)
+@pytest.fixture(scope="session")
+def written_store(tmp_path_factory):
+    store = EpisodeStore(tmp_path_factory.mktemp("toys") / "store")
+    for seed in range(6):
+        write_episode(store, make_episode(seed))
     return store
+
+
+@pytest.fixture
+def toy_store(tmp_path, written_store):
+    """A copy of its own of the store with the toy episodes."""
+    shutil.copytree(written_store.root, tmp_path / "store")
+    return EpisodeStore(tmp_path / "store")
 
 
 @pytest.fixture

@@ -62,11 +62,8 @@ def test_a_killed_run_goes_on_as_if_nothing_had_happened(toy_store, settings, tm
     assert_same_run(report, expected)
 
 
-@pytest.mark.parametrize("workers", [0, 1])
-def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_path, workers):
+def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_path):
     expected = train(settings.model_copy(update={"streaming": True}))
-    changes = {"streaming": True, "loader_workers": workers, "state_every_cpu_s": 0.0}
-    stopped = settings.model_copy(update={**changes, "output": tmp_path / "b.safetensors"})
 
     class StoppedError(Exception):
         pass
@@ -74,9 +71,13 @@ def test_windows_that_were_read_ahead_are_read_again(toy_store, settings, tmp_pa
     def stop(progress):
         raise StoppedError
 
-    with pytest.raises(StoppedError):
-        train(stopped, stop)
-    assert_same_run(train(stopped.model_copy(update={"resume": True})), expected)
+    for workers in (0, 1):
+        changes = {"streaming": True, "loader_workers": workers, "state_every_cpu_s": 0.0}
+        output = tmp_path / f"{workers}.safetensors"
+        stopped = settings.model_copy(update={**changes, "output": output})
+        with pytest.raises(StoppedError):
+            train(stopped, stop)
+        assert_same_run(train(stopped.model_copy(update={"resume": True})), expected)
 
 
 def test_a_state_of_another_run_is_refused(toy_store, settings, tmp_path):
