@@ -14,10 +14,12 @@ from types import FunctionType
 from typing import Any, ForwardRef, get_args, get_type_hints
 
 import jaxtyping
-from beartype import beartype
+from beartype import BeartypeConf, beartype
 
 BY_JAXTYPING = jaxtyping.jaxtyped
 _CHECKED = "__has_shape_checks__"
+# What does not fit is a TypeError, as Python itself says it of wrong arguments.
+_beartype = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
 
 
 def install(packages: list[str]) -> None:
@@ -36,7 +38,7 @@ def decorated(item: Any = None, **_: Any) -> Any:
             item.__init__ = checked(item.__init__)
         return item
     if not isinstance(item, FunctionType) or inspect.isgeneratorfunction(item):
-        return BY_JAXTYPING(item, typechecker=beartype)
+        return BY_JAXTYPING(item, typechecker=_beartype)
     return checked(item)
 
 
@@ -66,7 +68,7 @@ def _made(function: Callable) -> tuple[Callable, bool]:
     hints = {name: _resolved(hint, function.__globals__) for name, hint in written.items()}
     function.__annotations__ = hints
     try:
-        return beartype(function), any(map(_names_arrays, hints.values()))
+        return _beartype(function), any(map(_names_arrays, hints.values()))
     finally:
         function.__annotations__ = written
 

@@ -1,4 +1,4 @@
-"""Samples with faults of every kind, 100 000 in the slow run: finite, in limits, quick, told, and soon forgotten."""
+"""Samples with faults of every kind: finite, in limits, quick, told, and soon forgotten."""
 
 import json
 import os

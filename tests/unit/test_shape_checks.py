@@ -6,7 +6,6 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 import pytest
-from beartype.roar import BeartypeCallHintViolation
 from jaxtyping import Float64, TypeCheckError
 
 from dextouch.clients.policy import PolicyStart
@@ -17,16 +16,14 @@ from tests.shape_checks import decorated
 if TYPE_CHECKING:
     from services.twin.stage import Stage
 
-REFUSED = (BeartypeCallHintViolation, TypeCheckError)
-
 
 def test_the_packages_are_checked():
     anchor = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
     assert PolicyStart("reach", "", 0, anchor, np.eye(3)).seed == 0
     for wrong in (np.eye(4), np.eye(3, dtype=np.float32)):
-        with pytest.raises(REFUSED):
+        with pytest.raises(TypeCheckError):
             PolicyStart("reach", "", 0, anchor, wrong)
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         pinhole_matrix(width_px=8.5, height_px=8, fovy_rad=1.0)
 
 
@@ -41,9 +38,9 @@ def product(
 def test_an_axis_has_one_length_in_a_call_and_another_in_the_next():
     assert product(np.ones((2, 3)), np.ones((3, 4))).shape == (2, 4)
     assert product(np.ones((5, 6)), np.ones((6, 7))).shape == (5, 7)
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         product(np.ones((2, 3)), np.ones((4, 3)))
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         product(np.ones((1, 3)), np.ones((3, 4)))
     assert product(np.ones((2, 3)), np.ones((3, 4))).shape == (2, 4)
 
@@ -63,9 +60,9 @@ def test_plain_annotations_are_checked_too():
         return "word" if count else 7
 
     assert words(1) == "word"
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         words("1")
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         words(0)
 
 
@@ -82,11 +79,11 @@ def test_fields_of_a_dataclass_are_checked():
         name: "str"
 
     assert Named(np.zeros(2), np.zeros(2), "a").name == "a"
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         Pair(np.zeros(2), np.zeros(3))
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         Named(np.zeros(2), np.zeros(3), "a")
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         Named(np.zeros(2), np.zeros(2), 7)
 
 
@@ -107,11 +104,11 @@ def test_methods_properties_and_generators():
             yield from range(count)
 
     assert list(Box().sizes(3)) == [0, 1, 2]
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         Box().sizes("3")
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         _ = Box().size
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         Box.of("3")
 
 
@@ -121,5 +118,5 @@ def test_names_that_only_type_checkers_know_are_not_checked():
         return seed
 
     assert played(None, 3) == 3
-    with pytest.raises(REFUSED):
+    with pytest.raises(TypeCheckError):
         played(None, "3")

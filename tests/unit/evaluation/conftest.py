@@ -21,7 +21,7 @@ def demonstrations():
 
 @pytest.fixture(scope="session")
 def trained_policies(demonstrations):
-    settings = CloningSettings(num_training_steps=150, batch_size=32, learning_rate=3e-3)
+    settings = CloningSettings(num_training_steps=250, batch_size=32, learning_rate=3e-3)
     episodes = [toy.cloning_episode(item) for item in demonstrations]
     return train_cloned_policy(episodes, settings, command="a test", early_at=0.02)
 
