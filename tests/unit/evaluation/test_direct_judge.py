@@ -98,14 +98,14 @@ def test_fingertips_are_those_of_the_hand():
 
 def test_a_trained_judge_tells_near_from_far(tmp_path):
     settings = DirectSettings(
-        num_finder_steps=80, num_judge_steps=140, learning_rate=4e-3, max_cpu_s=60, batch_size=32
+        num_finder_steps=120, num_judge_steps=200, learning_rate=4e-3, max_cpu_s=60, batch_size=32
     )
-    items = [_labelled(seed) for seed in range(200)]
+    items = [_labelled(seed) for seed in range(300)]
     checkpoint = train_direct_judge(items, settings, command="test")
     path = tmp_path / "direct.safetensors"
     save_checkpoint(path, checkpoint)
     judge = DirectJudge.load(path)
-    assert len(judge.metadata.training_starts) == 200
+    assert len(judge.metadata.training_starts) == 300
     tested = [_labelled(seed) for seed in range(1000, 1200)]
     told = judge.probabilities([item.attempt for item in tested])
     assert area_under_roc(told, np.array([item.success for item in tested])) > 0.8
