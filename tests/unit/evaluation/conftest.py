@@ -33,7 +33,7 @@ def policy_checkpoint(trained_policies):
 
 @pytest.fixture(scope="session")
 def probe_checkpoint(demonstrations):
-    settings = ProbeSettings(num_training_steps=120, batch_size=32, shift_px=1, learning_rate=3e-3)
+    settings = ProbeSettings(num_training_steps=350, batch_size=32, shift_px=1, learning_rate=3e-3)
     return train_success_probe(
         [EndingEpisode.of(d) for d in demonstrations], settings, command="a test"
     )
