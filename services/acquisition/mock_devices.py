@@ -6,12 +6,14 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas.episodes import Matrix
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.camera.driver import CameraDecoder, CameraDriver
+from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.devices.mocking import mock_of
+from services.acquisition.devices.robot_state.mock import RobotStateSource
+from services.acquisition.devices.robot_state.packets import STREAM_SIZES, RobotStateDecoder
+from services.acquisition.devices.station_camera.mock import video_camera
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.camera import CameraDecoder, CameraDriver
-from services.acquisition.drivers.robot_state import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.place import MockPlace
@@ -22,13 +24,11 @@ from services.acquisition.mocks.replay import (
     ReplayStream,
     device_rng,
 )
-from services.acquisition.mocks.robot_state import RobotStateSource
 from services.acquisition.mocks.tracker_devices import (
     TrackerPlace,
     mock_finger_tracker,
     mock_pose_tracker,
 )
-from services.acquisition.mocks.video_camera import video_camera
 
 LATENCY_SIGMA_MS = 0.2
 WRISTS = ("wrist_left", "wrist_right")

@@ -15,13 +15,13 @@ import pytest
 from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import VirtualClock
+from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.bridge_tracker import (
     BridgeDriver,
     BridgeFingerTrackerDecoder,
     BridgePoseTrackerDecoder,
 )
-from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.bridge_server import BridgePort

@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.drivers.finger_tracker import DESCRIPTOR_REPORT
-from services.acquisition.drivers.robot_state import STREAM_SIZES
 from services.acquisition.health import TICK_NS, HealthMonitor
 from services.acquisition.live import LiveView
 from services.acquisition.mock_devices import MockFactory

@@ -8,7 +8,7 @@ import numpy as np
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import VirtualClock
-from services.acquisition.drivers.station_camera import StationCamera
+from services.acquisition.devices.station_camera.driver import StationCamera
 from services.acquisition.health import STATION
 from services.acquisition.health_station import DiskJudge
 from services.acquisition.mock_links import MockLinks

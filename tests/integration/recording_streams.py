@@ -3,7 +3,7 @@
 import numpy as np
 
 from dextouch.streams.descriptors import StreamDescriptor
-from services.acquisition.drivers.robot_state import STREAM_SIZES
+from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.mocks.replay import ReplayStream
 
 

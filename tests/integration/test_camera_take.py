@@ -16,13 +16,13 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 from services.acquisition.clock import VirtualClock
+from services.acquisition.devices.station_camera.driver import CameraTiming
+from services.acquisition.devices.station_camera.mock import video_camera
 from services.acquisition.drivers.image_encoding import begin_take, take_gates
-from services.acquisition.drivers.station_camera import CameraTiming
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.video_camera import video_camera
 from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader

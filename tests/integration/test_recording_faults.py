@@ -8,7 +8,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from services.acquisition.clock import VirtualClock
-from services.acquisition.drivers.robot_state import STREAM_SIZES
+from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript

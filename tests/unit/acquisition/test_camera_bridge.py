@@ -8,16 +8,16 @@ from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.drivers.camera import (
+from services.acquisition.devices.camera.driver import (
     ENCODING_CODES,
     MAGIC,
     PAYLOAD_HEADER,
     CameraDecoder,
     CameraDriver,
 )
+from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.drivers.image_encoding import ImageEncoder
 from services.acquisition.drivers.packets import Packet, encode_packet
-from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.ports import SocketPort
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.settings import AcquisitionSettings

@@ -4,8 +4,11 @@ import pytest
 from dextouch.errors import DeviceError, PacketError
 from dextouch.hands.skeleton import NODES
 from dextouch.images.jpeg import decode_jpeg, encode_jpeg
-from services.acquisition.drivers.camera import ENCODING_CODES, PAYLOAD_HEADER, CameraDecoder
-from services.acquisition.drivers.camera import MAGIC as CAMERA_MAGIC
+from services.acquisition.devices.camera.driver import ENCODING_CODES, PAYLOAD_HEADER, CameraDecoder
+from services.acquisition.devices.camera.driver import MAGIC as CAMERA_MAGIC
+from services.acquisition.devices.robot_state.packets import MAGIC as ROBOT_MAGIC
+from services.acquisition.devices.robot_state.packets import PAYLOAD as ROBOT_PAYLOAD
+from services.acquisition.devices.robot_state.packets import RobotStateDecoder
 from services.acquisition.drivers.finger_tracker import (
     CHAIN_IDS,
     DESCRIPTOR_MAGIC,
@@ -24,9 +27,6 @@ from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.drivers.robot_state import MAGIC as ROBOT_MAGIC
-from services.acquisition.drivers.robot_state import PAYLOAD as ROBOT_PAYLOAD
-from services.acquisition.drivers.robot_state import RobotStateDecoder
 
 POSE = (1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0)
 

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.devices.camera.mock import CameraSource
+from services.acquisition.devices.robot_state.mock import RobotStateSource
+from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
-from services.acquisition.drivers.robot_state import STREAM_SIZES
-from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.finger_tracker import FingerTrackerSource
 from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.mocks.robot_state import RobotStateSource
 
 FLAT = GloveCalibration(np.full(360, 120.0), np.full(360, 40.0))
 

@@ -8,7 +8,7 @@ from dextouch.episodes.video import is_keyframe
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images.jpeg import decode_jpeg
 from dextouch.streams.samples import Sample
-from services.acquisition.drivers.camera import CameraDecoder
+from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.drivers.image_encoding import (
     MAX_WAITING_IMAGES,
     EncodingQueue,

@@ -8,14 +8,14 @@ from dextouch.episodes.video import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.drivers import image_encoding
-from services.acquisition.drivers.image_encoding import TakeAware
-from services.acquisition.drivers.station_camera import CameraTiming, StationCamera
-from services.acquisition.drivers.video_capture import (
+from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     CaptureLink,
     CaptureRequest,
 )
+from services.acquisition.devices.station_camera.driver import CameraTiming, StationCamera
+from services.acquisition.drivers import image_encoding
+from services.acquisition.drivers.image_encoding import TakeAware
 from services.acquisition.settings import AcquisitionSettings
 
 MS = 1_000_000

@@ -6,14 +6,14 @@ import pytest
 
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import RealClock
-from services.acquisition.drivers.station_camera import StationCamera
-from services.acquisition.drivers.video_capture import (
+from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     CaptureLink,
     CaptureRequest,
     OpenCvCapture,
     find_camera,
 )
+from services.acquisition.devices.station_camera.driver import StationCamera
 
 REQUEST = CaptureRequest(height_px=48, width_px=64, rate_hz=30.0)
 NUM_IMAGES = 12

@@ -1,10 +1,10 @@
 """The kind `camera`."""
 
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.camera.driver import CameraDecoder, CameraDriver
 from services.acquisition.devices.camera.settings import CameraSettings
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.tcp import tcp_transport
-from services.acquisition.drivers.camera import CameraDecoder, CameraDriver
 
 
 def build(settings: CameraSettings, clock: StationClock) -> CameraDriver:

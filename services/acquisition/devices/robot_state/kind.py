@@ -2,10 +2,10 @@
 
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.robot_state.packets import RobotStateDecoder
 from services.acquisition.devices.robot_state.settings import RobotStateSettings
 from services.acquisition.devices.tcp import tcp_transport
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.robot_state import RobotStateDecoder
 
 
 def build(settings: RobotStateSettings, clock: StationClock) -> Driver:

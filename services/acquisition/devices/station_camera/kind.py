@@ -6,15 +6,15 @@ from functools import partial
 from dextouch.errors import InvalidInputError
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind
-from services.acquisition.devices.station_camera.settings import StationCameraSettings
-from services.acquisition.drivers.station_camera import CameraTiming, StationCamera
-from services.acquisition.drivers.video_capture import (
+from services.acquisition.devices.station_camera.capture import (
     NS_PER_MS,
     CaptureLink,
     CaptureRequest,
     OpenCvCapture,
     find_camera,
 )
+from services.acquisition.devices.station_camera.driver import CameraTiming, StationCamera
+from services.acquisition.devices.station_camera.settings import StationCameraSettings
 
 
 def build(settings: StationCameraSettings, clock: StationClock) -> StationCamera:

@@ -9,7 +9,19 @@ import numpy as np
 
 from dextouch.hands.skeleton import NUM_KEYPOINTS
 from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.devices.camera.driver import (
+    CameraDecoder,
+    ImageEncoding,
+    camera_descriptor,
+)
+from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.robot_state.mock import RobotStateSource
+from services.acquisition.devices.robot_state.packets import (
+    STREAM_SIZES,
+    RobotStateDecoder,
+    robot_descriptor,
+)
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.drivers.base import Decoder
@@ -17,22 +29,14 @@ from services.acquisition.drivers.bridge_tracker import (
     BridgeFingerTrackerDecoder,
     BridgePoseTrackerDecoder,
 )
-from services.acquisition.drivers.camera import CameraDecoder, ImageEncoding, camera_descriptor
 from services.acquisition.drivers.finger_tracker import FingerTrackerDecoder, keypoints_descriptor
 from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
-from services.acquisition.drivers.robot_state import (
-    STREAM_SIZES,
-    RobotStateDecoder,
-    robot_descriptor,
-)
 from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
-from services.acquisition.mocks.camera import CameraSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.finger_tracker import FingerTrackerSource
 from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.mocks.robot_state import RobotStateSource
 from services.acquisition.transports.socket import READ_BYTES
 from services.cli.bench.acquisition.families import FULL_SCALE, NUM_VALUES, make_families
 from services.cli.bench.figures import Figure

@@ -1,4 +1,4 @@
-"""Camera bridge over a socket: packets with raw, JPEG or H.264 images come in, images go out."""
+"""Driver of a camera bridge, whose packets hold raw, JPEG or H.264 images."""
 
 import struct
 

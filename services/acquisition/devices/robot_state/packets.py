@@ -1,4 +1,4 @@
-"""Robot state over a socket: packets come in, streams of joints and wrist poses go out."""
+"""State packets of a robot: the decoder of their joints and wrist poses, and their streams."""
 
 import struct
 from collections.abc import Sequence

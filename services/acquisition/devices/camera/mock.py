@@ -1,9 +1,9 @@
-"""Images of one camera come in; a camera bridge's packets, raw, JPEG or H.264, go out."""
+"""A simulated camera bridge that sends raw, JPEG or H.264 images."""
 
 import numpy as np
 from jaxtyping import Int64
 
-from services.acquisition.drivers.camera import ENCODING_CODES, MAGIC, PAYLOAD_HEADER
+from services.acquisition.devices.camera.driver import ENCODING_CODES, MAGIC, PAYLOAD_HEADER
 from services.acquisition.drivers.image_encoding import ImageEncoder, ImageEncoding
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.mocks.replay import ReplayStream

@@ -1,4 +1,4 @@
-"""Images of an episode come in; a mock camera on the station's own bus and its driver go out.
+"""A simulated camera on the station's own bus.
 
 What a driver hands over is not bytes, so this mock stands behind the `Capture` protocol: images
 with the kernel's stamps, four buffers, an error when it is pulled out.
@@ -14,13 +14,13 @@ from jaxtyping import Int64
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.drivers.image_encoding import ImageEncoding
-from services.acquisition.drivers.station_camera import CameraTiming, StationCamera
-from services.acquisition.drivers.video_capture import (
+from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     CaptureLink,
     CaptureRequest,
 )
+from services.acquisition.devices.station_camera.driver import CameraTiming, StationCamera
+from services.acquisition.drivers.image_encoding import ImageEncoding
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.link import Link
 from services.acquisition.mocks.replay import MockDevice, ReplayStream

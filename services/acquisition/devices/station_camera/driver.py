@@ -1,4 +1,4 @@
-"""A camera on the station itself: captured images come in, stamped, checked, encoded samples out.
+"""Driver of a camera on the station itself, whose images are stamped, checked and encoded here.
 
 Stamps of the driver are on this host's monotonic clock; an image carries the middle of its
 exposure. A camera whose stamps are on another clock gives arrival stamps only, and says so.
@@ -12,8 +12,15 @@ from dextouch.schemas.episodes import Matrix
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import NO_DEVICE_TIME
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.station_camera.capture import (
+    NS_PER_MS,
+    CapturedImage,
+    CaptureLink,
+    CaptureRequest,
+    StampPoint,
+)
+from services.acquisition.devices.station_camera.stamps import DriverStamps
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.driver_stamps import DriverStamps
 from services.acquisition.drivers.image_encoding import (
     EncodingQueue,
     ImageEncoder,
@@ -22,13 +29,6 @@ from services.acquisition.drivers.image_encoding import (
 )
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
 from services.acquisition.drivers.packets import DecoderStatistics
-from services.acquisition.drivers.video_capture import (
-    NS_PER_MS,
-    CapturedImage,
-    CaptureLink,
-    CaptureRequest,
-    StampPoint,
-)
 
 READ_TIMEOUT_S = 0.05
 # A camera that says nothing for so long is lost; the first image may take longer.

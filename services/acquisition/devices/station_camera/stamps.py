@@ -1,4 +1,4 @@
-"""Stamps of a camera's driver come in; times and numbers of its images, or refusals, go out."""
+"""Judgement of the stamps of a camera's kernel driver: which are times, which images are new."""
 
 from dextouch.errors import DeviceError
 from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
@@ -12,7 +12,7 @@ MAX_BAD_STAMPS = 10
 
 
 class DriverStamps:
-    """Stamps of a camera's driver in; device time and image number out, or a refusal, counted.
+    """Gives each image its device time and number, or refuses it and counts that.
 
     The number counts the images that must have been there, by the stamps: what got lost before
     us leaves a gap in it.

@@ -1,4 +1,4 @@
-"""Joint and pose streams of a robot come in; its state packets go out."""
+"""A simulated robot that sends its state."""
 
 from collections.abc import Mapping
 
@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Int64
 
 from dextouch.errors import InvalidInputError
+from services.acquisition.devices.robot_state.packets import MAGIC, STREAM_SIZES
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.robot_state import MAGIC, STREAM_SIZES
 from services.acquisition.mocks.replay import ReplayStream
 
 

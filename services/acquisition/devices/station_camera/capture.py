@@ -1,4 +1,4 @@
-"""A camera on this host comes in by OpenCV, images with the driver's stamps go out.
+"""Capture from a camera on this host by OpenCV, with the stamps of the kernel's driver.
 
 What OpenCV's V4L2 backend does, and what follows from it here: `waitAny` waits with a timeout and
 fetches the buffer, while `grab` alone may block for 10 s; a lost device is a `cv2.error`, or ready
