@@ -7,11 +7,12 @@ A device that this project does not know comes from a package of its own, found 
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.gloves import GloveSettings
 from services.acquisition.devices.kind import DeviceKind, DeviceSettings
 from services.acquisition.devices.registry import ENTRY_POINT_GROUP, device_kind, kind_names
 from services.acquisition.devices.serial_line import SerialLineSettings, serial_transport
 from services.acquisition.devices.station_drivers import build_drivers, load_calibration
-from services.acquisition.drivers.base import CellLayout, Decoder, Driver, Readings
+from services.acquisition.drivers.base import CellLayout, Decoder, Driver, Readings, hand_name
 from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
 from services.acquisition.transports.base import Transport, TransportInfo
 
@@ -25,6 +26,7 @@ __all__ = [
     "DeviceSettings",
     "Driver",
     "FrameSearch",
+    "GloveSettings",
     "Readings",
     "Sample",
     "SequenceCounter",
@@ -35,6 +37,7 @@ __all__ = [
     "TransportInfo",
     "build_drivers",
     "device_kind",
+    "hand_name",
     "kind_names",
     "load_calibration",
     "serial_transport",

@@ -6,6 +6,7 @@ from typing import Protocol, runtime_checkable
 from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample
+from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.packets import SOURCES, VERSION, DecoderStatistics, Packet
 from services.acquisition.transports.base import Transport, TransportInfo
@@ -34,6 +35,11 @@ class Decoder(Protocol):
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Samples completed by `data`, which arrived at `t_host_ns`."""
         ...
+
+
+def hand_name(side: Side, label: str | None = None) -> str:
+    """A hand's part in names of streams and devices: `left`, or `left_LABEL` of a further one."""
+    return side if label is None else f"{side}_{label}"
 
 
 @dataclass(frozen=True)

@@ -64,7 +64,12 @@ class TactileCalibration:
 
     @classmethod
     def from_record(
-        cls, record: Record, side: Side, *, num_cells: int = NUM_RAW_TAXELS
+        cls,
+        record: Record,
+        side: Side,
+        *,
+        num_cells: int = NUM_RAW_TAXELS,
+        stream: str | None = None,
     ) -> "TactileCalibration":
         """From a recording's calibration matrices.
 
@@ -74,19 +79,21 @@ class TactileCalibration:
                 another number of cells must have.
             side: of the glove.
             num_cells: numbers that the glove sends in each sample.
+            stream: of a further glove of this side, whose matrices begin with its name.
 
         Raises:
             InvalidInputError: a matrix of this side is missing, of the wrong shape, or holds
                 what it cannot.
         """
+        glove = stream or f"tactile_{side}"
         tare, gain = (
-            _row(record, f"tactile_{side}_{name}", num_cells)
+            _row(record, f"{glove}_{name}", num_cells)
             for name in ("tare_counts", "gain_counts_per_kpa")
         )
-        cells = _cells(record, side, num_cells)
+        cells = _cells(record, side, num_cells, glove)
         state = np.full(NUM_TAXELS, ABSENT, dtype=np.uint8)
         has_cell = cells != NO_CELL
-        state[has_cell] = _states(record, f"tactile_{side}_taxel_state", num_cells)[cells[has_cell]]
+        state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
         return cls(side, tare, gain, cells, state)
 
     def refused_taxels(self, counts: np.ndarray) -> UInt8[np.ndarray, "320"]:
@@ -198,9 +205,9 @@ def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
     return matrix[0]
 
 
-def _cells(record: Record, side: Side, num_cells: int) -> Int64[np.ndarray, "320"]:
+def _cells(record: Record, side: Side, num_cells: int, glove: str) -> Int64[np.ndarray, "320"]:
     """The map that comes with the calibration, else that of our own gloves."""
-    name = f"tactile_{side}_cells"
+    name = f"{glove}_cells"
     if name not in record:
         if num_cells == NUM_RAW_TAXELS:
             return raw_indices(side=side)

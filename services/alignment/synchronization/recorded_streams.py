@@ -214,7 +214,7 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
             f"stream {name!r}: got samples of {raw.descriptor.shape}, expected a row of cells"
         )
     num_cells = raw.descriptor.shape[0]
-    glove = TactileCalibration.from_record(calibration, side, num_cells=num_cells)
+    glove = TactileCalibration.from_record(calibration, side, num_cells=num_cells, stream=name)
     survey = TaxelSurvey(glove)
     for piece in raw.pieces():
         survey.add(piece.values)

@@ -114,9 +114,33 @@ def test_other_places_and_cameras_are_settings():
     ]
 
 
+def test_eight_gloves_are_told_apart_by_labels():
+    form = {"num_values": 64, "full_scale": 1.0, "rate_hz": 50}
+    kinds = {"tactile_glove": {}, "wuji_glove": {}, "justfloat_glove": form}
+    gloves = [(kind, side) for kind in kinds for side in ("left", "right")]
+    devices = [
+        {"kind": "tactile_glove", "side": side, "serial_number": side} for side in ("left", "right")
+    ]
+    devices += [
+        {"kind": kind, "side": side, "label": kind, "port": f"/dev/{kind}_{side}", **kinds[kind]}
+        for kind, side in gloves
+    ]
+    drivers = build_drivers(AcquisitionSettings(devices=devices).devices, RealClock())
+    assert [driver.name for driver in drivers] == [
+        "glove_left",
+        "glove_right",
+        *(f"glove_{side}_{kind}" for kind, side in gloves),
+    ]
+    for driver in drivers:
+        (stream,) = driver.descriptors
+        assert stream.name == driver.name.replace("glove", "tactile", 1)
+        assert (stream.device, stream.side) == (driver.name, driver.name.split("_")[1])
+
+
 @pytest.mark.parametrize(
     "device",
     [
+        {"kind": "tactile_glove", "side": "left", "port": "p", "label": "Fore Arm"},
         {"kind": "pose_tracker", "stream": "camera_head", **IDS},
         {"kind": "pose_tracker", "stream": "Elbow", **IDS},
         {"kind": "camera", "stream": "table", "port": 2},
@@ -124,7 +148,7 @@ def test_other_places_and_cameras_are_settings():
     ],
 )
 def test_names_of_other_roles_are_refused(device):
-    with pytest.raises(ValidationError, match=r"devices\.0\.stream"):
+    with pytest.raises(ValidationError, match=r"devices\.0\.(stream|label)"):
         AcquisitionSettings(devices=[device])
 
 

@@ -57,6 +57,21 @@ def test_what_the_calibration_refuses_is_zero_and_its_gain_does_not_matter():
     assert [REASONS[refused[taxel]] for taxel in (3, 200)] == ["dead", "imprecise"]
 
 
+def test_a_further_glove_of_a_hand_has_a_calibration_of_its_own():
+    record = {
+        f"{glove}_{name}": [[number] * 360]
+        for glove, (tare, gain) in {
+            "tactile_left": (1.0, 2.0),
+            "tactile_left_forearm": (100.0, 50.0),
+        }.items()
+        for name, number in (("tare_counts", tare), ("gain_counts_per_kpa", gain))
+    }
+    glove = TactileCalibration.from_record(record, "left", stream="tactile_left_forearm")
+    np.testing.assert_allclose(glove.to_kpa(np.full((1, 360), 400.0)), 6.0)
+    with pytest.raises(InvalidInputError, match="'tactile_left_wrist_tare_counts' is missing"):
+        TactileCalibration.from_record(record, "left", stream="tactile_left_wrist")
+
+
 def test_another_map_selects_its_cells():
     cells = np.r_[np.arange(319)[::-1], -1]
     other = {

@@ -10,14 +10,15 @@ from services.acquisition.drivers.base import Driver
 
 def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
     """The driver of one glove."""
-    transport = serial_transport(settings, device=f"glove {settings.side}")
+    transport = serial_transport(settings, device=settings.device)
     decoder = JustFloatGloveDecoder(
         settings.side,
         num_values=settings.num_values,
         full_scale=settings.full_scale,
         rate_hz=settings.rate_hz,
+        label=settings.label,
     )
-    return Driver(f"glove_{settings.side}", transport=transport, decoder=decoder, clock=clock)
+    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 
 
 KIND = DeviceKind(

@@ -13,7 +13,7 @@ from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import CellLayout, Readings
+from services.acquisition.drivers.base import CellLayout, Readings, hand_name
 from services.acquisition.drivers.frames import DecoderStatistics, PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
@@ -136,12 +136,23 @@ class JustFloatGloveDecoder:
         num_values: float32s of a packet (known versions send 401, 415 or 615).
         full_scale: the largest reading; packets with larger ones are held back.
         rate_hz: nominal rate; the stream has no clock of its own.
+        label: of a further glove of this hand.
     """
 
-    def __init__(self, side: Side, *, num_values: int, full_scale: float, rate_hz: float) -> None:
+    def __init__(
+        self,
+        side: Side,
+        *,
+        num_values: int,
+        full_scale: float,
+        rate_hz: float,
+        label: str | None = None,
+    ) -> None:
         self._frames = JustFloatFrames(num_values, full_scale)
         self.cells = CellLayout(full_scale, grid=None)
-        self._descriptor = justfloat_descriptor(side, num_values=num_values, rate_hz=rate_hz)
+        self._descriptor = justfloat_descriptor(
+            side, num_values=num_values, rate_hz=rate_hz, label=label
+        )
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -177,17 +188,19 @@ class JustFloatGloveDecoder:
         return {self._descriptor.name: samples} if samples else {}
 
 
-def justfloat_descriptor(side: Side, *, num_values: int, rate_hz: float) -> StreamDescriptor:
+def justfloat_descriptor(
+    side: Side, *, num_values: int, rate_hz: float, label: str | None = None
+) -> StreamDescriptor:
     """The raw stream of one glove; neither its unit nor its time is told by the device."""
     return StreamDescriptor(
-        name=f"tactile_{side}",
+        name=f"tactile_{hand_name(side, label)}",
         kind="tactile",
         shape=(num_values,),
         dtype="float32",
         unit="raw",
         nominal_rate_hz=rate_hz,
         side=side,
-        device=f"glove_{side}",
+        device=f"glove_{hand_name(side, label)}",
         capabilities=ClockCapabilities(),
     )
 

@@ -4,11 +4,10 @@ from typing import Literal
 
 from pydantic import Field
 
-from dextouch.tactile.layout import Side
-from services.acquisition.devices.serial_line import SerialLineSettings
+from services.acquisition.devices.gloves import GloveSettings
 
 
-class JustFloatGloveSettings(SerialLineSettings):
+class JustFloatGloveSettings(GloveSettings):
     """A glove on a serial line that tells nothing of itself.
 
     Attributes:
@@ -18,7 +17,6 @@ class JustFloatGloveSettings(SerialLineSettings):
     """
 
     kind: Literal["justfloat_glove"] = "justfloat_glove"
-    side: Side
     num_values: int = Field(ge=1, le=4096)
     full_scale: float = Field(gt=0, le=1e30)
     rate_hz: float = Field(gt=0, le=10_000)

@@ -25,7 +25,7 @@ from services.acquisition.devices.tactile_glove.commands import (
     parse_tare,
 )
 from services.acquisition.devices.tactile_glove.packets import NOMINAL_RATE_HZ, TactileGloveDecoder
-from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.base import Driver, Readings, hand_name
 from services.acquisition.drivers.packets import SEQUENCE_MODULUS, Packet
 from services.acquisition.transports.base import Transport
 
@@ -46,6 +46,7 @@ class TactileGlove(Driver):
         transport: where it is.
         clock: of the station.
         serial_number: that it must have; None takes any.
+        label: of a further glove of this hand.
     """
 
     def __init__(
@@ -55,9 +56,11 @@ class TactileGlove(Driver):
         transport: Transport,
         clock: StationClock,
         serial_number: str | None = None,
+        label: str | None = None,
     ) -> None:
-        decoder = TactileGloveDecoder(side, on_reply=self._accept)
-        super().__init__(f"glove_{side}", transport=transport, decoder=decoder, clock=clock)
+        decoder = TactileGloveDecoder(side, on_reply=self._accept, label=label)
+        name = f"glove_{hand_name(side, label)}"
+        super().__init__(name, transport=transport, decoder=decoder, clock=clock)
         self.identity: GloveIdentity | None = None
         self._side: Side = side
         self._serial_number = serial_number

@@ -11,9 +11,10 @@ def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
     """The driver of one glove."""
     return TactileGlove(
         settings.side,
-        transport=serial_transport(settings, device=f"glove {settings.side}"),
+        transport=serial_transport(settings, device=settings.device),
         clock=clock,
         serial_number=settings.serial_number,
+        label=settings.label,
     )
 
 

@@ -8,7 +8,7 @@ from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
 from services.acquisition.devices.tactile_glove.commands import MAX_REPLY, MIN_REPLY, REPLY_MAGIC
-from services.acquisition.drivers.base import Readings, check_packet
+from services.acquisition.drivers.base import Readings, check_packet, hand_name
 from services.acquisition.drivers.frames import DecoderStatistics
 from services.acquisition.drivers.packets import Packet, PacketDecoder
 
@@ -19,17 +19,17 @@ FULL_SCALE_COUNTS = 65_535
 _COUNT = np.dtype("<u2")
 
 
-def glove_descriptor(side: Side) -> StreamDescriptor:
+def glove_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
     """The raw stream of one glove."""
     return StreamDescriptor(
-        name=f"tactile_{side}",
+        name=f"tactile_{hand_name(side, label)}",
         kind="tactile",
         shape=(NUM_RAW_TAXELS,),
         dtype="uint16",
         unit="counts",
         nominal_rate_hz=NOMINAL_RATE_HZ,
         side=side,
-        device=f"glove_{side}",
+        device=f"glove_{hand_name(side, label)}",
         capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
     )
 
@@ -41,10 +41,15 @@ class TactileGloveDecoder:
         side: which glove it must be; None takes any.
         on_reply: takes each reply to a command with its arrival; without it replies are passed
             over.
+        label: of a further glove of this hand.
     """
 
     def __init__(
-        self, side: Side | None = None, *, on_reply: Callable[[Packet, int], None] | None = None
+        self,
+        side: Side | None = None,
+        *,
+        on_reply: Callable[[Packet, int], None] | None = None,
+        label: str | None = None,
     ) -> None:
         self._packets = PacketDecoder(
             MAGIC,
@@ -53,8 +58,8 @@ class TactileGloveDecoder:
             others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
         )
         self._side: Side | None = side
-        self._device = f"glove_{side or 'any'}"
-        self._descriptor = glove_descriptor(side or "left")
+        self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
+        self._descriptor = glove_descriptor(side or "left", label)
         self._on_reply = on_reply
 
     @property

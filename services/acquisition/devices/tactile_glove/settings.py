@@ -2,11 +2,10 @@
 
 from typing import Literal
 
-from dextouch.tactile.layout import Side
-from services.acquisition.devices.serial_line import SerialLineSettings
+from services.acquisition.devices.gloves import GloveSettings
 
 
-class TactileGloveSettings(SerialLineSettings):
+class TactileGloveSettings(GloveSettings):
     """Our glove on a serial line.
 
     With serial number and port, the port is opened and the glove there must say that it has the
@@ -15,4 +14,3 @@ class TactileGloveSettings(SerialLineSettings):
 
     kind: Literal["tactile_glove"] = "tactile_glove"
     protocol: Literal["dextouch"] = "dextouch"
-    side: Side

@@ -10,9 +10,9 @@ from services.acquisition.drivers.base import Driver
 
 def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
     """The driver of one glove."""
-    transport = serial_transport(settings, device=f"glove {settings.side}")
-    decoder = WujiGloveDecoder(settings.side)
-    return Driver(f"glove_{settings.side}", transport=transport, decoder=decoder, clock=clock)
+    transport = serial_transport(settings, device=settings.device)
+    decoder = WujiGloveDecoder(settings.side, label=settings.label)
+    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
 
 
 KIND = DeviceKind(

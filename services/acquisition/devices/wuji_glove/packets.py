@@ -12,7 +12,7 @@ from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import CellLayout, Readings
+from services.acquisition.drivers.base import CellLayout, Readings, hand_name
 from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
 
 MARK = b"\xaa\x55"
@@ -90,12 +90,13 @@ class WujiGloveDecoder:
 
     Args:
         side: which glove it must be; None takes any.
+        label: of a further glove of this hand.
     """
 
-    def __init__(self, side: Side | None = None) -> None:
+    def __init__(self, side: Side | None = None, *, label: str | None = None) -> None:
         self._frames = WujiFrames()
         self._side: Side | None = side
-        self._descriptor = wuji_descriptor(side or "left")
+        self._descriptor = wuji_descriptor(side or "left", label)
 
     @property
     def statistics(self) -> DecoderStatistics:
@@ -148,17 +149,17 @@ class WujiGloveDecoder:
             )
 
 
-def wuji_descriptor(side: Side) -> StreamDescriptor:
+def wuji_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
     """The raw stream of one glove; `unit` is the share of full scale, 0 … 1."""
     return StreamDescriptor(
-        name=f"tactile_{side}",
+        name=f"tactile_{hand_name(side, label)}",
         kind="tactile",
         shape=(NUM_CELLS,),
         dtype="float32",
         unit="full_scale",
         nominal_rate_hz=NOMINAL_RATE_HZ,
         side=side,
-        device=f"glove_{side}",
+        device=f"glove_{hand_name(side, label)}",
         capabilities=ClockCapabilities(
             crc=True,
             sequence=True,

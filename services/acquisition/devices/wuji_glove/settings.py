@@ -2,12 +2,10 @@
 
 from typing import Literal
 
-from dextouch.tactile.layout import Side
-from services.acquisition.devices.serial_line import SerialLineSettings
+from services.acquisition.devices.gloves import GloveSettings
 
 
-class WujiGloveSettings(SerialLineSettings):
+class WujiGloveSettings(GloveSettings):
     """A Wuji glove on a serial line; it tells which hand it is for."""
 
     kind: Literal["wuji_glove"] = "wuji_glove"
-    side: Side
