@@ -1,3 +1,3 @@
-"""The nouns of DexTouch: what a policy, a station and every service share."""
+"""Shared library of the DexTouch services: data types, geometry, clocks, storage, clients."""
 
 __version__ = "0.1.0"

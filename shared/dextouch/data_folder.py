@@ -1,4 +1,4 @@
-"""The default data folder that all commands share: `data`, or the folder named by DEXTOUCH_DATA."""
+"""Default data folder of all commands: `data`, or the folder named by DEXTOUCH_DATA."""
 
 import os
 from pathlib import Path

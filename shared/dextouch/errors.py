@@ -1,31 +1,31 @@
-"""Every error that DexTouch raises: one tree, one class for each decision that a caller can take.
+"""Exception hierarchy of DexTouch: one tree, one class per decision that a caller can take.
 
 ```
 DexTouchError
-├── InvalidInputError          the caller sent something that does not fit: mend the input
+├── InvalidInputError          invalid input from the caller: correct it and retry
 │   ├── ShapeError             an array has the wrong shape or kind of number
 │   ├── NonFiniteError         NaN or infinity where a finite number is needed
-│   ├── DegenerateRotationError  six numbers that span no plane, or a matrix that is no rotation
+│   ├── DegenerateRotationError  numbers that do not describe a rotation
 │   ├── UnknownNameError       a name that is not among the valid ones (which are listed)
-│   ├── ClockFitError          stamps from which no clock can be fitted
-│   └── PacketError            bytes that are no packet of the announced kind
-├── NotFoundError              the thing asked for does not exist
-├── ConflictError              the thing exists in another state than the request assumes
+│   ├── ClockFitError          stamps to which no clock can be fitted
+│   └── PacketError            bytes that are not a valid packet of their kind
+├── NotFoundError              the requested item does not exist
+├── ConflictError              the item is in another state than the request assumes
 │   └── EndedError             a rollout is over: start a new one or branch from its end
 ├── LimitExceededError         larger, longer or more than this installation allows
-├── UnavailableError           a service, model or world that is not ready: try again later
-├── DeviceError                a device is gone, silent or speaks another protocol
+├── UnavailableError           a service, model or world is not ready: try again later
+├── DeviceError                a device is disconnected, silent or speaks another protocol
 │   └── StaleDataError         the newest sample is older than the caller allows
 ├── StorageError               bytes on disk are damaged, foreign or cannot be written
-│   ├── CorruptDataError       a checksum or structure does not hold
-│   └── StorageFullError       no space left: free some
+│   ├── CorruptDataError       a checksum mismatch or an invalid structure
+│   └── StorageFullError       no space left on the device: free some
 └── AccessDeniedError          no key, or a key without the needed scope
 ```
 """
 
 
 class DexTouchError(Exception):
-    """Root of all errors raised on purpose.
+    """Base class of all errors that DexTouch raises deliberately.
 
     The message says what, where, got, expected and what to do. `details` holds the same facts
     as data for machines (problem+json, logs).
@@ -38,7 +38,7 @@ class DexTouchError(Exception):
 
 
 class InvalidInputError(DexTouchError):
-    """The caller sent something that does not fit."""
+    """Input from the caller is invalid."""
 
 
 class ShapeError(InvalidInputError):
@@ -62,30 +62,30 @@ class UnknownNameError(InvalidInputError):
 
 
 class ClockFitError(InvalidInputError):
-    """Stamps from which no clock can be fitted."""
+    """Stamps to which no clock can be fitted."""
 
 
 class PacketError(InvalidInputError):
-    """Bytes that are no packet of the announced kind."""
+    """Bytes that are not a valid packet of their kind."""
 
 
 class NotFoundError(DexTouchError):
-    """The thing asked for does not exist."""
+    """The requested item does not exist."""
 
 
 class ConflictError(DexTouchError):
-    """The thing exists in another state than the request assumes."""
+    """The item is in another state than the request assumes."""
 
 
 class EndedError(ConflictError):
-    """A rollout is over: its world goes no further with it, for a `reason` it names."""
+    """A rollout is over: its world cannot continue it, for the given `reason`."""
 
     def __init__(self, message: str, *, reason: str, **details: object) -> None:
         super().__init__(message, reason=reason, **details)
 
     @property
     def reason(self) -> str:
-        """Why, in words."""
+        """Why the rollout ended."""
         return str(self.details.get("reason", self.message))
 
 
@@ -98,7 +98,7 @@ class UnavailableError(DexTouchError):
 
 
 class DeviceError(DexTouchError):
-    """A device is gone, silent or speaks another protocol."""
+    """A device is disconnected, silent or speaks another protocol."""
 
 
 class StaleDataError(DeviceError):
@@ -110,11 +110,11 @@ class StorageError(DexTouchError):
 
 
 class CorruptDataError(StorageError):
-    """A checksum or structure does not hold."""
+    """A checksum mismatch or an invalid structure."""
 
 
 class StorageFullError(StorageError):
-    """No space left: free some."""
+    """No space left on the device."""
 
 
 class AccessDeniedError(DexTouchError):

@@ -1,1 +1,1 @@
-"""Episodes and recordings ↔ the file formats of other robot learning and viewing tools."""
+"""Import and export of episodes and recordings: LeRobot, MCAP, UMI and Rerun formats."""

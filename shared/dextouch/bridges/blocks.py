@@ -1,4 +1,4 @@
-"""A reader of an episode or a recording in, blocks of its samples with bounded memory out."""
+"""Bounded-memory iteration over the samples of an episode or recording, for exporters."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -39,14 +39,14 @@ def is_encoded(descriptor: StreamDescriptor) -> bool:
 
 
 def objects(items: list[bytes]) -> Shaped[np.ndarray, " n"]:
-    """Encoded images as an object array, the form that writers take."""
+    """Pack encoded images into an object array, as episode writers expect them."""
     array = np.empty(len(items), dtype=object)
     array[:] = items
     return array
 
 
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
-    """All samples of a stream in order, about a second at a time; encoded images stay encoded.
+    """Iterate over a stream in order, about one second per block; encoded images stay encoded.
 
     Args:
         reader: of the episode or recording.
@@ -54,7 +54,7 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
     """
     descriptor, stamps_ns = reader.streams[name], reader.stamps_ns(name)
     each = max(1, round(descriptor.nominal_rate_hz * BLOCK_SECONDS))
-    # Samples of one instant stay together, since a reader is asked by time.
+    # Samples with equal stamps stay in one block, since the reader is queried by time.
     starts = np.unique(np.searchsorted(stamps_ns, stamps_ns[::each]))
     for start, stop in zip(starts, [*starts[1:], len(stamps_ns)], strict=True):
         yield _block(reader, name, int(start), int(stop))
@@ -72,7 +72,7 @@ def _block(reader: Reader, name: str, start: int, stop: int) -> Block:
     )
     values = data.values if encoded is None else encoded
     if isinstance(data, SampleBatch):
-        # Of images too: the device's stamps come with the decoded values only.
+        # This includes images: the reader returns device stamps only with decoded values.
         return Block(data.t_host_ns, data.t_device_ns, data.sequence, values)
     return _of_episode(data.t_ref_ns, values)
 

@@ -1,4 +1,4 @@
-"""The path of a new file in; a place to write it that takes its name only when it is whole, out."""
+"""Atomic creation of a file: it gets its name only once it is complete."""
 
 import os
 import uuid
@@ -12,7 +12,7 @@ from dextouch.errors import ConflictError
 
 @contextmanager
 def new_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A path beside `path` that takes its name when the block ends well.
+    """Context manager with a temporary path, renamed to `path` when the block succeeds.
 
     Args:
         path: of the finished file; its folder is created.
@@ -20,7 +20,7 @@ def new_file(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
     Raises:
         ConflictError: `path` exists and `overwrite` is false.
-        StorageError: the disk does not take it.
+        StorageError: the write failed.
     """
     if path.is_dir() or (path.exists() and not overwrite):
         raise ConflictError(

@@ -1,4 +1,4 @@
-"""An episode or recording of a store in, a Rerun `.rrd` file to look at it out (one way only)."""
+"""Export of an episode or recording to a Rerun `.rrd` file, for viewing only."""
 
 import json
 from collections.abc import Callable, Iterable
@@ -40,12 +40,12 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
         overwrite: whether an existing file is replaced.
 
     Returns:
-        How many samples were written.
+        Number of samples.
 
     Raises:
         ConflictError: the file exists.
-        InvalidInputError: a stream that cannot be shown.
-        StorageError: the disk does not take it.
+        InvalidInputError: a stream that Rerun cannot display.
+        StorageError: the write failed.
     """
     with new_file(path, overwrite=overwrite) as partial:
         export = _Export(reader)
@@ -57,7 +57,7 @@ def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
 
 
 def entity_of(descriptor: StreamDescriptor) -> str:
-    """Where a stream stands in the viewer's tree; children of a pose move with it."""
+    """Entity path of a stream; children of a pose entity move with it."""
     name = descriptor.name
     if descriptor.kind == "pose":
         return f"world/{HEAD_CAMERA}" if name == "head" else f"world/{name}"
@@ -73,7 +73,7 @@ def _names(reader: Reader, kind: str) -> list[str]:
 
 
 def _blueprint(reader: Reader) -> rrb.Blueprint:
-    """Space and numbers on the left, cameras in the middle, touch on the right."""
+    """Viewer layout: 3D view and plots on the left, cameras in the middle, touch on the right."""
     columns = [
         rrb.Vertical(
             rrb.Spatial3DView(origin="world", name="space"),
@@ -96,7 +96,7 @@ class _Export:
         self.stream = rr.RecordingStream(APPLICATION, recording_id=_id_of(reader))
 
     def run(self) -> int:
-        """Everything that does not move, then every stream."""
+        """Log static entities, then every stream."""
         attributes = self._reader.attributes
         words = json.dumps(json_ready(attributes), indent=2)
         self.stream.log(
@@ -123,7 +123,7 @@ class _Export:
         return num_samples
 
     def _log_pinhole(self) -> None:
-        # Rerun's pinhole knows no lens: what is drawn into the image is off by the distortion.
+        # Rerun's pinhole has no distortion model, so projected entities are off by the distortion.
         camera = self._reader.streams.get(HEAD_CAMERA)
         K = self._reader.attributes.calibration.get("K_head")
         if isinstance(self._reader, EpisodeReader):
@@ -135,7 +135,7 @@ class _Export:
         self.stream.log(entity_of(camera), pinhole, static=True)
 
     def _sender(self, descriptor: StreamDescriptor) -> Callable[[Block], None]:
-        """How blocks of a stream are shown; what never changes is logged here."""
+        """The function that logs blocks of a stream; logs the static part of the stream at once."""
         entity = entity_of(descriptor)
         if descriptor.kind == "image":
             return self._image_sender(descriptor, entity)
@@ -194,7 +194,7 @@ class _Export:
         side = _side(descriptor) or "left"
         full_scale = FULL_SCALE_KPA
         if descriptor.unit != "kPa":
-            # Counts have no scale of their own; the strongest reading of the take is the brightest.
+            # Raw counts have no absolute scale; the strongest reading of the take is the brightest.
             largest = [block.values.max() for block in blocks(self._reader, descriptor.name)]
             full_scale = float(max(largest, default=1)) or 1.0
         picture = heat_map(np.zeros(descriptor.shape), side=side, full_scale=full_scale)
@@ -245,14 +245,14 @@ def heat_map(row: np.ndarray, *, side: Side, full_scale: float) -> UInt8[np.ndar
     Args:
         row: 320 taxels or the 360 raw cells.
         side: of the hand.
-        full_scale: reading that is shown brightest, in the unit of the row.
+        full_scale: reading shown at full brightness, in the unit of the row.
     """
     taxels = select_taxels(row, side=side) if row.shape == (NUM_RAW_TAXELS,) else row
     return colour(hand_canvas(taxels, side=side), full_scale_kpa=full_scale)
 
 
 def _side(descriptor: StreamDescriptor) -> Side | None:
-    """Whose hand a stream of touch is; None if it cannot be drawn as a hand."""
+    """Side of a tactile stream; None if it cannot be drawn as a hand."""
     if descriptor.shape not in {(NUM_TAXELS,), (NUM_RAW_TAXELS,)}:
         return None
     if descriptor.side is not None:
@@ -262,7 +262,7 @@ def _side(descriptor: StreamDescriptor) -> Side | None:
 
 
 def _is_key(access_unit: bytes) -> bool:
-    """Whether an Annex B access unit holds an IDR picture."""
+    """Whether an Annex B access unit contains an IDR picture."""
     units = access_unit.split(_ANNEX_B)[1:]
     return any(unit and unit[0] & 31 == _KEY_UNIT for unit in units)
 

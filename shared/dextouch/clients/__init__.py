@@ -1,4 +1,4 @@
-"""What policies and stations import to talk to the services; light on purpose."""
+"""Clients of the DexTouch services for policies and stations, with few dependencies."""
 
 from dextouch.clients.policy import Policy, PolicyStart
 from dextouch.clients.rollouts import Rollout, RolloutClient

@@ -1,4 +1,4 @@
-"""The store over HTTP: attributes and batches in, receipts, lists, windows and samples out."""
+"""HTTP client of the episode store: uploads, queries, windows and samples."""
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
@@ -40,13 +40,13 @@ DEFAULT_TIMEOUT_S = 30.0
 
 
 class EpisodeStoreClient:
-    """One store service. Every call is safe to repeat after UnavailableError.
+    """Client of one store service. Every call may be repeated after UnavailableError.
 
     Args:
         url: of the service.
-        api_key: if it asks for one.
+        api_key: if the service requires one.
         timeout_s: of one request.
-        transport: another way to reach the service (an application in this process).
+        transport: httpx transport, for example an application in this process.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class EpisodeStoreClient:
         )
 
     def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         self._http.close()
 
     def __enter__(self) -> "EpisodeStoreClient":
@@ -82,13 +82,13 @@ class EpisodeStoreClient:
         self.close()
 
     def create(self, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload, or learn where it stands."""
+        """Begin an upload, or query the state of one that exists."""
         return self._model(
             RecordingStatus, "POST", "/v1/recordings", content=attributes.model_dump_json()
         )
 
     def status(self, recording_id: str) -> RecordingStatus:
-        """Which batch each stream of an upload expects next."""
+        """The batch that each stream of an upload expects next."""
         return self._model(RecordingStatus, "GET", f"/v1/recordings/{_part(recording_id)}")
 
     def send_batch(
@@ -110,7 +110,7 @@ class EpisodeStoreClient:
         success: bool | None = None,
         ledger: tuple[LedgerEntry, ...] = (),
     ) -> RecordingStatus:
-        """Say how many batches each stream has; the recording becomes visible."""
+        """Finish an upload with its number of batches per stream; the recording becomes visible."""
         body = FinishRecording(num_batches=dict(num_batches), success=success, ledger=ledger)
         path = f"/v1/recordings/{_part(recording_id)}/finish"
         return self._model(RecordingStatus, "POST", path, content=body.model_dump_json())
@@ -119,13 +119,13 @@ class EpisodeStoreClient:
         """Finished recordings that match every given filter.
 
         Args:
-            wanted: filters and page, as the service names them (docs/wire_format.md), such as
+            wanted: filters and page, as in docs/wire_format.md, such as
                 `station="bench"`, `min_quality=["coverage:0.95"]`, `after="take-7"`.
         """
         return self._model(RecordingList, "GET", "/v1/recordings", query=wanted)
 
     def recording_attributes(self, recording_id: str) -> RecordingAttributes:
-        """What a finished recording says about itself."""
+        """Attributes of a finished recording."""
         path = f"/v1/recordings/{_part(recording_id)}/attributes"
         return self._model(RecordingAttributes, "GET", path)
 
@@ -153,16 +153,16 @@ class EpisodeStoreClient:
         return self._model(CatalogHours, "GET", "/v1/catalog/hours", query=wanted)
 
     def uploads(self, *, idle_s: float = 0.0) -> UploadList:
-        """Unfinished uploads for which nothing has come for so long."""
+        """Unfinished uploads that have been idle for at least `idle_s`."""
         return self._model(UploadList, "GET", "/v1/uploads", query={"idle_s": idle_s})
 
     def expire_uploads(self, *, idle_s: float) -> UploadList:
-        """Drop unfinished uploads for which nothing has come for so long; those that went."""
+        """Drop unfinished uploads that have been idle for at least `idle_s` and return them."""
         body = ExpireUploads(idle_s=idle_s).model_dump_json()
         return self._model(UploadList, "POST", "/v1/uploads/expire", content=body)
 
     def episode(self, episode_id: str) -> EpisodeDetail:
-        """What an episode says about itself."""
+        """Attributes of an episode."""
         return self._model(EpisodeDetail, "GET", f"/v1/episodes/{_part(episode_id)}")
 
     def episode_samples(
@@ -256,7 +256,7 @@ def _refusal(response: httpx.Response) -> DexTouchError:
     try:
         return error_from_problem(Problem.model_validate_json(response.content))
     except ValidationError:
-        # A proxy in between may say when to come again, too.
+        # A proxy in between may send Retry-After, too.
         seconds = response.headers.get("retry-after", "")
         return UnavailableError(
             f"episode store: {response.request.method} {response.request.url.path} answered "

@@ -1,4 +1,4 @@
-"""A served world as a gymnasium environment: one step is one action chunk.
+"""Gymnasium environment of a served world; one environment step is one action chunk.
 
     env = WorldEnv(RolloutClient(url), world="twin", task="stand_bottle", instruction="…")
     observation, info = env.reset(seed=3)
@@ -19,10 +19,10 @@ from dextouch.errors import EndedError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, POSE_SLICES
 from dextouch.schemas.rollouts import Observation, WorldDescription
 
-# Bounds of the action space: of what is sampled from it, not of what worlds accept.
+# Bounds of the action space. They limit its samples, not what worlds accept.
 MAX_REACH_M = 2.0
 MAX_JOINT_RAD = np.pi
-# Gymnasium wants finite bounds; no sensor comes near these.
+# Gymnasium requires finite bounds; no sensor comes near these.
 MAX_TACTILE_KPA = 1e6
 MAX_REACHED = 1e6
 
@@ -33,19 +33,19 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     """One task in one served world.
 
     The observation is that of the newest step: `tactile_kpa` [2, 320], `action_reached` [67] and
-    one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends
-    the episode, `max_chunks` truncates it. A world that does not judge success never ends by
-    itself. A world that goes no further with a rollout truncates it: the observation is then the
-    last one again, and `info["ended"]` says why (None otherwise). `info` also holds `success`
-    (None where unknown), `doubt` and what the world told about the chunk.
+    one image a camera. The reward is 1 on the chunk that ends in success, else 0; success ends the
+    episode, `max_chunks` truncates it. A world without a success check never terminates. A world
+    that cannot continue a rollout truncates it: the observation is then the last one again, and
+    `info["ended"]` says why (None otherwise). `info` also holds `success` (None where unknown),
+    `doubt` and the numbers that the world reports about the chunk.
 
     Args:
         client: of the service.
-        world: name there.
+        world: its name at the service.
         task: one of the world's.
         instruction: in words.
         chunk_steps: model steps of an action, a multiple of the world's chunk.
-        max_chunks: after so many the episode is truncated.
+        max_chunks: number of chunks after which the episode is truncated.
     """
 
     def __init__(
@@ -79,11 +79,11 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[SeenNow, dict[str, Any]]:
-        """Begin anew.
+        """Start a new rollout.
 
         Args:
             seed: of the start and the world's noise; None draws one.
-            options: {"init": (observation, anchor, K_head)} begins from an observation.
+            options: {"init": (observation, anchor, K_head)} starts from an observation.
         """
         super().reset(seed=seed)
         unknown = sorted(set(options or {}) - {"init"})

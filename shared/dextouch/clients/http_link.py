@@ -1,6 +1,7 @@
-"""Requests to one service over the standard library; its problems come back as our errors.
+"""Minimal HTTP client on the standard library that raises services' problems as our errors.
 
-http.client on purpose: it needs nothing installed and costs a third of httpx on large bodies.
+It uses http.client, which needs no dependency and takes a third of the time of httpx on large
+bodies.
 """
 
 import http.client
@@ -20,7 +21,7 @@ RETRY_PAUSES_S = (0.05, 0.2, 0.8)
 
 @dataclass(frozen=True)
 class Reply:
-    """A successful answer."""
+    """A successful response."""
 
     status: int
     headers: Mapping[str, str]
@@ -28,7 +29,7 @@ class Reply:
 
 
 class HttpLink:
-    """One kept-alive connection; for one thread."""
+    """One keep-alive connection; not thread-safe."""
 
     def __init__(
         self,
@@ -59,11 +60,11 @@ class HttpLink:
         content_type: str = "application/json",
         accept: str = "application/json",
     ) -> Reply:
-        """Ask, again after a lost connection: so every request must bear being made twice.
+        """Send a request, again after a lost connection: every request must be idempotent.
 
         Raises:
-            UnavailableError: no connection after all attempts.
-            DexTouchError: what the service answered, as its own class.
+            UnavailableError: no response after all attempts.
+            DexTouchError: the problem that the service reports, as its own class.
         """
         headers = self._headers | {"Accept": accept}
         if body is not None:

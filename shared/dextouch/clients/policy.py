@@ -1,4 +1,4 @@
-"""The protocol of policies, which act in any world."""
+"""Protocol of policies, which act in any world."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
@@ -12,7 +12,7 @@ from dextouch.schemas.rollouts import Observation
 
 @dataclass(frozen=True)
 class PolicyStart:
-    """What a policy may know before its first observation.
+    """Information that a policy gets before its first observation.
 
     `anchor` are the absolute poses of the rollout's step 0, which all actions are relative to;
     `seed` is for the policy's own random numbers.
@@ -30,16 +30,16 @@ class Policy(Protocol):
     """Acts in any world: the calls and arrays are the same in all of them (docs/policies.md).
 
     A policy with an attribute `looks` that is False gets no images after the first step, so that
-    worlds need not make them. With `looks = "last"` it may get nothing but the last step of each
-    chunk. `tasks` (names) are what it can do; `dextouch bench evaluator` leaves it out of others.
+    worlds need not render them. With `looks = "last"` it may get nothing but the last step of each
+    chunk. `tasks` names those it supports; `dextouch bench evaluator` skips all others.
     """
 
     def reset(self, start: PolicyStart) -> None:
-        """Forget the last rollout and begin another."""
+        """Reset all state for a new rollout."""
         ...
 
     def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
-        """The next chunk, from everything seen since the last call (the last step is now).
+        """The next action chunk, given the observations since the last call (the last step is now).
 
         Rows are poses and joint angles as commands, relative to the rollout's step 0; their
         number is a multiple of the world's chunk.

@@ -1,4 +1,4 @@
-"""Action chunks to a served world, observations back; base dependencies only.
+"""HTTP client of served worlds: start a rollout, step it by action chunks, fork it.
 
 with RolloutClient("http://127.0.0.1:8100") as client:
     with client.start(world="twin", task="stand_bottle", seed=3, instruction="…") as rollout:
@@ -49,13 +49,13 @@ InitialObservation = tuple[Observation, AnchorPoses, Float64[np.ndarray, "3 3"]]
 
 
 class RolloutClient:
-    """A connection to a service of worlds; for one thread (open one a thread).
+    """A connection to a service of worlds; not thread-safe (open one per thread).
 
     Args:
         url: of the service.
-        api_key: with the scope `rollout`; None where the service needs none.
-        timeout_s: for one answer.
-        selector: which cameras and steps every rollout of this client gets back.
+        api_key: with the scope `rollout`; None where the service requires none.
+        timeout_s: for one response.
+        selector: cameras and steps to return for every rollout of this client.
     """
 
     def __init__(
@@ -70,13 +70,13 @@ class RolloutClient:
         self.selector = selector
 
     def selecting(self, selector: ReturnSelector) -> "RolloutClient":
-        """This client, on the same connection, with another selector for what it starts."""
+        """A client on the same connection with another selector for new rollouts."""
         other = copy(self)
         other.selector = selector
         return other
 
     def worlds(self) -> list[WorldDescription]:
-        """What can be rolled out there."""
+        """Worlds and tasks of the service."""
         reply = self._link.request("GET", "/v1/worlds")
         return list(_parsed(WorldList, reply).worlds)
 
@@ -90,7 +90,7 @@ class RolloutClient:
         init: InitialObservation | None = None,
         action_kind: ActionKind = "commanded",
     ) -> "Rollout":
-        """Begin a future from a task and seed, or from an observation made elsewhere.
+        """Start a rollout from a task and seed, or from an observation made elsewhere.
 
         A connection that is lost meanwhile may leave a second, unused rollout at the service; it
         expires there by itself.
@@ -99,7 +99,7 @@ class RolloutClient:
             UnknownNameError: world, task or action kind (the valid ones are listed).
             InvalidInputError: a start that this world cannot begin from.
             LimitExceededError: the service has as many rollouts as it allows.
-            UnavailableError: the service does not answer.
+            UnavailableError: the service does not respond.
         """
         request = _start_request(
             world=world, task=task, seed=seed, instruction=instruction, action_kind=action_kind
@@ -136,14 +136,14 @@ class RolloutClient:
 
 
 class Rollout:
-    """One future at a service: what is seen now, and what every action is relative to.
+    """One rollout at a service: the current observation, and the anchor of all actions.
 
     Attributes:
         observation: the newest; n steps, of which the last is now.
         anchor: absolute poses of step 0, which actions are relative to for the whole rollout.
         K_head: the head camera's matrix in pixels.
-        info: where it stands.
-        told: numbers the world told about the newest chunk.
+        info: its state.
+        told: numbers that the world reports about the newest chunk.
     """
 
     def __init__(self, link: HttpLink, query: str, answer: RolloutAnswer, origin: Origin) -> None:
@@ -158,14 +158,14 @@ class Rollout:
 
     @property
     def id(self) -> str:
-        """Its name at the service."""
+        """Its id at the service."""
         return self.info.id
 
     def step(self, actions: np.ndarray, *, selector: ReturnSelector | None = None) -> Observation:
         """Advance by one action chunk.
 
         If this raises UnavailableError, the same call may be made again: a chunk that the service
-        already took is not taken twice, its answer is given again.
+        already applied is not applied twice; its response is repeated.
 
         Args:
             actions: [K, 67], K a multiple of the world's chunk; row i is the pose at step i+1 of
@@ -173,11 +173,11 @@ class Rollout:
             selector: of this chunk alone; None for the client's.
 
         Returns:
-            What was seen at the K steps (the last one if the selector says so).
+            The observation of the K steps (of the last one if the selector says so).
 
         Raises:
-            EndedError: the world goes no further with this rollout, for the `reason` it names;
-                what was seen last stays in `observation`.
+            EndedError: the world cannot continue this rollout, for the `reason` given; the last
+                observation stays in `observation`.
         """
         checked = check_actions(actions, where=f"rollout {self.id}")
         query = self._query if selector is None else _query(selector)
@@ -193,7 +193,7 @@ class Rollout:
         return self.observation
 
     def fork(self, *, seed: int | None = None) -> "Rollout":
-        """Branch here; a new seed gives the branch noise of its own."""
+        """Branch at this step; a new seed gives the branch noise of its own."""
         body = ForkRequest(seed=seed).model_dump_json().encode()
         reply = self._link.request("POST", f"/v1/rollouts/{self.id}/fork", body=body)
         info = _parsed(RolloutInfo, reply)
@@ -201,7 +201,7 @@ class Rollout:
         return Rollout(self._link, self._query, answer, self._origin)
 
     def close(self) -> None:
-        """End it at the service; an expired rollout counts as ended."""
+        """End the rollout at the service; an expired rollout counts as ended."""
         try:
             self._link.request("DELETE", f"/v1/rollouts/{self.id}")
         except NotFoundError:
@@ -219,7 +219,7 @@ class Rollout:
         if error is None:
             self.close()
             return
-        # What went wrong inside matters more than that this cannot be ended either.
+        # An exception in the block matters more than a failure to close the rollout.
         with suppress(DexTouchError):
             self.close()
 

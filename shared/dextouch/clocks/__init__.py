@@ -1,4 +1,4 @@
-"""Clocks: straight counters, and device time to host time, offline and as samples arrive."""
+"""Clock models: counter unwrapping, and device time to host time, offline and online."""
 
 from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock, lateness_ns
 from dextouch.clocks.counters import TickCounter

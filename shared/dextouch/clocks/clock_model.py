@@ -1,4 +1,4 @@
-"""A take's device stamps and host arrivals in, a map from device time to host time out."""
+"""Clock model that maps device time to host time, fitted offline, with clock steps."""
 
 from dataclasses import dataclass
 
@@ -10,32 +10,32 @@ from dextouch.clocks.steps import find_steps, find_wrong_stamps
 from dextouch.errors import ClockFitError, InvalidInputError
 
 MIN_SAMPLES = 10
-# Even the promptest of so many samples, of a second or more, are late where a fit is wrong.
+# Minimum number of samples of a second (or longer) for the lateness.
 MIN_PROMPT_SAMPLES = 10
 PROMPT_S = 1.0
 LATE_QUANTILE = 0.9
-# One straight line holds for a minute of a crystal's wander; longer takes get a bent one.
+# A straight line fits a minute of crystal drift; longer takes get a piecewise linear model.
 WINDOW_S = 60.0
 # Below this many samples or seconds a segment's own slope is mostly noise.
 MIN_SLOPE_SAMPLES = 50
 MIN_SLOPE_SPAN_S = 1.0
-# Beside a silence a line may hang on two late samples; then it leaves its neighbours by more.
+# Next to a gap a line may rest on two late samples; it then deviates from its neighbours by more.
 MAX_DRIFT_NS_PER_S = 1e6
 SILENCE_S = 1.0
 NEIGHBOURS = 2
 PATH_DELAY_NOTE = (
-    "host times include the stream's smallest path delay, which stamps of one direction cannot "
+    "host times include the stream's smallest path delay, which one-way stamps cannot "
     "show; subtract the calibrated latency_ns"
 )
 
 
 @dataclass(frozen=True)
 class ClockSegment:
-    """Stretch of a take during which the device's clock ran without a step.
+    """Part of a take in which the device's clock ran without a step.
 
-    host = device + reference_offset_ns + (broken line through knots of the offset), where knots
-    are in seconds of device time after `start_device_ns`; beyond the ends the end lines go on.
-    Arrivals from `start_host_ns` on belong to it, but for the first `num_tied` at that very moment.
+    host = device + reference_offset_ns + (piecewise linear through knots of the offset), where
+    knots are in seconds of device time after `start_device_ns`, extrapolated linearly. It covers
+    arrivals from `start_host_ns` on, except the first `num_tied` with that exact stamp.
     """
 
     start_device_ns: int
@@ -61,19 +61,19 @@ class ClockSegment:
 
 @dataclass(frozen=True)
 class ClockModel:
-    """Device time → host time.
+    """Piecewise map from device time to host time.
 
     Attributes:
         segments: in order of arrival; more than one where the device's clock was stepped.
         skew_ppm: how much faster the host's clock runs, mean over all segments.
-        residual_rms_ns: root mean square of arrival minus fitted time: the path's queueing, not
-            the error of the fit (which is far smaller).
-        lateness_ns: how much later than fitted the promptest sample of a second arrives (90 %
-            quantile over all seconds), delays that were found left out. Near zero where the fit
-            is right, on paths with queues, clumps and stalls too.
+        residual_rms_ns: RMS of arrival minus fitted time: queueing on the path, not the error of
+            the fit (which is far smaller).
+        lateness_ns: minimum of arrival minus fitted time within a second (90 % quantile over all
+            seconds), excluding detected delays. Near zero for a good fit, even on paths with
+            queueing, bursts and stalls.
         has_unsure_stops: whether a stop of the device's clock may have been a delay, or a delay at
             the end of the take a stop.
-        path_delay_note: what these host times still contain.
+        path_delay_note: offset that these host times still contain.
     """
 
     segments: tuple[ClockSegment, ...]
@@ -85,12 +85,12 @@ class ClockModel:
 
     @property
     def num_steps(self) -> int:
-        """How often the device's clock was stepped or restarted."""
+        """Number of steps and restarts of the device's clock."""
         return len(self.segments) - 1
 
     @property
     def is_ambiguous(self) -> bool:
-        """Whether the device's clock went back, so that one device time means two moments."""
+        """Whether the device's clock went back, so that a device time can have two host times."""
         stops = [segment.stop_device_ns for segment in self.segments[:-1]]
         starts = [segment.start_device_ns for segment in self.segments[1:]]
         return any(start <= stop for stop, start in zip(stops, starts, strict=True))
@@ -102,9 +102,8 @@ class ClockModel:
 
         Args:
             t_device_ns: unwrapped device stamps, int64.
-            t_host_ns: arrival of each, needed only where the device's clock went back: it tells
-                which stretch a stamp belongs to. No sample is dated after its arrival, whatever
-                its stamp says.
+            t_host_ns: arrival of each, needed only if the device's clock went back, to select the
+                segment. No sample is dated after its arrival.
 
         Raises:
             InvalidInputError: the device's clock went back and no arrivals are given.
@@ -134,17 +133,17 @@ class ClockModel:
 
 
 def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
-    """Fit device time → host time on a whole take by the lower convex hull, looking both ways.
+    """Fit a clock model to a whole take by the lower convex hull, non-causally.
 
     Args:
         t_device_ns: unwrapped device stamps [n], in order of arrival. Steps and restarts of the
-            device's clock are found and fitted piece by piece.
+            device's clock are detected, and segments fitted separately.
         t_host_ns: arrivals [n] on the host's monotonic clock.
 
     Raises:
         ClockFitError: `details["cause"]` is "too_few" (below 10 samples), "not_finite" (no
-            integers), "not_increasing" (arrivals go back, or device stamps run back more often
-            than a clock is stepped) or "length" (unequal lengths).
+            integers), "not_increasing" (arrivals go back, or device stamps go back more often than
+            clock steps explain) or "length" (unequal lengths).
     """
     device, host = _checked(t_device_ns, t_host_ns)
     right = np.delete(np.arange(len(device)), find_wrong_stamps(device))
@@ -176,10 +175,10 @@ def fit_clock(t_device_ns: np.ndarray, t_host_ns: np.ndarray) -> ClockModel:
 
 
 def lateness_ns(residual_ns: np.ndarray, host: np.ndarray) -> float:
-    """How much later than fitted the promptest sample of a second is, 90 % quantile over seconds.
+    """Minimum of arrival minus fitted time within a second, 90 % quantile over all seconds.
 
-    Queues, clumps and stalls let some samples through in time; only where the fit is wrong, or a
-    delay lasts, all of them are late.
+    Queueing, bursts and stalls let some samples through promptly; only with a wrong fit or a
+    lasting delay are all of them late.
 
     Args:
         residual_ns: arrival minus fitted time of every sample.
@@ -227,7 +226,7 @@ def _refusal(cause: str, text: str) -> ClockFitError:
 
 
 def _offsets(device: np.ndarray, host: np.ndarray) -> tuple[list[float], list[float], int]:
-    """Seconds of device time, apparent offsets in ns, and the int64 taken away from the latter."""
+    """Seconds of device time, apparent offsets in ns, and the subtracted int64 reference."""
     reference_ns = int(host[0] - device[0])
     x = (device - device[0]).astype(np.float64) * 1e-9
     y = (host - device - reference_ns).astype(np.float64)
@@ -242,7 +241,7 @@ def _hull(x: list[float], y: list[float]) -> LowerHull:
 
 
 def _slope(device: np.ndarray, host: np.ndarray) -> float | None:
-    """Drift of a segment in ns per second, or None where it is too short to tell."""
+    """Drift of a segment in ns per second; None if it is too short."""
     if len(device) < MIN_SLOPE_SAMPLES or device[-1] - device[0] < MIN_SLOPE_SPAN_S * 1e9:
         return None
     x, y, _ = _offsets(device, host)
@@ -252,7 +251,7 @@ def _slope(device: np.ndarray, host: np.ndarray) -> float | None:
 def _fit_segment(
     device: np.ndarray, host: np.ndarray, points: np.ndarray, slope: float | None
 ) -> ClockSegment:
-    """The first and the last of `points` are those of the segment; it may have more between."""
+    """Fit one segment to a subset of its samples that includes its first and last one."""
     first = points[0]
     x, y, reference_ns = _offsets(device[points], host[points])
     knots = _knots(x, y) if slope is None else _straight(x, _hull(x, y).line_of_slope(slope))
@@ -273,7 +272,7 @@ def _straight(x: list[float], line: Line) -> list[tuple[float, float]]:
 
 
 def _knots(x: list[float], y: list[float]) -> list[tuple[float, float]]:
-    """Centres of half-overlapping windows, each with its supporting line's value, and the ends."""
+    """Knots at the ends and at the centres of half-overlapping windows, on supporting lines."""
     span_s = x[-1]
     num_windows = max(1, int(np.ceil((span_s - WINDOW_S) / (WINDOW_S / 2))) + 1)
     if num_windows == 1:
@@ -282,7 +281,7 @@ def _knots(x: list[float], y: list[float]) -> list[tuple[float, float]]:
     for start_s in np.linspace(0, span_s - WINDOW_S, num_windows):
         a, b = np.searchsorted(x, [start_s, start_s + WINDOW_S])
         if b - a >= MIN_SAMPLES:
-            # Where samples are missing, the window's own middle may lie beside its last one.
+            # With missing samples, the centre of a window may lie beyond its last one.
             middle_s, hull = (x[a] + x[b - 1]) / 2, _hull(x[a:b], y[a:b])
             fits.append((middle_s, hull, bool(np.diff(x[a:b]).max() > SILENCE_S)))
     if not fits:

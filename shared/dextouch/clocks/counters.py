@@ -1,11 +1,11 @@
-"""A sample's stamps as a device sent them in, one straight device time in nanoseconds out."""
+"""Conversion of a sample's wrapping stamps or sequence numbers to continuous device time."""
 
 from typing import Literal, Protocol, runtime_checkable
 
 from dextouch.errors import InvalidInputError
 
 ABSENT = -1
-# Stamps coarser than this share of the sample period say less than counting samples does.
+# Stamps coarser than this share of the sample period are less accurate than counting samples.
 COARSE_SHARE = 0.25
 
 Source = Literal["device", "sequence", "arrival"]
@@ -13,7 +13,7 @@ Source = Literal["device", "sequence", "arrival"]
 
 @runtime_checkable
 class Capabilities(Protocol):
-    """What `dextouch.streams.descriptors.ClockCapabilities` tells about a device's counters."""
+    """Counter properties of a device, see `dextouch.streams.descriptors.ClockCapabilities`."""
 
     @property
     def sequence_bits(self) -> int:
@@ -30,18 +30,18 @@ class Capabilities(Protocol):
 
 @runtime_checkable
 class ClockSource(Protocol):
-    """The part of a stream's descriptor that a clock needs."""
+    """Clock-related part of a stream's descriptor."""
 
     @property
     def capabilities(self) -> Capabilities:
         """Counters of the device."""
 
     def period_ns(self) -> int:
-        """Nominal distance of two samples."""
+        """Nominal sample period."""
 
 
 class TickCounter:
-    """A wrapping counter of ticks that are no whole nanoseconds (48 MHz), made straight.
+    """Unwraps a counter whose ticks are not whole nanoseconds (48 MHz).
 
     Args:
         bits: width of the counter.
@@ -59,10 +59,10 @@ class TickCounter:
         self._last: tuple[int, int] | None = None
 
     def to_ns(self, count: int, t_host_ns: int) -> int:
-        """Device time in ns, exact and without wraps, of a count that arrived at a host time.
+        """Exact, unwrapped device time in ns of a count that arrived at a host time.
 
         Raises:
-            InvalidInputError: a count that the counter cannot hold.
+            InvalidInputError: a count outside the counter's range.
         """
         if not 0 <= count < self._modulus:
             raise InvalidInputError(
@@ -77,10 +77,10 @@ class TickCounter:
 
 
 class DeviceCounter:
-    """What a device says of time, made straight: its stamps, else its numbers times its period.
+    """Continuous device time from stamps, or else from sequence numbers times the period.
 
-    Which of them is decided by the first sample: the stamp where there is one, unless it is
-    coarser than a quarter of the period and samples are numbered.
+    The first sample decides: stamps if present, unless they are coarser than a quarter of the
+    period and samples are numbered.
 
     Args:
         descriptor: the stream's descriptor; needed for counters that wrap, for the resolution
@@ -97,18 +97,18 @@ class DeviceCounter:
 
     @property
     def source(self) -> Source | None:
-        """What device time is made of; None before the first sample."""
+        """Source of device time; None before the first sample."""
         return self._source
 
     @property
     def resolution_ns(self) -> int:
-        """How coarse the straight device time is: it is cut down to multiples of this."""
+        """Resolution of device time, which is truncated to multiples of this."""
         return self._resolution_ns
 
     def straighten(
         self, t_host_ns: int, t_device_ns: int | None, sequence: int | None
     ) -> int | None:
-        """Device time of one sample, in ns; None where the device tells nothing.
+        """Device time of one sample, in ns; None if the device provides no counter.
 
         Raises:
             InvalidInputError: a stamp or number that earlier samples had is missing.
@@ -153,16 +153,16 @@ class DeviceCounter:
 
 
 def nearest_congruent(count: int, expected: int, modulus: int) -> int:
-    """The number nearest to the expected one that leaves the count when it wraps."""
+    """The number nearest to `expected` that is congruent to `count` modulo `modulus`."""
     half = modulus // 2
     return expected + (count - expected + half) % modulus - half
 
 
 def prefers_sequence(tick_ns: int, period_ns: int) -> bool:
-    """Whether stamps are so coarse that numbering samples dates them better."""
+    """Whether stamps are so coarse that sequence numbers are the better clock."""
     return tick_ns > COARSE_SHARE * period_ns
 
 
 def _modulus(bits: int, unit_ns: int) -> int | None:
-    """Nanoseconds after which the device's counter starts again, if ever."""
+    """Period of the counter's wraparound in ns; None if it never wraps."""
     return None if bits > 62 else 2**bits * unit_ns

@@ -1,7 +1,7 @@
-"""Arrivals of samples without stamps in; how many got lost between them, and their times, out.
+"""Clock of a steady device without stamps: counts samples, detects losses by looking ahead.
 
-Such a device's clock is its sample count. Whether a late sample is late, or the one before it was
-lost, only the samples behind it tell: the earliest of the next ten has hardly waited.
+The clock of such a device is its sample count. Whether a sample is late, or the one before it was
+lost, is decided from the following samples: the promptest of the next ten has hardly been delayed.
 """
 
 from collections import deque
@@ -19,23 +19,23 @@ LOOK_AHEAD = 10
 # A sample counts as lost where everything behind is later by nearly a period: delays are common,
 # losses are rare.
 LOST_SHARE = 0.75
-# While a queue drains the answer may have to wait for so many times more samples.
+# While a queue drains, the look-ahead may be extended by this factor.
 MAX_WAIT = 6
 # A device whose samples are counted must be a steady one. Beyond these its nominal rate is wrong
 # or it samples when it likes, and its arrivals say more.
 MAX_STEADY_SKEW_PPM = 20_000.0
 MAX_STEADY_LOSS = 0.1
 MAX_STEPS_PER_SAMPLE = 0.001
-# Provisional times believe in a loss after so many late samples.
+# Provisional times assume a loss after this many late samples.
 LOOK_BACK = 3
 
 
 class CountedSample(NamedTuple):
-    """One sample without a stamp.
+    """A counted sample.
 
     Attributes:
-        number: as the device must have counted, 0 for the first.
-        t_host_ns: when it left the device, on the host's clock.
+        number: inferred sample number, 0 for the first.
+        t_host_ns: time at which it left the device, on the host's clock.
     """
 
     number: int
@@ -43,20 +43,20 @@ class CountedSample(NamedTuple):
 
 
 class CountingUpdate(NamedTuple):
-    """What an arrival brings: its own provisional time, and final ones of older samples."""
+    """Result of an update: the sample's provisional time, and final times of older samples."""
 
     provisional_ns: int
     final: tuple[CountedSample, ...]
 
 
 class CountingClock:
-    """Dates the samples of a steady device that sends neither time nor sequence numbers.
+    """Estimates the times of samples of a steady device without stamps and sequence numbers.
 
-    Final times come `look_ahead` samples later, or once a queue has drained; a provisional one
-    comes at once.
+    Final times are available `look_ahead` samples later, or once a queue has drained; a provisional
+    one at once.
 
     Args:
-        period_ns: nominal distance of two samples, right within a few percent.
+        period_ns: nominal sample period, accurate within a few percent.
         look_ahead: samples to wait for.
     """
 
@@ -78,22 +78,22 @@ class CountingClock:
 
     @property
     def num_lost(self) -> int:
-        """Samples that never arrived, as far as final times go."""
+        """Number of lost samples, up to the last final time."""
         return self._num_lost
 
     @property
     def num_steps(self) -> int:
-        """Restarts of the device, and losses that were miscounted and mended."""
+        """Number of device restarts and of corrected miscounts."""
         return self._envelope.num_steps
 
     @property
     def skew_ppm(self) -> float:
-        """How much longer a sample period is than the nominal one."""
+        """Relative excess of the sample period over the nominal one, in ppm."""
         return self._envelope.slope_ns_per_s * 1e-3
 
     @property
     def is_steady(self) -> bool:
-        """Whether the device samples so steadily that counting dates it better than arrivals."""
+        """Whether the device is so steady that counting is more accurate than arrival times."""
         num_arrived = self._index + 1 - self._num_lost
         return (
             abs(self.skew_ppm) <= MAX_STEADY_SKEW_PPM
@@ -102,19 +102,19 @@ class CountingClock:
         )
 
     def update(self, t_host_ns: int) -> CountingUpdate:
-        """Take in one arrival on the host's monotonic clock.
+        """Add one arrival on the host's monotonic clock.
 
         Raises:
-            InvalidInputError: it lies before the one before.
+            InvalidInputError: it precedes the last arrival.
         """
         final = self.advance(t_host_ns)
         return CountingUpdate(self._provisional_ns(t_host_ns), final)
 
     def advance(self, t_host_ns: int) -> tuple[CountedSample, ...]:
-        """As `update`, for those who need final times only.
+        """Like `update`, but returns final times only.
 
         Raises:
-            InvalidInputError: the arrival lies before the one before.
+            InvalidInputError: it precedes the last arrival.
         """
         if self._waiting and t_host_ns < self._waiting[-1]:
             raise InvalidInputError(
@@ -130,12 +130,12 @@ class CountingClock:
         return tuple(final)
 
     def flush(self) -> tuple[CountedSample, ...]:
-        """Final times of the samples that still wait, with what little lies ahead of them."""
+        """Final times of the pending samples, with less than the full look-ahead."""
         decided = (self._decide(is_last_chance=True) for _ in range(len(self._waiting)))
         return tuple(sample for sample in decided if sample is not None)
 
     def _lateness_ns(self, first: int, last: int) -> list[float]:
-        """How much later some waiting samples came than they could have, were none lost."""
+        """Delay of pending samples if none were lost."""
         start_ns = self._start_ns if self._start_ns is not None else 0
         period_ns = self._period_ns * (1 + self._envelope.slope_ns_per_s * 1e-9)
         x_ns = (self._index + 1) * self._period_ns
@@ -144,7 +144,7 @@ class CountingClock:
         return [waiting[k] - origin_ns - k * period_ns for k in range(first, last)]
 
     def _num_lost_before(self, *, is_last_chance: bool) -> int | None:
-        """Samples lost before the oldest that waits; None while that cannot be told."""
+        """Number of samples lost before the oldest pending one; None while undecided."""
         if self._index < 0:
             return 0
         threshold_ns = LOST_SHARE * self._period_ns
@@ -154,7 +154,7 @@ class CountingClock:
         least_ns = min(late_ns)
         if least_ns < threshold_ns:
             return 0
-        # A queue that still drains: what comes next will have waited less.
+        # A queue that is still draining: the following samples are delayed less.
         draining = late_ns[-1] <= least_ns
         if draining and not is_last_chance and len(late_ns) < MAX_WAIT * self._look_ahead:
             return None
@@ -176,7 +176,7 @@ class CountingClock:
         return CountedSample(self._index, final_ns)
 
     def _provisional_ns(self, t_host_ns: int) -> int:
-        """When the newest sample left if the last few tell of losses, without looking ahead."""
+        """Provisional time of the newest sample, from past samples only."""
         estimate_ns = t_host_ns
         if self._index >= 0 and self._waiting:
             num = len(self._waiting)
@@ -192,15 +192,15 @@ class CountingClock:
 
 @dataclass(frozen=True)
 class CountedTake:
-    """A whole take of samples without stamps, dated.
+    """Estimated times of a whole take without stamps.
 
     Attributes:
-        number: of each sample as the device must have counted, 0 for the first.
-        t_host_ns: when each left the device, on the host's clock, strictly increasing.
-        skew_ppm: how much longer a sample period is than the nominal one, at the end.
-        num_lost: samples that never arrived.
-        num_steps: restarts of the device, and losses that were miscounted and mended.
-        is_steady: whether these times are better than the arrivals.
+        number: inferred sample numbers, 0 for the first.
+        t_host_ns: times at which samples left the device, on the host's clock, strictly increasing.
+        skew_ppm: relative excess of the sample period over the nominal one, at the end.
+        num_lost: number of lost samples.
+        num_steps: number of device restarts and of corrected miscounts.
+        is_steady: whether these times are more accurate than the arrivals.
     """
 
     number: Int64[np.ndarray, " n"]
@@ -214,12 +214,12 @@ class CountedTake:
 def date_by_counting(
     t_host_ns: np.ndarray, *, period_ns: int, look_ahead: int = LOOK_AHEAD
 ) -> CountedTake:
-    """Date the samples of a steady device by their arrivals alone.
+    """Estimate the sample times of a steady device from its arrivals alone.
 
     Args:
         t_host_ns: arrivals [n] in order, int64.
-        period_ns: nominal distance of two samples, right within a few percent.
-        look_ahead: samples to look ahead.
+        period_ns: nominal sample period, accurate within a few percent.
+        look_ahead: number of samples to look ahead.
 
     Raises:
         InvalidInputError: arrivals out of order.

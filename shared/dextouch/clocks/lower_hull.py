@@ -1,4 +1,4 @@
-"""Points of (device time, apparent offset) in, the line under them out: delay only ever adds.
+"""Lower convex hull of (device time, apparent offset) points, the basis of clock fits.
 
 A sample cannot arrive before it was sent, so the true offset between two clocks lies on the
 lower edge of the cloud of apparent offsets (Moon, Skelly, Towsley 1999; Zhang, Liu, Xia 2002).
@@ -27,7 +27,7 @@ class Line(NamedTuple):
 
 
 class LowerHull:
-    """Lower convex hull of points that come in order of x; old ones can be forgotten.
+    """Incremental lower convex hull of points in order of x; old points can be removed.
 
     Holds at most `MAX_VERTICES` vertices: beyond that every second inner one is dropped.
     """
@@ -43,7 +43,7 @@ class LowerHull:
         return iter(self._vertices)
 
     def moved(self, x_s: float, y_ns: float) -> "LowerHull":
-        """A hull of the same points, all of them moved by as much."""
+        """A hull of the same points, translated."""
         hull = LowerHull()
         hull._vertices = deque((x + x_s, y + y_ns) for x, y in self._vertices)
         return hull
@@ -54,7 +54,7 @@ class LowerHull:
         return self._vertices[-1][0] - self._vertices[0][0] if self._vertices else 0.0
 
     def add(self, x_s: float, y_ns: float) -> None:
-        """Take in a point; its x must not lie before the last one's."""
+        """Add a point; its x must not precede the last one's."""
         vertices = self._vertices
         if vertices and vertices[-1][0] == x_s:
             y_ns = min(y_ns, vertices.pop()[1])
@@ -77,7 +77,7 @@ class LowerHull:
     def supporting_line(self, x_s: float) -> Line:
         """The hull's edge that spans `x_s` (outside the points: the nearest edge).
 
-        A single vertex gives a level line.
+        A single vertex gives a horizontal line.
         """
         vertices = self._vertices
         if len(vertices) < 2:

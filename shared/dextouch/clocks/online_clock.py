@@ -1,21 +1,20 @@
-"""Samples as they arrive in, their time on the host's clock out: causal, monotonic, bounded."""
+"""Online clock that estimates host times of samples as they arrive: causal and monotonic."""
 
 from dextouch.clocks.counters import ClockSource, DeviceCounter, Source
 from dextouch.clocks.running_envelope import MIN_SLOPE_SPAN_S, RunningEnvelope
 
-# A nominal rate can be off by percents, a crystal by some ten ppm: counted samples need a slope
-# sooner than stamped ones.
+# A nominal rate can be off by percents, a crystal by tens of ppm: counted samples need a slope
+# earlier than stamped ones.
 COUNTED_SLOPE_SPAN_S = 0.5
 
 
 class OnlineClock:
-    """Running estimate of when each sample left its device, on the host's clock.
+    """Running estimate of the time at which each sample left its device, on the host's clock.
 
-    The line under the (device time, apparent offset) points of the last minute, as in
-    `fit_clock`, but looking back only (`RunningEnvelope`). Without device time, or where it is
-    very coarse, the sequence number times the nominal period is the device's clock; without
-    either the arrival itself is returned (`CountingClock` dates such samples better, a little
-    later).
+    The line under the (device time, apparent offset) points of the last minute, as in `fit_clock`,
+    but causal (`RunningEnvelope`). Without device time, or where it is very coarse, the sequence
+    number times the nominal period is the device's clock; without either, the arrival itself is
+    returned (`CountingClock` is more accurate for such samples, with a delay).
 
     Args:
         descriptor: the stream's descriptor; needed for wrapping or coarse stamps and for streams
@@ -31,7 +30,7 @@ class OnlineClock:
 
     @property
     def source(self) -> Source | None:
-        """What the clock runs on: device, sequence or arrival; None before the first sample."""
+        """Source of the clock: device, sequence or arrival; None before the first sample."""
         return self._counter.source
 
     @property
@@ -46,18 +45,18 @@ class OnlineClock:
 
     @property
     def spread_ns(self) -> float:
-        """How long samples wait on their way beyond the smallest delay, in the recent mean."""
+        """Recent mean of the path delay above its minimum."""
         return 0.0 if self._envelope is None else self._envelope.spread_ns
 
     def update(
         self, *, t_host_ns: int, t_device_ns: int | None = None, sequence: int | None = None
     ) -> int:
-        """Corrected host time of one sample, strictly later than the one before.
+        """Corrected host time of one sample, strictly increasing.
 
         Args:
             t_host_ns: arrival on the host's monotonic clock.
-            t_device_ns: the device's stamp as it came (wrapping as the descriptor says); None or
-                -1 where the device gives none.
+            t_device_ns: the device's raw stamp (wrapping as in the descriptor); None or -1 if the
+                device has none.
             sequence: the device's sequence number; None or -1 likewise.
 
         Raises:
@@ -83,6 +82,6 @@ class OnlineClock:
         since_ns = device_ns - self._device_start_ns
         ahead_ns = t_host_ns - device_ns - self._reference_ns
         offset_ns = envelope.add(since_ns * 1e-9, float(ahead_ns), (since_ns + ahead_ns) * 1e-9)
-        # A stamp is cut down to whole ticks: on average the sample lies half a tick later. The line
-        # does not see it, as it hangs on the stamps that were cut least.
+        # Stamps are truncated to whole ticks: on average the sample is half a tick later. The line
+        # does not show it, since it is determined by the stamps with the smallest truncation.
         return device_ns + self._reference_ns + round(offset_ns) + self._counter.resolution_ns // 2

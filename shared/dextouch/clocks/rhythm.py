@@ -1,25 +1,25 @@
-"""Distances of a device's stamps in; its sample period, where it keeps one, out."""
+"""Sample period of a device, learned from the distances of its stamps."""
 
 from statistics import fmean, median
 
 LEARNED_DISTANCES = 32
-# So many of the learned distances must be one period long; the others are lost samples.
+# Minimum share of distances that are one period long; the others are lost samples.
 MIN_REGULAR_SHARE = 0.75
 NEAR_SHARE = 0.05
 RATE = 0.01
-# The stamps of a regular device are this near to its period in the mean.
+# Maximum mean deviation from the period for a regular device.
 MAX_SCATTER_S = 100e-6
 ODD_S = 100e-6
 ODD_SCATTERS = 5.0
-# After so many odd distances in a row the period is learned again.
+# After this many irregular distances in a row, the period is learned again.
 MAX_ODD = 8
 
 
 class Rhythm:
-    """How far apart a device's stamps are.
+    """Regularity of a device's stamps.
 
-    A device that samples by a timer stamps at whole periods, lost samples or not. Only a jump of
-    its clock, or a restart of the timer, makes a distance of two stamps odd.
+    The stamps of a timer-driven device are whole periods apart, even with lost samples. Only a jump
+    of its clock, or a restart of the timer, gives an irregular distance.
     """
 
     def __init__(self) -> None:
@@ -30,13 +30,13 @@ class Rhythm:
 
     @property
     def period_s(self) -> float | None:
-        """Distance of two samples by the device's clock; None while unknown, or irregular."""
+        """Sample period by the device's clock; None while unknown or irregular."""
         if self._period_s > 0.0 and self._scatter_s <= MAX_SCATTER_S:
             return self._period_s
         return None
 
     def is_odd(self, distance_s: float) -> bool:
-        """Whether a regular device's distance is no whole number of periods."""
+        """Whether a distance is not a whole number of periods of a regular device."""
         period_s = self.period_s
         if period_s is None:
             return False
@@ -44,7 +44,7 @@ class Rhythm:
         return abs(distance_s - num * period_s) > ODD_S + ODD_SCATTERS * self._scatter_s
 
     def is_kept(self, distance_s: float) -> bool:
-        """Whether a distance is one period of a regular device: no jump, nothing lost."""
+        """Whether a distance is exactly one period of a regular device: no jump, no loss."""
         period_s = self.period_s
         return (
             period_s is not None
@@ -53,7 +53,7 @@ class Rhythm:
         )
 
     def add(self, distance_s: float) -> None:
-        """Take in the next distance, of whatever sign."""
+        """Add the next distance, of either sign."""
         if self._period_s <= 0.0:
             self._learn(distance_s)
             return

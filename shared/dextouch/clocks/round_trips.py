@@ -1,10 +1,10 @@
-"""Questions and answers between two clocks in, the offset between them with its sigma out.
+"""Clock offset between two hosts from round-trip exchanges, with its standard deviation.
 
-The way there bounds the offset from above, the way back from below: remote minus local lies
-between (answer sent - answer received) and (question received - question sent). Over many exchanges
-the quickest ways of either direction leave a narrow band (as NTP does with the least round trip,
-here with drift: Zhang, Liu, Xia 2002). Where in the band the offset lies, the exchanges cannot
-show, since the two ways may differ; the sigma says so.
+The forward path bounds the offset from above, the return path from below: remote minus local lies
+between (reply sent - reply received) and (request received - request sent). Over many exchanges the
+fastest paths of either direction leave a narrow band (as NTP does with the minimum round trip, here
+with drift: Zhang, Liu, Xia 2002). The position within the band is unobservable, since the two path
+delays may differ; sigma accounts for it.
 """
 
 import math
@@ -14,19 +14,19 @@ from dextouch.clocks.lower_hull import LowerHull
 from dextouch.errors import ClockFitError, InvalidInputError
 
 WINDOW_S = 600.0
-# Two crystals differ by less; a slope of their own needs a stretch of exchanges.
+# Upper bound of the drift between two crystals; estimating it needs a span of exchanges.
 MAX_SKEW_PPM = 100.0
 MIN_SLOPE_SPAN_S = 30.0
 MIN_SLOPE_EXCHANGES = 10
-# A number anywhere in a band is known with its half width over the root of three.
+# The standard deviation of a uniform distribution is its half width over the root of three.
 BAND_SIGMA = 1 / math.sqrt(12)
 
 
 @dataclass(frozen=True)
 class RoundTrip:
-    """One exchange: question sent and answer received by the local clock, the rest by the remote.
+    """One exchange: request sent and reply received on the local clock, the rest on the remote.
 
-    A device that only tells its time has both remote stamps equal.
+    A device that only reports its time has two equal remote stamps.
     """
 
     sent_ns: int
@@ -36,7 +36,7 @@ class RoundTrip:
 
     @property
     def delay_ns(self) -> int:
-        """Time on the way, both ways together."""
+        """Round-trip delay without the remote's processing time."""
         return self.received_ns - self.sent_ns - (self.remote_sent_ns - self.remote_received_ns)
 
 
@@ -45,8 +45,8 @@ class ClockOffset:
     """Remote clock minus local clock at one local time.
 
     Attributes:
-        sigma_ns: standard deviation; the two ways may differ by anything.
-        delay_ns: least time on the way, both ways together: the offset's band.
+        sigma_ns: standard deviation, for arbitrary asymmetry of the path delays.
+        delay_ns: minimum round-trip delay, the width of the offset's band.
         skew_ppm: how much faster the remote clock runs.
     """
 
@@ -59,7 +59,7 @@ class ClockOffset:
 
 @dataclass(frozen=True)
 class PathLatency:
-    """Constant delay between a sample and its stamp on the host's clock."""
+    """Constant latency between a sample and its stamp on the host's clock."""
 
     latency_ns: int
     sigma_ns: float
@@ -74,11 +74,11 @@ class KnownSkew:
 
 
 class RoundTripClock:
-    """Offset between the local clock and a remote one that answers.
+    """Estimates the offset between the local clock and a remote one that replies to requests.
 
-    For a device (its stamps minus the host's clock) as for another host (its clock against the
-    station's reference clock). A remote clock that is stepped by more than the band is found at
-    once and starts the estimate anew; memory is bounded.
+    Used for devices (stamps against the host's clock) and for other hosts (their clock against the
+    station's reference clock). A step of the remote clock by more than the band is detected at once
+    and restarts the estimate; memory is bounded.
 
     Args:
         resolution_ns: of the remote stamps.
@@ -94,12 +94,12 @@ class RoundTripClock:
 
     @property
     def num_steps(self) -> int:
-        """How often the remote clock was stepped."""
+        """Number of steps of the remote clock."""
         return self._num_steps
 
     @property
     def num_exchanges(self) -> int:
-        """Exchanges since the last step."""
+        """Number of exchanges since the last step."""
         return self._num_exchanges
 
     def _start(self) -> None:
@@ -107,10 +107,10 @@ class RoundTripClock:
         self._num_exchanges = 0
 
     def add(self, exchange: RoundTrip) -> None:
-        """Take in one exchange; they come in the order of their questions.
+        """Add one exchange, in order of the requests.
 
         Raises:
-            InvalidInputError: an answer before its question, or out of order.
+            InvalidInputError: a reply before its request, or out of order.
         """
         if exchange.received_ns < exchange.sent_ns or exchange.sent_ns < self._last_ns:
             raise InvalidInputError(
@@ -142,11 +142,11 @@ class RoundTripClock:
     def estimate(
         self, at_local_ns: int | None = None, *, skew: KnownSkew | None = None
     ) -> ClockOffset:
-        """The offset at a local time; without one, at the last exchange.
+        """Offset at a local time; by default at the last exchange.
 
         Args:
             at_local_ns: any local time.
-            skew: what something else tells of it; used where the exchanges know it less.
+            skew: estimate from another source, used if more accurate than that of the exchanges.
 
         Raises:
             ClockFitError: no exchange yet (`details["cause"]` is "too_few").
@@ -172,12 +172,12 @@ class RoundTripClock:
     def latency(
         self, *, t_remote_ns: int, t_estimated_ns: int, skew: KnownSkew | None = None
     ) -> PathLatency:
-        """The path delay that is still in a device's corrected times.
+        """Path latency that is still contained in a device's corrected times.
 
         Args:
             t_remote_ns: a sample's device time.
             t_estimated_ns: the same sample's time by `OnlineClock` or `fit_clock`.
-            skew: of the remote clock, as samples tell it.
+            skew: of the remote clock, as estimated from samples.
         """
         offset = self.estimate(t_estimated_ns, skew=skew)
         true_ns = t_remote_ns - offset.offset_ns
@@ -188,7 +188,7 @@ class RoundTripClock:
         return (at_local_ns - start_ns) * 1e-9
 
     def _slope(self) -> tuple[float, float]:
-        """Drift in ns per second, and how well it is known."""
+        """Drift in ns per second, and its uncertainty."""
         span_s = min(self._upper.span_s, self._lower.span_s)
         if span_s < MIN_SLOPE_SPAN_S or self._num_exchanges < MIN_SLOPE_EXCHANGES:
             return 0.0, MAX_SKEW_PPM * 1e3 * BAND_SIGMA * 2
@@ -198,18 +198,18 @@ class RoundTripClock:
         return (above + below) / 2, abs(above - below) / 2
 
     def _band_ns(self, x_s: float, slope: float) -> tuple[float, float]:
-        """Highest and lowest offset that the exchanges allow."""
+        """Upper and lower bound of the offset."""
         high_ns = self._upper.line_of_slope(slope).at(x_s)
         low_ns = -self._lower.line_of_slope(-slope).at(x_s)
         return high_ns, low_ns
 
     def _age_s(self, x_s: float, slope: float) -> float:
-        """How far from the exchanges that hold the band."""
+        """Distance in time from the exchanges that define the band."""
         held = (self._upper.line_of_slope(slope), self._lower.line_of_slope(-slope))
         return max(abs(x_s - line.x_at_s) for line in held)
 
     def _contradicts(self, x_s: float, high_ns: float, low_ns: float) -> bool:
-        """Whether an exchange lies wholly outside the band that the others allow."""
+        """Whether an exchange lies entirely outside the band of the others."""
         slope, doubt = self._slope()
         band_high_ns, band_low_ns = self._band_ns(x_s, slope)
         slack_ns = 2 * doubt * self._age_s(x_s, slope) + self._resolution_ns

@@ -1,7 +1,7 @@
-"""Points of (device time, apparent offset) as they come in, the line under the last minute out.
+"""Causal lower envelope of apparent clock offsets over the last minute, with step detection.
 
-The line looks back only. It tells delays from steps of the device's clock: a delay only ever adds
-and ends; a step may go either way and stays.
+It distinguishes delays from steps of the device's clock: a delay is positive and transient, a step
+has either sign and persists.
 """
 
 import math
@@ -11,36 +11,36 @@ from dextouch.clocks.lower_hull import Line, LowerHull
 from dextouch.clocks.rhythm import Rhythm
 
 WINDOW_S = 60.0
-# Below this span the slope of before the last step is kept (at the start: 0).
+# Below this span the slope from before the last step is kept (initially 0).
 MIN_SLOPE_SPAN_S = 3.0
-# So many points make a slope, however long they span.
+# This many points determine a slope, whatever their span.
 MIN_SLOPE_POINTS = 30
-# A slope that was fitted over so long is better than one of a shorter stretch after a step.
+# A slope fitted over this span is better than one of a shorter span after a step.
 GOOD_SLOPE_SPAN_S = 20.0
-# Within its first second the line may still hang on one late sample, and cannot show a step.
+# In its first second the line may still rest on a single late sample, and cannot reveal a step.
 SETTLED_S = 1.0
 STEP_NS = 1_000_000.0
-# How far single samples stand above the line is a matter of the path: thresholds grow with it.
+# The spread above the line depends on the path: thresholds scale with it.
 LATE_SPREADS = 0.5
 EARLY_SPREADS = 0.25
-# Until the slope is known.
+# While the slope is unknown.
 UNSURE_STEP_NS = 4_000_000.0
 UNSURE_SPREADS = 4.0
 CONFIRM_S = 1.0
-# Where the stamps of a regular device kept their distance all the while, its clock did not jump:
-# the host is busy, and may be for so long before the path is believed to have become longer.
+# If the stamps of a regular device kept their distance, its clock did not jump: the host is busy.
+# After this time the path delay is assumed to have increased.
 BUSY_S = 10.0
-# So many in a row are late by half the mean delay or more only where all of them are.
+# This many in a row are late by half the mean delay or more only if all of them are.
 MIN_CONFIRM_SAMPLES = 30
-# Samples that were merely late may have come before the step itself.
+# Late samples may have arrived before the step itself.
 DOUBTFUL_S = 0.4
 SPREAD_RATE = 0.005
-# Which whole number of periods a step left out shows only where samples wait less than a period.
+# The number of whole periods of a step is determined only if delays are below a period.
 MIN_PERIOD_SPREADS = 4.0
 MAX_PERIODS = 100
-# A moved line may lie so much of a period above the first point.
+# A shifted line may lie this share of a period above the first point.
 BELOW_SHARE = 0.1
-# A line that was moved by what the stamps tell must soon be met by points, and undercut by none.
+# Points must soon reach a shifted line, and none may fall below it.
 TRIAL_SAMPLES = 1000
 MIN_TRIAL_SAMPLES = 2
 TRIAL_NS = 100_000.0
@@ -49,15 +49,15 @@ TRIAL_BELOW_SPREADS = 0.1
 
 
 class _Trial:
-    """Whether a line that was moved at a step lies where the points since then want it.
+    """Check whether a line that was shifted at a step agrees with the points since then.
 
-    A device that was restarted samples at other moments than before; then it does not, and the
-    points since the step are all that is known.
+    A restarted device samples at another phase; then it does not agree, and only the points since
+    the step are valid.
 
     Args:
         hull: of the points since the step.
-        num: of these points.
-        least_ns: how near they come to the moved line.
+        num: number of these points.
+        least_ns: their minimum distance to the shifted line.
     """
 
     def __init__(self, hull: LowerHull, num: int = 0, least_ns: float = math.inf) -> None:
@@ -67,11 +67,11 @@ class _Trial:
 
     @property
     def is_over(self) -> bool:
-        """Whether enough points agree."""
+        """Whether enough points confirm the line."""
         return self._num >= TRIAL_SAMPLES
 
     def fails(self, x_s: float, y_ns: float, residual_ns: float, spread_ns: float) -> bool:
-        """Take in a point; whether the moved line is refuted: the nearest of n lies near."""
+        """Add a point; whether the shifted line is refuted: the nearest of n must lie near it."""
         self.hull.add(x_s, y_ns)
         self._num += 1
         self._least_ns = min(self._least_ns, residual_ns)
@@ -82,29 +82,28 @@ class _Trial:
 
 
 class _Odd(NamedTuple):
-    """Two stamps that are no whole number of periods apart: device time of the later, distance."""
+    """Two stamps at an irregular distance: device time of the later one, distance."""
 
     x_s: float
     distance_s: float
 
 
 class RunningEnvelope:
-    """The line under apparent offsets, with a detector of steps; O(vertices) work and memory.
+    """Lower envelope of apparent offsets with step detection; O(vertices) time and memory.
 
-    A point far below the line cannot be a delay: the clock was stepped and the line starts anew
-    at once. Points that all lie above it for a second, by the device's time and by the host's, are
-    a step too (a burst of packets after a stall is a second of device time only), unless the stamps
-    of a regular device kept their distance all the while: then the host was busy.
+    A point far below the line cannot be a delay: the clock was stepped and the line is restarted at
+    once. Points that all lie above it for a second, in device and host time, are a step too (a
+    burst of packets after a stall is a second of device time only), unless the stamps of a regular
+    device kept their distance: then the host was busy.
 
-    A device that samples regularly shows in the distance of its stamps by how much its clock was
-    stepped, but for whole periods. Then the line and what it hangs on are moved by as much, instead
-    of waiting for samples that hardly waited; points that disagree make it start anew after all.
+    For a regular device, the distance of its stamps gives the size of a step modulo the period.
+    Then the line and its support points are shifted accordingly, instead of waiting for promptly
+    delivered samples; points that disagree restart it after all.
 
     Args:
-        resolution_ns: of the device's stamps; steps below it do not show.
-        min_slope_span_s: the slope is 0 until the points span so many seconds.
-        is_counted: device time is a count of samples, which keeps its distance whatever the device
-            does.
+        resolution_ns: of the device's stamps; smaller steps are not detectable.
+        min_slope_span_s: the slope is 0 until the points span this many seconds.
+        is_counted: device time is a sample count, whose distances are always regular.
     """
 
     def __init__(
@@ -130,25 +129,25 @@ class RunningEnvelope:
 
     @property
     def num_steps(self) -> int:
-        """How often the line was started anew."""
+        """Number of restarts of the line."""
         return self._num_steps
 
     @property
     def slope_ns_per_s(self) -> float:
-        """Present slope."""
+        """Current slope."""
         return self._slope_ns_per_s
 
     @property
     def spread_ns(self) -> float:
-        """How far points stand above the line, in the mean of the last few hundred."""
+        """Mean distance of the last few hundred points above the line."""
         return self._spread_ns
 
     def at(self, x_s: float) -> float:
-        """The line's value, ns; 0 before the first point."""
+        """Value of the line in ns; 0 before the first point."""
         return 0.0 if self._line is None else self._line.at(x_s)
 
     def add(self, x_s: float, y_ns: float, now_s: float) -> float:
-        """Take in a point and tell the line's value there, ns.
+        """Add a point and return the line's value there, in ns.
 
         Args:
             x_s: device time.
@@ -180,7 +179,7 @@ class RunningEnvelope:
         self._odd = None
 
     def _is_pending(self, line: Line, x_s: float, y_ns: float, now_s: float) -> bool:
-        """Sort out steps; whether the point awaits confirmation and must not move the line."""
+        """Step detection; returns whether the point is pending and must not affect the line."""
         residual_ns = y_ns - line.at(x_s)
         early_ns, late_ns = self._thresholds_ns()
         settled = self._hull.span_s >= SETTLED_S
@@ -203,7 +202,7 @@ class RunningEnvelope:
         return False
 
     def _confirm(self, line: Line) -> None:
-        """The points that waited were above the line because of a step."""
+        """Confirm that the pending points lie above the line because of a step."""
         odd, pending = self._odd, self._pending
         if odd is None or odd.x_s < self._pending_since[0]:
             self._start(pending)
@@ -213,12 +212,12 @@ class RunningEnvelope:
         self._start_after(step_s, _Trial(pending))
 
     def _step_s(self, line: Line, distance_s: float, point: tuple[float, float]) -> float | None:
-        """By how much the device's clock jumped; None where its stamps do not tell.
+        """Size of a clock step; None if the stamps do not determine it.
 
         Args:
-            line: of before.
-            distance_s: of the stamps before and after the step.
-            point: device time and apparent offset of one after the step that hardly waited.
+            line: before the step.
+            distance_s: between the stamps before and after the step.
+            point: device time and apparent offset of a promptly delivered sample after the step.
         """
         period_s = self._rhythm.period_s
         if period_s is None or period_s * 1e9 < MIN_PERIOD_SPREADS * self._spread_ns:
@@ -226,14 +225,14 @@ class RunningEnvelope:
         step_s = distance_s - period_s
         residual_s = (point[1] - line.at(point[0] - step_s)) * 1e-9 + step_s
         num_more = math.floor(residual_s / period_s + BELOW_SHARE)
-        # A sample that waited for longer than a period at the step itself hides whole periods of
-        # it; the next ones show them.
+        # A sample delayed by more than a period at the step hides whole periods of it; the next
+        # ones reveal them.
         if abs(num_more) > MAX_PERIODS or (num_more < 0 and self._trial is None):
             return None
         return step_s - num_more * period_s
 
     def _start_after(self, step_s: float | None, trial: _Trial) -> None:
-        """Go on after a step of known size with the moved line, of unknown size with new points."""
+        """Continue after a step: with the shifted line if the size is known, else anew."""
         if step_s is None:
             self._start(trial.hull)
             return
@@ -244,7 +243,7 @@ class RunningEnvelope:
         self._num_followed, self._trial = num_followed, trial
 
     def _has_lasted(self, x_s: float, y_ns: float, now_s: float) -> bool:
-        """Take in a point above the line; whether they have all been above it long enough."""
+        """Add a point above the line; whether all have been above it long enough."""
         if self._num_pending == 0:
             self._pending_since = (x_s, now_s)
             self._pending = LowerHull()
@@ -257,7 +256,7 @@ class RunningEnvelope:
         return lasted_s >= needed_s and self._num_pending >= MIN_CONFIRM_SAMPLES
 
     def _thresholds_ns(self) -> tuple[float, float]:
-        """How far below, and how far above the line a point is remarkable."""
+        """Detection thresholds below and above the line."""
         spread_ns = self._spread_ns
         late_ns = self._step_ns + LATE_SPREADS * spread_ns
         if self._slope_span_s < MIN_SLOPE_SPAN_S:
@@ -266,7 +265,7 @@ class RunningEnvelope:
         return self._step_ns + EARLY_SPREADS * spread_ns, late_ns
 
     def _measure_spread(self, residual_ns: float) -> None:
-        """Follow the mean distance to the line; one outlier or a step must not throw it."""
+        """Update the mean distance to the line, robust against outliers and steps."""
         self._num_points += 1
         bounded_ns = min(abs(residual_ns), UNSURE_STEP_NS + UNSURE_SPREADS * self._spread_ns)
         rate = max(SPREAD_RATE, 1.0 / self._num_points)

@@ -1,6 +1,7 @@
-"""Finds where a device's clock jumped or stood still, and stamps that are wrong by themselves.
+"""Detection of steps and stops of a device's clock, and of single wrong stamps, in a whole take.
 
-`fit_clock` needs it before it can fit anything: one line through a step is wrong on both sides.
+`fit_clock` splits a take at these before fitting, since a line across a step is wrong on both
+sides.
 """
 
 from typing import NamedTuple
@@ -11,16 +12,16 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 CONFIRM_S = 1.0
 STEP_NS = 1_000_000.0
-# A step must also stand out this far above the usual scatter of the one-second minima.
+# A step must also exceed the usual scatter of the one-second minima by this factor.
 SPREAD_FACTOR = 8.0
-# A single stamp is wrong where it is off by so many times what stamps usually are.
+# A single stamp is wrong if its deviation exceeds the usual one by this factor.
 WRONG_SCATTERS = 3.0
 # How near to a change of level a jump of the stamps lies, in samples: a few late ones before a
 # rise look risen too. Without regular stamps to tell, only next to it.
 REACH = 30
 IRREGULAR_REACH = 3
-# Jumps of stamps and changes of level are the same to these shares of a sample period and of the
-# change: the levels scatter.
+# Tolerances for matching jumps of stamps to changes of level, as shares of a sample period and of
+# the change: the levels scatter.
 MATCH_SHARE = 0.2
 MATCH_CHANGE_SHARE = 0.5
 REGULAR_QUANTILE = 0.9
@@ -28,10 +29,10 @@ REGULAR_QUANTILE = 0.9
 # second they become late, and stay so. A rise of so much must last for so long, by both clocks.
 SUDDEN_RISES = ((25e6, 1_000_000_000), (5e6, 10_000_000_000))
 # The path may have become longer little by little and then stay so: the fit follows after a minute
-# anyway. What goes on rising is a rate that changed.
+# anyway. A continuing rise is a change of rate.
 GRADUAL_RISE = (5e6, 60_000_000_000)
 SUDDEN_S = 0.2
-# It was a delay if arrivals come back within this time: so many of them, as single stamps lie.
+# It was a delay if this many arrivals return within this time; single stamps may be wrong.
 RETURN_NS = 120_000_000_000
 MIN_RETURNED = 3
 # What rises so near to the end of a take, and stays, is more often a delay than a stop, unless it
@@ -41,13 +42,13 @@ MAX_END_DELAY_NS = 500e6
 
 
 class Steps(NamedTuple):
-    """What a take's arrivals tell of its device's clock.
+    """Steps and delays found in a take.
 
     Attributes:
         cuts: first samples after a step or a stop, in order.
-        waiting: samples [n] that all waited longer than those around them, for a second or more.
-        is_unsure: whether the take ends, or the clock steps, too early after a stop (or after
-            samples that wait until the end) to tell stops from delays, or irregular stamps do not.
+        waiting: mask [n] of samples in delays of a second or more.
+        is_unsure: whether stops and delays cannot be distinguished, because the take ends or the
+            clock steps too soon after one, or stamps are irregular.
     """
 
     cuts: list[int]
@@ -56,12 +57,12 @@ class Steps(NamedTuple):
 
 
 class _Rise(NamedTuple):
-    """A rise of the offset that lasts.
+    """A lasting rise of the offset.
 
     Attributes:
-        first: sample after it.
-        last: first sample that waits no longer; None where the clock stood still.
-        is_unsure: whether it might be the other one.
+        first: first sample after it.
+        last: first sample that is no longer delayed; None if the clock stopped.
+        is_unsure: whether the opposite is possible.
     """
 
     first: int
@@ -70,14 +71,14 @@ class _Rise(NamedTuple):
 
 
 def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
-    """Find where a device's clock jumped or stood still.
+    """Find steps and stops of a device's clock.
 
-    A step lasts, a delay does not: the smallest apparent offset of the second before is compared
-    with that of the second after. Where a device samples regularly, a step shows in the distance
-    of its stamps too. What does not show there was a delay if it ended within two minutes;
-    otherwise the clock stood still, or the path became longer for good, which looks the same. In
-    the last five seconds of a take a rise below half a second counts as a delay.
-    Where device time runs back there is a step in any case.
+    A step persists, a delay does not: the minimum apparent offset of the second before is compared
+    with that of the second after. For a regular device, a step is also visible in the distance of
+    its stamps. A rise not visible there was a delay if it ended within two minutes; otherwise the
+    clock stopped, or the path delay increased permanently, which is indistinguishable. In the last
+    five seconds of a take a rise below half a second counts as a delay. Device time that goes back
+    is always a step.
     """
     waiting = np.zeros(len(device), dtype=bool)
     is_unsure = False
@@ -102,9 +103,9 @@ def find_steps(device: np.ndarray, host: np.ndarray) -> Steps:
 
 
 def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
-    """Indices of single stamps that lie at no whole period between their two neighbours.
+    """Indices of single stamps that are not whole periods from their two neighbours.
 
-    Only a device that samples regularly shows them; of others none are found.
+    Only for regular devices; for others none are found.
     """
     if len(device) < 3:
         return np.empty(0, dtype=np.int64)
@@ -123,7 +124,7 @@ def find_wrong_stamps(device: np.ndarray) -> Int64[np.ndarray, " k"]:
 
 
 class _Levels:
-    """The smallest apparent offsets of a second before and after each sample."""
+    """Minimum apparent offsets of the second before and after each sample."""
 
     def __init__(self, device: np.ndarray, host: np.ndarray, count: int) -> None:
         self._device, self._host, self._count = device, host, count
@@ -140,20 +141,20 @@ class _Levels:
         # The same from sample 1 on: before the first second is over, the least since the start.
         least_ns = np.minimum.accumulate(offset_ns[: count - 1])
         self._rise_ns = np.concatenate([minima[1:count] - least_ns, self._change_ns])
-        # Without drift, levels that are minutes apart can be compared.
+        # With the drift removed, levels that are minutes apart can be compared.
         elapsed = (host - host[0]) / float(np.median(host[count:] - host[:-count]))
         self._straight_ns = offset_ns - drift_ns * elapsed
 
     def changes(self) -> list[tuple[int, float]]:
-        """Where the one-second minimum changes for good, and by how much."""
+        """Lasting changes of the one-second minimum, with their size."""
         change_ns, threshold_ns = self._change_ns, self._threshold_ns
-        # A fall shows until the first fallen sample, a rise from the first risen one on.
+        # A fall is visible up to the first fallen sample, a rise from the first risen one on.
         falls = [(b, change_ns[a : b + 1].min()) for a, b in _runs(-change_ns, threshold_ns)]
         rises = [(a, change_ns[a : b + 1].max()) for a, b in _runs(change_ns, threshold_ns)]
         return sorted((self._count + index, float(height)) for index, height in falls + rises)
 
     def rises(self, cuts: list[int]) -> list[_Rise]:
-        """Where the offset rose between known cuts and stayed, and where it came back, if ever."""
+        """Lasting rises of the offset between known cuts, with their ends."""
         bounds = [0, *cuts, len(self._device)]
         found: list[_Rise] = []
         known = 0
@@ -166,12 +167,12 @@ class _Levels:
         return found
 
     def _rise(self, first: int, index: int, last: int) -> _Rise | None:
-        """The rise that shows at `index`; None if none lasts.
+        """The lasting rise at `index`, if any.
 
         Args:
-            first: of the samples before it that tell the level.
-            index: of a sample from which on all of a second are above that level.
-            last: where the next step of the clock is.
+            first: start of the samples that define the previous level.
+            index: of a sample from which on a full second lies above that level.
+            last: next step of the clock.
         """
         y, host, device = self._straight_ns, self._host[index:last], self._device[index:last]
         before_ns = y[first:index].min()
@@ -185,7 +186,7 @@ class _Levels:
             if risen.min() - before_ns <= max(least_ns, self._threshold_ns):
                 continue
             level_ns = risen[num // 2 :].min()
-            # What lies below the new level had waited at the old one.
+            # Samples below the new level were delayed at the old one.
             early = np.flatnonzero(risen < level_ns - STEP_NS)
             start = index + int(early[-1]) + 1 if len(early) else index
             middle_ns = (before_ns + level_ns) / 2
@@ -199,7 +200,7 @@ class _Levels:
     def _stop_or_delay(
         self, start: int, around: tuple[int, int, int], levels_ns: tuple[float, float]
     ) -> _Rise:
-        """What a rise was: arrivals come back below the middle of its two levels after a delay."""
+        """Classify a rise: after a delay, arrivals return below the middle of the two levels."""
         first, index, last = around
         host = self._host[index:last]
         within = int(np.searchsorted(host, host[0] + RETURN_NS))
@@ -208,20 +209,20 @@ class _Levels:
             return _Rise(start, index + int(back[0]), is_unsure=False)
         is_at_end = last == len(self._host) and host[-1] - host[0] < END_NS
         is_delay = is_at_end and levels_ns[1] - levels_ns[0] < MAX_END_DELAY_NS
-        # Fewer samples than a second of them are too few to date the end of the take by.
+        # Less than a second of samples is too short to judge the end of the take.
         is_delay = is_delay and index - first >= self._count
         return _Rise(start, last if is_delay else None, is_unsure=within == len(host))
 
 
 def _runs(change: np.ndarray, threshold: float) -> list[tuple[int, int]]:
-    """First and last index of every stretch above the threshold."""
+    """First and last index of every run above the threshold."""
     above = np.concatenate([[False], change > threshold, [False]])
     edges = np.flatnonzero(np.diff(above.astype(np.int8)))
     return [(int(a), int(b) - 1) for a, b in edges.reshape(-1, 2)]
 
 
 class _Stamps:
-    """The distances of a device's stamps: does a change of level show in them, and where?"""
+    """Distances of a device's stamps, to locate changes of level."""
 
     def __init__(self, device: np.ndarray) -> None:
         steps: Float64[np.ndarray, " m"] = np.diff(device).astype(np.float64)
@@ -233,11 +234,11 @@ class _Stamps:
         self.is_regular = self.scatter_ns < self._tolerance_ns / 2
 
     def place(self, cut: int, change_ns: float) -> int | None:
-        """The first sample after the step near `cut`; None where there was none, only a delay.
+        """The first sample after the step near `cut`; None if it was only a delay.
 
         Args:
             cut: first sample after a change of level, give or take a few.
-            change_ns: of the apparent offset: a clock that goes back makes it rise.
+            change_ns: of the apparent offset, positive if the clock goes back.
         """
         reach = REACH if self.is_regular else IRREGULAR_REACH
         first, last = max(cut - reach, 1), min(cut + reach, len(self._departures_ns))
@@ -261,6 +262,6 @@ class _Stamps:
         return first + odd if odd_ns[odd] > self._tolerance_ns else None
 
     def _beside_period(self, departures_ns: np.ndarray) -> Float64[np.ndarray, " m"]:
-        """How far each lies from a whole number of sample periods."""
+        """Distance of each to the nearest whole number of sample periods."""
         period_ns = max(self.period_ns, 1.0)
         return np.abs(departures_ns - period_ns * np.rint(departures_ns / period_ns))

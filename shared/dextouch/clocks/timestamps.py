@@ -1,4 +1,4 @@
-"""Wrapping device counters in, straight int64 counts out; sequence numbers in, lost samples out."""
+"""Unwrapping of device counters, and detection of lost samples from sequence numbers."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from dextouch.errors import InvalidInputError, ShapeError
 
 @dataclass(frozen=True)
 class SequenceReport:
-    """What a stream's sequence numbers say about loss.
+    """Lost samples of a stream.
 
     `num_missing_before[i]` samples are missing between sample i-1 and i (0 for the first, at a
     duplicate and at a restart); `restart_indices` are samples whose number went back or stood.
@@ -21,25 +21,25 @@ class SequenceReport:
 
     @property
     def num_missing(self) -> int:
-        """All samples that were numbered by the device and never arrived."""
+        """Total number of lost samples."""
         return int(self.num_missing_before.sum())
 
 
 def unwrap_counter(
     raw: np.ndarray, *, modulus: int, hint: np.ndarray | None = None
 ) -> Int64[np.ndarray, " n"]:
-    """A counter that wraps at `modulus`, made straight.
+    """Unwrap a counter that wraps at `modulus`.
 
     Args:
         raw: integer counts [n], each in 0 … modulus - 1.
         modulus: count at which the counter starts again from zero, 2 … 2**62.
-        hint: another clock in the same unit [n] (arrival times). It tells how often the counter
-            wrapped in a silence longer than a wrap; without it a step of more than half a
-            modulus counts as one wrap, a smaller step back as a step back.
+        hint: another clock in the same unit [n] (arrival times). It gives the number of wraps in a
+            gap longer than a wrap; without it a step of more than half a modulus counts as one
+            wrap, a smaller step back as a step back.
 
     Raises:
         ShapeError: not one axis of integers, or a hint of another length.
-        InvalidInputError: a count outside 0 … modulus - 1, or an impossible modulus.
+        InvalidInputError: a count outside 0 … modulus - 1, or an invalid modulus.
     """
     counts = np.asarray(raw)
     if counts.ndim != 1 or not np.issubdtype(counts.dtype, np.integer):
@@ -56,7 +56,7 @@ def unwrap_counter(
     if expected.shape != steps.shape:
         raise ShapeError(f"counter: got {counts.size} counts and a hint of another length")
     half = modulus // 2
-    # The step congruent to the counted one that lies nearest to the expected one.
+    # The congruent step nearest to the expected one.
     steps = expected + np.mod(steps - expected + half, modulus) - half
     return np.concatenate([straight[:1], straight[:1] + np.cumsum(steps)]).astype(np.int64)
 

@@ -1,4 +1,4 @@
-"""Episodes and recordings on disk: write them whole, read slices and windows of them."""
+"""Store of episodes and recordings: crash-safe writers, random access readers, training windows."""
 
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.store import EpisodeStore

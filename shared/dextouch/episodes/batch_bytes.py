@@ -1,4 +1,4 @@
-"""Samples of one stream ↔ the body of a record in a spool's log.
+"""Binary encoding of a batch of samples as the body of a record in a spool's log.
 
 Little endian, n samples: t_host_ns int64 [n], t_device_ns int64 [n], sequence int64 [n], then of a
 numeric stream the values as they lie in memory, of an encoded one the length of each image as
@@ -19,7 +19,7 @@ _STAMP_BYTES = 8
 
 
 def batch_bytes(descriptor: StreamDescriptor, batch: SampleBatch) -> bytes:
-    """The body that holds a batch, which fits the descriptor (checked by the caller)."""
+    """Encode a batch, which the caller has checked against the descriptor."""
     stamps = (batch.t_host_ns, batch.t_device_ns, batch.sequence)
     parts: list[bytes | memoryview] = [
         np.ascontiguousarray(column, dtype="<i8").data for column in stamps
@@ -30,14 +30,14 @@ def batch_bytes(descriptor: StreamDescriptor, batch: SampleBatch) -> bytes:
     else:
         dtype = descriptor.numpy_dtype().newbyteorder("<")
         parts.append(np.ascontiguousarray(batch.values, dtype=dtype).data)
-    # Arrays are joined as they lie in memory: an image is copied once.
+    # Buffers are joined without conversion, so an image is copied once.
     return b"".join(parts)
 
 
 def batch_of_bytes(
     descriptor: StreamDescriptor, bodies: Iterable[bytes], counts: Iterable[int], *, what: str
 ) -> SampleBatch:
-    """Consecutive bodies of one stream as one batch, the inverse of `batch_bytes`.
+    """Decode consecutive bodies of one stream to one batch, the inverse of `batch_bytes`.
 
     Args:
         descriptor: of the stream.
@@ -46,7 +46,7 @@ def batch_of_bytes(
         what: names the log in errors.
 
     Raises:
-        CorruptDataError: a body is not that of so many samples of this stream.
+        CorruptDataError: the size of a body does not match its number of samples.
     """
     columns: list[list[bytes]] = [[], [], []]
     values: list[bytes] = []
@@ -74,7 +74,7 @@ def batch_of_bytes(
 
 
 def _images(data: bytes, count: int) -> list[bytes] | None:
-    """The images behind their lengths; None where these do not fit."""
+    """Split images by their length prefixes; None where these are inconsistent."""
     start = 4 * count
     if len(data) < start:
         return None

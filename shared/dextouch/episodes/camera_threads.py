@@ -1,4 +1,4 @@
-"""The same work for several cameras at once, one thread a camera."""
+"""Parallel processing of cameras, one thread each."""
 
 import os
 from collections.abc import Callable, Iterable
@@ -9,12 +9,12 @@ R = TypeVar("R")
 
 MAX_THREADS = 8
 _pools: list[ThreadPoolExecutor] = []
-# A forked worker has none of its parent's threads, so it must not wait for them.
+# A forked worker does not inherit its parent's threads, so it must not reuse their pools.
 os.register_at_fork(after_in_child=_pools.clear)
 
 
 def each_camera(work: Callable[[str], R], cameras: Iterable[str]) -> dict[str, R]:
-    """`work` of every camera; one camera alone is worked on in the caller's thread."""
+    """Call `work` for every camera; a single camera is processed in the caller's thread."""
     names = list(cameras)
     if len(names) < 2:
         return {name: work(name) for name in names}

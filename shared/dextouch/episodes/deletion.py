@@ -1,7 +1,7 @@
-"""An operator or a recording → all that stems from it gone for good, and the proof of that.
+"""Permanent deletion of all data of an operator or a recording, with a receipt as proof.
 
-What is to go is written down first (`.deletions/`), so that a deletion that was interrupted is
-completed by repeating it, even when the recordings that led to their episodes are gone already.
+The plan is journaled first (`.deletions/`), so that repeating an interrupted deletion completes it,
+even when the recordings that led to derived episodes are already gone.
 """
 
 import fcntl
@@ -23,7 +23,7 @@ from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
 RECEIPT_VERSION = 1
 INTENTS = ".deletions"
-# What an interrupted run found is found again; more rounds than that only under constant uploads.
+# Rounds of search and removal; more are needed only under constant uploads.
 _MAX_ROUNDS = 5
 _MAX_HEADER_BYTES = 64 << 20
 _VERSION = re.compile(r"-(salvaged|recovered)-[0-9]+")
@@ -31,10 +31,10 @@ _VERSION = re.compile(r"-(salvaged|recovered)-[0-9]+")
 
 @dataclass(frozen=True)
 class DeletionRequest:
-    """What is to go: all of an operator, or a recording, with all that was made from it.
+    """Scope of a deletion: an operator or a recording, with all data derived from it.
 
     Raises:
-        InvalidInputError: not exactly one of both.
+        InvalidInputError: both or neither were given.
     """
 
     operator: str | None = None
@@ -51,7 +51,7 @@ class DeletionRequest:
 
 @dataclass(frozen=True)
 class Victim:
-    """One thing that goes, and why."""
+    """One item to delete, and the reason."""
 
     kind: str
     id: str
@@ -63,7 +63,7 @@ class Victim:
 
 @dataclass(frozen=True)
 class Reference:
-    """A file or folder that still names something deleted."""
+    """A file or folder that still refers to deleted data."""
 
     where: str
     names: tuple[str, ...]
@@ -71,7 +71,7 @@ class Reference:
 
 @dataclass(frozen=True)
 class DeletionReceipt:
-    """What went, when, and what was looked through afterwards; written as JSON."""
+    """Record of a deletion: deleted items, time, and files searched afterwards; saved as JSON."""
 
     request: DeletionRequest
     started_at: str
@@ -87,26 +87,26 @@ class DeletionReceipt:
 
     @property
     def complete(self) -> bool:
-        """Whether nothing that names what was deleted is left, as far as can be read."""
+        """Whether no readable file refers to the deleted data any more."""
         return not self.remaining and not self.unreadable
 
 
 def plan_deletion(
     root: Path, request: DeletionRequest, *, known: Sequence[Victim] = ()
 ) -> list[Victim]:
-    """Everything in a store that a request concerns, those it begins with first.
+    """List everything in a store that a request covers, direct matches first.
 
     Args:
         root: of the store.
-        request: what is asked for.
-        known: what an interrupted deletion had found.
+        request: operator or recording.
+        known: items found by an interrupted deletion.
     """
     waiting = all_facts(root)
     spreads = request.derived or request.operator is not None
     names = {(victim.kind, victim.id) for victim in known if spreads}
     hashes = {victim.sha256 for victim in known if spreads} - {None}
     if spreads and request.recording is not None:
-        # What was made of it may outlive it.
+        # Derived data may outlive its source.
         names.add(("recording", request.recording))
     found: list[Victim] = []
     grown = True
@@ -131,7 +131,7 @@ def plan_deletion(
                 grown = True
                 names.add((facts.kind, facts.item_id))
                 hashes |= {facts.content_sha256} - {None}
-                # Earlier versions of it, which a repair or a migration left behind.
+                # Earlier versions, left behind by a repair or a migration.
                 names |= {(k, i) for k, i, _ in facts.lineage if _is_version(facts, k, i)}
                 hashes |= {h for k, i, h in facts.lineage if h and _is_version(facts, k, i)}
     return found
@@ -159,7 +159,7 @@ def _reason_of_kin(
             return f"made from {kind} {item_id}"
     if facts.content_sha256 is not None and facts.content_sha256 in hashes:
         return "same content"
-    # An id that was used again by somebody else is another thing.
+    # An id that was reused by another operator is a different item.
     if (facts.kind, facts.item_id) in names and facts.operator in {None, operator}:
         return "same id"
     return None
@@ -179,20 +179,20 @@ def delete_for_good(
     *,
     checkpoints: Path | None = None,
 ) -> DeletionReceipt:
-    """Remove all that a request concerns, search what is left, and write the receipt.
+    """Delete all that a request covers, search the remaining files, and write the receipt.
 
-    Uploads and stages that a writer holds stay, and are listed as what is left: stop the writer
-    and repeat. Checkpoints are only searched.
+    Uploads and stages locked by a writer are kept and listed as remaining: stop the writer and
+    repeat. Checkpoints are only searched.
 
     Args:
         root: of the store.
-        request: what is asked for.
+        request: operator or recording.
         receipt_path: new file outside the store.
-        checkpoints: folder with models that may have been trained on what goes.
+        checkpoints: folder with models that may have been trained on the deleted data.
 
     Raises:
-        NotFoundError: nothing in the store is concerned.
-        InvalidInputError: a receipt inside the store, which is searched for what it names.
+        NotFoundError: nothing in the store matches.
+        InvalidInputError: a receipt path inside the store, where the search would find it.
     """
     if receipt_path.resolve().is_relative_to(root.resolve()):
         raise InvalidInputError(
@@ -240,10 +240,10 @@ def delete_for_good(
 def search(
     root: Path, words: set[str], *, skip: Path | None = None
 ) -> tuple[list[Reference], list[str], int]:
-    """What still names some words: every attributes file, and the names of what they lie in.
+    """Find remaining references to identifiers, in every attributes file and in folder names.
 
     Returns:
-        The references, what cannot be read, and how many files were read.
+        The references, the unreadable files, and the number of files searched.
     """
     wanted, found, num_files = Wanted(words), [], 0
     facts = all_facts(root)
@@ -265,7 +265,7 @@ def search(
 
 
 def search_checkpoints(folder: Path, words: set[str]) -> tuple[list[Reference], int]:
-    """Checkpoints whose metadata names some words: safetensors headers and JSON beside them."""
+    """Find references to identifiers in checkpoints: safetensors headers and JSON beside them."""
     wanted, found, num_files = Wanted(words), [], 0
     with disk_errors(f"search {folder}"):
         for path in sorted(folder.rglob("*")):
@@ -291,7 +291,7 @@ def _words(wanted: Wanted, path: Path) -> list[str]:
 
 
 def _remove(root: Path, victim: Victim) -> bool:
-    """Remove one thing unless a writer holds it; whether it was there and went."""
+    """Remove one item unless a writer holds its lock; returns whether it was removed."""
     folder = root / victim.place / victim.folder
     if not folder.exists() and not folder.is_symlink():
         return False
@@ -304,7 +304,7 @@ def _remove(root: Path, victim: Victim) -> bool:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if victim.place in {"episodes", "recordings"}:
-            # Invisible in one moment, whatever happens to this process afterwards.
+            # The rename makes it invisible at once, whatever happens to this process afterwards.
             folder = put_into_trash(root, homes[victim.place], victim.folder)
         remove_for_good(folder)
     except BlockingIOError:
@@ -330,7 +330,7 @@ def _now() -> str:
 
 
 def _intent_path(root: Path, request: DeletionRequest) -> Path:
-    # A hash, so that no name of a file is a pseudonym.
+    # A hash, so that no file name contains a pseudonym.
     return root / INTENTS / f"{sha256_hex(json.dumps(asdict(request)).encode())[:32]}.json"
 
 

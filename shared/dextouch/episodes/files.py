@@ -1,4 +1,4 @@
-"""Bytes to files that survive a crash: whole writes, atomic replacement, and honest disk errors."""
+"""Crash-safe file operations: full writes, fsync, atomic replacement, and mapped disk errors."""
 
 import errno
 import fcntl
@@ -11,19 +11,19 @@ from pathlib import Path
 from dextouch.errors import StorageError, StorageFullError
 
 _SYNC_THREADS = 16
-# EFBIG: the file size limit of the process or file system; for a recording the same decision.
+# EFBIG: the file size limit of the process or file system; handled like a full disk.
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 
 
 @contextmanager
 def disk_errors(what: str, *, advice: str = "free space and try again") -> Iterator[None]:
-    """Turn the operating system's errors into ours, naming `what` was being done.
+    """Context manager that maps OSError to DexTouch errors, naming the operation `what`.
 
     `advice` ends the message about a full disk.
 
     Raises:
         StorageFullError: no space, quota or file size left.
-        StorageError: any other failure of the disk.
+        StorageError: any other I/O error.
     """
     try:
         yield
@@ -41,7 +41,7 @@ def write_all(descriptor: int, data: bytes | memoryview) -> None:
 
 
 def write_parts(descriptor: int, parts: Sequence[bytes]) -> None:
-    """Write every byte of the parts, one behind the other, without joining them first."""
+    """Write all parts in order without joining them first (writev)."""
     views = [memoryview(part) for part in parts if part]
     while views:
         num_written = os.writev(descriptor, views)
@@ -52,7 +52,7 @@ def write_parts(descriptor: int, parts: Sequence[bytes]) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Make the names in a folder survive a power loss."""
+    """Sync a folder, so that its entries survive a power loss."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -61,19 +61,19 @@ def sync_folder(path: Path) -> None:
 
 
 def make_held_folder(path: Path) -> int:
-    """Make a new folder and lock it; a descriptor that holds the lock until it is closed."""
+    """Create and lock a folder; the returned descriptor holds the lock until it is closed."""
     while True:
         path.mkdir(parents=True)
         descriptor = os.open(path, os.O_RDONLY)
         fcntl.flock(descriptor, fcntl.LOCK_EX)
         if is_folder_at(descriptor, path):
             return descriptor
-        # A sweep found it before it was locked, and removed it.
+        # A sweep removed it before it was locked.
         os.close(descriptor)
 
 
 def is_folder_at(descriptor: int, path: Path) -> bool:
-    """Whether an open folder is still the one at a path."""
+    """Whether an open folder is still the one at `path`."""
     try:
         there = path.stat()
     except FileNotFoundError:
@@ -82,7 +82,7 @@ def is_folder_at(descriptor: int, path: Path) -> bool:
 
 
 def write_file(path: Path, data: bytes, *, sync: bool = True) -> None:
-    """A new file with these bytes, on the disk when this returns unless `sync` is off."""
+    """Write a new file; it is durable on return unless `sync` is false."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o644)
     try:
         write_all(descriptor, data)
@@ -93,9 +93,9 @@ def write_file(path: Path, data: bytes, *, sync: bool = True) -> None:
 
 
 def sync_files(paths: Iterable[Path]) -> None:
-    """Make many files survive a power loss.
+    """Sync many files, so that they survive a power loss.
 
-    At the same time, because a file system then writes its journal once for many of them.
+    In parallel, because the file system then commits its journal once for many of them.
     """
     with ThreadPoolExecutor(_SYNC_THREADS, thread_name_prefix="sync") as threads:
         for _ in threads.map(_sync_file, paths):
@@ -111,12 +111,12 @@ def _sync_file(path: Path) -> None:
 
 
 def partial_name(name: str) -> str:
-    """What a file is called while `replace_file` writes it."""
+    """Temporary name of a file while `replace_file` writes it."""
     return name + ".partial"
 
 
 def replace_file(path: Path, data: bytes) -> None:
-    """Put these bytes in place of a file, whole or not at all."""
+    """Replace the contents of a file atomically."""
     partial = path.with_name(partial_name(path.name))
     partial.unlink(missing_ok=True)
     write_file(partial, data)
@@ -125,7 +125,7 @@ def replace_file(path: Path, data: bytes) -> None:
 
 
 def folder_bytes(folder: Path) -> int:
-    """Bytes of all files below a folder; what vanishes meanwhile counts nothing."""
+    """Total size of all files below a folder; files that vanish meanwhile are ignored."""
     total = 0
     with disk_errors(f"measure {folder.name}"):
         for here, _, names in os.walk(folder):

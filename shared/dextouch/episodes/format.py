@@ -1,4 +1,4 @@
-"""Episode format v2: names of files, Zarr v3 metadata, and the commit record that makes it true."""
+"""Episode format v2: file names, Zarr v3 metadata and the commit record."""
 
 import hashlib
 import json
@@ -20,15 +20,15 @@ FORMAT_VERSION: Final = 2
 COMMIT_FILE = "commit.json"
 METADATA_FILE = "zarr.json"
 ATTRIBUTES_KEY = "dextouch"
-# Numbers a storage chunk: half a second of them, or as many samples as fit into this.
+# Maximum size of a numeric storage chunk, which otherwise holds half a second of samples.
 CHUNK_SECONDS = 0.5
 CHUNK_BYTES = 1 << 20
 ZSTD_LEVEL = 1
-# Images a closed group of pictures, which is a storage chunk.
+# Images per closed group of pictures, which is one storage chunk.
 GOP_IMAGES = 8
 # Names under which zarr-python finds the image codecs (dextouch.episodes.zarr_codecs).
 ZARR_CODECS: Mapping[Codec, str] = {"jpeg": "dextouch.jpeg", "h264": "dextouch.h264"}
-# No array of ours comes near; a forged one must not overflow what is computed from it.
+# Far above any real array; a forged one must not overflow later arithmetic.
 MAX_ROWS = 1 << 40
 Size = Annotated[int, Field(ge=0, le=MAX_ROWS)]
 STAMPS: Mapping[Kind, tuple[str, ...]] = {
@@ -38,10 +38,10 @@ STAMPS: Mapping[Kind, tuple[str, ...]] = {
 
 
 class ArrayEntry(BaseModel):
-    """What the commit record says about one array.
+    """Entry of one array in the commit record.
 
-    `sha256` is that of its decoded bytes; of image codecs that of all encoded storage chunks one
-    after the other. `encoder` says what wrote the images, with its settings.
+    `sha256` covers the decoded bytes; for image codecs, the concatenated encoded storage chunks.
+    `encoder` names the encoder of the images and its settings.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -56,7 +56,7 @@ class ArrayEntry(BaseModel):
 
 
 class CommitRecord(BaseModel):
-    """The list of all that belongs to an episode or a recording; without it there is none."""
+    """Manifest of an episode or a recording; without it the group is not committed."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -68,10 +68,10 @@ class CommitRecord(BaseModel):
 
 
 def check_id(text: str, *, kind: str = "id") -> str:
-    """The id itself, if it is one: lower-case letters, digits, `-` and `_`.
+    """Validate and return an id: lower-case letters, digits, `-` and `_`.
 
     Raises:
-        InvalidInputError: anything else, path separators and dots included.
+        InvalidInputError: any other character, including path separators and dots.
     """
     if not re.fullmatch(ID_PATTERN, text):
         raise InvalidInputError(
@@ -82,22 +82,22 @@ def check_id(text: str, *, kind: str = "id") -> str:
 
 
 def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:
-    """The same array with another length."""
+    """A copy of the entry with another number of rows."""
     return entry.model_copy(update={"shape": (num_rows, *entry.shape[1:])})
 
 
 def codec_of(descriptor: StreamDescriptor) -> Codec:
-    """How a stream's values are kept."""
+    """Codec of a stream's values."""
     units: Mapping[str, Codec] = {JPEG_UNIT: "jpeg", H264_UNIT: "h264"}
     return units.get(descriptor.unit, "zstd")
 
 
 def stream_arrays(descriptor: StreamDescriptor, kind: Kind) -> dict[str, ArrayEntry]:
-    """Every array that a stream occupies in a group, without rows yet; its values come first."""
+    """The empty arrays of a stream in a group, values first."""
     name, codec = descriptor.name, codec_of(descriptor)
     half_second = max(1, round(descriptor.nominal_rate_hz * CHUNK_SECONDS))
     rows = min(half_second, max(1, CHUNK_BYTES // descriptor.sample_bytes()))
-    # Stamps end where values do, so that a kill parts neither: of encoded images after as many.
+    # Stamps use the same chunk length as values, so that a kill never separates the two.
     stamp_rows = half_second // rows * rows if codec == "zstd" else GOP_IMAGES
     time, no_hash = f"{name}_time", "0" * 64
     axes = (f"{name}_axis{axis}" for axis in range(1, 1 + len(descriptor.shape)))
@@ -171,12 +171,12 @@ def array_metadata(entry: ArrayEntry) -> bytes:
 
 
 def shard_path(num_dimensions: int) -> str:
-    """The one shard file of an array, below the array's folder."""
+    """Path of an array's single shard file, relative to the array's folder."""
     return "/".join(["c", *(["0"] * num_dimensions)])
 
 
 def encode_commit(record: CommitRecord) -> tuple[bytes, str]:
-    """Bytes of `commit.json`, and the record's sha256: the content hash of the whole."""
+    """Bytes of `commit.json` and the record's sha256, which is the content hash of the group."""
     plain = record.model_dump(mode="json")
     digest = sha256_hex(canonical_json(plain))
     return canonical_json({"record": plain, "sha256": digest}), digest
@@ -187,7 +187,7 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
 
     Raises:
         StorageError: written by a newer version of the format.
-        CorruptDataError: anything else that is no commit record.
+        CorruptDataError: not a valid commit record.
     """
     try:
         outer = json.loads(data)
@@ -201,7 +201,7 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
     if version != FORMAT_VERSION:
         older = isinstance(version, int) and 1 <= version < FORMAT_VERSION
         advice = (
-            "bring it over with `dextouch store migrate`"
+            "upgrade it with `dextouch store migrate`"
             if older
             else "read it with the release that wrote it"
         )

@@ -1,4 +1,4 @@
-"""A committed group, or one that is still being written → its attributes and its arrays."""
+"""Attributes and arrays of a committed group, or of one that is still being written."""
 
 import hashlib
 import json
@@ -42,7 +42,7 @@ MAX_IMAGE_PIXELS = 139_264 * 256
 
 @dataclass
 class CommittedGroup(Generic[A]):
-    """A group with a commit record; `read_group` makes it."""
+    """A group with a commit record; created by `read_group`."""
 
     files: GroupFiles
     kind: Kind
@@ -53,7 +53,7 @@ class CommittedGroup(Generic[A]):
     _shards: dict[str, ShardReader] = field(default_factory=dict)
 
     def shard(self, name: str) -> ShardReader:
-        """One array; its index is kept."""
+        """Reader of one array; its shard index is cached."""
         if name not in self._shards:
             entry = self.entries[name]
             path = f"{name}/{shard_path(len(entry.shape))}"
@@ -66,7 +66,7 @@ class CommittedGroup(Generic[A]):
         """Read everything and compare it with the commit record.
 
         Raises:
-            CorruptDataError: the first array that does not hold, by name.
+            CorruptDataError: the first damaged array, by name.
         """
         num_bytes = sum(self._verify_array(name, entry) for name, entry in self.entries.items())
         return Verification(
@@ -80,7 +80,7 @@ class CommittedGroup(Generic[A]):
         shard.check_index()
         rows = entry.chunk_rows
         row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
-        # Image codecs are hashed as they are stored, a storage chunk at a time.
+        # Image codecs are hashed in encoded form, one storage chunk at a time.
         plain = entry.codec == "zstd"
         step = max(1, VERIFY_BYTES // max(1, row_bytes * rows)) * rows if plain else rows
         for start in range(0, entry.shape[0], step):
@@ -94,13 +94,13 @@ class CommittedGroup(Generic[A]):
 
 
 class _GrowingFile(LocalFile):
-    """The part file of an array that is being written."""
+    """Part file of an array that is being written."""
 
     def read(self, offset: int, length: int) -> memoryview:
         """Bytes offset … offset + length − 1.
 
         Raises:
-            NotFoundError: its writer finished meanwhile.
+            NotFoundError: its writer has finished in the meantime.
         """
         data = super().read(offset, length)
         if not data and self.size() is None:
@@ -110,7 +110,7 @@ class _GrowingFile(LocalFile):
 
 @dataclass
 class LiveGroup(Generic[A]):
-    """A group that is being written, as far as its journals vouched for it when this was made."""
+    """Snapshot of a group that is being written, up to the rows of its journals."""
 
     stage: Path
     kind: Kind
@@ -130,12 +130,12 @@ class LiveGroup(Generic[A]):
         )
 
 
-# What a reader reads from.
+# Either kind of group.
 GroupContents = CommittedGroup[A] | LiveGroup[A]
 
 
 def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[A]:
-    """The contents of a committed group; no array is read yet.
+    """Open a committed group; arrays are read lazily.
 
     Raises:
         CorruptDataError: the commit record or the attributes are damaged.
@@ -165,7 +165,7 @@ def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[
 def _check_arrays(
     expected: Mapping[str, Mapping[str, ArrayEntry]], arrays: Mapping[str, ArrayEntry], what: str
 ) -> None:
-    """Refuse a commit record whose arrays are not those of the streams, each of one length."""
+    """Check that the commit record's arrays match the streams and have consistent lengths."""
     names: list[str] = []
     for stream, wanted in expected.items():
         names += wanted
@@ -197,10 +197,10 @@ def _layout(entry: ArrayEntry) -> tuple[object, ...]:
 
 
 def get_metadata(files: GroupFiles, name: str, what: str) -> bytes | None:
-    """All bytes of a small file inside a group; None where there is none.
+    """Contents of a small file of a group; None if it does not exist.
 
     Raises:
-        CorruptDataError: a link, or a file far larger than metadata ever is.
+        CorruptDataError: a symbolic link, or a file larger than any metadata.
     """
     refuse_links(files, name, what=what)
     if isinstance(files, LocalGroup):
@@ -215,7 +215,7 @@ def get_metadata(files: GroupFiles, name: str, what: str) -> bytes | None:
 
 
 def refuse_links(files: GroupFiles, name: str, *, what: str) -> None:
-    """A group's files lie inside it: what a link points at may be anybody's.
+    """Refuse symbolic links: a group's files must lie inside its folder.
 
     Raises:
         CorruptDataError: the group's folder, the file or a folder between is a symbolic link.
@@ -233,10 +233,10 @@ def refuse_links(files: GroupFiles, name: str, *, what: str) -> None:
 
 
 def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
-    """What a stage holds at this moment: whole storage chunks that all arrays of a stream have.
+    """Snapshot of a stage: storage chunks that are complete in all arrays of a stream.
 
     Raises:
-        NotFoundError: nothing that can be followed is being written there.
+        NotFoundError: the stage does not exist, or cannot be read while it is written.
         CorruptDataError: damage in a journal.
     """
     attributes = read_stage(stage)

@@ -1,4 +1,4 @@
-"""The contents of a group → slices of its streams, decoding only what is asked."""
+"""Random access to the streams of a group, decoding only the samples requested."""
 
 from typing import Generic, TypeVar
 
@@ -17,10 +17,10 @@ A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
 
 
 class GroupReader(Generic[A]):
-    """What episodes and recordings share: attributes, arrays and their verification.
+    """Common base of episode and recording readers: attributes, arrays and verification.
 
-    Nothing is read before it is asked for. A reader may be used by several threads, be pickled and
-    be taken along into the worker processes of a data loader.
+    Everything is read lazily. A reader is thread-safe and picklable, so that the worker processes
+    of a data loader can use it.
 
     Args:
         contents: of a committed group, or of one that is being written.
@@ -33,22 +33,22 @@ class GroupReader(Generic[A]):
         self.content_sha256 = contents.content_sha256
         self.streams: dict[str, StreamDescriptor] = {s.name: s for s in self.attributes.streams}
         self._whole: dict[str, np.ndarray] = {}
-        # Names and codecs of the streams, which are asked for with every window.
+        # Names and codecs of the streams, cached since every window needs them.
         stamp = STAMPS[self._kind][0]
         self._stamps = {name: f"{name}_{stamp}" for name in self.streams}
         self._codecs = {name: codec_of(stream) for name, stream in self.streams.items()}
 
     def num_samples(self, name: str) -> int:
-        """How many samples a stream holds; nothing is read."""
+        """Number of samples of a stream, without reading it."""
         return self._contents.entries[self._stamps[self._stream(name).name]].shape[0]
 
     def count(self, name: str, start_ns: int | None = None, stop_ns: int | None = None) -> int:
-        """How many samples `read` would give; only stamps are read."""
+        """Number of samples that `read` would return; reads only the stamps."""
         low, high = self._range(name, start_ns, stop_ns)
         return high - low
 
     def stamps_ns(self, name: str) -> np.ndarray:
-        """The stamps of a stream that put its samples in order, int64 [n], read-only."""
+        """The stamps by which a stream is sorted, int64 [n], read-only."""
         return self._column(self._stamps[self._stream(name).name])
 
     def images(
@@ -67,12 +67,12 @@ class GroupReader(Generic[A]):
             start: first image.
             stop: one past the last; None for all.
             form: half size or gray instead of the stored size and colours.
-            out: where the images go; made anew when not given.
+            out: destination; allocated when not given.
 
         Raises:
             UnknownNameError: no such stream.
             InvalidInputError: images outside the stream, or a stream without images.
-            ShapeError: an `out` that does not fit.
+            ShapeError: an `out` of another shape or dtype.
             CorruptDataError: damaged bytes.
         """
         if self._stream(name).kind != "image":
@@ -83,12 +83,12 @@ class GroupReader(Generic[A]):
                 f"{self._what}: got images {start} … {stop} of {name!r}, expected within "
                 f"0 … {self.num_samples(name)}"
             )
-        # A forged length must not become a list of numbers.
+        # A forged length must not be expanded to a list of numbers.
         self._contents.shard(name).check_index()
         return self._pick_images(self._stream(name), np.arange(start, stop), form, out)
 
     def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
-        """Images start … stop−1 of a `jpeg` or `h264` stream as they are stored, bytes each.
+        """Encoded images start … stop−1 of a `jpeg` or `h264` stream.
 
         Raises:
             InvalidInputError: a stream of another unit, or images outside the stream.
@@ -119,7 +119,7 @@ class GroupReader(Generic[A]):
         """Read everything and compare it with the commit record.
 
         Raises:
-            CorruptDataError: the first array that does not hold, by name.
+            CorruptDataError: the first damaged array, by name.
             InvalidInputError: a group that is still being written.
         """
         if not isinstance(self._contents, CommittedGroup):
@@ -138,7 +138,7 @@ class GroupReader(Generic[A]):
         return self.streams[name]
 
     def _column(self, name: str) -> np.ndarray:
-        """A whole small array (stamps, actions), read once and kept."""
+        """A whole small array (stamps, actions), cached after the first read."""
         column = self._whole.get(name)
         if column is None:
             column = self._contents.shard(name).read()
@@ -169,7 +169,7 @@ class GroupReader(Generic[A]):
         form: ImageForm,
         out: np.ndarray | None,
     ) -> np.ndarray:
-        """Images at ascending indices, of which some may repeat."""
+        """Images at non-decreasing indices."""
         shape = (len(indices), *form.shape(descriptor.shape))
         if out is not None and (out.shape != shape or out.dtype != np.uint8):
             raise ShapeError(

@@ -1,4 +1,4 @@
-"""Encoded images ↔ storage chunks of an image array, and storage chunks → pixels.
+"""Packing of JPEG and H.264 images into storage chunks, and decoding of chunks to pixels.
 
 A `jpeg` storage chunk is the bytes of one JPEG image. An `h264` one is a closed group of pictures:
 u32 number of images, u32 length of each access unit, the access units; little endian.
@@ -19,7 +19,7 @@ from dextouch.images.jpeg import jpeg_size
 
 
 def pack_chunk(codec: Codec, images: Sequence[bytes]) -> bytes:
-    """The storage chunk of one JPEG image or of the access units of one group of pictures."""
+    """Pack one JPEG image, or the access units of one group of pictures, into a storage chunk."""
     if codec == "jpeg":
         return images[0]
     return struct.pack(f"<{1 + len(images)}I", len(images), *map(len, images)) + b"".join(images)
@@ -27,10 +27,10 @@ def pack_chunk(codec: Codec, images: Sequence[bytes]) -> bytes:
 
 @dataclass(frozen=True)
 class ImageChunks:
-    """How the storage chunks of one image array are read.
+    """Decoder for the storage chunks of one image array.
 
-    `shape` is [h, w, 3] of an image, `rows` the images a storage chunk, `what` the array's name in
-    errors.
+    `shape` is [h, w, 3] of an image, `rows` the number of images per storage chunk, `what` the
+    array's name in errors.
     """
 
     codec: Codec
@@ -39,10 +39,10 @@ class ImageChunks:
     what: str
 
     def unpack(self, payload: bytes, number: int) -> list[bytes]:
-        """The encoded images of storage chunk `number`, inverse of `pack_chunk`.
+        """Split storage chunk `number` into its encoded images, the inverse of `pack_chunk`.
 
         Raises:
-            CorruptDataError: bytes that are no such storage chunk.
+            CorruptDataError: an invalid storage chunk.
         """
         if self.codec == "jpeg":
             return [payload]
@@ -59,17 +59,17 @@ class ImageChunks:
     def decode(
         self, payload: bytes, number: int, places: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Write images of storage chunk `number` into `out`, decoding no more than they need.
+        """Decode images of storage chunk `number` into `out`, decoding no more than necessary.
 
         Args:
             payload: of the storage chunk.
             number: of the storage chunk.
-            places: of the wanted images in the chunk, ascending.
-            form: of what comes out.
+            places: indices of the requested images in the chunk, ascending.
+            form: size and colours of the output.
             out: uint8 [len(places), *form.shape(shape)].
 
         Raises:
-            CorruptDataError: bytes that are no such images.
+            CorruptDataError: invalid image data.
         """
         images = self.unpack(payload, number)
         if places[-1] >= len(images):
@@ -89,11 +89,12 @@ class ImageChunks:
             ) from error
 
     def _decode_jpeg(self, data: bytes, form: ImageForm, out: np.ndarray) -> None:
-        # The header first: what it announces is what gets allocated.
+        # Check the header first: the decoder allocates what it declares.
         if (size := jpeg_size(data)) != self.shape[:2]:
             raise CorruptDataError(f"got a JPEG image of {size} pixels, expected {self.shape[:2]}")
         try:
-            # At half size libjpeg leaves half the frequencies out, which is faster than averaging.
+            # At half size libjpeg skips half of the DCT coefficients, which is faster than
+            # averaging.
             image = simplejpeg.decode_jpeg(
                 data,
                 colorspace="GRAY" if form.gray else "RGB",

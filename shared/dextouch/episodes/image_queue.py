@@ -1,4 +1,4 @@
-"""Blocks of images in, the same blocks handed on in order by a thread; a bounded number waits."""
+"""Bounded queue with a worker thread that encodes blocks of images in order, with backpressure."""
 
 from collections import deque
 from collections.abc import Callable, Mapping
@@ -13,10 +13,10 @@ Work = Callable[[np.ndarray, Mapping[str, np.ndarray]], None]
 
 
 class ImageQueue:
-    """Hands blocks to `work` one after the other in a thread of its own.
+    """Passes blocks to `work` in order, in a background thread.
 
     Args:
-        work: takes the images and stamps of a block.
+        work: called with the images and stamps of a block.
         name: of the stream, for the thread.
         when_full: "wait" or "drop".
     """
@@ -30,10 +30,10 @@ class ImageQueue:
         self._thread = ThreadPoolExecutor(max_workers=1, thread_name_prefix=f"encode-{name}")
 
     def put(self, values: np.ndarray, stamps: Mapping[str, np.ndarray]) -> None:
-        """Queue a copy of a block; raises what an earlier block raised."""
+        """Queue a copy of a block; re-raises the exception of an earlier block."""
         while self._waiting and self._waiting[0][0].done():
             self._take_oldest()
-        # A block larger than the queue goes in when nothing waits.
+        # A block larger than the queue is accepted when the queue is empty.
         while self._waiting and self._num_images + len(values) > MAX_WAITING_IMAGES:
             if self._when_full == "drop":
                 self.num_dropped += len(values)
@@ -45,18 +45,18 @@ class ImageQueue:
         self._num_images += len(values)
 
     def drain(self) -> None:
-        """Wait until everything queued is written; raises as `put`."""
+        """Wait until the queue is empty; raises as `put`."""
         while self._waiting:
             self._take_oldest()
 
     def stop(self, *, drop: bool) -> None:
-        """End the thread; what still waits is left out, or written before."""
+        """End the thread, after discarding or writing the queued blocks."""
         self._thread.shutdown(cancel_futures=drop)
 
     def _copy(self, values: np.ndarray) -> np.ndarray:
         if values.dtype == object:
             return values.copy()
-        # The memory of blocks that are done: fresh memory for an image costs more than the image.
+        # Reused buffers: page faults of fresh memory cost more than copying the image.
         while self._spare:
             spare = self._spare.pop()
             if spare.shape == values.shape:

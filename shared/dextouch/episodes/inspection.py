@@ -1,6 +1,6 @@
-"""A store → all damage in it, by item, array and storage chunk, and what is foreign or unfinished.
+"""Full inspection of a store: all damage by item, array and storage chunk, foreign files, stages.
 
-Where a reader stops at the first thing that does not hold, an inspection goes on and names all.
+A reader stops at the first damage; an inspection continues and lists all of it.
 """
 
 import fcntl
@@ -40,13 +40,13 @@ from dextouch.schemas.recordings import RecordingAttributes
 UPLOADS = ".uploads"
 STAGING = ".staging"
 Group = CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes]
-# Told how many bytes were read, as they are.
+# Called with the number of bytes read.
 Progress = Callable[[int], None]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that does not hold; without `array` the whole item, without `chunk` the array."""
+    """One damaged part; without `array` the whole item, without `chunk` the whole array."""
 
     message: str
     array: str | None = None
@@ -56,7 +56,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class ItemReport:
-    """What was found of one group, unfinished upload or stage; `busy` if a writer holds it."""
+    """Findings on one group, unfinished upload or stage; `busy` if a writer holds its lock."""
 
     kind: str
     item_id: str
@@ -67,12 +67,12 @@ class ItemReport:
 
     @property
     def damaged(self) -> bool:
-        """Whether anything does not hold."""
+        """Whether there is any finding."""
         return bool(self.findings)
 
 
 def open_contents(files: GroupFiles, kind: Kind) -> Group:
-    """The contents of a committed group of either kind; raises as `read_group`."""
+    """Open a committed group of either kind; raises as `read_group`."""
     if kind == "episode":
         return read_group(files, kind, EpisodeAttributes)
     return read_group(files, kind, RecordingAttributes)
@@ -81,12 +81,12 @@ def open_contents(files: GroupFiles, kind: Kind) -> Group:
 def inspect_group(
     files: GroupFiles, kind: Kind, *, progress: Progress = lambda _: None
 ) -> ItemReport:
-    """Read everything of a committed group and name all that does not hold.
+    """Read a committed group completely and list all damage.
 
     Args:
         files: of the group.
         kind: of the group.
-        progress: told about every storage chunk.
+        progress: called after every storage chunk.
     """
     try:
         contents = open_contents(files, kind)
@@ -129,19 +129,19 @@ def _inspect_array(contents: Group, name: str, progress: Progress) -> tuple[list
         else:
             num_bytes += len(payload)
             progress(len(payload))
-    # Sees also what checksums of a forger hold for.
+    # Also detects damage for which a forger has adapted the checksums.
     if not findings and digest.hexdigest() != contents.entries[name].sha256:
         findings.append(Finding(f"{what}: sha256 does not hold", name))
     return findings, num_bytes
 
 
 def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> bytes:
-    """What a storage chunk adds to its array's hash.
+    """Bytes of a storage chunk that enter its array's hash.
 
-    Of images the number and the headers are looked at, not the pixels.
+    For images only their number and headers are checked, not the pixels.
 
     Raises:
-        CorruptDataError: it does not hold the rows that it should.
+        CorruptDataError: it does not contain the expected rows.
     """
     where = f"{what}: storage chunk {number}"
     num_rows = min(entry.chunk_rows, entry.shape[0] - number * entry.chunk_rows)
@@ -157,7 +157,7 @@ def hashed_bytes(payload: bytes, entry: ArrayEntry, number: int, what: str) -> b
 
 
 def _stamp_findings(contents: Group) -> list[Finding]:
-    """Stamps that are out of order, by which every search in them would go wrong."""
+    """Stamps that are out of order, which breaks binary search in them."""
     first, strictly = STAMPS[contents.kind][0], contents.kind == "episode"
     findings = []
     for stream in contents.attributes.streams:
@@ -171,7 +171,7 @@ def _stamp_findings(contents: Group) -> list[Finding]:
 
 
 def foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
-    """Files, folders and links in a group's folder that belong to none of its arrays."""
+    """Files, folders and links in a group's folder that belong to no array."""
     wanted = {COMMIT_FILE, METADATA_FILE}
     for name, entry in entries.items():
         wanted |= {f"{name}/{METADATA_FILE}", f"{name}/{shard_path(len(entry.shape))}"}
@@ -187,9 +187,9 @@ def foreign_paths(folder: Path, entries: dict[str, ArrayEntry]) -> list[str]:
 
 
 def inspect_upload(folder: Path) -> ItemReport:
-    """Read an unfinished upload, or any other spool; a torn end is no damage."""
+    """Inspect an unfinished upload or any other spool; a torn tail does not count as damage."""
     with disk_errors(f"look at upload {folder.name}"):
-        # A name with a dot, or without attributes, is one that is only being born.
+        # A name with a dot, or a folder without attributes, is still being created.
         if not (folder / RECORDING_FILE).exists():
             return ItemReport("upload", folder.name)
     try:
@@ -217,7 +217,7 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
                     message = f"{what}: batch {number - 1} of {name!r} does not match its checksum"
                     torn.append(Finding(message, name, number - 1))
                 else:
-                    # What a writer that lives has not written yet is no damage, nor a torn end.
+                    # Data that a live writer has not written yet is neither damage nor a torn tail.
                     findings += torn
                     torn, num_bytes = [], num_bytes + int(row["length"])
     except StorageError as error:
@@ -226,7 +226,7 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
 
 
 def inspect_stage(folder: Path) -> ItemReport:
-    """Read what a writer left, or has written so far."""
+    """Inspect the stage of a running or terminated writer."""
     try:
         attributes = read_stage(folder)
     except StorageError as error:
@@ -243,7 +243,7 @@ def inspect_stage(folder: Path) -> ItemReport:
         except StorageError as error:
             findings.append(Finding(f"stage {folder.name}: {error.message}", name))
             continue
-        # What a writer that lives has not written yet is no damage, nor is a torn end.
+        # Neither data that a live writer has not written yet nor a torn tail is damage.
         for number, row in enumerate(rows):
             try:
                 (payload,) = read_payloads(folder, name, np.array([row]))
@@ -273,7 +273,7 @@ def _only_bad_follow(folder: Path, name: str, rows: np.ndarray) -> bool:
 
 
 def is_held(folder: Path) -> bool:
-    """Whether a writer holds a stage or a spool."""
+    """Whether a writer holds the lock of a stage or a spool."""
     with disk_errors(f"look at {folder.name}"):
         descriptor = os.open(folder, os.O_RDONLY)
     try:

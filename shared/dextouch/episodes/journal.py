@@ -1,8 +1,8 @@
-"""Storage chunks ↔ a `part` file and a `journal` whose fixed rows vouch for them.
+"""Append-only log of storage chunks: a `part` file of payloads and a `journal` of checksummed rows.
 
-A payload is there when its row is there: the payload is written first, then the row, each with a
+A payload counts once its row exists: the payload is written first, then the row, each with a
 crc32c. Rows have one length, so a torn tail is found from the file's size alone. The rows have a
-file of their own because the part file becomes the shard as it is.
+separate file because the part file becomes the shard unchanged.
 """
 
 import os
@@ -32,23 +32,23 @@ JOURNAL_ROW = np.dtype(
 
 
 def part_path(folder: Path, name: str) -> Path:
-    """The file of a log's payloads."""
+    """Path of a log's payload file."""
     return folder / f"{name}.part"
 
 
 def journal_path(folder: Path, name: str) -> Path:
-    """The file of a log's rows."""
+    """Path of a log's journal."""
     return folder / f"{name}.journal"
 
 
 def read_rows(folder: Path, name: str) -> np.ndarray:
-    """All good rows of a journal, whose payloads are wholly in the part file.
+    """All valid rows of a journal whose payloads are complete in the part file.
 
-    Rows that are not whole at the end are left out: that is what a crash leaves. A bad row before
-    a good one is damage, and refused.
+    An incomplete tail, which is what a crash leaves, is ignored. An invalid row before a valid one
+    is damage, and refused.
 
     Raises:
-        CorruptDataError: damage in the middle, or no journal.
+        CorruptDataError: damage in the middle, or a missing journal.
     """
     with disk_errors(f"read journal of {name}"):
         data = journal_path(folder, name).read_bytes()
@@ -88,7 +88,7 @@ def _rows_hold(rows: np.ndarray, part_bytes: int) -> np.ndarray:
 
 
 def read_payloads(folder: Path, name: str, rows: np.ndarray) -> list[bytes]:
-    """The payloads of consecutive rows, each checked.
+    """Read the payloads of consecutive rows and verify their checksums.
 
     Raises:
         CorruptDataError: a payload does not match its checksum.
@@ -119,10 +119,10 @@ class JournalWriter:
     Args:
         folder: of the log.
         name: of the log.
-        num_rows: None for new files, else how many rows to keep and go on after.
+        num_rows: None for new files; otherwise the number of rows to keep and append to.
 
     Raises:
-        StorageError: the files exist already, or cannot be made.
+        StorageError: the files exist already, or cannot be created.
     """
 
     def __init__(self, folder: Path, name: str, *, num_rows: int | None = None) -> None:
@@ -142,10 +142,10 @@ class JournalWriter:
                 self.truncate(num_rows)
 
     def append(self, payload: bytes, num_rows: int) -> None:
-        """Append a storage chunk with so many rows of the array, whole or not at all.
+        """Append a storage chunk of `num_rows` rows of the array, atomically.
 
         Raises:
-            StorageFullError: no space; the files are as they were before this call.
+            StorageFullError: no space; the files are unchanged.
         """
         crc = google_crc32c.value(payload)
         body = _BODY.pack(self._part_bytes, num_rows, len(payload), crc)
@@ -154,24 +154,24 @@ class JournalWriter:
                 write_all(self._part, payload)
                 write_all(self._journal, body + _CRC.pack(google_crc32c.value(body)))
         except BaseException:
-            # Cutting off needs no space: what was acknowledged before stays readable. An interrupt
-            # between the two writes would otherwise put the next payload in the wrong place.
+            # Truncating needs no space, so acknowledged data stays readable. Without it, an
+            # interrupt between the two writes would misplace the next payload.
             self._cut()
             raise
         self.num_rows += 1
         self._part_bytes += len(payload)
 
     def sync(self) -> None:
-        """Make everything appended survive a power loss: payloads first, then rows."""
+        """Sync everything appended to disk: payloads first, then rows."""
         with disk_errors(f"sync log {self.name}"):
             os.fdatasync(self._part)
             os.fdatasync(self._journal)
 
     def truncate(self, num_rows: int) -> np.ndarray:
-        """Keep the first rows, drop what follows; the kept rows come back.
+        """Keep the first `num_rows` rows, drop the rest, and return the kept rows.
 
         Raises:
-            StorageError: fewer rows than that exist.
+            StorageError: fewer rows exist.
         """
         rows = read_rows(self._folder, self.name)
         if num_rows > len(rows):
@@ -186,12 +186,12 @@ class JournalWriter:
         return rows
 
     def write_tail(self, data: bytes) -> None:
-        """Put bytes behind the last payload that belong to no row; nothing is appended after."""
+        """Write a trailer after the last payload; nothing may be appended afterwards."""
         with disk_errors(f"close log {self.name}"):
             write_all(self._part, data)
 
     def close(self) -> None:
-        """Give the files back."""
+        """Close the files."""
         # Forgotten before it is closed: after an interrupt between the two the number may already
         # be that of another file.
         for field in ("_part", "_journal"):

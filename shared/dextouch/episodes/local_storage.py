@@ -1,4 +1,4 @@
-"""Groups in a folder of this machine: a commit is a rename, an id is the name of a folder."""
+"""Storage backend in a local folder, where a commit is a rename."""
 
 import builtins
 import re
@@ -28,7 +28,7 @@ from dextouch.schemas.episodes import ID_PATTERN
 
 
 def local_folder(url: str | Path) -> Path:
-    """The folder that a store's address names.
+    """Local folder of a store's URL.
 
     Args:
         url: a path, or `file:///…`.
@@ -49,10 +49,10 @@ def local_folder(url: str | Path) -> Path:
 
 
 class LocalStorage:
-    """Committed groups as folders `episodes/ID` and `recordings/ID` below one folder.
+    """Stores committed groups as `episodes/ID` and `recordings/ID` below one folder.
 
     Args:
-        root: that folder; made when the first thing is written.
+        root: that folder; created on the first write.
     """
 
     def __init__(self, root: Path) -> None:
@@ -60,11 +60,11 @@ class LocalStorage:
 
     @property
     def root(self) -> Path:
-        """The folder of the store."""
+        """Folder of the store."""
         return self._root
 
     def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
-        """A writer whose commit puts a group here.
+        """Writer of a new group.
 
         Raises:
             ConflictError: the id exists already.
@@ -76,7 +76,7 @@ class LocalStorage:
         return EpisodeWriter(stage=stage, target=target, attributes=attributes, options=options)
 
     def group(self, kind: Kind, item_id: str) -> LocalGroup:
-        """The files of a committed group.
+        """Files of a committed group.
 
         Raises:
             NotFoundError: no such id.
@@ -98,7 +98,7 @@ class LocalStorage:
             return (self._existing(kind, item_id) / COMMIT_FILE).stat().st_mtime_ns
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
-        """What a committed group takes on the disk.
+        """Size of a committed group on disk.
 
         Raises:
             NotFoundError: no such id.
@@ -106,7 +106,7 @@ class LocalStorage:
         return folder_bytes(self._existing(kind, item_id))
 
     def list(self, kind: Kind) -> list[str]:
-        """Committed ids in order."""
+        """Sorted committed ids."""
         folder = self.root / f"{kind}s"
         with disk_errors(f"list {kind}s"):
             if not folder.is_dir():
@@ -114,7 +114,7 @@ class LocalStorage:
             return sorted(path.name for path in folder.iterdir() if _is_committed(path))
 
     def delete(self, kind: Kind, item_id: str) -> None:
-        """Remove a group for good; it vanishes at once, its bytes a moment later.
+        """Delete a group permanently; it disappears atomically and is then removed from disk.
 
         Raises:
             NotFoundError: no such id.
@@ -123,13 +123,13 @@ class LocalStorage:
         remove_for_good(put_into_trash(self.root, kind, item_id))
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Bring a group of an older format version over; False if it is of the current one.
+        """Upgrade a group of an older format version; False if it is current.
 
-        The new group takes the old one's place in one moment; its lineage names the old content.
+        The new group replaces the old one atomically; its lineage names the old content.
 
         Raises:
             NotFoundError: no such id.
-            CorruptDataError: damaged; it stays as it is.
+            CorruptDataError: damaged; the group is unchanged.
             StorageError: of a newer version.
         """
         folder = self._existing(kind, item_id)
@@ -138,8 +138,8 @@ class LocalStorage:
             return False
         old = OldGroup(files, kind)
         staging, number = self.root / STAGING, uuid.uuid4().hex
-        # Committed beside the store first: a kill between the two renames below is mended by
-        # `recover`, which finds a whole group whose place is free.
+        # Committed beside the store first: after a kill between the two renames below, `recover`
+        # finds a complete group whose place is free.
         whole = staging / f"migrated-{item_id}-{number}"
         with EpisodeWriter(
             stage=staging / f"{kind}-{item_id}-{number}",
@@ -159,10 +159,10 @@ class LocalStorage:
         return True
 
     def recover(self) -> builtins.list[RecoveredGroup]:
-        """Complete what killed writers left behind, as far as they went.
+        """Commit the stages of terminated writers, as far as they were written.
 
         Raises:
-            CorruptDataError: damage that is no torn end; that stage is as it was, all others are
+            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
                 completed.
         """
         stages = abandoned_stages(self.root)
@@ -171,7 +171,7 @@ class LocalStorage:
         return found
 
     def sweep(self) -> int:
-        """Remove stages of which nothing can be made; how many went comes back."""
+        """Remove stages that cannot be recovered and return their number."""
         with disk_errors("sweep"):
             return sweep_stages(self.root, ids_below(self.root))
 
@@ -186,7 +186,7 @@ class LocalStorage:
 
 
 def _is_committed(folder: Path) -> bool:
-    """Whether a group is there; one that may not be looked into counts: opening it says why."""
+    """Whether a group exists; an inaccessible one counts, since opening it explains why."""
     try:
         return (folder / COMMIT_FILE).is_file()
     except PermissionError:

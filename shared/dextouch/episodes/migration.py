@@ -1,7 +1,7 @@
-"""A group of an older format version → the same group in the current one.
+"""Upgrade of a group from format version 1 to the current version.
 
-Version 1 had no `h264` and kept JPEG images end to end in one array of bytes, with an array of the
-byte after each. Attributes, stamps and numbers are the same in both.
+Version 1 had no `h264` and kept concatenated JPEG images in one array of bytes, with an array of
+their end offsets. Attributes, stamps and numbers are the same in both.
 """
 
 import json
@@ -40,7 +40,7 @@ Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 class OldGroup:
-    """A group of format version 1, checked as its own release checked it.
+    """A group of format version 1, with the checks of its release.
 
     Args:
         files: of the group.
@@ -78,12 +78,12 @@ class OldGroup:
 
     @property
     def attributes(self) -> EpisodeAttributes | RecordingAttributes:
-        """The old attributes; lineage says which content they were brought over from."""
+        """The attributes, with the migrated content in their lineage."""
         before = LineageEntry(kind=self._kind, id=self._files.item_id, sha256=self._content_sha256)
         return self._attributes.model_copy(update={"lineage": (*self._attributes.lineage, before)})
 
     def blocks(self, stream: StreamDescriptor) -> Iterator[Block]:
-        """Values and stamps of a stream, some samples at a time, every byte of them checked."""
+        """Iterate over values and stamps of a stream in blocks, verifying every byte."""
         stamps = {
             stamp: self._shard(f"{stream.name}_{stamp}").read() for stamp in STAMPS[self._kind]
         }

@@ -1,4 +1,4 @@
-"""`s3://bucket/prefix?option=value` and a mapping of options → one checked address."""
+"""Parsing and validation of object storage URLs, `s3://bucket/prefix?option=value`."""
 
 import hashlib
 import re
@@ -17,18 +17,18 @@ _SECRETS = frozenset({"access_key_id", "secret_access_key", "session_token"})
 
 
 class ObjectOptions(BaseModel):
-    """How a bucket is reached; what is None is left to the AWS_* environment that obstore reads.
+    """Connection options of a bucket; None leaves an option to obstore's AWS_* environment.
 
     Attributes:
-        endpoint: address of the service where it is not Amazon's, `https://…`.
+        endpoint: URL of a service other than Amazon S3, `https://…`.
         region: of the bucket.
-        allow_http: whether an endpoint `http://…` may be used, which sends everything in clear.
+        allow_http: whether an unencrypted endpoint `http://…` may be used.
         skip_signature: read a public bucket without credentials.
         virtual_hosted_style_request: whether the bucket is part of the host's name.
-        access_key_id, secret_access_key, session_token: credentials; refused in an address.
-        max_retries: of one request that failed for a reason that may pass.
-        retry_timeout_s: after which no retry begins.
-        cache_bytes: of memory for parts of objects that were read; 0 keeps nothing.
+        access_key_id, secret_access_key, session_token: credentials; refused in a URL.
+        max_retries: of one request after transient errors.
+        retry_timeout_s: time after which no retry starts.
+        cache_bytes: size of the in-memory block cache; 0 disables it.
         work_folder: where groups are written before they are uploaded.
     """
 
@@ -50,7 +50,7 @@ class ObjectOptions(BaseModel):
 
 @dataclass(frozen=True)
 class ObjectAddress:
-    """A bucket, the prefix of all keys in it (without slashes around), and how it is reached."""
+    """A bucket, the common prefix of its keys (without outer slashes), and connection options."""
 
     bucket: str
     prefix: str
@@ -61,7 +61,7 @@ class ObjectAddress:
 
     @property
     def work_folder(self) -> Path:
-        """The folder that was given, or one below the data folder that no other address has."""
+        """The given work folder, or one below the data folder that is unique to this address."""
         if self.options.work_folder is not None:
             return self.options.work_folder
         name = re.sub(r"[^a-z0-9]+", "-", str(self).removeprefix("s3://").lower()).strip("-")
@@ -69,7 +69,7 @@ class ObjectAddress:
 
     @property
     def fingerprint(self) -> str:
-        """Hexadecimal; the same for two addresses of one place."""
+        """Hexadecimal id, equal for addresses of the same location."""
         place = f"{self.options.endpoint or ''} {self}"
         return hashlib.sha256(place.encode()).hexdigest()
 
@@ -77,11 +77,11 @@ class ObjectAddress:
 def parse_address(
     url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
 ) -> ObjectAddress:
-    """The address that a URL and options name; options given apart win over the URL's.
+    """Parse a URL; explicit options take precedence over those in the URL.
 
     Raises:
-        InvalidInputError: no bucket, secrets in the URL, or an option's value that does not fit.
-        UnknownNameError: an option that there is not.
+        InvalidInputError: no bucket, secrets in the URL, or an invalid option value.
+        UnknownNameError: an unknown option.
     """
     parts = urlsplit(url)
     where = f"{parts.scheme}://{parts.hostname or ''}{parts.path}"
@@ -107,7 +107,7 @@ def parse_address(
     try:
         options = ObjectOptions.model_validate(given)
     except ValidationError as error:
-        # Only the names: the values may be secret.
+        # Option names only: the values may be secret.
         names = sorted({str(problem["loc"][0]) for problem in error.errors()})
         problem = error.errors(include_input=False)[0]["msg"]
         raise InvalidInputError(f"{where}: options {names} do not fit ({problem})") from None

@@ -1,7 +1,4 @@
-"""Requests for keys below one prefix of a bucket → bytes, or one of our errors that says why not.
-
-The only module that knows obstore.
-"""
+"""Requests to one S3 bucket, with errors mapped to DexTouch errors; the only user of obstore."""
 
 import os
 import re
@@ -29,7 +26,7 @@ _PASSED_ON = (
     "endpoint", "region", "skip_signature", "virtual_hosted_style_request", "access_key_id",
     "secret_access_key", "session_token",
 )  # fmt: skip
-# How the library tells why a request failed where it has no class of error for it.
+# The library puts the status code in the message where it has no exception class for it.
 _STATUS = re.compile(r"status code: (\d{3})")
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _CREDENTIAL_HOST = "169.254.16"
@@ -37,7 +34,7 @@ _CREDENTIAL_HOST = "169.254.16"
 
 @dataclass(frozen=True)
 class ObjectFacts:
-    """What is known of an object without reading it."""
+    """Metadata of an object (HEAD)."""
 
     key: str
     size: int
@@ -46,7 +43,7 @@ class ObjectFacts:
 
 
 class _Runtime:
-    """The process whose threads do the library's work; a forked child has none of them."""
+    """Guards against use after a fork, where the library's threads do not exist."""
 
     owner: int | None = None
 
@@ -65,7 +62,7 @@ class _Runtime:
 class Bucket:
     """One bucket below one prefix.
 
-    May be used by several threads, and pickled into processes that were not forked.
+    Thread-safe, and picklable for spawned processes, not for forked ones.
     """
 
     def __init__(self, address: ObjectAddress) -> None:
@@ -96,7 +93,7 @@ class Bucket:
         return Bucket, (self.address,)
 
     def get(self, key: str) -> bytes | None:
-        """All bytes of an object; None where there is none."""
+        """Contents of an object; None if it does not exist."""
         try:
             with self._errors("read", key):
                 return bytes(obstore.get(self._store, key).bytes())
@@ -104,25 +101,25 @@ class Bucket:
             return None
 
     def head(self, key: str) -> ObjectFacts | None:
-        """What is known of an object; None where there is none."""
+        """Metadata of an object; None if it does not exist."""
         try:
             with self._errors("look at", key):
                 return _facts(obstore.head(self._store, key))
         except FileNotFoundError:
-            # That answer has no body which could say that even the bucket is missing.
+            # A HEAD response has no body that could tell a missing bucket from a missing key.
             if self.get(key) is None:
                 return None
             return self.head(key)
 
     def tail(self, key: str, length: int) -> tuple[ObjectFacts, bytes] | None:
-        """An object's last bytes, all of it if it is shorter; None where there is none."""
+        """The last bytes of an object, all if it is shorter; None if it does not exist."""
         try:
             with self._errors("read", key):
                 try:
                     found = obstore.get(self._store, key, options={"range": {"suffix": length}})
                     return _facts(found.meta), bytes(found.bytes())
                 except BaseError:
-                    # No part can be cut from nothing: services refuse it in different ways.
+                    # A range of an empty object is invalid; services refuse it in different ways.
                     facts = _facts(obstore.head(self._store, key))
                     if facts.size == 0:
                         return facts, b""
@@ -131,10 +128,10 @@ class Bucket:
             return None
 
     def read(self, facts: ObjectFacts, start: int, stop: int) -> bytes:
-        """Bytes start … stop−1 of an object that must still be the one that was looked at.
+        """Bytes start … stop−1 of an object, which must be unchanged since `facts` was read.
 
         Raises:
-            StorageError: it is gone or another one.
+            StorageError: it was deleted or replaced.
             CorruptDataError: it is shorter.
         """
         try:
@@ -153,7 +150,7 @@ class Bucket:
         return data
 
     def put(self, key: str, content: bytes | Path, *, create: bool = False) -> bool:
-        """Write an object; False if `create` is asked for and there is one already."""
+        """Write an object; False if `create` is set and it exists already."""
         with self._errors("write", key):
             try:
                 obstore.put(self._store, key, content, mode="create" if create else "overwrite")
@@ -164,29 +161,29 @@ class Bucket:
         return True
 
     def list(self, folder: str) -> Iterator[ObjectFacts]:
-        """All objects below a prefix, in no order that can be relied on."""
+        """All objects below a prefix, in arbitrary order."""
         with self._errors("list", folder):
             for some in obstore.list(self._store, prefix=folder):
                 for found in some:
                     yield _facts(found)
 
     def remove(self, keys: Sequence[str]) -> None:
-        """Delete objects; those that are not there do not matter."""
+        """Delete objects; missing ones are ignored."""
         if keys:
             with self._errors("delete", keys[0]):
                 obstore.delete(self._store, list(keys))
 
     def url(self, key: str) -> str:
-        """A key as messages name it."""
+        """URL of a key, for messages."""
         return f"{self.address}/{key}"
 
     @contextmanager
     def _errors(self, word: str, key: str) -> Iterator[None]:
-        """Ours for the library's; FileNotFoundError and PreconditionError pass.
+        """Map obstore's exceptions to ours; FileNotFoundError and PreconditionError pass through.
 
         Raises:
-            StorageError: the service refuses: credentials, bucket, rights.
-            UnavailableError: the service does not answer, or not now.
+            StorageError: refused because of credentials, bucket or permissions.
+            UnavailableError: no answer, or the service is overloaded.
         """
         _Runtime.check(self.url(key))
         try:

@@ -1,4 +1,4 @@
-"""Files of a group in a bucket → their bytes, fetched in blocks that a bounded memory keeps."""
+"""Cached range reads of the files of a group in a bucket."""
 
 import threading
 from collections import OrderedDict
@@ -9,16 +9,16 @@ from dextouch.episodes.object_bucket import Bucket, ObjectFacts
 BLOCK_BYTES = 1 << 18
 # One request for the end of a file gives its size, the index of its shard, and all of a small one.
 TAIL_BYTES = 1 << 16
-# Someone who reads on is met with ever larger requests, up to this many blocks.
+# Sequential reads get ever larger requests, up to this many blocks.
 MAX_READ_AHEAD = 8
 _TAIL = -1
 
 
 class BlockCache:
-    """The most recently read blocks of all objects, up to a number of bytes.
+    """LRU cache of object blocks, limited in bytes.
 
     Args:
-        capacity: in bytes; 0 keeps nothing.
+        capacity: in bytes; 0 disables the cache.
     """
 
     def __init__(self, capacity: int) -> None:
@@ -28,7 +28,7 @@ class BlockCache:
         self._num_bytes = 0
 
     def get(self, facts: ObjectFacts, number: int) -> bytes | None:
-        """A block of an object as it was when it was looked at."""
+        """A cached block of this version of an object."""
         key = (facts.key, facts.etag, number)
         with self._guard:
             block = self._blocks.get(key)
@@ -37,7 +37,7 @@ class BlockCache:
         return block
 
     def put(self, facts: ObjectFacts, number: int, block: bytes) -> None:
-        """Keep a block; the longest unused go."""
+        """Add a block, evicting the least recently used ones."""
         key = (facts.key, facts.etag, number)
         with self._guard:
             self._num_bytes += len(block) - len(self._blocks.pop(key, b""))
@@ -47,7 +47,7 @@ class BlockCache:
 
 
 class CachedBucket:
-    """A bucket and the blocks of its objects that are kept."""
+    """A bucket with its block cache."""
 
     def __init__(self, bucket: Bucket) -> None:
         self.bucket = bucket
@@ -58,16 +58,16 @@ class CachedBucket:
 
 
 class ObjectFile:
-    """One object that is read in parts.
+    """One object, read by ranges.
 
     Args:
-        place: where it lies.
+        place: bucket and cache.
         key: of the object.
     """
 
     def __init__(self, place: CachedBucket, key: str) -> None:
         self._place, self._key = place, key
-        # Held over a request: a second reader finds in the memory what the first one fetched.
+        # Held during a request: a second reader then finds the first one's blocks in the cache.
         self._guard = threading.Lock()
         self._facts: ObjectFacts | None = None
         self._next_block, self._ahead = -1, 1
@@ -76,7 +76,7 @@ class ObjectFile:
         return ObjectFile, (self._place, self._key)
 
     def size(self) -> int | None:
-        """Its length in bytes; None where there is no such object."""
+        """Length in bytes; None if the object does not exist."""
         with self._guard:
             facts = self._look()
         return None if facts is None else facts.size
@@ -147,9 +147,9 @@ class ObjectGroup:
     """The files of a committed group in a bucket.
 
     Args:
-        place: where it lies.
+        place: bucket and cache.
         folder: prefix of its keys, `episodes/ID`.
-        known: files whose bytes were read already, by name.
+        known: contents of files that were read already, by name.
     """
 
     def __init__(self, place: CachedBucket, folder: str, known: dict[str, bytes]) -> None:
@@ -157,15 +157,15 @@ class ObjectGroup:
 
     @property
     def item_id(self) -> str:
-        """The id under which the group is stored."""
+        """Id of the group."""
         return self._folder.rpartition("/")[2]
 
     def get(self, name: str) -> bytes | None:
-        """All bytes of a small file; None where there is no such file."""
+        """Contents of a small file; None if it does not exist."""
         if name in self._known:
             return self._known[name]
         return self._place.bucket.get(f"{self._folder}/{name}")
 
     def source(self, name: str) -> ObjectFile:
-        """A file that is read in parts."""
+        """A file for range reads."""
         return ObjectFile(self._place, f"{self._folder}/{name}")

@@ -1,4 +1,4 @@
-"""Groups in a bucket (S3 API): written in a work folder, then uploaded, the commit record last."""
+"""Storage backend in an S3 bucket: groups are written locally and uploaded on commit."""
 
 import builtins
 import hashlib
@@ -41,19 +41,19 @@ _OWNER_FILE = "uploads_to"
 def open_object_storage(
     url: str, storage_options: Mapping[str, str], work_folder: str | Path | None
 ) -> "ObjectStorage":
-    """The storage at `s3://bucket/prefix?options`; nothing is asked of the service yet.
+    """Open `s3://bucket/prefix?options` without contacting the service.
 
     Raises:
-        InvalidInputError, UnknownNameError: an address or options that do not fit.
+        InvalidInputError, UnknownNameError: an invalid address or option.
     """
     address = parse_address(url, storage_options, work_folder)
     return ObjectStorage(address, CachedBucket(Bucket(address)))
 
 
 class UploadingWriter(EpisodeWriter):
-    """Writes a group in the work folder; its commit uploads it.
+    """Writes a group in the work folder and uploads it on commit.
 
-    An interrupt during the upload leaves the group in the outbox, from where `recover` uploads it.
+    After an interrupted upload the group stays in the outbox, from where `recover` uploads it.
 
     Args:
         stage: new folder.
@@ -67,26 +67,26 @@ class UploadingWriter(EpisodeWriter):
 
     def _commit(self) -> None:
         super()._commit()
-        # The lock that came along from the stage is still held: `recover` leaves it to us.
+        # The stage's lock is still held, so a concurrent `recover` skips it.
         try:
             self.upload()
         except ConflictError:
-            # Back where what is broken off is kept under another id, or removed.
+            # Back among the stages, where recovery gives it another id or removes it.
             with disk_errors(f"move {self._target}"):
                 self._target.rename(self._stage)
             raise
 
     def _complete(self) -> RecoveredGroup | None:
-        # What could not be uploaded waits in the outbox.
+        # Groups that could not be uploaded stay in the outbox.
         return self.complete(self._stage) if self._stage.exists() else None
 
 
 class ObjectStorage:
-    """Committed groups as keys `episodes/ID/…` and `recordings/ID/…` of a bucket.
+    """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket.
 
     Args:
         address: of the bucket, with the work folder.
-        place: the bucket and its memory.
+        place: the bucket and its block cache.
     """
 
     def __init__(self, address: ObjectAddress, place: CachedBucket) -> None:
@@ -96,16 +96,16 @@ class ObjectStorage:
 
     @property
     def root(self) -> Path:
-        """The work folder."""
+        """Work folder."""
         return self._root
 
     def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
-        """A writer whose commit puts a group here.
+        """Writer of a new group.
 
         Raises:
-            ConflictError: the id exists already, or waits to be uploaded.
+            ConflictError: the id exists already, or its upload is pending.
             InvalidInputError: the work folder belongs to another address.
-            StorageError, UnavailableError: the bucket cannot be reached; nothing was begun.
+            StorageError, UnavailableError: the bucket cannot be reached; nothing was written.
         """
         item_id = attributes_id(attributes)
         self._own_work_folder()
@@ -123,7 +123,7 @@ class ObjectStorage:
         return writer
 
     def group(self, kind: Kind, item_id: str) -> ObjectGroup:
-        """The files of a committed group.
+        """Files of a committed group.
 
         Raises:
             NotFoundError: no such id.
@@ -139,7 +139,7 @@ class ObjectStorage:
         return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}") is not None
 
     def revision(self, kind: Kind, item_id: str) -> int:
-        """A number of 63 bits from the commit record's entity tag and time.
+        """A 63-bit hash of the commit record's entity tag and modification time.
 
         Raises:
             NotFoundError: no such id.
@@ -151,7 +151,7 @@ class ObjectStorage:
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
-        """What a committed group takes in the bucket.
+        """Size of a committed group in the bucket.
 
         Raises:
             NotFoundError: no such id.
@@ -161,12 +161,12 @@ class ObjectStorage:
         return sum(facts.size for facts in self._bucket.list(group_key(kind, item_id)))
 
     def list(self, kind: Kind) -> list[str]:
-        """Committed ids in order; one request for every thousand files in the bucket."""
+        """Sorted committed ids; takes one request per 1000 objects in the bucket."""
         keys = (facts.key.split("/") for facts in self._bucket.list(f"{kind}s"))
         return sorted(parts[1] for parts in keys if len(parts) == 3 and parts[2] == COMMIT_FILE)
 
     def delete(self, kind: Kind, item_id: str) -> None:
-        """Remove a group; it vanishes at once, its bytes a moment later.
+        """Delete a group: its commit record first, then its other objects.
 
         Raises:
             NotFoundError: no such id.
@@ -176,10 +176,10 @@ class ObjectStorage:
         delete_group(self._bucket, kind, item_id)
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
-        """False for a group of the current version, which all are that were written here.
+        """Return False for a group of the current version; older ones cannot be migrated here.
 
         Raises:
-            StorageError: a copy of an older group: keys cannot be exchanged in one moment.
+            StorageError: a group of an older version: keys cannot be replaced atomically.
         """
         if is_current(self.group(kind, item_id), what=f"{kind} {item_id}"):
             return False
@@ -189,12 +189,12 @@ class ObjectStorage:
         )
 
     def recover(self) -> builtins.list[RecoveredGroup]:
-        """Complete what killed writers left behind, and uploads that were cut off.
+        """Commit the stages of terminated writers, and complete interrupted uploads.
 
         Raises:
-            CorruptDataError: damage that is no torn end; that stage is as it was, all others are
+            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
                 completed.
-            StorageError, UnavailableError: the bucket cannot be reached; repeat it later.
+            StorageError, UnavailableError: the bucket cannot be reached; try again later.
         """
         if not self._root.is_dir():
             return []
@@ -210,7 +210,7 @@ class ObjectStorage:
         return found
 
     def sweep(self) -> int:
-        """Remove stages of which nothing can be made, and files of dead uploads in the bucket."""
+        """Remove stages that cannot be recovered, and objects of abandoned uploads."""
         with disk_errors("sweep"):
             removed = sweep_stages(self._root, self._is_taken)
         return removed + sweep_orphans(self._bucket)
@@ -230,9 +230,9 @@ class ObjectStorage:
             raise
 
     def _deliver(self, kind: Kind, folder: Path) -> RecoveredGroup | None:
-        """Upload a group that nobody holds; a recording under another id if its own was taken."""
+        """Upload a group that no writer holds; a recording gets another id if its own is taken."""
         if not (folder / COMMIT_FILE).exists():
-            # What is left of one that was uploaded.
+            # The remainder of a group that was uploaded.
             with disk_errors(f"remove {folder}"):
                 shutil.rmtree(folder)
             return None
@@ -243,7 +243,7 @@ class ObjectStorage:
             self._upload(kind, folder)
         except ConflictError:
             if kind == "episode":
-                # It can be made again; there is nobody left to be told.
+                # It can be written again, and its writer is gone.
                 shutil.rmtree(folder, ignore_errors=True)
                 return None
             stage = new_stage(self._root, kind, folder.name)
@@ -267,7 +267,7 @@ class ObjectStorage:
         return (self._outbox / f"{kind}s" / item_id).exists() or self.exists(kind, item_id)
 
     def _own_work_folder(self) -> None:
-        """Refuse a work folder whose remains would be uploaded to the wrong place."""
+        """Refuse a work folder of another address, whose groups belong to another bucket."""
         owner, mine = self._root / _OWNER_FILE, self._address.fingerprint.encode()
         with disk_errors(f"use work folder {self._root}"):
             if not owner.is_file():

@@ -1,4 +1,4 @@
-"""An episode or recording on disk → its streams by time, and windows on the model grid."""
+"""Readers of episodes and recordings: streams by time, and windows on the model grid."""
 
 from typing import Literal, overload
 
@@ -26,15 +26,15 @@ from dextouch.streams.samples import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS
 
 SIDES = ("left", "right")
-# Half a step, as with a camera of the model's rate that runs on its own, and a little jitter.
+# Half a step, for a free-running camera at the model rate, plus some jitter.
 OWN_IMAGE_SHARE = 0.6
-# A camera may drop this share of its images now and then; images of every second step lack more.
+# Tolerated share of dropped images; images of every second step miss more.
 MAX_UNSHOWN_SHARE = 0.05
 ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
 
 
 class RecordingReader(GroupReader[RecordingAttributes]):
-    """A recording: raw streams, each with its own clock."""
+    """Reader of a recording: raw streams, each with its own device clock."""
 
     def read(
         self, name: str, start_ns: int | None = None, stop_ns: int | None = None
@@ -59,7 +59,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
             CorruptDataError: damaged bytes.
         """
         t_host_ns = self.stamps_ns(name).copy()
-        # Not kept as the first column is: nobody asks for them twice.
+        # Not cached like the first column, since they are read once.
         t_device_ns, sequence = (
             self._contents.shard(f"{name}_{stamp}").read() for stamp in STAMPS["recording"][1:]
         )
@@ -82,7 +82,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
 
 
 class EpisodeReader(GroupReader[EpisodeAttributes]):
-    """An episode: streams on one reference clock, actions on the model grid."""
+    """Reader of an episode: streams on one reference clock, actions on the model grid."""
 
     @property
     def num_steps(self) -> int:
@@ -139,7 +139,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         Args:
             start: first step, 0 … `num_steps` of the episode − 1.
             num_steps: at least 1.
-            cameras: whose images are wanted; the others are not touched.
+            cameras: image streams to read; the others are not decoded.
             action_kind: measured (reached) or commanded (sent) actions.
             grid: on the model grid; False gives all streams at their own rates, the camera
                 streams among them only for `cameras` (see `native_window`).
@@ -187,13 +187,13 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         streams: tuple[str, ...] | None = None,
         form: ImageForm = FULL_FORM,
     ) -> NativeWindow:
-        """The time of steps start … start + num_steps − 1 with every stream at its own rate.
+        """The time span of steps start … start + num_steps − 1 with every stream at its own rate.
 
         Args:
             start: first step.
             num_steps: at least 1.
-            cameras: whose images are wanted.
-            streams: other streams that are wanted; None for all.
+            cameras: image streams to read.
+            streams: other streams to read; None for all.
             form: half size or gray images.
 
         Raises:
@@ -226,7 +226,7 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     def shown_steps(
         self, camera: str
     ) -> tuple[Int64[np.ndarray, " shown"], Int64[np.ndarray, " shown"]]:
-        """Steps with an image of their own, at most 0.6 steps away, and which image that is.
+        """Steps that have an image at most 0.6 steps away, and the index of that image.
 
         Raises:
             UnknownNameError: no such camera.
@@ -241,10 +241,10 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
         return steps.astype(np.int64), nearest[steps]
 
     def require_images(self, camera: str) -> None:
-        """Refuse an episode whose images do not show its steps, some dropped ones apart.
+        """Check that nearly every step of the episode has an image of its own.
 
-        `window` gives the nearest image whatever its time: where only every N-th step was drawn,
-        that is the image of another step.
+        `window` returns the nearest image whatever its time: where only every N-th step was
+        rendered, that is the image of another step.
 
         Raises:
             InvalidInputError: more than a twentieth of the steps have no image of their own.

@@ -1,4 +1,4 @@
-"""A spool that a crash left behind → the same spool cut back to its last good samples."""
+"""Crash recovery of a spool: truncation to its last valid record."""
 
 import fcntl
 import os
@@ -14,27 +14,27 @@ from dextouch.errors import ConflictError
 
 @dataclass(frozen=True)
 class RecoveryReport:
-    """What is left of a spool: samples by stream, and how many bytes had to go."""
+    """Result of a recovery: samples by stream, and the number of bytes dropped."""
 
     num_samples: dict[str, int]
     dropped_bytes: int
 
 
 def recover(path: Path) -> RecoveryReport:
-    """Cut a spool back to its last good samples after a crash, and say how much went.
+    """Truncate a spool to its last valid record after a crash.
 
-    Everything that `append` had acknowledged stays. Calling it again changes nothing.
+    Everything that `append` acknowledged is kept. The operation is idempotent.
 
     Raises:
         NotFoundError: no spool there.
         ConflictError: it is being written.
-        CorruptDataError: damage that is no torn end; nothing is changed.
+        CorruptDataError: damage other than a torn tail; nothing is changed.
     """
     attributes = read_attributes(path)
     lock = lock_spool(path)
     try:
         if not (path / LOG_FILE).exists():
-            # The process died before it had made the log.
+            # The process died before it created the log.
             BatchLogWriter(path).close()
         records = read_records(path)
         rows = records.rows[: _num_trusted(path, records.rows)]
@@ -54,7 +54,7 @@ def recover(path: Path) -> RecoveryReport:
 
 
 def _num_trusted(path: Path, rows: np.ndarray) -> int:
-    """Records left when those at the end are dropped whose body never reached the disk."""
+    """Number of records after dropping those at the end whose body never reached the disk."""
     num_rows = len(rows)
     with open_log(path) as data:
         while num_rows and body_at(data, rows[num_rows - 1]) is None:
@@ -63,10 +63,10 @@ def _num_trusted(path: Path, rows: np.ndarray) -> int:
 
 
 def lock_spool(path: Path) -> int:
-    """A descriptor that keeps every other writer out until it is closed.
+    """Lock a spool exclusively; the returned descriptor holds the lock until it is closed.
 
     Raises:
-        ConflictError: a writer or a recovery is at work.
+        ConflictError: another process is writing or recovering it.
     """
     descriptor = os.open(path, os.O_RDONLY)
     try:

@@ -1,6 +1,6 @@
-"""What an inspection found damaged → mended from a copy, or salvaged as a group of its own.
+"""Repair of damaged groups from an intact copy, or by salvaging the readable samples.
 
-Nothing is lost by repairing: what was damaged goes to the trash, from where it can be restored.
+Repairing is reversible: damaged groups go to the trash, from where they can be restored.
 """
 
 import json
@@ -63,12 +63,12 @@ WHOLE, MENDED, SALVAGED, RECOVERED, LEFT = "whole", "mended", "salvaged", "recov
 
 @dataclass(frozen=True)
 class RepairReport:
-    """What was done about one item.
+    """Result of the repair of one item.
 
-    `action` is `whole` (nothing to do), `mended` (as it was before the damage), `salvaged` (what
-    holds is under `new_id`, the damaged one in the trash), `recovered` (an interrupted take is
-    complete as far as it went) or `left` (as it was, `notes` say why). `lost` counts the samples
-    that a salvage left out.
+    `action` is `whole` (nothing to do), `mended` (restored as it was before the damage), `salvaged`
+    (the readable samples are in `new_id`, the damaged group in the trash), `recovered` (an
+    interrupted take was committed as far as it was written) or `left` (unchanged, `notes` say why).
+    `lost` counts the samples that a salvage dropped.
     """
 
     kind: str
@@ -82,13 +82,13 @@ class RepairReport:
 def repair_group(
     root: Path, kind: Kind, item_id: str, *, copy: GroupFiles | None = None
 ) -> RepairReport:
-    """Make a committed group whole, or salvage what holds of it.
+    """Repair a committed group, or salvage its readable samples.
 
     Args:
         root: of the store.
         kind: of the group.
         item_id: of the group.
-        copy: of the same content, from which good arrays are taken.
+        copy: a group of the same content, the source of intact arrays.
 
     Raises:
         ConflictError: a copy of other content.
@@ -113,7 +113,7 @@ def repair_group(
         streams = group_streams(folder, attributes, entries)
         new_id, lost = _write_once(root, attributes, streams, source)
     except (StorageError, InvalidInputError) as error:
-        # Often what the inspection had found already.
+        # Often the inspection has already found the same.
         notes = tuple(dict.fromkeys((*notes, error.message)))
         return RepairReport(kind, item_id, LEFT, notes=notes)
     put_into_trash(root, kind, item_id)
@@ -121,10 +121,10 @@ def repair_group(
 
 
 def repair_unfinished(root: Path) -> list[RepairReport]:
-    """Complete what killed writers left, and salvage stages and uploads that are damaged.
+    """Commit the stages of terminated writers, and salvage damaged stages and uploads.
 
-    Uploads without damage stay as they are: their station goes on with them. Of damaged ones what
-    holds becomes a recording `ID-salvaged-N`, so that the station may send all of it anew.
+    Intact uploads are unchanged, since their station continues them. The readable samples of
+    damaged ones become a recording `ID-salvaged-N`, so that the station can send everything again.
     """
     reports = []
     for stage in unheld_folders(root / STAGING):
@@ -180,7 +180,7 @@ def _salvage(root: Path, kind: TrashKind, folder: Path, found: ItemReport) -> Re
 def _write_once(
     root: Path, attributes: Attributes, streams: list[SalvagedStream], source: LineageEntry
 ) -> tuple[str, dict[str, int]]:
-    """Write what holds, unless a repair that was interrupted has done it already."""
+    """Write the readable samples, unless an interrupted repair has done so already."""
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     for folder in sorted((root / f"{kind}s").glob(f"{item_id[:112]}-salvaged-*")):
         try:
@@ -193,7 +193,7 @@ def _write_once(
 
 
 def _mend_metadata(files: LocalGroup, kind: Kind) -> None:
-    """Write `zarr.json` of arrays anew: it says nothing that the commit record does not say."""
+    """Rewrite the `zarr.json` of arrays, which is fully determined by the commit record."""
     try:
         contents = open_contents(files, kind)
     except StorageError:
@@ -203,7 +203,7 @@ def _mend_metadata(files: LocalGroup, kind: Kind) -> None:
 
 
 def _put(folder: Path, name: str, data: bytes) -> None:
-    """Give a file of a group these bytes; links on the way to it go, what they point at stays."""
+    """Replace a file of a group; symbolic links on its path are removed, their targets kept."""
     with disk_errors(f"mend {name} of {folder.name}"):
         place = folder
         for part in name.split("/"):
@@ -217,7 +217,7 @@ def _put(folder: Path, name: str, data: bytes) -> None:
 
 
 def _mend_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
-    """Take from a copy all that differs or does not hold here and holds there."""
+    """Copy all files that differ or are damaged here and are intact in the copy."""
     theirs = open_contents(copy, kind)
     what = f"{kind} {folder.name}"
     _check_same_content(LocalGroup(folder), theirs, what)
@@ -235,7 +235,7 @@ def _mend_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
 
 
 def _put_shard(folder: Path, name: str, data: bytes) -> None:
-    # Written beside the group: nothing half is ever seen in its place.
+    # Written beside the group, so that no partial group is ever visible.
     partial = folder.parent.parent / STAGING / f"mend-{folder.name}-{uuid.uuid4().hex}"
     _put(folder, name, b"")
     with disk_errors(f"mend {name} of {folder.name}"):
@@ -259,7 +259,7 @@ def _check_same_content(
     if record is not None:
         same = record[1] == theirs.content_sha256
     else:
-        # The attributes name the streams and where they come from: enough to know them by.
+        # The attributes name the streams and their lineage, which identifies the content.
         group, other = ours.get(METADATA_FILE), theirs.files.get(METADATA_FILE)
         same = group is not None and group == other
     if not same:
@@ -281,7 +281,7 @@ def _commit_of(files: LocalGroup, what: str) -> tuple[CommitRecord, str] | None:
 def _known(
     files: LocalGroup, kind: Kind, report: ItemReport
 ) -> tuple[Attributes, Mapping[str, ArrayEntry], str | None]:
-    """Attributes, arrays and content hash of a damaged group, as far as they can be trusted.
+    """Trustworthy attributes, arrays and content hash of a damaged group.
 
     Raises:
         StorageError: another version, or attributes that are damaged.
@@ -307,7 +307,7 @@ def _known(
 
 
 def _entries(files: LocalGroup, attributes: Attributes) -> dict[str, ArrayEntry]:
-    """Arrays without a commit record: their lengths as their own metadata say."""
+    """Array entries without a commit record, with the lengths of the arrays' own metadata."""
     entries = {}
     for stream in attributes.streams:
         for name, entry in stream_arrays(stream, kind_of(attributes)).items():

@@ -1,7 +1,7 @@
-"""Damaged arrays and logs → the samples of them that hold, written as a new group that says so.
+"""Salvage of the readable samples of a damaged group, stage or spool into a new group.
 
-Nothing is filled in: a storage chunk or sample that does not hold is left out with its stamps, and
-counted as `lost_to_damage`.
+Nothing is filled in: a damaged storage chunk or sample is dropped with its stamps, and counted as
+`lost_to_damage`.
 """
 
 import uuid
@@ -42,7 +42,7 @@ from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch, encoded_values
 
 LOST = "lost_to_damage"
-# Rows of these belong to each other by their number: the steps of the model grid.
+# The rows of these streams correspond by index: the steps of the model grid.
 GRID_STREAMS = ("action", "action_commanded")
 BLOCK_SAMPLES = 256
 
@@ -51,10 +51,10 @@ Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 @dataclass(frozen=True)
 class SalvagedStream:
-    """What holds of one stream.
+    """The readable samples of one stream.
 
-    `kept` says of each sample whether it is wanted; `read` gives values and stamps of the wanted
-    ones among some consecutive samples, which begin and end at multiples of `block`.
+    `kept` is the mask of samples to keep; `read` returns values and stamps of the kept ones in a
+    range that starts and ends at multiples of `block`.
     """
 
     descriptor: StreamDescriptor
@@ -64,11 +64,11 @@ class SalvagedStream:
 
     @property
     def num_lost(self) -> int:
-        """Samples that are left out."""
+        """Number of dropped samples."""
         return int((~self.kept).sum())
 
     def blocks(self) -> Iterator[Block]:
-        """The kept samples, some at a time."""
+        """Iterate over the kept samples."""
         for start in range(0, len(self.kept), self.block):
             stop = min(start + self.block, len(self.kept))
             if self.kept[start:stop].any():
@@ -76,7 +76,7 @@ class SalvagedStream:
 
 
 class _SalvagedArray:
-    """One array by its storage chunks, of which some do not hold."""
+    """An array of which some storage chunks are damaged."""
 
     def __init__(self, path: Path, entry: ArrayEntry, index: np.ndarray) -> None:
         self.entry, self._what = entry, f"array {path.name!r}"
@@ -92,7 +92,7 @@ class _SalvagedArray:
         return True
 
     def values(self, number: int) -> np.ndarray:
-        """Rows of a storage chunk that holds; of images the encoded bytes."""
+        """Rows of an intact storage chunk; for images the encoded bytes."""
         payload = self._shard.payload(number)
         if self.entry.codec == "zstd":
             return decode_rows(payload, self.entry, what=self._what)
@@ -101,7 +101,7 @@ class _SalvagedArray:
         return encoded_values(chunks.unpack(payload, number))
 
     def column(self) -> np.ndarray:
-        """All rows; those that do not hold are of no meaning."""
+        """All rows; damaged ones are undefined."""
         column, rows = np.zeros(self.entry.shape[0], dtype=np.int64), self.entry.chunk_rows
         for number in range(-(-len(column) // rows)):
             if self.rows_hold[number * rows]:
@@ -113,7 +113,7 @@ class _SalvagedArray:
 def group_streams(
     folder: Path, attributes: Attributes, entries: Mapping[str, ArrayEntry]
 ) -> list[SalvagedStream]:
-    """What holds of a committed group.
+    """The readable samples of a committed group.
 
     Args:
         folder: of the group.
@@ -130,13 +130,13 @@ def group_streams(
 
 
 def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
-    """What holds of a stage that a killed writer left."""
+    """The readable samples of an abandoned stage."""
     kind = kind_of(attributes)
     layouts = {n: e for s in attributes.streams for n, e in stream_arrays(s, kind).items()}
 
     def array(name: str) -> _SalvagedArray:
         entry = layouts[name]
-        # A writer, or a recovery, that died while it committed has closed some shards.
+        # A writer or a recovery that died during its commit has closed some shards.
         closed = stage / name / shard_path(len(entry.shape))
         path = closed if closed.is_file() else part_path(stage, name)
         rows, hold = lenient_rows(stage, name, _bytes_of(path))
@@ -152,7 +152,7 @@ def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
 
 
 def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
-    """What holds of a spool, batch by batch."""
+    """The readable samples of a spool, batch by batch."""
     with open_log(spool) as data:
         rows = find_records(data).rows
         holds = np.array(
@@ -168,19 +168,19 @@ def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
 def write_salvaged(
     root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
 ) -> tuple[str, dict[str, int]]:
-    """Write what holds as a new group `ID-salvaged-N` of a store.
+    """Write the readable samples as a new group `ID-salvaged-N` of a store.
 
     Args:
         root: of the store.
-        attributes: of the damaged thing.
-        streams: what holds of it.
-        source: the damaged thing.
+        attributes: of the damaged item.
+        streams: its readable samples.
+        source: the damaged item.
 
     Returns:
-        The new id, and the samples that are left out by stream.
+        The new id, and the number of dropped samples by stream.
 
     Raises:
-        InvalidInputError: nothing holds.
+        InvalidInputError: no sample is readable.
     """
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     streams = _on_one_grid(streams) if kind == "episode" else list(streams)
@@ -244,7 +244,7 @@ def _array_reader(
 
 
 def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
-    """Images of a group of pictures need those before them: a group stays whole or goes."""
+    """Keep or drop whole groups of pictures, since their images depend on each other."""
     starts = np.arange(0, len(kept), size)
     if not len(starts):
         return kept
@@ -253,7 +253,7 @@ def _whole_groups(kept: np.ndarray, size: int) -> np.ndarray:
 
 
 def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
-    """Of the model grid the longest run of steps without a hole: steps are found by number."""
+    """Keep the longest gap-free run of the model grid, since steps are addressed by number."""
     grid = [stream for stream in streams if stream.descriptor.name in GRID_STREAMS]
     if not grid:
         return list(streams)
@@ -274,7 +274,7 @@ def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
 
 
 def lenient_rows(folder: Path, name: str, payloads: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """All rows of a journal, and of each whether it and its payload hold, whatever is around it."""
+    """All rows of a journal, and for each whether it and its payload are intact."""
     data = _bytes_of(journal_path(folder, name))[len(JOURNAL_MAGIC) :]
     size = JOURNAL_ROW.itemsize
     rows = np.frombuffer(data[: len(data) // size * size], JOURNAL_ROW)
@@ -316,7 +316,7 @@ def _batch(
 def _spooled(
     spool: Path, descriptor: StreamDescriptor, rows: np.ndarray, holds: np.ndarray
 ) -> SalvagedStream:
-    # What is torn off at the end was never acknowledged; it is no loss.
+    # A torn tail was never acknowledged, so it does not count as lost.
     count = int(np.flatnonzero(holds)[-1]) + 1 if holds.any() else 0
     rows = rows[:count][holds[:count]]
     ends = rows["first_sample"] + rows["num_samples"]

@@ -1,4 +1,4 @@
-"""A shard file whose index may be damaged or gone → where its whole storage chunks lie."""
+"""Reconstruction of a damaged or missing shard index from the storage chunks themselves."""
 
 import math
 import struct
@@ -12,19 +12,19 @@ from dextouch.episodes.sources import ByteSource
 from dextouch.episodes.zstd import frame_bytes
 from dextouch.errors import CorruptDataError
 
-# A day of 30 images a second, each a storage chunk.
+# One day of 30 images per second, each a storage chunk.
 _MAX_CHUNKS = 86_400 * 30
 _JPEG_END = b"\xff\xd9"
 
 
 def salvaged_index(source: ByteSource, entry: ArrayEntry) -> np.ndarray:
-    """(offset, length) of each storage chunk whose checksum holds, (0, 0) of the others.
+    """(offset, length) of each intact storage chunk, (0, 0) of the others.
 
-    Places come from the index as far as it makes sense, else from the neighbours, since storage
-    chunks follow each other without gaps; of a truncated file from the storage chunks themselves.
+    Offsets come from the index where it is plausible, otherwise from neighbouring chunks, since
+    storage chunks are contiguous; in a truncated file, from the chunks' own headers.
 
     Raises:
-        CorruptDataError: more storage chunks than any file of ours has.
+        CorruptDataError: more storage chunks than the limit of this reader.
     """
     num_chunks = -(-entry.shape[0] // entry.chunk_rows)
     if num_chunks > _MAX_CHUNKS:
@@ -46,7 +46,7 @@ def salvaged_index(source: ByteSource, entry: ArrayEntry) -> np.ndarray:
 
 
 def _place(data: bytes, places: list[list[int]], number: int, end: int) -> tuple[int, int]:
-    """Where a storage chunk lies, by its own entry of the index or by those beside it."""
+    """Offset and length of a storage chunk by its own index entry or by its neighbours'."""
     offset, length = places[number]
     before = sum(places[number - 1]) if number else 0
     after = places[number + 1][0] if number + 1 < len(places) else end
@@ -69,7 +69,7 @@ def _holds(chunk: bytes) -> bool:
 
 
 def _walk(data: bytes, entry: ArrayEntry) -> list[tuple[int, int]]:
-    """Storage chunks from the first byte up to the first that does not hold."""
+    """Intact storage chunks from the first byte up to the first damaged one."""
     found, start = [], 0
     while start < len(data) and (length := _chunk_bytes(data, start, entry)):
         found.append((start, length))
@@ -78,10 +78,10 @@ def _walk(data: bytes, entry: ArrayEntry) -> list[tuple[int, int]]:
 
 
 def _chunk_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
-    """Length of the storage chunk that begins at a byte, its checksum included; 0 for none."""
+    """Length of the storage chunk at an offset, checksum included; 0 if there is none."""
     if entry.codec == "jpeg":
         stop = data.find(_JPEG_END, start)
-        # An end inside a thumbnail is none: the checksum tells.
+        # An end marker inside a thumbnail is ruled out by the checksum.
         while stop >= 0 and not _holds(data[start : stop + 2 + CRC_BYTES]):
             stop = data.find(_JPEG_END, stop + 1)
         return stop + 2 + CRC_BYTES - start if stop >= 0 else 0
@@ -90,9 +90,9 @@ def _chunk_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
 
 
 def _encoded_bytes(data: bytes, start: int, entry: ArrayEntry) -> int:
-    """Length that a zstd frame or a group of pictures says it has; 0 for none."""
+    """Length declared by a zstd frame or a group of pictures; 0 if there is none."""
     if entry.codec == "zstd":
-        # Far less is looked at than copied: the headers of its blocks.
+        # Only block headers are parsed, which is far less than is copied.
         longest = entry.chunk_rows * math.prod(entry.shape[1:]) * np.dtype(entry.dtype).itemsize
         return frame_bytes(data[start : start + longest + longest // 8 + 1024]) or 0
     count = int.from_bytes(data[start : start + 4], "little")

@@ -1,8 +1,8 @@
-"""One Zarr v3 shard file → rows of its array, or the encoded storage chunks as they are.
+"""Reader of Zarr v3 shard files: rows, or the encoded storage chunks.
 
-A shard is the standard `sharding_indexed` layout: encoded storage chunks one after the other, then
+A shard has the standard `sharding_indexed` layout: concatenated encoded storage chunks, then
 (offset, length) of each as uint64, then crc32c of that index. Every storage chunk ends in its own
-crc32c, so a flipped bit or a torn file is refused and never becomes a number.
+crc32c, so a flipped bit or a truncated file is always detected.
 """
 
 import math
@@ -23,25 +23,25 @@ INDEX_ENTRY_BYTES = 16
 _ZSTD_MAX_RATIO = 1 << 15
 # The length of an access unit, a start code and the header of its first unit.
 _H264_MIN_BYTES = 4 + 3 + 1
-# Storage chunks that lie behind each other are fetched together up to this many bytes: once for
-# most windows, while whole arrays still come in pieces.
+# Adjacent storage chunks are fetched together up to this many bytes: enough for most windows in one
+# request, while whole arrays are still read in pieces.
 _SPAN_BYTES = 1 << 21
 
 
 def with_crc(data: bytes) -> bytes:
-    """Bytes and their crc32c behind them."""
+    """Append the crc32c to bytes."""
     return data + google_crc32c.value(data).to_bytes(CRC_BYTES, "little")
 
 
 def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -> bytes:
-    """The `length` bytes from `start` on, but for their checksum, which was compared."""
+    """Verify the checksum of `length` bytes from `start` on, and return the bytes without it."""
     stop = start + length
     if len(data) < stop:
         raise CorruptDataError(
             f"{what} lies outside the file ({max(0, len(data) - start)} of {length} bytes there); "
             "the file is truncated, restore it from a copy"
         )
-    # Copied before it is checked, so that a file that changes below us cannot differ from it.
+    # Copied before it is verified, so that a concurrent change of the file has no effect.
     body, crc = bytes(data[start : stop - CRC_BYTES]), data[stop - CRC_BYTES : stop]
     if length < CRC_BYTES or google_crc32c.value(body) != int.from_bytes(crc, "little"):
         raise CorruptDataError(
@@ -52,13 +52,13 @@ def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -
 
 
 class ShardReader:
-    """Reads rows or storage chunks of one array; the index is read once and kept.
+    """Reads rows or storage chunks of one array; the index is cached.
 
     Args:
         source: the shard file, or the part file of a shard that is being written.
-        entry: what is known of the array.
+        entry: dtype, shape and codec of the array.
         what: names the array in errors.
-        index: (offset, length) of each storage chunk where the file has no index yet.
+        index: (offset, length) of each storage chunk, for a file that has no index yet.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class ShardReader:
         self._index = index
 
     def read(self, start: int = 0, stop: int | None = None) -> Shaped[np.ndarray, "n ..."]:
-        """Rows start … stop-1; only the storage chunks that hold them are read and decoded.
+        """Rows start … stop-1; only the storage chunks that contain them are read and decoded.
 
         Raises:
             InvalidInputError: rows outside the array.
-            CorruptDataError: a checksum does not hold, or bytes are missing.
+            CorruptDataError: a checksum mismatch, or missing bytes.
         """
         num_rows, rows_each = self._num_rows, self._rows_each
         stop = num_rows if stop is None else stop
@@ -87,7 +87,7 @@ class ShardReader:
         places = self.check_index()[first : -(-stop // rows_each) if stop > start else first]
         layout = self._layout
         rows = np.empty((stop - start) * layout.row_bytes, dtype=np.uint8)
-        # As plain bytes, which are cheaper to copy than rows where a window is small.
+        # As plain bytes, which are cheaper to copy than rows for small windows.
         wanted, skip = rows.data, start % rows_each * layout.row_bytes
         for what, payload in self._payloads(first, places.tolist()):
             data = decompress(payload, size=layout.num_bytes, what=what)
@@ -102,7 +102,7 @@ class ShardReader:
         return rows.view(layout.dtype).reshape(stop - start, *layout.row_shape)
 
     def payload(self, number: int) -> bytes:
-        """The encoded bytes of one storage chunk, without their checksum, which was compared.
+        """The encoded bytes of one storage chunk, verified, without the checksum.
 
         Raises:
             CorruptDataError: a checksum does not hold, or bytes are missing.
@@ -112,9 +112,9 @@ class ShardReader:
         return _without_crc(self._source.read(offset, length), 0, length, what)
 
     def _payloads(self, number: int, places: list[list[int]]) -> Iterator[tuple[str, bytes]]:
-        """Name in errors and payload of storage chunks from `number` on, by offset and length.
+        """Error label and payload of storage chunks from `number` on, by offset and length.
 
-        Those that lie behind each other are fetched together.
+        Adjacent ones are fetched together.
         """
         while places:
             begin, end, count = places[0][0], places[0][0], 0
@@ -130,11 +130,11 @@ class ShardReader:
             places = places[count:]
 
     def check_index(self) -> np.ndarray:
-        """The (offset, length) of every storage chunk, read once, before anything is allocated.
+        """Read and validate the (offset, length) of every storage chunk, cached.
 
         Raises:
-            CorruptDataError: a missing file; storage chunks that do not follow each other up to the
-                index, or are too short for the rows that the commit record claims.
+            CorruptDataError: a missing file; storage chunks that are not contiguous up to the
+                index, or too short for the rows in the commit record.
         """
         if self._index is None:
             size = self._source.size()
@@ -147,8 +147,8 @@ class ShardReader:
         return self._index
 
     def _check_follows(self, index: np.ndarray, end: int) -> None:
-        """Refuse overlaps, gaps, and bytes that belong to nothing."""
-        # First alone, since the sum of two forged numbers could come round to a small one.
+        """Refuse overlaps, gaps and unreferenced bytes."""
+        # Checked separately, since the sum of two forged numbers could overflow.
         inside = bool((index <= end).all())
         ends = np.concatenate([np.zeros(1, "<u8"), index.sum(axis=1)])
         if not inside or int(ends[-1]) != end or not np.array_equal(index[:, 0], ends[:-1]):
@@ -157,7 +157,7 @@ class ShardReader:
             )
 
     def _check_claim(self, index: np.ndarray) -> None:
-        """Refuse more rows than the bytes there can hold."""
+        """Refuse more rows than the chunk's bytes can encode."""
         entry, lengths = self._entry, index[:, 1].astype(np.int64)
         if not len(lengths):
             return
@@ -187,7 +187,7 @@ class ShardReader:
 
 
 class _ChunkLayout:
-    """How the rows of a `zstd` storage chunk lie in its bytes; worked out once an array."""
+    """Memory layout of the rows of a `zstd` storage chunk, computed once per array."""
 
     def __init__(self, entry: ArrayEntry) -> None:
         self.dtype = np.dtype(entry.dtype).newbyteorder("<")
@@ -197,10 +197,10 @@ class _ChunkLayout:
 
 
 def decode_rows(payload: bytes, entry: ArrayEntry, *, what: str) -> Shaped[np.ndarray, "n ..."]:
-    """The rows of one `zstd` storage chunk, those that pad it included.
+    """Decode the rows of one `zstd` storage chunk, padding included.
 
     Raises:
-        CorruptDataError: not that many rows.
+        CorruptDataError: another number of rows.
     """
     layout = _ChunkLayout(entry)
     data = decompress(payload, size=layout.num_bytes, what=what)

@@ -1,4 +1,4 @@
-"""Rows of one array → storage chunks in a log, which closing turns into a Zarr v3 shard file."""
+"""Writer of one array: appends rows to a log, which closing turns into a Zarr v3 shard file."""
 
 import hashlib
 from pathlib import Path
@@ -20,13 +20,13 @@ from dextouch.episodes.zstd import compress
 
 
 class ShardWriter:
-    """Appends rows; memory holds one storage chunk at most, the rest survives a kill.
+    """Appends rows; buffers at most one storage chunk, everything before survives a kill.
 
     Args:
         stage: folder that is being written.
         name: of the array.
         entry: of the array, with 0 rows and no hash yet.
-        sync: whether every storage chunk survives a power loss before `append` returns.
+        sync: whether `append` waits until complete storage chunks are synced to disk.
     """
 
     def __init__(self, stage: Path, name: str, entry: ArrayEntry, *, sync: bool) -> None:
@@ -56,21 +56,21 @@ class ShardWriter:
                 self._write_rows()
 
     def append_encoded(self, payload: bytes, num_rows: int) -> None:
-        """Append one storage chunk of an image codec as it is."""
+        """Append one encoded storage chunk of an image codec."""
         self.num_rows += num_rows
         self._sha256.update(payload)
         self._log_chunk(payload, num_rows)
 
     def flush(self) -> None:
-        """Write the rows that do not fill a storage chunk; nothing is appended after this."""
+        """Write the last, partial storage chunk; nothing may be appended afterwards."""
         if self._num_pending:
             self._chunk[self._num_pending :] = 0
             self._write_rows()
 
     def flush_until(self, num_rows: int) -> None:
-        """End the log of a `zstd` array after so many rows, where an append was broken off.
+        """Truncate the log of a `zstd` array to `num_rows` rows after an interrupted append.
 
-        Only the log itself is believed: an interrupt may lie between a write and its counting.
+        Relies on the log only: an interrupt may fall between a write and its bookkeeping.
         """
         if self._entry.codec != "zstd":
             return
@@ -79,7 +79,7 @@ class ShardWriter:
         num_whole = int(np.searchsorted(ends, num_rows, side="right"))
         chunk = self._chunk
         if num_whole < len(rows):
-            # Rows of what was broken off completed this storage chunk.
+            # Rows of the interrupted append completed this storage chunk.
             (payload,) = read_payloads(self._stage, self._name, rows[num_whole : num_whole + 1])
             chunk = decode_rows(payload[:-CRC_BYTES], self._entry, what=self._name).copy()
         self._log.truncate(num_whole)
@@ -89,14 +89,14 @@ class ShardWriter:
             self._log.append(with_crc(compress(chunk.tobytes())), num_waiting)
 
     def finish(self) -> ArrayEntry:
-        """Turn the log into the shard; what the commit record says about the array comes back."""
+        """Turn the log into the shard and return the array's entry of the commit record."""
         self.flush()
         finish_shard(self._stage, self._name, self._entry, self._log, self._index)
         entry = with_rows(self._entry, self.num_rows)
         return entry.model_copy(update={"sha256": self._sha256.hexdigest()})
 
     def close(self) -> None:
-        """Give the files back; without `finish` they are a log and no shard."""
+        """Close the files; without a prior `finish` they remain a log."""
         self._log.close()
 
     def _write_rows(self) -> None:
@@ -118,9 +118,9 @@ class ShardWriter:
 def finish_shard(
     stage: Path, name: str, entry: ArrayEntry, log: JournalWriter, index: list[tuple[int, int]]
 ) -> None:
-    """Append the shard's index to a log's part file and put it in the shard's place.
+    """Append the shard's index to a log's part file and rename it to the shard.
 
-    The journal stays until the whole group is committed: a crash before that is mended from it.
+    The journal is kept until the whole group is committed, for recovery after a crash.
     """
     data = np.array(index, dtype="<u8").reshape(-1, 2).tobytes()
     log.write_tail(data + google_crc32c.value(data).to_bytes(4, "little"))

@@ -1,4 +1,4 @@
-"""Names of a group's files → their bytes; the one place that knows where a group lies."""
+"""File access for group readers, independent of the backend; local files are memory-mapped."""
 
 import mmap
 import os
@@ -9,16 +9,16 @@ from typing import Protocol, runtime_checkable
 
 from dextouch.episodes.files import disk_errors
 
-# Each mapping holds a file descriptor, of which a process has about a thousand.
+# Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
 
 
 @runtime_checkable
 class ByteSource(Protocol):
-    """One file's bytes, wherever it is."""
+    """Random access to the bytes of one file."""
 
     def size(self) -> int | None:
-        """Its length in bytes; None where there is no such file."""
+        """Length in bytes; None if the file does not exist."""
         ...
 
     def read(self, offset: int, length: int) -> memoryview | bytes:
@@ -28,11 +28,11 @@ class ByteSource(Protocol):
 
 @runtime_checkable
 class GroupFiles(Protocol):
-    """The files of one committed group; names are relative, with `/` between."""
+    """The files of one committed group, by relative names with `/`."""
 
     @property
     def item_id(self) -> str:
-        """The id under which the group is stored."""
+        """Id of the group."""
         ...
 
     def get(self, name: str) -> bytes | None:
@@ -45,7 +45,7 @@ class GroupFiles(Protocol):
 
 
 class _MappedFiles:
-    """The most recently read files of this process, mapped into memory."""
+    """LRU cache of memory-mapped files."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
@@ -53,12 +53,12 @@ class _MappedFiles:
         self._maps: OrderedDict[tuple[str, int, int, int], mmap.mmap] = OrderedDict()
 
     def get(self, path: Path) -> memoryview | None:
-        """The file's bytes; None where it is missing or empty."""
+        """The mapped bytes of a file; None if it is missing or empty."""
         try:
             status = path.stat()
         except (FileNotFoundError, NotADirectoryError):
             return None
-        # A file of the same name that was written anew is another file.
+        # A file that was replaced under the same name has another identity.
         key = (str(path), status.st_ino, status.st_size, status.st_mtime_ns)
         with self._guard:
             known = self._maps.get(key)
@@ -67,7 +67,7 @@ class _MappedFiles:
                     return memoryview(b"")
                 known = self._map(path)
                 self._maps[key] = known
-                # Dropped, not closed: readers may still look at it, the last one frees it.
+                # Dropped, not closed: readers may still use the mapping, and the last one frees it.
                 while len(self._maps) > self._capacity:
                     self._maps.popitem(last=False)
             else:
@@ -75,7 +75,7 @@ class _MappedFiles:
         return memoryview(known)
 
     def forget(self) -> None:
-        """Begin anew, as a forked process must."""
+        """Drop all mappings, as a forked process must."""
         self._guard = threading.Lock()
         self._maps.clear()
 
@@ -94,13 +94,13 @@ os.register_at_fork(after_in_child=_MAPPED.forget)
 
 
 class LocalFile:
-    """A file on this machine, mapped into memory when it is first read."""
+    """A local file, memory-mapped on first read."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
 
     def size(self) -> int | None:
-        """Its length in bytes; None where there is no such file."""
+        """Length in bytes; None if the file does not exist."""
         data = self._bytes()
         return None if data is None else len(data)
 
@@ -113,13 +113,13 @@ class LocalFile:
         try:
             return _MAPPED.get(self.path)
         except OSError:
-            # Entered only now: on the way of every read it would cost as much as the lookup.
+            # Entered only on a miss: on every read it would cost as much as the lookup.
             with disk_errors(f"read {self.path}"):
                 raise
 
 
 class LocalGroup:
-    """The files of a group in a folder of this machine."""
+    """The files of a group in a local folder."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder

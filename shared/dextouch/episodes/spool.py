@@ -1,7 +1,7 @@
-"""Batches of samples ↔ a spool: an append-only folder that a kill at any moment leaves readable.
+"""Spool of a recording: a crash-safe, append-only folder of sample batches.
 
-The spool is where a station records before anything else, and where the store keeps an upload
-until it is finished. Images of `jpeg` and `h264` streams travel as object arrays of bytes.
+A station records to a spool first, and the store keeps an upload in one until it is finished.
+Images of `jpeg` and `h264` streams are object arrays of bytes.
 """
 
 import os
@@ -38,7 +38,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class StreamRecord:
-    """A batch of one stream as it goes into a spool's log."""
+    """An encoded batch of one stream, ready for a spool's log."""
 
     stream_name: str
     body: RecordBody
@@ -49,17 +49,17 @@ class StreamRecord:
 class SpoolWriter:
     """Appends batches to the streams of one recording.
 
-    After `append` returns, the samples survive the death of the process; after `flush` with
-    `sync`, also that of the machine.
+    After `append` returns, the samples survive a crash of the process; after `flush` with `sync`,
+    also a power loss.
 
     Args:
         path: new folder.
         attributes: of the recording; `streams` names all streams.
         sync: whether `flush` waits for the disk.
-        resume: go on with a folder that exists (see the class method).
+        resume: continue an existing folder (see the class method).
 
     Raises:
-        ConflictError: the folder exists; go on with `SpoolWriter.resume`.
+        ConflictError: the folder exists; continue it with `SpoolWriter.resume`.
         InvalidInputError: a recording without a stream, or with more than MAX_STREAMS.
     """
 
@@ -76,7 +76,7 @@ class SpoolWriter:
         self._streams = {d.name: number for number, d in enumerate(attributes.streams)}
         self._num_samples = dict.fromkeys(self._streams, 0)
         self._num_batches = dict.fromkeys(self._streams, 0)
-        # The last stamp of each stream, which the next may not go below.
+        # The last stamp of each stream, a lower bound of the next one.
         self._last_t_host_ns: dict[str, int | None] = dict.fromkeys(self._streams)
         end = None
         if resume:
@@ -89,7 +89,7 @@ class SpoolWriter:
         if resume:
             end = self._count()
         self._log = BatchLogWriter(path, end=end)
-        # What a process wrote that died before it flushed is taken for kept from here on.
+        # Records that a crashed process wrote but did not sync count as kept from here on.
         self._is_dirty = resume
         self.flush()
         with disk_errors(f"open spool {path.name}"):
@@ -97,12 +97,12 @@ class SpoolWriter:
 
     @classmethod
     def resume(cls, path: Path, *, sync: bool = True) -> "SpoolWriter":
-        """Go on after the last good sample of a spool that was closed or crashed.
+        """Continue after the last valid record of a spool that was closed or crashed.
 
         Raises:
             NotFoundError: no spool there.
             ConflictError: another process is writing it.
-            CorruptDataError: damage that is no torn end.
+            CorruptDataError: damage other than a torn tail.
         """
         return cls(path, read_attributes(path), sync=sync, resume=True)
 
@@ -112,7 +112,7 @@ class SpoolWriter:
         Args:
             stream_name: one of the recording's streams.
             batch: of the stream's dtype and shape; `t_host_ns` never decreases. Values of `jpeg`
-                and `h264` streams are an object array of bytes, one an image
+                and `h264` streams are an object array of bytes, one per image
                 (`dextouch.streams.samples.encoded_values`).
             flush: keep the batch only if `flush` succeeds too.
 
@@ -126,9 +126,10 @@ class SpoolWriter:
             self.append_record(record, flush=flush)
 
     def encode(self, stream_name: str, batch: SampleBatch) -> StreamRecord | None:
-        """What `append_record` writes of a batch; None of an empty one.
+        """Encode a batch for `append_record`; None for an empty one.
 
-        It changes nothing, so that many threads can call it at once while another one appends.
+        It does not change the writer, so that several threads can call it while another one
+        appends.
 
         Raises:
             UnknownNameError: no such stream.
@@ -165,23 +166,23 @@ class SpoolWriter:
         self._last_t_host_ns[name] = record.last_t_host_ns
 
     def num_samples(self, stream_name: str) -> int:
-        """How many samples of a stream are spooled."""
+        """Number of samples of a stream in the spool."""
         self._number(stream_name)
         return self._num_samples[stream_name]
 
     def num_batches(self, stream_name: str) -> int:
-        """In how many appends the samples of a stream came."""
+        """Number of appends of a stream."""
         self._number(stream_name)
         return self._num_batches[stream_name]
 
     def flush(self) -> None:
-        """Make what was appended survive a power loss (unless opened with `sync=False`)."""
+        """Sync appended records to disk (unless opened with `sync=False`)."""
         if self._sync and self._is_dirty:
             self._log.sync()
         self._is_dirty = False
 
     def set_attributes(self, attributes: RecordingAttributes) -> None:
-        """Replace what is known of the recording (ledger, success); id and streams stay.
+        """Replace attributes of the recording (ledger, success); id and streams must not change.
 
         Raises:
             InvalidInputError: another id or other streams.
@@ -207,7 +208,7 @@ class SpoolWriter:
             self.abandon()
 
     def abandon(self) -> None:
-        """Give the files back without marking the recording as complete."""
+        """Close the files without marking the recording as complete."""
         self._log.close()
         if self._lock >= 0:
             os.close(self._lock)
@@ -233,7 +234,7 @@ class SpoolWriter:
         return self._streams[name]
 
     def _count(self) -> int:
-        """Take over what an existing log holds; where it ends."""
+        """Count the samples of an existing log; returns its end."""
         records = read_records(self.path)
         for name, number in self._streams.items():
             rows = records.rows[records.rows["stream"] == number]
@@ -261,7 +262,7 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
             f"spool {attributes.recording_id!r}: got {len(attributes.streams)} streams, expected "
             f"at most {MAX_STREAMS} streams; put some into one stream of a larger shape"
         )
-    # Under another name first, so that a spool that is seen has its attributes.
+    # Created under a temporary name, so that a visible spool always has its attributes.
     unborn = path.with_name(path.name + ".new")
     with disk_errors(f"create spool {path.name}"):
         if path.exists():

@@ -1,8 +1,8 @@
-"""Bodies ↔ records of one append-only file: the log of a spool, whatever its streams are.
+"""Append-only, checksummed record file of a spool, shared by all of its streams.
 
-A record is a header, which says where it lies and has a checksum of its own, and a body behind it.
-One file for all streams, so that one wait for the disk keeps everything. A torn end is told from
-damage by what follows: behind a torn end there is no whole header.
+A record is a header with its own offset and checksum, followed by a body. All streams share one
+file, so that a single sync covers them. A torn tail differs from damage in that no valid header
+follows it.
 """
 
 import os
@@ -21,8 +21,8 @@ from dextouch.errors import CorruptDataError, StorageError
 LOG_FILE = "batches.log"
 LOG_MAGIC = b"DXTBLOG\x01"
 _MARK = b"DXTR"
-# Mark, place of the record in the file, samples of its stream before it, stream, samples, length
-# and crc32c of the body; then the crc32c of all that.
+# Magic, offset of the record, samples of its stream before it, stream, samples, length and crc32c
+# of the body; then the crc32c of the header.
 _HEADER = struct.Struct("<4sQQIIII")
 _CRC = struct.Struct("<I")
 HEADER_BYTES = _HEADER.size + _CRC.size
@@ -43,9 +43,9 @@ _SEARCH_BYTES = 1 << 20
 
 @dataclass(frozen=True)
 class LogRecords:
-    """The records of a log whose headers hold, and the spans of bytes that are no record.
+    """The records of a log with valid headers, and the byte spans in between that are not records.
 
-    `rows` is [n] of RECORD_ROW; a span at the end of the file is what a crash tore off.
+    `rows` is [n] of RECORD_ROW; a span at the end of the file is a torn tail.
     """
 
     rows: np.ndarray
@@ -54,22 +54,22 @@ class LogRecords:
 
     @property
     def end(self) -> int:
-        """Where the next record goes: behind the last one."""
+        """Offset of the next record, after the last one."""
         if not len(self.rows):
             return len(LOG_MAGIC)
         return int(self.rows["offset"][-1]) + HEADER_BYTES + int(self.rows["length"][-1])
 
     @property
     def damage(self) -> tuple[tuple[int, int], ...]:
-        """Spans with whole records behind them: no crash leaves those."""
+        """Invalid spans that are followed by valid records, which no crash leaves."""
         return tuple(gap for gap in self.gaps if gap[1] < self.num_bytes)
 
 
 class LogBytes:
-    """The bytes of a log as long as it was when this was made.
+    """Snapshot of a log, up to its length at the time of opening.
 
-    Read and not mapped: a writer that takes its last append back makes the file shorter, and
-    touching what is gone of a mapping kills the process.
+    Read and not memory-mapped: a writer that undoes its last append truncates the file, and access
+    beyond the end of a mapping kills the process (SIGBUS).
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -89,7 +89,7 @@ class LogBytes:
         return self._block[low : low + length]
 
     def find(self, mark: bytes, start: int) -> int:
-        """Where a mark next begins; -1 if nowhere."""
+        """Offset of the next occurrence of `mark`; -1 if there is none."""
         while start < self._num_bytes:
             block = os.pread(self._descriptor, _SEARCH_BYTES, start)
             place = block.find(mark)
@@ -103,10 +103,10 @@ class LogBytes:
 
 @contextmanager
 def open_log(folder: Path) -> Iterator[LogBytes]:
-    """The bytes of a spool's log.
+    """Open a spool's log for reading.
 
     Raises:
-        CorruptDataError: there is no log.
+        CorruptDataError: the log is missing.
     """
     path = folder / LOG_FILE
     with disk_errors(f"read log of spool {folder.name!r}"):
@@ -121,15 +121,15 @@ def open_log(folder: Path) -> Iterator[LogBytes]:
 
 
 def find_records(data: LogBytes) -> LogRecords:
-    """Every record of a log's bytes, going on behind damage.
+    """Find all records of a log, continuing after damage.
 
     Raises:
-        CorruptDataError: the bytes are no log.
+        CorruptDataError: the bytes are not a log.
     """
     magic = data.read(0, len(LOG_MAGIC))
     if not LOG_MAGIC.startswith(magic):
         raise CorruptDataError(f"log: begins with {magic!r}, expected {LOG_MAGIC!r}")
-    # Rows as bytes: those of a minute of a station take 14 MB as tuples, 2 MB so.
+    # Packed rows: those of one minute of a station take 2 MB, against 14 MB as tuples.
     rows, gaps, place = bytearray(), [], len(LOG_MAGIC)
     while place < len(data):
         row = _header_at(data, place)
@@ -144,10 +144,10 @@ def find_records(data: LogBytes) -> LogRecords:
 
 
 def read_records(folder: Path) -> LogRecords:
-    """The records of a spool's log; what a crash tore off is left out.
+    """The records of a spool's log; a torn tail is ignored.
 
     Raises:
-        CorruptDataError: damage that is no torn end, or a log that is missing or foreign.
+        CorruptDataError: damage other than a torn tail, or a missing or foreign log.
     """
     with open_log(folder) as data:
         records = find_records(data)
@@ -169,7 +169,7 @@ def read_records(folder: Path) -> LogRecords:
 
 
 def body_at(data: LogBytes, row: np.void) -> bytes | None:
-    """The body of a record; None where it does not hold."""
+    """The body of a record; None if its checksum does not match."""
     start = int(row["offset"]) + HEADER_BYTES
     body = data.read(start, int(row["length"]))
     whole = len(body) == row["length"] and google_crc32c.value(body) == row["body_crc32c"]
@@ -177,7 +177,7 @@ def body_at(data: LogBytes, row: np.void) -> bytes | None:
 
 
 def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
-    """The bodies of some records, one after the other.
+    """Iterate over the bodies of records.
 
     Raises:
         CorruptDataError: a body does not match its checksum.
@@ -194,7 +194,7 @@ def read_bodies(folder: Path, rows: np.ndarray) -> Iterator[bytes]:
 
 
 def _header_at(data: LogBytes, place: int) -> tuple[int, int, int, int, int, int] | None:
-    """The header at a place as a row of RECORD_ROW; None where none is or its body is cut off."""
+    """The header at an offset as a row of RECORD_ROW; None if invalid or its body is truncated."""
     header = data.read(place, HEADER_BYTES)
     if len(header) < HEADER_BYTES or header[: len(_MARK)] != _MARK:
         return None
@@ -206,7 +206,7 @@ def _header_at(data: LogBytes, place: int) -> tuple[int, int, int, int, int, int
 
 
 def _next_header(data: LogBytes, place: int) -> int:
-    """Where the next whole record begins; the end of the data where none does."""
+    """Offset of the next complete record; the end of the data if there is none."""
     place = data.find(_MARK, place)
     while place >= 0 and _header_at(data, place) is None:
         place = data.find(_MARK, place + 1)
@@ -215,7 +215,7 @@ def _next_header(data: LogBytes, place: int) -> int:
 
 @dataclass(frozen=True)
 class RecordBody:
-    """The body of a record with its checksum, ready to be written."""
+    """The body of a record with its checksum."""
 
     data: bytes
     crc32c: int
@@ -223,7 +223,7 @@ class RecordBody:
 
     @staticmethod
     def of(data: bytes, *, num_samples: int) -> "RecordBody":
-        """A body whose checksum is made here."""
+        """Compute the checksum of a body."""
         return RecordBody(data, google_crc32c.value(data), num_samples)
 
 
@@ -232,10 +232,10 @@ class BatchLogWriter:
 
     Args:
         folder: of the spool.
-        end: None for a new log, else where to go on; what lies behind is cut off.
+        end: None for a new log; otherwise the offset to continue at, where the file is truncated.
 
     Raises:
-        StorageError: the file exists already, or cannot be made.
+        StorageError: the file exists already, or cannot be created.
     """
 
     def __init__(self, folder: Path, *, end: int | None = None) -> None:
@@ -249,10 +249,10 @@ class BatchLogWriter:
             self._cut(self._end)
 
     def append(self, body: RecordBody, *, stream: int, first_sample: int) -> int:
-        """Append a record, whole or not at all; its place comes back, for `undo`.
+        """Append a record atomically and return its offset, for `undo`.
 
         Raises:
-            StorageFullError: no space; the file is as it was before this call.
+            StorageFullError: no space; the file is unchanged.
         """
         place, length = self._end, len(body.data)
         header = _HEADER.pack(
@@ -265,25 +265,25 @@ class BatchLogWriter:
             ):
                 write_parts(self._file, parts)
         except StorageError:
-            # Cutting off needs no space: what was acknowledged before stays readable.
+            # Truncating needs no space, so acknowledged records stay readable.
             self._cut(place)
             raise
         self._end = place + HEADER_BYTES + length
         return place
 
     def undo(self, place: int) -> None:
-        """Take back the last append, whose place is given."""
+        """Remove the last record, at the given offset."""
         with disk_errors(f"cut {self._what}"):
             self._cut(place)
         self._end = place
 
     def sync(self) -> None:
-        """Make everything appended survive a power loss."""
+        """Sync all appended records to disk."""
         with disk_errors(f"sync {self._what}"):
             os.fdatasync(self._file)
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         if self._file >= 0:
             os.close(self._file)
             self._file = -1

@@ -1,4 +1,4 @@
-"""A spool folder → its recording's attributes and checked batches of samples."""
+"""Reader of a spool: attributes of the recording and verified batches of samples."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,9 +19,9 @@ DEFAULT_BATCH_SAMPLES = 60
 
 
 class SpoolReader:
-    """Reads a spool, even while it is written: every sample whose record is whole.
+    """Reads the complete records of a spool, even while it is being written.
 
-    The log is looked through when a stream is first asked for; what comes later is not seen.
+    The log is scanned on first access; records appended later are not visible.
 
     Args:
         path: of the spool.
@@ -39,16 +39,16 @@ class SpoolReader:
         self._rows: dict[str, np.ndarray] | None = None
 
     def num_samples(self, stream_name: str) -> int:
-        """How many samples a stream held when the log was looked through.
+        """Number of samples of a stream when the log was scanned.
 
         Raises:
             UnknownNameError: no such stream.
-            CorruptDataError: damage that is no torn end.
+            CorruptDataError: damage other than a torn tail.
         """
         return int(self._stream_rows(stream_name)["num_samples"].sum())
 
     def read(self, stream_name: str, start: int = 0, stop: int | None = None) -> SampleBatch:
-        """Samples start … stop-1 of a stream, each checked.
+        """Samples start … stop-1 of a stream, verified.
 
         Raises:
             InvalidInputError: outside the stream.
@@ -75,10 +75,10 @@ class SpoolReader:
         )
 
     def appended(self, stream_name: str, number: int) -> SampleBatch:
-        """The samples of one append, the first being number 0.
+        """The samples of one append, numbered from 0.
 
         Raises:
-            InvalidInputError: there were not so many.
+            InvalidInputError: no such append.
             CorruptDataError: they do not match their checksum.
         """
         rows = self._stream_rows(stream_name)
@@ -91,9 +91,10 @@ class SpoolReader:
     def batches(
         self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES, first: int = 0
     ) -> Iterator[SampleBatch]:
-        """Batches first, first + 1, … of fixed size, so that batch n is always the same.
+        """Iterate over batches of fixed size from number `first` on; batch n is always the same.
 
-        Of a spool that is still written only full batches come; of a closed one also the rest.
+        A spool that is still written yields only full batches; a closed one also the last, partial
+        batch.
         """
         total = self.num_samples(stream_name)
         for start in range(first * num_samples, total, num_samples):
@@ -126,7 +127,7 @@ class SpoolReader:
 
 
 def read_attributes(path: Path) -> RecordingAttributes:
-    """The attributes of a spool's recording.
+    """Attributes of a spool's recording.
 
     Raises:
         NotFoundError: no spool there.

@@ -1,7 +1,7 @@
-"""A folder that is being written → a committed group; and what a kill left of one → the same.
+"""A stage: the folder in which a group is written, and its commit to the final place.
 
-A stage holds a log an array (`dextouch.episodes.journal`), and `stage.json` with the attributes if
-its remains are worth keeping.
+A stage holds one log per array (`dextouch.episodes.journal`), and `stage.json` with the attributes
+if it is recoverable.
 """
 
 import errno
@@ -42,26 +42,26 @@ Attributes = EpisodeAttributes | RecordingAttributes
 
 
 def attributes_id(attributes: Attributes) -> str:
-    """The id that attributes carry, whatever their kind."""
+    """The episode or recording id of attributes."""
     if isinstance(attributes, EpisodeAttributes):
         return attributes.episode_id
     return attributes.recording_id
 
 
 def kind_of(attributes: Attributes) -> Kind:
-    """The kind of group that attributes belong to."""
+    """The kind of group that attributes describe."""
     return "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
 
 
 def write_stage(stage: Path, attributes: Attributes) -> None:
-    """Say what is being written here, so that `recover` can complete it."""
+    """Write `stage.json`, so that `recover` can complete the stage."""
     known = {"kind": kind_of(attributes), "attributes": json_ready(attributes)}
     with disk_errors(f"write {STAGE_FILE} of {attributes_id(attributes)}"):
         replace_file(stage / STAGE_FILE, json.dumps(known).encode())
 
 
 def read_stage(stage: Path) -> Attributes | None:
-    """What is being written in a stage; None where it is not worth keeping.
+    """Attributes of the group in a stage; None where it is not recoverable.
 
     Raises:
         CorruptDataError: `stage.json` is damaged.
@@ -98,10 +98,10 @@ def read_committed(stage: Path, kind: Kind) -> Attributes:
 def commit_stage(
     stage: Path, target: Path, attributes: Attributes, entries: Mapping[str, ArrayEntry]
 ) -> None:
-    """Write metadata and commit record of finished arrays and move the folder into place.
+    """Write metadata and commit record of finished arrays and rename the stage to its target.
 
     Raises:
-        ConflictError: something is in that place.
+        ConflictError: the target exists.
     """
     group = group_metadata(json_ready(attributes))
     record = CommitRecord(
@@ -114,7 +114,7 @@ def commit_stage(
         for name, entry in entries.items():
             write_file(stage / name / METADATA_FILE, array_metadata(entry), sync=False)
         write_file(stage / METADATA_FILE, group, sync=False)
-        # All that the commit record vouches for is on the disk before the record is.
+        # Everything in the commit record is synced before the record itself.
         shards = [stage / name / shard_path(len(entry.shape)) for name, entry in entries.items()]
         metadata = [stage / name / METADATA_FILE for name in entries]
         sync_files([*shards, *metadata, stage / METADATA_FILE])
@@ -123,9 +123,9 @@ def commit_stage(
 
 
 def change_attributes(stage: Path, record: CommitRecord, attributes: Attributes) -> CommitRecord:
-    """Give a stage with a whole commit record other attributes; its new record comes back.
+    """Replace the attributes of a stage with a valid commit record and return the new record.
 
-    After a kill between the two files their ids differ; do it again then.
+    After a kill between the two files their ids differ; repeat the call then.
     """
     group = group_metadata(json_ready(attributes))
     update = {"id": attributes_id(attributes), "attributes_sha256": sha256_hex(group)}
@@ -137,15 +137,15 @@ def change_attributes(stage: Path, record: CommitRecord, attributes: Attributes)
 
 
 def publish_stage(stage: Path, target: Path, record: CommitRecord) -> None:
-    """Move a stage with a whole commit record into place.
+    """Rename a stage with a valid commit record to its target.
 
     Raises:
-        ConflictError: something is in that place; the stage can be recovered as before.
+        ConflictError: the target exists; the stage is still recoverable.
     """
     if target.exists():
         raise _taken(target)
     known = read_stage(stage)
-    # What a crash is mended from goes only when there is nothing left to mend.
+    # The journals are removed only once recovery no longer needs them.
     for name in record.arrays:
         forget_journal(stage, name)
     with disk_errors(f"commit {record.id}"):

@@ -1,4 +1,4 @@
-"""The folder where groups are written before they are committed, and the stages in it."""
+"""The staging folder of a store: creation, listing and removal of stages."""
 
 import fcntl
 import os
@@ -12,22 +12,22 @@ from dextouch.episodes.format import Kind
 from dextouch.episodes.staging_recovery import IsTaken, is_recoverable
 
 STAGING = ".staging"
-# Names of stages end in a uuid4 in hexadecimal.
+# Stage names end in a hexadecimal uuid4.
 _STAGE_NUMBER = "[0-9a-f]" * 32
 
 
 def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
-    """A name for a stage that nobody has; the folder is not made."""
+    """A unique path for a new stage; the folder is not created."""
     return root / STAGING / f"{kind}-{item_id}-{uuid.uuid4().hex}"
 
 
 def stages_of(root: Path, kind: Kind, item_id: str) -> list[Path]:
-    """The stages in which an id is being written, in order of their names."""
+    """The stages of an id, sorted by name."""
     return sorted((root / STAGING).glob(f"{kind}-{item_id}-{_STAGE_NUMBER}"))
 
 
 def unheld_folders(parent: Path) -> Iterator[Path]:
-    """Folders that no writer holds, each held while the caller looks at it."""
+    """Iterate over folders not locked by a writer, holding each one's lock meanwhile."""
     for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
         try:
             descriptor = os.open(folder, os.O_RDONLY)
@@ -38,7 +38,7 @@ def unheld_folders(parent: Path) -> Iterator[Path]:
         except BlockingIOError:
             continue
         else:
-            # Its writer may have committed it, and let go, between the two calls above.
+            # Its writer may have committed and unlocked it between the two calls above.
             if is_folder_at(descriptor, folder):
                 yield folder
         finally:
@@ -46,16 +46,16 @@ def unheld_folders(parent: Path) -> Iterator[Path]:
 
 
 def abandoned_stages(root: Path) -> Iterator[Path]:
-    """Stages whose writer is gone, each held while the caller looks at it."""
+    """Iterate over stages whose writer is gone, holding each one's lock meanwhile."""
     return unheld_folders(root / STAGING)
 
 
 def sweep_stages(root: Path, is_taken: IsTaken) -> int:
-    """Remove abandoned stages of which `recover_stage` would make nothing; how many went.
+    """Remove abandoned stages that `recover_stage` cannot recover, and return their number.
 
     Args:
         root: folder with the stages.
-        is_taken: whether an id cannot be had.
+        is_taken: whether an id is in use.
     """
     removed = 0
     for stage in abandoned_stages(root):

@@ -1,4 +1,4 @@
-"""What a killed writer left in its stage → a committed group that says it was recovered."""
+"""Recovery of abandoned stages: a terminated writer's data becomes a group marked as recovered."""
 
 import hashlib
 import math
@@ -51,7 +51,7 @@ IsTaken = Callable[[Kind, str], bool]
 
 @dataclass(frozen=True)
 class RecoveredGroup:
-    """One interrupted take that is complete again as far as it went."""
+    """A group recovered from an interrupted take."""
 
     kind: Kind
     item_id: str
@@ -59,14 +59,14 @@ class RecoveredGroup:
 
 
 def ids_below(root: Path) -> IsTaken:
-    """Whether the folder of an id is there."""
+    """A check whether the folder of an id exists."""
     return lambda kind, item_id: (root / f"{kind}s" / item_id).exists()
 
 
 def recover_all(
     folders: Iterable[Path], recover: Callable[[Path], RecoveredGroup | None]
 ) -> tuple[list[RecoveredGroup], list[DexTouchError]]:
-    """Recover one folder after the other, also when one fails; what was made, and what failed."""
+    """Recover all folders, continuing after failures; returns the groups and the errors."""
     found: list[RecoveredGroup] = []
     failures: list[DexTouchError] = []
     for folder in folders:
@@ -80,7 +80,7 @@ def recover_all(
 
 
 def raise_first(failures: Sequence[DexTouchError], found: Sequence[RecoveredGroup]) -> None:
-    """Raise the first failure, if any, with notes about the others and about what was recovered."""
+    """Raise the first error, if any, with notes about the others and the recovered groups."""
     if not failures:
         return
     for other in failures[1:]:
@@ -94,18 +94,18 @@ def raise_first(failures: Sequence[DexTouchError], found: Sequence[RecoveredGrou
 def recover_stage(
     stage: Path, root: Path, is_taken: IsTaken | None = None
 ) -> RecoveredGroup | None:
-    """Cut every stream of a stage to its last whole storage chunk and commit the stage.
+    """Truncate every stream of a stage to its last complete storage chunk and commit the stage.
 
     Args:
-        stage: that no writer holds any more.
+        stage: no longer locked by a writer.
         root: folder in which the group appears.
-        is_taken: whether an id cannot be had; whether its folder is in `root` when None.
+        is_taken: whether an id is in use; None checks for its folder in `root`.
 
     Returns:
-        What was recovered; None where nothing is worth keeping, and the stage is as it was.
+        The recovered group; None if there is nothing to recover, and the stage is unchanged.
 
     Raises:
-        CorruptDataError: damage that is no torn end; nothing is changed.
+        CorruptDataError: damage other than a torn tail; nothing is changed.
     """
     is_taken = is_taken or ids_below(root)
     record = _whole_commit(stage)
@@ -114,7 +114,8 @@ def recover_stage(
     attributes = read_stage(stage)
     if attributes is None:
         return None
-    # Before any shard becomes a log again: a torn commit record must not be taken for a whole one.
+    # Before any shard is turned back into a log: a torn commit record must not pass for a valid
+    # one.
     for name in (METADATA_FILE, COMMIT_FILE):
         (stage / name).unlink(missing_ok=True)
     kind = kind_of(attributes)
@@ -139,7 +140,7 @@ def recover_stage(
 def _publish(
     stage: Path, root: Path, record: CommitRecord, is_taken: IsTaken
 ) -> RecoveredGroup | None:
-    """Move a stage with a whole commit record into place, under another id if its own was taken."""
+    """Publish a stage with a valid commit record, under another id if its own is taken."""
     attributes = read_committed(stage, record.kind)
     if attributes_id(attributes) != record.id or is_taken(record.kind, record.id):
         # What can be made again was told so, and so was a migration that never got to put its
@@ -152,14 +153,14 @@ def _publish(
 
 
 def samples_of(record: CommitRecord, attributes: Attributes) -> dict[str, int]:
-    """Samples by stream."""
+    """Number of samples by stream."""
     return {stream.name: record.arrays[stream.name].shape[0] for stream in attributes.streams}
 
 
 def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
-    """Whether `recover_stage` would make something of an abandoned stage.
+    """Whether `recover_stage` can recover an abandoned stage.
 
-    A damaged stage counts: somebody should look at it before it goes.
+    A damaged stage counts, so that it is inspected before it is removed.
     """
     record = _whole_commit(stage)
     if record is not None:
@@ -191,7 +192,7 @@ def _whole_commit(stage: Path) -> CommitRecord | None:
 
 
 def _num_whole_samples(stage: Path, arrays: dict[str, ArrayEntry]) -> int:
-    """Samples of a stream up to the last place where a storage chunk of each array ends."""
+    """Number of samples up to the last chunk boundary common to all arrays of a stream."""
     ends = [
         np.cumsum(_trusted_rows(stage, name, entry)["num_rows"], dtype=np.int64)
         for name, entry in arrays.items()
@@ -212,7 +213,7 @@ def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
         part_path(stage, name).touch()
         journal_path(stage, name).touch()
     rows = read_rows(stage, name)
-    # After a power loss rows may be there whose payload is not.
+    # After a power loss there may be rows without their payload.
     while len(rows):
         try:
             read_payloads(stage, name, rows[-1:])
@@ -252,9 +253,9 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
 
 
 def _as_written(entry: ArrayEntry, payload: bytes) -> ArrayEntry:
-    """The entry with as many rows a storage chunk as this one of its log has.
+    """The entry with the chunk length that the log actually has.
 
-    Releases before wrote half a second of samples, however large.
+    Earlier releases always wrote half a second of samples per chunk.
     """
     row_bytes = np.dtype(entry.dtype).itemsize * math.prod(entry.shape[1:])
     chunk_rows, rest = divmod(content_bytes(payload), row_bytes)
@@ -264,7 +265,7 @@ def _as_written(entry: ArrayEntry, payload: bytes) -> ArrayEntry:
 
 
 def _as_recovered(attributes: Attributes, is_taken: IsTaken) -> Attributes:
-    """The same attributes, marked, under another id if theirs was taken in the meantime."""
+    """The attributes marked as recovered, under another id if theirs was taken meanwhile."""
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     number = 0
     free = item_id

@@ -1,4 +1,4 @@
-"""What `EpisodeStore` needs of the place where groups are kept; one class a kind of place."""
+"""Interface of storage backends, which keep the groups of an `EpisodeStore`."""
 
 import builtins
 from pathlib import Path
@@ -14,22 +14,22 @@ from dextouch.episodes.writer import EpisodeWriter
 
 @runtime_checkable
 class Storage(Protocol):
-    """Committed groups by kind and id, and what is on its way to become one.
+    """Committed groups by kind and id, and stages of unfinished ones.
 
-    What is committed never changes, and what is not committed is not seen.
+    Committed groups are immutable, and uncommitted ones are invisible.
     """
 
     @property
     def root(self) -> Path:
-        """The folder of this machine that unfinished things lie in."""
+        """Local folder of unfinished groups."""
         ...
 
     def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
-        """A writer whose commit puts a group here; ConflictError if the id is taken."""
+        """Writer of a new group; ConflictError if the id is taken."""
         ...
 
     def group(self, kind: Kind, item_id: str) -> GroupFiles:
-        """The files of a committed group; NotFoundError if there is none."""
+        """Files of a committed group; NotFoundError if there is none."""
         ...
 
     def exists(self, kind: Kind, item_id: str) -> bool:
@@ -41,25 +41,25 @@ class Storage(Protocol):
         ...
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
-        """What a committed group takes there; NotFoundError if there is none."""
+        """Size of a committed group; NotFoundError if there is none."""
         ...
 
     def list(self, kind: Kind) -> list[str]:
-        """Committed ids in order."""
+        """Sorted committed ids."""
         ...
 
     def delete(self, kind: Kind, item_id: str) -> None:
-        """Make a group vanish."""
+        """Delete a group."""
         ...
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Bring a group of an older format version over; False if it is of the current one."""
+        """Upgrade a group of an older format version; False if it is current."""
         ...
 
     def recover(self) -> builtins.list[RecoveredGroup]:
-        """Complete what killed writers left behind, as far as they went."""
+        """Commit the stages of terminated writers, as far as they were written."""
         ...
 
     def sweep(self) -> int:
-        """Remove what nothing can be made of; how many things went comes back."""
+        """Remove stages that cannot be recovered and return their number."""
         ...

@@ -1,4 +1,4 @@
-"""A folder, or a bucket, of episodes and recordings: open, list, write and delete them by id."""
+"""Store of episodes and recordings in a folder or a bucket: open, list, write, delete by id."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,9 +32,9 @@ _OBJECT_SCHEME = "s3://"
 def open_storage(
     url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
 ) -> Storage:
-    """The storage that an address names; see `EpisodeStore` for the arguments."""
+    """Storage backend for a URL; see `EpisodeStore` for the arguments."""
     if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
-        # Here, so that a store in a folder needs no obstore.
+        # Imported lazily, so that a local store does not need obstore.
         try:
             from dextouch.episodes.object_storage import open_object_storage
         except ModuleNotFoundError as error:
@@ -55,18 +55,18 @@ def open_storage(
 class EpisodeStore:
     """All episodes and recordings below one address.
 
-    Reading and writing from several processes at once is safe: what is committed never changes,
-    and what is not committed is not seen.
+    Concurrent use from several processes is safe: committed groups are immutable, and uncommitted
+    ones are invisible.
 
     Args:
         url: local folder, `file:///…`, or `s3://bucket/prefix` with the options `endpoint`,
-            `region` and others of `dextouch.episodes.object_address` behind a `?`.
-        storage_options: of an `s3://…` store; secrets belong here or into the usual AWS_*
+            `region` and others of `dextouch.episodes.object_address` after a `?`.
+        storage_options: of an `s3://…` store; credentials belong here or in the usual AWS_*
             environment, which obstore reads.
-        work_folder: of an `s3://…` store: where groups are written before they are uploaded.
+        work_folder: of an `s3://…` store: local folder where groups are written before the upload.
 
-    `root` is the folder of this machine that unfinished things lie in: the store itself where
-    that is a folder, else the work folder.
+    `root` is the local folder of unfinished groups: the store itself if that is a folder, otherwise
+    the work folder.
     """
 
     def __init__(
@@ -89,7 +89,7 @@ class EpisodeStore:
 
         Args:
             kind: of the group.
-            attributes: of that kind.
+            attributes: of the same kind.
             options: durability, speed and quality of video; None for the defaults.
 
         Raises:
@@ -107,7 +107,7 @@ class EpisodeStore:
         return self._storage.writer(kind, attributes, options or WriteOptions())
 
     def open(self, episode_id: str) -> EpisodeReader:
-        """The reader of a committed episode.
+        """Open a committed episode.
 
         Raises:
             NotFoundError: no such episode.
@@ -117,12 +117,12 @@ class EpisodeStore:
         return EpisodeReader(read_group(group, "episode", EpisodeAttributes))
 
     def recording(self, recording_id: str) -> RecordingReader:
-        """The reader of a finished recording; raises as `open`."""
+        """Open a finished recording; raises as `open`."""
         group = self._storage.group(*_check("recording", recording_id))
         return RecordingReader(read_group(group, "recording", RecordingAttributes))
 
     def files(self, item_id: str, *, kind: Kind = "episode") -> GroupFiles:
-        """The files of a committed group as they lie there, for inspection and repair.
+        """The raw files of a committed group, for inspection and repair.
 
         Raises:
             NotFoundError: no such id.
@@ -130,10 +130,10 @@ class EpisodeStore:
         return self._storage.group(*_check(kind, item_id))
 
     def live(self, recording_id: str) -> RecordingReader:
-        """A reader of what an unfinished recording holds at this moment; ask again for more.
+        """Open a snapshot of an unfinished recording; call again for later samples.
 
         Raises:
-            NotFoundError: no writer of this machine is at work under this id.
+            NotFoundError: no local writer is writing this id.
         """
         stages = stages_of(self.root, *_check("recording", recording_id))
         if not stages:
@@ -153,22 +153,22 @@ class EpisodeStore:
         return self._storage.revision(*_check(kind, item_id))
 
     def num_bytes(self, item_id: str, *, kind: Kind = "episode") -> int:
-        """What a committed group takes where it lies; raises as `revision`."""
+        """Size of a committed group; raises as `revision`."""
         return self._storage.num_bytes(*_check(kind, item_id))
 
     def list(self, *, kind: Kind = "episode") -> list[str]:
-        """Committed ids in order."""
+        """Sorted committed ids."""
         if kind not in KINDS:
             raise UnknownNameError("kind", kind, list(KINDS))
         return self._storage.list(kind)
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
-        """Put an episode or recording into the trash, where nobody sees it.
+        """Move an episode or recording to the trash.
 
         Args:
             item_id: of the group.
             kind: of the group.
-            for_good: remove it instead; so does object storage, which has no trash.
+            for_good: delete permanently; always so in object storage, which has no trash.
 
         Raises:
             NotFoundError: no such id.
@@ -182,15 +182,15 @@ class EpisodeStore:
         put_into_trash(self.root, kind, item_id)
 
     def restore(self, item_id: str, *, kind: TrashKind = "episode") -> None:
-        """Put what was deleted last under an id back; raises as `restore_from_trash`."""
+        """Restore the last deleted group of an id; raises as `restore_from_trash`."""
         restore_from_trash(self._trash_root(), kind, check_id(item_id))
 
     def trash_list(self) -> Sequence[TrashEntry]:
-        """What can be restored or purged, the oldest first."""
+        """Contents of the trash, oldest first."""
         return list_trash(self._trash_root())
 
     def purge(self, *, older_than_s: float = 0.0) -> Sequence[TrashEntry]:
-        """Remove for good what has been in the trash for so long; what went comes back."""
+        """Permanently delete trash older than `older_than_s` and return the deleted entries."""
         return purge_trash(self._trash_root(), older_than_s=older_than_s)
 
     def _trash_root(self) -> Path:
@@ -202,40 +202,40 @@ class EpisodeStore:
         return self.root
 
     def migrate(self, item_id: str, *, kind: Kind = "episode") -> bool:
-        """Bring a group of an older format version over; False if it is of the current one.
+        """Upgrade a group of an older format version; False if it is current.
 
-        The new group takes the old one's place in one moment; its lineage names the old content.
+        The new group replaces the old one atomically; its lineage names the old content.
 
         Raises:
             NotFoundError: no such id.
-            CorruptDataError: damaged; it stays as it is.
+            CorruptDataError: damaged; the group is unchanged.
             StorageError: of a newer version, or of an older one in object storage.
         """
         return self._storage.migrate(*_check(kind, item_id))
 
     def recover(self) -> tuple[RecoveredGroup, ...]:
-        """Complete the recordings that killed writers left behind, as far as they went.
+        """Commit the recordings of terminated writers, as far as they were written.
 
-        Each is there afterwards with `recovered` set, cut to its last whole storage chunks. Stages
-        with nothing worth keeping stay for `sweep`, and those of running writers are not touched.
-        Uploads that were cut off are completed.
+        They have `recovered` set and are truncated to complete storage chunks. Stages that are not
+        recoverable are left to `sweep`, those of running writers are not touched. Interrupted
+        uploads are completed.
 
         Raises:
-            CorruptDataError: damage that is no torn end; that stage is as it was, all others are
+            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
                 completed. Notes name them, and other failures.
         """
         return tuple(self._storage.recover())
 
     def sweep(self) -> int:
-        """Remove what crashed writers left behind; the number of removed things comes back.
+        """Remove stages of crashed writers that cannot be recovered, and return their number.
 
-        Recordings that `recover` can complete stay until it did.
+        Stages that `recover` can complete are kept.
         """
         return self._storage.sweep()
 
 
 def _check(kind: Kind, item_id: str) -> tuple[Kind, str]:
-    """Kind and id, if they are one of each."""
+    """Validate a kind and an id."""
     if kind not in KINDS:
         raise UnknownNameError("kind", kind, list(KINDS))
     return kind, check_id(item_id, kind=f"{kind} id")

@@ -1,6 +1,6 @@
-"""A store's folder → who and what each thing in it names, even where it is damaged or unfinished.
+"""Lenient scan of a store: operator, ids and lineage of each item, even damaged or unfinished ones.
 
-Read leniently, for deletion: an attributes file whose hash does not hold still names its operator.
+Used for deletion, where an attributes file with a wrong hash still names its operator.
 """
 
 import json
@@ -17,7 +17,7 @@ from dextouch.episodes.spool_reader import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE
 from dextouch.episodes.trash import TRASH
 
-# Where things lie, and the kind of group that lies there.
+# Folders of a store and the kind of group in each.
 PLACES: dict[str, str] = {
     "episodes": "episode",
     "recordings": "recording",
@@ -34,10 +34,10 @@ _AROUND_TRASH = re.compile(r"(episode|recording|upload|stage)\.(.+)\.[0-9]+")
 
 @dataclass(frozen=True)
 class Facts:
-    """What one folder of a store says of itself.
+    """Identity of one folder of a store.
 
-    `item_id` and `kind` are those of the group that it is or was to become; `lineage` the kinds,
-    ids and hashes that it was made from; `readable` is false where nothing could be learned.
+    `item_id` and `kind` are those of its (intended) group; `lineage` the kinds, ids and hashes of
+    its sources; `readable` is false where nothing could be parsed.
     """
 
     folder: Path
@@ -93,7 +93,7 @@ def _facts(folder: Path, place: str) -> Facts:
 
 
 def _named(name: str, place: str) -> tuple[str, str]:
-    """Kind and id as the name of a folder says them."""
+    """Kind and id from the name of a folder."""
     pattern = {STAGING: _AROUND_STAGE, TRASH: _AROUND_TRASH}.get(place)
     match = pattern.fullmatch(name) if pattern else None
     if match is None:
@@ -115,7 +115,7 @@ def _lineage(value: object) -> Iterator[tuple[str, str, str | None]]:
 
 
 def small_files(folder: Path) -> Iterator[Path]:
-    """Files right in a folder that may say something of what lies there; samples are none."""
+    """Metadata files directly in a folder, without samples."""
     if folder.is_file():
         yield folder
     with disk_errors(f"look through {folder.name}"):
@@ -134,20 +134,20 @@ def _json(path: Path) -> object:
 
 
 class Wanted:
-    """Words that must not be left: a pseudonym, ids and hashes; each whole, not inside another.
+    """Search for identifiers (a pseudonym, ids, hashes) as whole words.
 
     Args:
-        words: what is looked for.
+        words: the identifiers.
     """
 
     def __init__(self, words: set[str]) -> None:
         self._words = words
-        # Longest first, so that of two words that begin alike the longer one is named.
+        # Longest first, so that of two words with a common prefix the longer one matches.
         either = "|".join(re.escape(word) for word in sorted(words, key=len, reverse=True))
         self._pattern = re.compile(rf"(?<![{_WORD}])(?:{either})(?![{_WORD}])") if words else None
 
     def found_in(self, data: bytes) -> list[str]:
-        """Which words some bytes hold, as JSON or as text."""
+        """Identifiers in bytes of JSON or text."""
         try:
             texts = list(_strings(json.loads(data)))
         except (ValueError, RecursionError):
@@ -157,7 +157,7 @@ class Wanted:
         return sorted({word for text in texts for word in self.in_text(text)})
 
     def in_text(self, text: str) -> list[str]:
-        """Which words a text holds."""
+        """Identifiers in a text."""
         return sorted(set(self._pattern.findall(text))) if self._pattern else []
 
 

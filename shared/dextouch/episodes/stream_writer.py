@@ -1,4 +1,4 @@
-"""Blocks of one stream → its arrays in a group that is being written, after every check."""
+"""Writer of one stream of a group: validates blocks, encodes images, appends to the arrays."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -27,9 +27,9 @@ Stamps = Mapping[str, np.ndarray]
 
 
 class StreamWriter:
-    """One stream: its values, its stamps, and the checks that every block passes.
+    """Writes values and stamps of one stream, after validating every block.
 
-    Plain images of a `jpeg` or `h264` stream are encoded by a thread of the stream's own.
+    Plain images of a `jpeg` or `h264` stream are encoded in a background thread.
     """
 
     def __init__(
@@ -39,10 +39,10 @@ class StreamWriter:
         self._last_stamp_ns: int | None = None
         # Arrival stamps may repeat: a device can hand over several samples at once.
         self._least_step_ns = 1 if kind == "episode" else 0
-        # Whether values come as numbers or as encoded images; the first block decides.
+        # Whether values are numbers or encoded images, decided by the first block.
         self._plain: bool | None = None
-        # Whether a block was broken off half written: what follows would not line up with it. And
-        # the samples of all blocks before it.
+        # Whether a block was interrupted, after which arrays are misaligned; and the number of
+        # samples of all blocks before it.
         self._is_broken = False
         self._num_whole = 0
         self._codec = codec_of(descriptor)
@@ -57,7 +57,7 @@ class StreamWriter:
 
     @property
     def num_dropped(self) -> int:
-        """Images that found the queue full and were left out."""
+        """Number of images dropped because the queue was full."""
         return 0 if self._queue is None else self._queue.num_dropped
 
     def append(self, values: np.ndarray, stamps: Stamps) -> None:
@@ -71,7 +71,7 @@ class StreamWriter:
                 )
         if not len(values):
             return
-        # All checks come before the first byte, so that a refused block leaves no trace.
+        # All checks come before the first write, so that a refused block has no effect.
         plain = self._codec == "zstd" or values.dtype != object
         if self._plain is not None and self._plain != plain:
             raise InvalidInputError(
@@ -92,7 +92,7 @@ class StreamWriter:
             self._enqueue(values, stamps)
 
     def _enqueue(self, values: np.ndarray, stamps: Stamps) -> None:
-        # Once there is a queue, everything goes through it: the order must stay.
+        # Once there is a queue, everything goes through it to keep the order.
         if self._queue is None:
             name, when_full = self.descriptor.name, self._options.when_full
             self._queue = ImageQueue(self._write, name=name, when_full=when_full)
@@ -102,7 +102,7 @@ class StreamWriter:
         least, first_ns, last_ns = self._least_step_ns, int(stamps_ns[0]), self._last_stamp_ns
         if last_ns is not None and first_ns - last_ns < least:
             raise self._disorder(first_ns - last_ns, 0)
-        # Compared, not subtracted: the difference of two extreme stamps can come round.
+        # Compared, not subtracted: the difference of two extreme stamps can overflow.
         earlier, later = stamps_ns[:-1], stamps_ns[1:]
         wrong = later <= earlier if least else later < earlier
         if wrong.any():
@@ -124,7 +124,7 @@ class StreamWriter:
                 f"{descriptor.name}: got values {values.dtype} {values.shape}, expected "
                 f"{descriptor.dtype} [n, {', '.join(map(str, descriptor.shape))}]"
             )
-        # Recordings stay as the device spoke; in an episode nothing downstream expects NaN.
+        # Recordings keep raw device values; consumers of episodes do not expect NaN.
         if self._kind == "episode" and values.dtype.kind == "f" and not np.isfinite(values).all():
             raise NonFiniteError(
                 f"{descriptor.name}: {int((~np.isfinite(values)).sum())} values are NaN or "
@@ -132,7 +132,7 @@ class StreamWriter:
             )
 
     def _write(self, values: np.ndarray, stamps: Stamps) -> None:
-        """Append a block that was checked to all arrays of the stream."""
+        """Append a validated block to all arrays of the stream."""
         self._check_unbroken()
         self._is_broken = True
         array = self.arrays[self.descriptor.name]
@@ -154,10 +154,10 @@ class StreamWriter:
             )
 
     def finish(self) -> dict[str, ArrayEntry]:
-        """Complete all arrays; what the commit record says about each.
+        """Complete all arrays and return their entries of the commit record.
 
         Raises:
-            StorageError: a block was written in part, since the disk failed in the middle.
+            StorageError: a block was written partially because of a disk failure.
         """
         if self._queue is not None:
             self._queue.drain()
@@ -172,17 +172,17 @@ class StreamWriter:
         return entries
 
     def _flush(self) -> None:
-        """Write what waits in memory for its storage chunk to be full; nothing is appended then."""
+        """Write the last, partial storage chunks; nothing may be appended afterwards."""
         for payload, num_images in self._images.rest():
             self.arrays[self.descriptor.name].append_encoded(payload, num_images)
         for array in self.arrays.values():
             array.flush()
 
     def keep(self) -> None:
-        """Write all that waits in memory, but of a block that was broken off, and give all back.
+        """Write all buffered samples, except those of an interrupted block, and close the files.
 
         Raises:
-            StorageError: the disk fails; what was written before stays.
+            StorageError: a disk failure; earlier data is kept.
         """
         try:
             if self._queue is not None:
@@ -196,7 +196,7 @@ class StreamWriter:
             self.close()
 
     def close(self) -> None:
-        """Give thread and files back; what waits in memory is left out."""
+        """Stop the thread and close the files, discarding buffered samples."""
         if self._queue is not None:
             self._queue.stop(drop=True)
         for array in self.arrays.values():
@@ -204,7 +204,7 @@ class StreamWriter:
 
 
 class _EncodedImages:
-    """Images of a `jpeg` or `h264` stream → its storage chunks."""
+    """Groups the images of a `jpeg` or `h264` stream into storage chunks."""
 
     def __init__(self, descriptor: StreamDescriptor, settings: VideoSettings) -> None:
         self._descriptor, self._settings = descriptor, settings
@@ -217,7 +217,7 @@ class _EncodedImages:
             check_video_size(*descriptor.shape[:2])
 
     def check(self, values: np.ndarray) -> None:
-        """Refuse encoded images that are none of this stream."""
+        """Refuse encoded images that do not belong to this stream."""
         name = self._descriptor.name
         for index, data in enumerate(values):
             number = self._num_given + index
@@ -232,7 +232,7 @@ class _EncodedImages:
         self._num_given += len(values)
 
     def chunks(self, values: np.ndarray) -> list[tuple[bytes, int]]:
-        """Storage chunks that these images complete, each with its number of images."""
+        """Add images; returns the completed storage chunks with their number of images."""
         images = list(values) if values.dtype == object else [self._encode(v) for v in values]
         if self._codec == "jpeg":
             return [(pack_chunk("jpeg", [data]), 1) for data in images]
@@ -244,7 +244,7 @@ class _EncodedImages:
         return complete
 
     def rest(self) -> list[tuple[bytes, int]]:
-        """The storage chunk of what is left."""
+        """The last, partial storage chunk."""
         group, self._group = self._group, []
         return [(pack_chunk("h264", group), len(group))] if group else []
 

@@ -1,7 +1,7 @@
-"""Folders of a store → its trash, from which they come back whole or are removed for good.
+"""Trash of a store: deleted groups can be restored until they are purged.
 
-An entry is a folder `.trash/KIND.ID.TIME`, TIME being nanoseconds since 1970. Going in and coming
-back are one rename each, so that a thing is there whole or not at all.
+An entry is a folder `.trash/KIND.ID.TIME`, TIME being nanoseconds since 1970. Deleting and
+restoring are one rename each, hence atomic.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from dextouch.episodes.format import COMMIT_FILE, KINDS
 from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
 
 TRASH = ".trash"
-# Beside groups: unfinished uploads and stages that were too damaged to be completed.
+# Besides groups: unfinished uploads and stages that were too damaged to be recovered.
 TrashKind = Literal["episode", "recording", "upload", "stage"]
 TRASH_KINDS: tuple[TrashKind, ...] = get_args(TrashKind)
 HOMES: dict[TrashKind, str] = {
@@ -31,7 +31,7 @@ _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})"
 
 @dataclass(frozen=True)
 class TrashEntry:
-    """One deleted thing; `num_bytes` is what removing it for good would free."""
+    """One deleted item; `num_bytes` is the space that purging it frees."""
 
     kind: TrashKind
     item_id: str
@@ -41,19 +41,19 @@ class TrashEntry:
 
 
 def put_into_trash(root: Path, kind: TrashKind, item_id: str, *, now_ns: int | None = None) -> Path:
-    """Make a folder vanish from its place; it can be restored until it is purged.
+    """Move a folder to the trash, where it can be restored until it is purged.
 
     Args:
         root: of the store.
-        kind: of the thing.
+        kind: of the item.
         item_id: name of its folder.
-        now_ns: nanoseconds since 1970; the clock's when None.
+        now_ns: nanoseconds since 1970; None for now.
 
     Returns:
-        Where it lies now.
+        Its path in the trash.
 
     Raises:
-        NotFoundError: it is not there.
+        NotFoundError: no such item.
     """
     home = root / _home(kind)
     number = time.time_ns() if now_ns is None else now_ns
@@ -71,7 +71,7 @@ def put_into_trash(root: Path, kind: TrashKind, item_id: str, *, now_ns: int | N
 
 
 def list_trash(root: Path) -> list[TrashEntry]:
-    """What is in the trash, the oldest first; what a purge began to remove counts too."""
+    """Contents of the trash, oldest first, including partially purged entries."""
     folder = root / TRASH
     entries = []
     with disk_errors("list the trash"):
@@ -85,10 +85,10 @@ def list_trash(root: Path) -> list[TrashEntry]:
 
 
 def restore_from_trash(root: Path, kind: TrashKind, item_id: str) -> TrashEntry:
-    """Put what was deleted last under an id back into its place.
+    """Restore the last deleted item of an id.
 
     Raises:
-        NotFoundError: nothing whole of that kind and id is in the trash.
+        NotFoundError: no complete item of that kind and id is in the trash.
         ConflictError: the id was taken in the meantime.
     """
     home = _home(kind)
@@ -114,9 +114,9 @@ def restore_from_trash(root: Path, kind: TrashKind, item_id: str) -> TrashEntry:
 def purge_trash(
     root: Path, *, older_than_s: float = 0.0, now_ns: int | None = None
 ) -> list[TrashEntry]:
-    """Remove what has been in the trash for so long; it cannot be restored. What went comes back.
+    """Permanently delete trash older than `older_than_s` and return the deleted entries.
 
-    A purge that was interrupted is completed by the next one.
+    An interrupted purge is completed by the next one.
     """
     now_ns = time.time_ns() if now_ns is None else now_ns
     old = [e for e in list_trash(root) if e.deleted_at_ns <= now_ns - round(older_than_s * 1e9)]
@@ -126,12 +126,12 @@ def purge_trash(
 
 
 def remove_for_good(folder: Path) -> None:
-    """Remove a folder outside the places of groups; a link goes, what it points at stays."""
+    """Delete a folder; a symbolic link is removed, its target kept."""
     with disk_errors(f"remove {folder.name}"), contextlib.suppress(FileNotFoundError):
         if folder.is_symlink() or folder.is_file():
             folder.unlink()
             return
-        # First, so that what is only half removed is never taken for whole.
+        # First, so that a partially removed group never passes for a complete one.
         (folder / COMMIT_FILE).unlink(missing_ok=True)
         shutil.rmtree(folder)
 

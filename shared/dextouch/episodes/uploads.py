@@ -1,8 +1,8 @@
-"""Committed groups in local folders → the same groups in a bucket, each whole or not at all.
+"""Atomic upload of committed groups from local folders to a bucket.
 
 Every group in a bucket carries a `claim` from before its first file until after its last one is
-deleted: the sha256 of the content that may be there. Writers of equal content may repeat and help
-each other, since their files are equal; all others are refused before they overwrite anything.
+deleted: the sha256 of the content that may be there. Writers of equal content may run concurrently,
+    since their files are equal; all others are refused before they overwrite anything.
 """
 
 import shutil
@@ -16,30 +16,30 @@ from dextouch.episodes.object_bucket import Bucket, ObjectFacts
 from dextouch.errors import ConflictError, StorageError, UnavailableError
 
 CLAIM_FILE = "claim"
-# No content has this hash: nothing may be written while a group is deleted.
+# A hash that no content has, so that nothing is written while a group is deleted.
 _DELETING = b"deleting"
-# An upload that takes longer is taken for dead.
+# Uploads older than this count as abandoned.
 ORPHAN_AGE = timedelta(days=1)
 _PARALLEL_REQUESTS = 8
 
 
 def group_key(kind: Kind, item_id: str) -> str:
-    """The prefix of all keys of a group."""
+    """Key prefix of a group."""
     return f"{kind}s/{item_id}"
 
 
 def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
-    """Put a committed group into a bucket and remove its folder; may be repeated after a failure.
+    """Upload a committed group and remove its local folder; may be repeated after a failure.
 
     Args:
-        bucket: to write to.
+        bucket: destination.
         kind: of the group.
         folder: of the group, named by its id.
 
     Raises:
-        ConflictError: the id has other content there; the folder stays.
-        UnavailableError: no connection, or another writer is at the id; the folder stays.
-        StorageError: the upload failed; the folder stays.
+        ConflictError: the id has other content there; the folder is kept.
+        UnavailableError: no connection, or another writer uses the id; the folder is kept.
+        StorageError: the upload failed; the folder is kept.
     """
     group, name = group_key(kind, folder.name), f"{kind} {folder.name!r}"
     with disk_errors(f"upload {name}"):
@@ -48,18 +48,18 @@ def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
     if not _is_committed(bucket, group, content, name):
         _claim(bucket, group, content, name)
         _put_files(bucket, group, folder)
-        # Asked again: a sweep may have taken this upload for dead.
+        # Checked again, since a sweep may have considered this upload abandoned.
         _claim(bucket, group, content, name)
         if not bucket.put(f"{group}/{COMMIT_FILE}", commit, create=True):
             _is_committed(bucket, group, content, name)
     with disk_errors(f"remove what was uploaded of {name}"):
-        # First, so that nobody takes what a kill leaves of the rest for a group.
+        # First, so that the remainder after a kill does not pass for a group.
         (folder / COMMIT_FILE).unlink()
         shutil.rmtree(folder)
 
 
 def delete_group(bucket: Bucket, kind: Kind, item_id: str) -> None:
-    """Remove a group: it vanishes at once, its other files a moment later."""
+    """Delete a group: its commit record first, then its other objects."""
     group = group_key(kind, item_id)
     bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
     bucket.remove([f"{group}/{COMMIT_FILE}"])
@@ -67,11 +67,11 @@ def delete_group(bucket: Bucket, kind: Kind, item_id: str) -> None:
 
 
 def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
-    """Remove files of uploads and deletions that died; how many groups of them went comes back.
+    """Remove objects of abandoned uploads and deletions, and return the number of groups.
 
     Args:
-        bucket: to look through, all of it.
-        now: for what counts as dead, see ORPHAN_AGE; the present when not given.
+        bucket: to scan completely.
+        now: reference time for ORPHAN_AGE; defaults to the present.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
     removed = 0
@@ -85,7 +85,7 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
             if not is_old or f"{group}/{COMMIT_FILE}" in keys:
                 continue
             bucket.put(f"{group}/{CLAIM_FILE}", _DELETING)
-            # It may have come to life since it was listed.
+            # It may have become active since it was listed.
             if bucket.head(f"{group}/{COMMIT_FILE}") is None:
                 _remove_files(bucket, group, keys)
                 removed += 1
@@ -93,12 +93,12 @@ def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
 
 
 def _claim(bucket: Bucket, group: str, content: str, name: str) -> None:
-    """Make sure that only equal content is written from now on."""
+    """Claim a group, so that only equal content can be written from now on."""
     key, mine = f"{group}/{CLAIM_FILE}", content.encode()
     bucket.put(key, mine, create=True)
     if bucket.get(key) == mine:
         _is_committed(bucket, group, content, name)
-        # Read again: a deletion marks the claim before it takes the commit record away.
+        # Read again: a deletion marks the claim before it removes the commit record.
         if bucket.get(key) == mine:
             return
     _is_committed(bucket, group, content, name)
@@ -115,7 +115,7 @@ def _is_committed(bucket: Bucket, group: str, content: str, name: str) -> bool:
     try:
         same = decode_commit(found, what=name)[1] == content
     except StorageError:
-        # Damaged or of another version: not ours in any case.
+        # Damaged or of another version: different content in any case.
         same = False
     if not same:
         raise ConflictError(f"{name} exists already in {bucket.address}; choose another id")

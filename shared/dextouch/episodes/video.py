@@ -1,7 +1,7 @@
-"""Images ↔ H.264 access units in closed groups of pictures: the only place that knows PyAV.
+"""H.264 encoding and decoding in closed groups of pictures, through PyAV.
 
-One access unit is one image; without B-frames they come out in the order in which they went in, so
-image k of a group needs its first k + 1 access units and nothing else.
+One access unit is one image; without B-frames their order is that of the input, so image k of a
+group needs exactly its first k + 1 access units. No other module of the store uses PyAV.
 """
 
 import threading
@@ -20,15 +20,15 @@ if TYPE_CHECKING:
 
 _IDR_SLICE, _SLICE, _SEQUENCE_PARAMETERS, _PICTURE_PARAMETERS = 5, 1, 7, 8
 _START_CODE = b"\x00\x00\x01"
-# Averaging chroma over its 2×2 pixels costs nothing against the nearest one and gives 0.25 dB.
-# SWS_AREA | SWS_FULL_CHR_H_INP of libswscale: with all chroma going in, it stays in its vectorized
-# path: little more than half the time, the same PSNR.
+# Averaging chroma over 2×2 pixels is as fast as nearest-neighbour and gains 0.25 dB.
+# SWS_AREA | SWS_FULL_CHR_H_INP of libswscale: with full chroma input it stays in its vectorized
+# path, which takes little more than half the time at the same PSNR.
 _TO_YUV = 0x20 | 0x4000
 _TO_RGB = "BICUBIC"
 
 
 class VideoSettings(BaseModel):
-    """How images become H.264: the smaller `crf`, the better and the larger."""
+    """H.264 encoder settings; a lower `crf` gives better quality and larger files."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -38,13 +38,13 @@ class VideoSettings(BaseModel):
 
 @dataclass(frozen=True)
 class ImageForm:
-    """What is wanted of each stored image: `half_size` in both axes, `gray` with one channel."""
+    """Requested form of decoded images: `half_size` in both axes, `gray` with one channel."""
 
     half_size: bool = False
     gray: bool = False
 
     def shape(self, stored: tuple[int, ...]) -> tuple[int, int, int]:
-        """Height, width and channels of what comes out for a stored shape [h, w, 3]."""
+        """Output height, width and channels for a stored shape [h, w, 3]."""
         divisor = 2 if self.half_size else 1
         return stored[0] // divisor, stored[1] // divisor, 1 if self.gray else 3
 
@@ -53,15 +53,12 @@ FULL_FORM = ImageForm()
 
 
 def is_keyframe(access_unit: bytes) -> bool:
-    """Whether an access unit of H.264 (Annex B) can be decoded without those before it.
-
-    It is an IDR picture with its parameter sets in front of it.
-    """
+    """Whether an H.264 access unit (Annex B) is an IDR picture preceded by its parameter sets."""
     return bool(parameter_sets(access_unit))
 
 
 def parameter_sets(access_unit: bytes) -> bytes:
-    """The sequence and picture parameter sets in front of an IDR picture; none: empty."""
+    """The sequence and picture parameter sets before an IDR picture; empty if there are none."""
     kinds: set[int] = set()
     found = b""
     start = access_unit.find(_START_CODE)
@@ -79,7 +76,7 @@ def parameter_sets(access_unit: bytes) -> bytes:
 
 
 def check_video_size(height: int, width: int) -> None:
-    """Refuse images that H.264 with halved chroma cannot hold.
+    """Refuse image sizes that 4:2:0 H.264 cannot encode.
 
     Raises:
         InvalidInputError: an odd or empty side.
@@ -92,7 +89,7 @@ def check_video_size(height: int, width: int) -> None:
 
 
 class GopEncoder:
-    """One persistent encoder of one camera; every GOP_IMAGES-th access unit begins a group.
+    """Persistent encoder of one camera; every GOP_IMAGES-th access unit begins a group.
 
     Args:
         height: of the images, even.
@@ -101,7 +98,7 @@ class GopEncoder:
         settings: quality and speed.
 
     Raises:
-        InvalidInputError: a size or settings that H.264 cannot have.
+        InvalidInputError: an invalid size or invalid settings.
     """
 
     def __init__(self, height: int, width: int, *, rate_hz: float, settings: VideoSettings) -> None:
@@ -118,7 +115,7 @@ class GopEncoder:
         self._context.gop_size = GOP_IMAGES
         x264 = (
             f"keyint={GOP_IMAGES}:min-keyint={GOP_IMAGES}:scenecut=0:open-gop=0:bframes=0"
-            # Half-pixel motion: a seventh fewer bytes for a tenth more time, and decoding gains.
+            # Half-pixel motion: a seventh fewer bytes for a tenth more time, and faster decoding.
             ":threads=1:sliced-threads=0:subme=1"
         )
         self._context.options = {
@@ -135,7 +132,7 @@ class GopEncoder:
         self.description = f"libx264 {settings.preset} crf {settings.crf} gop {GOP_IMAGES}"
 
     def encode(self, image: np.ndarray) -> bytes:
-        """The access unit of the next image, uint8 [h, w, 3] RGB."""
+        """Encode the next image, uint8 [h, w, 3] RGB, to an access unit."""
         import av
 
         if image.shape != self._shape or image.dtype != np.uint8:
@@ -156,7 +153,7 @@ class GopEncoder:
 
 
 class GopDecoder:
-    """Decodes groups of pictures of one image size, each from its first access unit."""
+    """Decoder of groups of pictures of one image size."""
 
     def __init__(self, height: int, width: int) -> None:
         from av.video.reformatter import VideoReformatter
@@ -169,16 +166,16 @@ class GopDecoder:
     def decode(
         self, access_units: list[bytes], wanted: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Write images of a group into `out`.
+        """Decode images of a group into `out`.
 
         Args:
-            access_units: of the group from its first to the last one wanted.
-            wanted: places in the group, ascending.
-            form: of what comes out.
+            access_units: of the group, up to the last requested image.
+            wanted: indices in the group, ascending.
+            form: size and colours of the output.
             out: uint8 [len(wanted), *form.shape].
 
         Raises:
-            CorruptDataError: bytes that are not the images they should be.
+            CorruptDataError: invalid access units, or another number or size of images.
         """
         import av
 
@@ -202,7 +199,7 @@ class GopDecoder:
             )
 
     def _begin(self, parameters: bytes) -> None:
-        """Make sure that what is decoded next depends on nothing that was decoded before."""
+        """Reset the decoder, so that the next group is independent of earlier ones."""
         import av
 
         if not parameters:
@@ -210,7 +207,7 @@ class GopDecoder:
         if parameters == self._parameters:
             self._context.flush_buffers()
             return
-        # A decoder that refuses parameter sets goes on with those that it had.
+        # A decoder that refuses parameter sets continues with the previous ones.
         self._context = av.CodecContext.create("h264", "r")
         self._context.thread_count = 1
         # The bound keeps a forged header from allocating gigabytes.
@@ -230,7 +227,7 @@ class GopDecoder:
             width=width,
             height=height,
             format="gray" if form.gray else "rgb24",
-            # Halving by area averages each 2×2 pixels, as the other codecs do.
+            # Area scaling averages each 2×2 pixels, as the other codecs do.
             interpolation="AREA" if form.half_size else _TO_RGB,
             threads=1,
         )
@@ -244,7 +241,7 @@ _MAX_DECODERS = 4
 
 
 def decoder_of_this_thread(height: int, width: int) -> GopDecoder:
-    """A decoder that no other thread uses; making one anew would cost more than an image."""
+    """Thread-local decoder, since creating one takes longer than decoding an image."""
     known: dict[tuple[int, int], GopDecoder] = _DECODERS.__dict__.setdefault("by_size", {})
     if (height, width) not in known:
         while len(known) >= _MAX_DECODERS:

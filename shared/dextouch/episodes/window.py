@@ -1,4 +1,4 @@
-"""Stamps and samples at native rates → values on the model grid, and the window they make up."""
+"""Windows of an episode, and resampling of its streams from native rates to the model grid."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.rollouts import ActionKind
 
-# Stamps of one instant may differ by the rounding of whoever computed them.
+# Stamps of one instant may differ by rounding.
 SAME_INSTANT_NS = 1_000
 
 
@@ -27,7 +27,7 @@ class StreamData:
 class Window:
     """n consecutive steps of the model grid.
 
-    `images` are the nearest ones (one channel if asked for in gray), `image_dt_ns` the image's
+    `images` are the nearest ones (one channel if requested in gray), `image_dt_ns` the image's
     stamp minus the step's. `tactile_kpa` [step, left/right, taxel] is the mean of the samples in
     (t−1, t]; where `tactile_valid` is false there was none, and the row is zero. `actions` are
     relative to the *measured* poses of the first step, whose absolute poses are `anchor`; `K_head`
@@ -51,7 +51,7 @@ class Window:
 
 @dataclass(frozen=True)
 class NativeWindow:
-    """The same stretch of time with every stream at its own rate, as it was stored."""
+    """The same time span with every stream at its native rate."""
 
     streams: dict[str, StreamData]
     start_ns: int
@@ -62,11 +62,11 @@ class NativeWindow:
 
 
 def nearest_indices(stamps_ns: np.ndarray, t_ns: np.ndarray) -> Int64[np.ndarray, " n"]:
-    """Index of the stamp nearest to each time; of two equally near ones the earlier.
+    """Index of the stamp nearest to each time; the earlier one in a tie.
 
     Args:
         stamps_ns: at least one, strictly increasing.
-        t_ns: times to look for.
+        t_ns: query times.
     """
     right = np.searchsorted(stamps_ns, t_ns).clip(1, max(1, len(stamps_ns) - 1))
     left = right - 1
@@ -78,10 +78,10 @@ def nearest_indices(stamps_ns: np.ndarray, t_ns: np.ndarray) -> Int64[np.ndarray
 def step_ranges(
     stamps_ns: np.ndarray, grid_ns: np.ndarray, start: int, stop: int
 ) -> Int64[np.ndarray, "n 2"]:
-    """For grid steps start … stop-1 the samples [low, high) with t−1 < stamp ≤ t.
+    """Sample ranges [low, high) with t−1 < stamp ≤ t for grid steps start … stop-1.
 
-    Step 0 has no step before it: it takes the first sample of the stream, if that lies within half
-    a step of it. An empty range means that there is no sample.
+    Step 0 has no predecessor: it takes the first sample of the stream, if that lies within half a
+    step of it. A range is empty if there is no sample.
 
     Args:
         stamps_ns: of the samples, strictly increasing.
@@ -102,16 +102,16 @@ def step_ranges(
 def mean_over_ranges(
     values: np.ndarray, ranges: np.ndarray
 ) -> tuple[Float32[np.ndarray, "n taxels"], Bool[np.ndarray, " n"]]:
-    """Means of rows [low, high) in float32, and which ranges held anything.
+    """Means of rows [low, high) in float32, and a mask of non-empty ranges.
 
     Args:
-        values: rows, the first of them the one that `ranges` counts from.
+        values: rows, indexed by `ranges`.
         ranges: [n, 2].
     """
     valid = ranges[:, 1] > ranges[:, 0]
     means = np.zeros((len(ranges), *values.shape[1:]), dtype=np.float32)
     for step, (low, high) in enumerate(ranges.tolist()):
         if high > low:
-            # What `mean` does to the last bit, without what it looks up around it.
+            # Bit-identical to `mean`, without its overhead.
             means[step] = np.add.reduce(values[low:high], axis=0, dtype=np.float64) / (high - low)
     return means, valid

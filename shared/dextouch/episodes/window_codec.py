@@ -1,4 +1,4 @@
-"""A window ↔ bytes (msgpack): what the store answers and what a trainer elsewhere reads."""
+"""Serialization of windows with msgpack, for the store's HTTP interface."""
 
 from typing import get_args
 
@@ -14,7 +14,7 @@ _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
 
 
 def encode_window(window: Window) -> bytes:
-    """Bytes of a window."""
+    """Serialize a window."""
     arrays = {
         "tactile_kpa": window.tactile_kpa,
         "tactile_valid": window.tactile_valid,
@@ -30,11 +30,11 @@ def encode_window(window: Window) -> bytes:
 
 
 def decode_window(data: bytes, *, max_bytes: int) -> Window:
-    """The window of bytes that came from elsewhere; arrays are read-only.
+    """Deserialize and validate a window from an untrusted source; arrays are read-only.
 
     Raises:
         LimitExceededError: more bytes than allowed.
-        InvalidInputError: bytes that are no window.
+        InvalidInputError: not a valid window.
     """
     fields, arrays = unpack(data, max_bytes=max_bytes)
     cameras = [name.removeprefix(_IMAGES) for name in arrays if name.startswith(_IMAGES)]
@@ -72,7 +72,7 @@ def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
         "K_head": ("float64", (3, 3)),
     }
     for camera in cameras:
-        # Height and width are the camera's own; gray images have one channel.
+        # Height and width vary by camera; gray images have one channel.
         shape = arrays[_IMAGES + camera].shape
         channels = 1 if shape[3:] == (1,) else 3
         expected[_IMAGES + camera] = ("uint8", (n, *shape[1:3], channels))

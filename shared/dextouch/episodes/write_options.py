@@ -1,4 +1,4 @@
-"""How an episode is written: durability, threads, and what to do when the encoder is too slow."""
+"""Options of an episode writer: durability, encoder threads and backpressure."""
 
 from typing import Literal
 
@@ -13,15 +13,15 @@ class WriteOptions(BaseModel):
     """Settings of a writer.
 
     Attributes:
-        sync: every storage chunk survives a power loss; otherwise only what is committed does, and
-            everything written survives the death of the process.
-        threads: whether images are encoded beside the caller, one thread a camera.
-        when_full: of the queue before an encoder: "wait" holds the caller up, "drop" leaves the
-            image out and counts it, which is what a live take needs.
-        recoverable: whether what was written is kept when the writer is broken off: after an
-            exception or Ctrl-C at once, after a kill or on a full disk by `EpisodeStore.recover`.
-            None: recordings, but not episodes, since these are made again from their recording.
-            False suits whoever can repeat the whole of it, such as an import.
+        sync: sync every storage chunk to disk. Otherwise only committed groups survive a power
+            loss, while everything written survives a crash of the process.
+        threads: whether images are encoded in background threads, one per camera.
+        when_full: backpressure of the encoder queue: "wait" blocks the caller, "drop" drops and
+            counts the image, as a live take needs.
+        recoverable: whether an interrupted group is kept: at once after an exception or Ctrl-C, by
+            `EpisodeStore.recover` after a kill or on a full disk. None: recordings only, since
+            episodes can be recomputed from their recording. False suits writers that can start
+            over, such as an import.
         video: quality of `h264` streams.
     """
 

@@ -1,4 +1,4 @@
-"""Writer of a new episode or recording, which appears at once when it is finished."""
+"""Writer of a new episode or recording, which appears atomically on commit."""
 
 import os
 import shutil
@@ -37,15 +37,14 @@ DROPPED_IMAGES = "dropped_before_encoder"
 
 
 class EpisodeWriter:
-    """Writes one episode or recording beside the store and moves it in when all is well.
+    """Writes one episode or recording to a stage and publishes it on commit.
 
-    Use it as a context manager (from `EpisodeStore.writer`): leaving it normally commits. An
-    exception, Ctrl-C included, keeps what was appended if the writer is `recoverable`, as
-    recordings are unless `WriteOptions` say otherwise: the take is completed as far as it went and
-    has `recovered` set. Where that is impossible, on a full disk, its stage stays and
-    `EpisodeStore.recover` completes it later; a note on the exception says which of the two. Other
-    writers leave nothing behind after an exception. Streams listed in the attributes are there
-    from the start.
+    Use it as a context manager (from `EpisodeStore.writer`): leaving it normally commits. After an
+    exception, Ctrl-C included, appended samples are kept if the writer is `recoverable`, as
+    recordings are by default: the take is committed as far as it was written, with `recovered` set.
+    Where that is impossible, as on a full disk, its stage is kept and `EpisodeStore.recover`
+    completes it later; a note on the exception says which of the two. Other writers leave nothing
+    behind after an exception. Streams listed in the attributes are added at the start.
 
     Args:
         stage: new folder on the store's file system.
@@ -65,7 +64,8 @@ class EpisodeWriter:
         self._unannounced, self._recoverable = keep, keep
         self._is_discarded = False
         with disk_errors(f"create {stage}"):
-            # Held as long as the writer lives: tells a sweep that this stage is not abandoned.
+            # Lock held as long as the writer lives, so that a sweep does not consider the stage
+            # abandoned.
             self._lock = make_held_folder(stage)
         try:
             for descriptor in attributes.streams:
@@ -76,7 +76,7 @@ class EpisodeWriter:
             raise
 
     def add_stream(self, descriptor: StreamDescriptor) -> None:
-        """Announce a stream.
+        """Add a stream.
 
         Raises:
             ConflictError: one of its arrays has the name of an array that exists.
@@ -118,21 +118,21 @@ class EpisodeWriter:
         """Append a block of samples to a stream.
 
         Args:
-            name: of an announced stream.
-            values: [n, *shape] of the stream's dtype; finite in episodes. For the units
-                `jpeg` and `h264` uint8 images [n, h, w, 3], or an object array of bytes, one an
-                image, that is kept as it is.
+            name: of an added stream.
+            values: [n, *shape] of the stream's dtype; finite in episodes. For the units `jpeg` and
+                `h264` uint8 images [n, h, w, 3], or an object array of encoded images (bytes),
+                stored unchanged.
             t_ref_ns: [n], strictly increasing; episodes need exactly this stamp.
-            t_host_ns: [n], never decreasing; recordings need it.
+            t_host_ns: [n], non-decreasing; required for recordings.
             t_device_ns: [n]; recordings only, NO_DEVICE_TIME where absent.
             sequence: [n]; recordings only, NO_SEQUENCE where absent.
 
         Raises:
             UnknownNameError: no such stream.
-            InvalidInputError: stamps of the other kind, out of order, values that do not fit, or
-                a writer that was discarded.
+            InvalidInputError: stamps of the other kind or out of order, values of another dtype or
+                shape, or a writer that was discarded.
             StorageFullError: the disk is full.
-            StorageError: an earlier block of the stream was broken off.
+            StorageError: an earlier block of the stream was interrupted.
         """
         if self._is_discarded:
             raise InvalidInputError(
@@ -163,7 +163,7 @@ class EpisodeWriter:
         self._streams[name].append(values, stamps)
 
     def set_attributes(self, attributes: Attributes) -> None:
-        """Replace the attributes with ones that are known only at the end (success, ledger).
+        """Replace the attributes, for values known only at the end (success, ledger).
 
         Raises:
             InvalidInputError: of another kind or id than the writer was opened for.
@@ -196,7 +196,7 @@ class EpisodeWriter:
         self._leave(broken_off=kind is not None, error=error)
 
     def discard(self) -> None:
-        """Give up what was written: the context leaves nothing behind, however it is left."""
+        """Discard everything written when the context is left, normally or not."""
         self._is_discarded = True
 
     def _leave(self, *, broken_off: bool, error: BaseException | None) -> None:
@@ -207,16 +207,16 @@ class EpisodeWriter:
         finally:
             for stream in self._streams.values():
                 stream.close()
-            # Also after another interrupt: what is worth keeping stays until it is complete.
+            # Also after another interrupt: a recoverable stage is kept until it is committed.
             if not keep:
                 shutil.rmtree(self._stage, ignore_errors=True)
             os.close(self._lock)
 
     def _keep(self, error: BaseException | None) -> bool:
-        """Complete the take as far as it went; whether its stage must stay for `recover`."""
+        """Commit the take as far as written; returns whether its stage is left to `recover`."""
         what = f"{self._kind} {attributes_id(self._attributes)!r}"
         for stream in self._streams.values():
-            # On a full disk the storage chunks that are there already are what is kept.
+            # On a full disk, the storage chunks written so far are kept.
             with suppress(StorageError):
                 stream.keep()
         try:
@@ -242,7 +242,7 @@ class EpisodeWriter:
         return self._stage.exists()
 
     def _complete(self) -> RecoveredGroup | None:
-        """Commit what is in the stage; None where that is not worth it."""
+        """Commit the stage; None if there is nothing to keep."""
         return recover_stage(self._stage, self._target.parent.parent)
 
     def _commit(self) -> None:
@@ -260,7 +260,7 @@ class EpisodeWriter:
         return self._attributes.model_copy(update={"streams": descriptors})
 
     def _with_losses(self) -> Attributes:
-        """The attributes with the images that were dropped here counted in them."""
+        """The attributes with counts of images dropped by this writer."""
         attributes = self._with_streams()
         dropped = {name: s.num_dropped for name, s in self._streams.items() if s.num_dropped}
         if isinstance(attributes, EpisodeAttributes):

@@ -1,7 +1,7 @@
-"""Image arrays for zarr-python: it calls these codecs where metadata says `dextouch.jpeg|h264`.
+"""Zarr-python codecs `dextouch.jpeg` and `dextouch.h264`, for reading image arrays.
 
-zarr-python finds them by itself through the entry points of this package. They only decode: what
-is written to a store goes through `EpisodeWriter`.
+zarr-python finds them through this package's entry points. They only decode; writing goes through
+`EpisodeWriter`.
 """
 
 from dataclasses import dataclass
@@ -20,18 +20,18 @@ from dextouch.errors import InvalidInputError
 
 @dataclass(frozen=True)
 class _ImageCodec(ArrayBytesCodec):
-    """Storage chunks of images → uint8 [n, h, w, 3]; rows that only pad a chunk are zero."""
+    """Decodes image chunks to uint8 [n, h, w, 3]; padding rows are zero."""
 
     is_fixed_size = False
     codec: Codec = "jpeg"
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> "_ImageCodec":
-        """The codec as array metadata names it; it has no configuration."""
+        """Create the codec from array metadata; it has no configuration."""
         return cls()
 
     def to_dict(self) -> dict[str, Any]:
-        """How array metadata names the codec."""
+        """The codec's entry of the array metadata."""
         return {"name": ZARR_CODECS[self.codec]}
 
     def compute_encoded_size(self, input_byte_length: int, chunk_spec: ArraySpec) -> NoReturn:

@@ -1,6 +1,6 @@
-"""Bytes ↔ one zstd frame that says its size; each thread keeps its contexts.
+"""Zstandard compression with thread-local contexts and bounded decompression.
 
-Making a context costs as much as unpacking a storage chunk.
+Creating a context costs as much as decompressing a storage chunk.
 """
 
 import threading
@@ -10,8 +10,8 @@ import zstandard
 from dextouch.episodes.format import ZSTD_LEVEL
 from dextouch.errors import CorruptDataError
 
-# Far above what is written today (1 MiB, or one sample), and above the half second of raw images
-# that releases before wrote.
+# Far above current chunks (1 MiB, or one sample), and above the half second of raw images that
+# earlier releases wrote.
 MAX_CHUNK_BYTES = 1 << 29
 _MAGIC = bytes.fromhex("28b52ffd")
 _REPEATED = 1
@@ -27,20 +27,22 @@ _CONTEXTS = _Contexts()
 
 
 def compress(data: bytes) -> bytes:
-    """One frame with these bytes."""
+    """Compress bytes to one frame."""
     return _CONTEXTS.compressor.compress(data)
 
 
 def decompress(frame: bytes, *, size: int, what: str) -> bytes:
-    """The bytes of one frame that must hold `size` of them and be followed by nothing.
+    """Decompress a single frame of exactly `size` bytes.
 
     Raises:
-        CorruptDataError: anything else, or more than MAX_CHUNK_BYTES; `what` names it.
+        CorruptDataError: another size or trailing data, or more than MAX_CHUNK_BYTES; `what` names
+            the frame in errors.
     """
     if size > MAX_CHUNK_BYTES:
         raise CorruptDataError(f"{what}: is of {size} bytes, expected at most {MAX_CHUNK_BYTES}")
     try:
-        # Asked before anything is unpacked: a bomb says a size that we never allocate.
+        # Checked before decompression: a decompression bomb declares a size that is never
+        # allocated.
         said = zstandard.get_frame_parameters(frame).content_size
         if said != size:
             raise CorruptDataError(f"{what}: holds {said} bytes, expected {size}")
@@ -50,7 +52,7 @@ def decompress(frame: bytes, *, size: int, what: str) -> bytes:
 
 
 def content_bytes(frame: bytes) -> int:
-    """How many bytes a zstd frame says that it holds; 0 if it says nothing or is none."""
+    """Content size declared by a zstd frame; 0 if absent or not a frame."""
     try:
         said = int(zstandard.get_frame_parameters(frame).content_size)
     except zstandard.ZstdError:
@@ -59,7 +61,7 @@ def content_bytes(frame: bytes) -> int:
 
 
 def frame_bytes(frame: bytes) -> int | None:
-    """Where the first zstd frame of some bytes ends, going from block to block; None if nowhere."""
+    """Length of the first zstd frame, found by walking its blocks; None if it is incomplete."""
     place, length = _size_field(frame)
     place += length
     last = False
@@ -74,7 +76,7 @@ def frame_bytes(frame: bytes) -> int | None:
 
 
 def _size_field(frame: bytes) -> tuple[int, int]:
-    """Where a zstd frame says its size, and in how many bytes; (0, 0) if it is none."""
+    """Offset and width of a frame's content size field; (0, 0) if absent."""
     if len(frame) < 6 or frame[:4] != _MAGIC:
         return 0, 0
     descriptor = frame[4]

@@ -1,1 +1,1 @@
-"""Rotations, rigid transforms, interpolation and pinhole cameras, all in float64."""
+"""Rotations, rigid transforms, interpolation and pinhole cameras in float64."""

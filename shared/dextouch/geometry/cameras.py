@@ -1,11 +1,11 @@
-"""Pinhole cameras: points in the optical frame (x right, y down, z forward) to pixels."""
+"""Pinhole projection of points in the optical frame (x right, y down, z forward) to pixels."""
 
 import numpy as np
 from jaxtyping import Bool, Float64
 
 
 def pinhole_matrix(*, width_px: int, height_px: int, fovy_rad: float) -> Float64[np.ndarray, "3 3"]:
-    """K of an ideal camera with square pixels and its centre in the middle of the image.
+    """K of an ideal camera with square pixels and its principal point at the image centre.
 
     Pixel centres lie at half-integers (the first pixel spans 0 … 1), so cx = width / 2.
     """
@@ -20,8 +20,9 @@ def project(
 ) -> tuple[Float64[np.ndarray, "*batch 2"], Bool[np.ndarray, "*batch"]]:
     """Pixels [..., 2] of points [..., 3] in metres, and whether each lies in front of the camera.
 
-    Points nearer than `min_depth_m` are projected as if at that depth and marked False. A lens is
-    not modelled: on an image of a real camera, points are off by its `distortion_<camera>`.
+    Points nearer than `min_depth_m` are projected as if at that depth and marked False. Lens
+    distortion is not modelled: in images of a real camera, points are off by its
+    `distortion_<camera>`.
     """
     points = np.asarray(points_camera, dtype=np.float64)
     in_front = points[..., 2] >= min_depth_m

@@ -1,4 +1,4 @@
-"""Values and poses at other times than they were sampled, refusing to reach across gaps."""
+"""Interpolation of values and poses in time, with gap detection."""
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -11,16 +11,16 @@ from dextouch.geometry.transforms import transform
 def bracket(
     t_ns: np.ndarray, at_ns: np.ndarray, *, max_gap_ns: int
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Where each query time falls among strictly increasing sample times.
+    """Bracket each query time by two strictly increasing sample times.
 
     Args:
         t_ns: sample times [m ≥ 2], int64 nanoseconds, strictly increasing.
         at_ns: query times [n] on the same clock.
-        max_gap_ns: two neighbours further apart than this are not connected.
+        max_gap_ns: no interpolation between neighbours further apart than this.
 
     Returns:
-        Left index [n] (0 … m-2), weight of the right neighbour [n] in [0, 1], and whether the
-        query lies inside the samples and in no gap.
+        Left index [n] (0 … m-2), weight of the right neighbour [n] in [0, 1], and whether the query
+        lies within the samples and not in a gap.
 
     Raises:
         InvalidInputError: fewer than two samples, or times that do not increase.
@@ -41,7 +41,7 @@ def bracket(
 def interpolate_linear(
     values: np.ndarray, left: np.ndarray, weight: np.ndarray
 ) -> Float64[np.ndarray, "..."]:
-    """Linear interpolation of values [m, ...] at brackets from `bracket`."""
+    """Interpolate values [m, ...] linearly at brackets from `bracket`."""
     values = np.asarray(values, dtype=np.float64)
     w = weight.reshape(-1, *([1] * (values.ndim - 1)))
     return (1 - w) * values[left] + w * values[left + 1]

@@ -1,4 +1,4 @@
-"""Rotation matrices to and from 6-D, quaternions and rotation vectors; bad input raises."""
+"""Conversions between rotation matrices, 6-D vectors, quaternions and rotation vectors."""
 
 import numpy as np
 from jaxtyping import Float64

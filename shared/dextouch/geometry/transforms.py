@@ -1,4 +1,4 @@
-"""Rigid transforms as 4×4 matrices: build, invert, and the 7-number pose of a tracker."""
+"""Rigid transforms as 4×4 matrices: composition, inversion, and conversion to 7-D poses."""
 
 import numpy as np
 from jaxtyping import Float64

@@ -1,1 +1,1 @@
-"""The human skeleton, the robot hand and the 67-D action that both are mapped into."""
+"""Hand models: tracked human skeleton, robot hand kinematics, and the 67-D action space."""

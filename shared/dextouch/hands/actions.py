@@ -1,4 +1,4 @@
-"""The 67-D action: layout, packing, and the only code that changes what poses are relative to.
+"""The 67-D action: layout, packing, and changes of the anchor of relative poses.
 
 Equation 5 of the paper: a_t = [e_L, e_R, q_L, q_R, e_c]. e is a pose relative to an anchor step,
 3 numbers of translation (metres) then 6 of rotation (`rotation_to_6d`); q are the robot hand's 20
@@ -22,7 +22,7 @@ JOINTS_LEFT = slice(18, 38)
 JOINTS_RIGHT = slice(38, 58)
 CAMERA_HEAD = slice(58, 67)
 POSE_SLICES = (WRIST_LEFT, WRIST_RIGHT, CAMERA_HEAD)
-# All pose columns: transforms of the three parts at once cost half of one after the other.
+# All pose columns: converting the three parts together takes half the time.
 _POSE_COLUMNS = np.concatenate([np.arange(part.start, part.stop) for part in POSE_SLICES])
 
 IDENTITY_POSE_9D = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
@@ -30,7 +30,7 @@ IDENTITY_POSE_9D = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0, 0.0])
 
 @dataclass(frozen=True)
 class AnchorPoses:
-    """Absolute poses that action poses are relative to: the measured ones of the anchor step."""
+    """Measured absolute poses of the anchor step, to which action poses are relative."""
 
     T_world_wrist_left: Float64[np.ndarray, "4 4"]
     T_world_wrist_right: Float64[np.ndarray, "4 4"]
@@ -61,7 +61,7 @@ class HandTrajectory:
 
 
 def check_actions(actions: np.ndarray, *, where: str = "actions") -> Float64[np.ndarray, "time 67"]:
-    """The actions as float64 [T, 67], or a clear refusal.
+    """Validate actions and return them as float64 [T, 67].
 
     Raises:
         ShapeError: not [T, 67] with T ≥ 1.
@@ -114,7 +114,7 @@ def pack_action(
     joints_right_rad: np.ndarray,
     camera_head: np.ndarray,
 ) -> Float64[np.ndarray, "*batch 67"]:
-    """Actions [..., 67] from 9-D poses and 20 joint angles a hand."""
+    """Actions [..., 67] from 9-D poses and 20 joint angles per hand."""
     parts = {
         "wrist_left": (wrist_left, POSE_DIM),
         "wrist_right": (wrist_right, POSE_DIM),
@@ -143,7 +143,7 @@ class ActionParts:
 
 
 def unpack_action(actions: np.ndarray) -> ActionParts:
-    """The blocks of actions [..., 67]; inverse of `pack_action`."""
+    """Split actions [..., 67] into their blocks; inverse of `pack_action`."""
     actions = np.asarray(actions)
     if actions.shape[-1:] != (ACTION_DIM,):
         raise ShapeError(f"actions: got shape {actions.shape}, expected [..., {ACTION_DIM}]")
@@ -177,7 +177,7 @@ def actions_from_poses(
 
 def _relative_9d(T_world_anchor: np.ndarray, Ts_world_x: np.ndarray) -> Float64[np.ndarray, "n 9"]:
     relative = pose_to_9d(invert(T_world_anchor) @ Ts_world_x)
-    # A product with the inverse leaves rounding of 1e-16 where nothing moved.
+    # Multiplication with the inverse leaves rounding errors of 1e-16 where nothing moved.
     relative[(Ts_world_x == T_world_anchor).all(axis=(1, 2))] = IDENTITY_POSE_9D
     return relative
 
@@ -203,14 +203,14 @@ def _poses(actions: np.ndarray) -> Float64[np.ndarray, "time 3 4 4"]:
 def reanchor(
     actions: np.ndarray, index: int, *, anchor_action: np.ndarray | None = None
 ) -> Float64[np.ndarray, "time 67"]:
-    """The same actions relative to another step.
+    """Re-express actions relative to another step.
 
     Args:
         actions: [T, 67], all relative to one anchor.
         index: step that becomes the anchor; its poses come out as exactly the identity.
-        anchor_action: [67], relative to the same anchor as `actions`: what the new anchor is
-            taken from instead of `actions[index]`. Commanded actions need this: their anchor is
-            the *measured* action of the step.
+        anchor_action: [67], relative to the same anchor as `actions`: source of the new anchor
+            instead of `actions[index]`. Commanded actions need this: their anchor is the *measured*
+            action of the step.
 
     Raises:
         InvalidInputError: index outside 0 … T-1.

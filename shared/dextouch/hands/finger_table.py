@@ -1,7 +1,7 @@
-"""What describes a finger of any hand: its hinges, its tip and which hinges are its knuckles.
+"""Kinematic table of a finger: its hinges, its tip, and which hinges are its knuckles.
 
-Hinges stand from the wrist outwards. Each has a frame in the frame before it (the first: in the
-wrist frame), turns about an axis of its own frame, and stays within its limits.
+Hinges are ordered from the wrist outwards. Each has a frame in its parent's frame (the first: in
+the wrist frame), rotates about an axis of its own frame, and has limits.
 """
 
 from collections.abc import Iterable, Sequence
@@ -16,13 +16,13 @@ Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 MAX_HINGES: Final = 6
-# Axes come normalised; what is left of their length's error must not show in a fingertip.
+# Tolerance of unit axes, small enough not to affect fingertip positions.
 AXIS_TOLERANCE: Final = 1e-9
 _POINT_NAMES: Final = ("knuckle", "PIP", "DIP")
 
 
 class JointRow(NamedTuple):
-    """One hinge: where its frame sits in its parent, how it turns, how far."""
+    """One hinge: pose of its frame in the parent, axis and limits."""
 
     name: str
     position_m: Vector3
@@ -34,10 +34,9 @@ class JointRow(NamedTuple):
 class FingerTable(NamedTuple):
     """One finger: 1 to 6 hinges from the wrist outwards, and the tip in the last hinge's frame.
 
-    `chain` is the finger of the tracked skeleton that this one follows (`CHAINS`). `points` are
-    the indices of the hinges whose origins are the knuckle (of the thumb: the CMC joint), the PIP
-    (MCP) and the DIP (IP) joint. An index stands twice where a finger has fewer hinges: that bone
-    has no length.
+    `chain` is the finger of the tracked skeleton that this one follows (`CHAINS`). `points` are the
+    indices of the hinges whose origins are the knuckle (of the thumb: the CMC joint), the PIP (MCP)
+    and the DIP (IP) joint. A finger with fewer hinges repeats an index: that bone has zero length.
     """
 
     chain: str
@@ -47,15 +46,15 @@ class FingerTable(NamedTuple):
 
 
 def check_fingers(fingers: Sequence[FingerTable], *, where: str) -> None:
-    """Nothing, or a refusal that names the hinge.
+    """Validate finger tables.
 
     Args:
         fingers: of one hand.
-        where: what the message begins with.
+        where: prefix of error messages.
 
     Raises:
         InvalidInputError: no finger, a chain or name given twice, too few or many hinges, limits
-            that are no interval, an axis that is no unit vector, points out of order.
+            that are not an interval, an axis that is not a unit vector, points out of order.
         NonFiniteError: NaN or infinity in a table.
         UnknownNameError: a chain that the skeleton lacks.
     """

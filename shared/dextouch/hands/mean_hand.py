@@ -1,8 +1,8 @@
-"""The mean adult hand, lying flat: what a tracked hand is compared with to see how it is turned.
+"""Keypoints of the mean adult hand, the reference for the orientation of tracked hands.
 
-Bone lengths are adult means (Buryanov and Kotiuk 2010). Where the metacarpals begin and how they
-fan out is ours, from common anatomy; their axes define our wrist axes of a human hand: -z along the
-third metacarpal, x across the palm to the thumb's side, y through the palm.
+Bone lengths are adult means (Buryanov and Kotiuk 2010). Position and spread of the metacarpals are
+our estimate from common anatomy; they define our wrist axes of a human hand: -z along the third
+metacarpal, x across the palm to the thumb's side, y through the palm.
 """
 
 from functools import lru_cache
@@ -36,7 +36,7 @@ FINGER_CHAINS: Final = CHAINS[1:]
 WRIST_NODE: Final = NODE_INDEX[WRIST, WRIST]
 METACARPAL_NODES: Final = tuple(NODE_INDEX[chain, FINGER_JOINTS[0]] for chain in FINGER_CHAINS)
 KNUCKLE_NODES: Final = tuple(NODE_INDEX[chain, FINGER_JOINTS[1]] for chain in FINGER_CHAINS)
-# What stays as it is whatever the fingers do.
+# Keypoints that do not move with the fingers.
 PALM_NODES: Final = (WRIST_NODE, *METACARPAL_NODES, *KNUCKLE_NODES)
 
 
@@ -51,7 +51,7 @@ def mean_hand_m(side: str) -> Float64[np.ndarray, "25 3"]:
         raise UnknownNameError("side", side, ["left", "right"])
     points = np.zeros((NUM_KEYPOINTS, 3))
     for chain, (base_m, lean_rad, bones_m) in _FINGERS.items():
-        # Fingers fan out half as much as their metacarpals.
+        # Fingers spread half as much as their metacarpals.
         leans = np.array([lean_rad, *[lean_rad / 2] * 3])
         points[chain_indices(chain)] = _chain(base_m, leans, np.array(bones_m))
     direction = np.array(_THUMB_DIRECTION) / np.linalg.norm(_THUMB_DIRECTION)

@@ -1,8 +1,8 @@
-"""Nodes of any tracker in any order come in; where each belongs among our 25 keypoints goes out.
+"""Mapping of a hand tracker's nodes, in any order and naming, to our 25 keypoints.
 
-Node ids are opaque and orders differ, between a maker's own systems too: a node is known by its
-chain and joint, or by its chain and how far it is from the wrist. Words for joints differ as well,
-and some are one joint off; a chain's words only mean something together.
+Node ids are opaque and orders differ even between products of one manufacturer, so nodes are
+identified by chain and joint, or by chain and distance from the wrist. Joint names differ as well,
+and some are shifted by one joint; the names of a chain are interpreted together.
 """
 
 from collections import Counter
@@ -25,16 +25,16 @@ from dextouch.hands.skeleton import (
 
 Node = tuple[str, str]
 
-# What trackers without the four bones of the palm lack (MediaPipe: 21 nodes).
+# Nodes that trackers without metacarpals lack (MediaPipe: 21 nodes).
 FINGER_METACARPALS: Final = tuple((chain, "metacarpal") for chain in CHAINS[1:])
 NO_KEYPOINT: Final = -1
 _PALM: Final = "palm"
 # The root of MANUS's tree is of the chain "Hand" and of the joint type "Invalid".
 _WRIST_WORDS: Final = ((WRIST, WRIST), ("hand", "hand"), ("hand", "invalid"), ("hand", WRIST))
 _CHAIN_WORDS: Final = {"pinky": "little"}
-# Medicine names joints, we name the bones that begin there. MANUS's ROS 2 node names the
-# metacarpal bone's base "MCP" and so on, one joint off; the five names together give it away, as a
-# "PIP" gives away its thumb.
+# Anatomy names joints, we name the bones that start there. MANUS's ROS 2 node names the metacarpal
+# bone's base "MCP" and so on, shifted by one joint; the set of five names identifies the scheme, as
+# a "PIP" does for its thumb.
 _FINGER_WORDS: Final = (
     ("mcp", "pip", "dip", "tip"),
     ("cmc", "mcp", "pip", "dip", "tip"),
@@ -45,21 +45,21 @@ _THUMB_WORDS: Final = (("cmc", "mcp", "ip", "tip"), ("mcp", "pip", "dip", "tip")
 
 @dataclass(frozen=True)
 class NodeOrder:
-    """Where a tracker's nodes belong.
+    """Assignment of a tracker's nodes to keypoints.
 
     Attributes:
         places: our keypoint index of each of the tracker's nodes, in its order; −1 for a palm.
-        absent: our nodes that it does not have.
+        absent: our nodes that the tracker lacks.
     """
 
     places: tuple[int, ...]
     absent: tuple[Node, ...]
 
     def keypoints(self, points: np.ndarray) -> Float64[np.ndarray, "*batch 25 3"]:
-        """Our keypoints of the tracker's points [..., n, 3], same unit and axes; NaN where absent.
+        """Reorder a tracker's points [..., n, 3] to our keypoints; NaN where absent.
 
         Raises:
-            ShapeError: not one point a node.
+            ShapeError: not one point per node.
         """
         array = np.asarray(points, dtype=np.float64)
         if array.shape[-2:] != (len(self.places), 3):
@@ -77,7 +77,7 @@ class NodeOrder:
 class TreeNode:
     """A node by its parent: ids are opaque, the root's parent is None or itself.
 
-    `chain` is needed at one node of each chain at least; chains alone cannot be told apart.
+    At least one node of each chain needs `chain`, since the tree alone does not identify it.
     """
 
     id: int
@@ -86,17 +86,17 @@ class TreeNode:
 
 
 def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> NodeOrder:
-    """Where nodes belong that are described by chain and joint.
+    """Assign nodes given by chain and joint.
 
     Args:
         nodes: (chain, joint) in the tracker's order. Chains by our names ("pinky" is "little", the
             chain "hand" the wrist), joints of a chain all by our names, or all by medicine's (CMC
-            MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them; upper or lower case. A palm
-            is no keypoint and left out.
-        may_lack: our nodes that need not be there, such as `FINGER_METACARPALS`.
+            MCP PIP DIP TIP), or as MANUS's ROS 2 node misnames them; case-insensitive. A palm is
+            ignored.
+        may_lack: optional nodes, such as `FINGER_METACARPALS`.
 
     Raises:
-        InvalidInputError: a node unknown to us, missing, or named twice; the message says which.
+        InvalidInputError: unknown, missing or duplicate nodes; the message lists them.
     """
     translated = _in_our_words(nodes)
     counts = Counter(node for node in translated if node is not None)
@@ -118,7 +118,7 @@ def node_order(nodes: Sequence[Node], *, may_lack: Collection[Node] = ()) -> Nod
 
 
 def _in_our_words(nodes: Sequence[Node]) -> list[Node | None]:
-    """The same nodes by our names; None for a palm. What we have no name for stays as it is."""
+    """Translate nodes to our names; None for a palm. Unknown names are unchanged."""
     lowered = [(chain.lower(), joint.lower()) for chain, joint in nodes]
     named = [(_CHAIN_WORDS.get(chain, chain), joint) for chain, joint in lowered]
     words = {
@@ -137,7 +137,7 @@ def _in_our_words(nodes: Sequence[Node]) -> list[Node | None]:
 
 
 def _joint_words(chain: str, joints: Sequence[str]) -> Mapping[str, str]:
-    """Our name of each of a chain's words, if they are all words of one of the other languages."""
+    """Translation of a chain's joint names, if all belong to one other naming scheme."""
     is_thumb = chain == "thumb"
     ours = THUMB_JOINTS if is_thumb else FINGER_JOINTS
     for words in _THUMB_WORDS if is_thumb else _FINGER_WORDS:
@@ -147,15 +147,15 @@ def _joint_words(chain: str, joints: Sequence[str]) -> Mapping[str, str]:
 
 
 def nodes_of_tree(tree: Sequence[TreeNode]) -> list[Node]:
-    """Chain and joint of nodes that are described by their parents, in the order given.
+    """Chain and joint of nodes given by their parents, in the same order.
 
-    The root is the wrist, each of its children begins a chain. The thumb has four nodes; another
+    The root is the wrist, each of its children starts a chain. The thumb has four nodes; another
     chain has five, or four if it begins at its knuckle.
 
     Raises:
-        InvalidInputError: ids that repeat, no root or several, a loop, a chain that forks, has
-            another number of nodes, no name or two names. Whether all chains are there,
-            `node_order` says.
+        InvalidInputError: duplicate ids, no root or several, a cycle, or a chain that branches, has
+            another number of nodes, no name or two names. `node_order` checks that all chains are
+            present.
     """
     by_id = {node.id: node for node in tree}
     roots = [node.id for node in tree if node.parent in (None, node.id)]
@@ -182,7 +182,7 @@ def nodes_of_tree(tree: Sequence[TreeNode]) -> list[Node]:
 
 
 def _path(first: int, children: Mapping[int | None, Sequence[int]]) -> list[int]:
-    """Ids from the first node of a chain to its tip."""
+    """Node ids of a chain, from its first node to its tip."""
     ids = [first]
     while following := children.get(ids[-1], ()):
         if len(following) > 1:
@@ -195,7 +195,7 @@ def _path(first: int, children: Mapping[int | None, Sequence[int]]) -> list[int]
 
 
 def _named(ids: Sequence[int], labels: Sequence[str | None]) -> dict[int, Node]:
-    """Chain and joint of the nodes of one chain, by their number from the tip."""
+    """Chain and joint of the nodes of one chain, counted from the tip."""
     chains = {label.lower() for label in labels if label is not None}
     chains = {_CHAIN_WORDS.get(chain, chain) for chain in chains}
     if len(chains) != 1:

@@ -1,6 +1,6 @@
-"""Hands of any number of fingers: joint names, limits and forward kinematics in wrist coordinates.
+"""Kinematic models of robot hands: joint names, limits and forward kinematics in the wrist frame.
 
-`HandModel` takes finger tables (of a module or, by `dextouch.hands.hand_files`, of a file);
+`HandModel` is built from finger tables (of a module or, by `dextouch.hands.hand_files`, of a file);
 `RobotHand` is the Wuji Hand 2. All share one wrist frame: fingers along -z, the thumb side +x,
 the right palm faces +y, the left -y.
 """
@@ -33,7 +33,7 @@ class HandModel:
 
     Raises:
         UnknownNameError: any other side, or a chain that the tracked skeleton lacks.
-        InvalidInputError: tables that describe no hand; the message names the joint.
+        InvalidInputError: invalid tables; the message names the joint.
         NonFiniteError: NaN or infinity in a table.
     """
 
@@ -62,7 +62,7 @@ class HandModel:
 
     @cached_property
     def _is_joint(self) -> Bool[np.ndarray, "fingers hinges"]:
-        """Which places of the [fingers, most hinges of a finger] table a hinge fills."""
+        """Mask of existing hinges in the padded [fingers, hinges] table."""
         counts = np.array([len(finger.joints) for finger in self.fingers])
         return np.asarray(np.arange(counts.max()) < counts[:, None])
 
@@ -91,7 +91,7 @@ class HandModel:
     def joint_frames(
         self, joints_rad: np.ndarray
     ) -> Float64[np.ndarray, "time fingers hinges 4 4"]:
-        """T_wrist_joint of every hinge, after its own turn; of the Wuji hand [T, 5, 4, 4, 4].
+        """T_wrist_joint of every hinge after its rotation; [T, 5, 4, 4, 4] for the Wuji hand.
 
         A finger with fewer hinges than another repeats its last frame.
 
@@ -122,11 +122,11 @@ class HandModel:
     def chain_points_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time fingers 4 3"]:
         """Knuckle, PIP, DIP and tip of every finger in wrist coordinates, metres.
 
-        The knuckle is the last common point of a finger before its first phalanx: of the Wuji
-        hand the origin of the abduction frame (of the thumb: of the second CMC frame).
+        The knuckle is the base of the first phalanx: for the Wuji hand the origin of the abduction
+        frame (thumb: of the second CMC frame).
         """
         frames = self.joint_frames(joints_rad)
-        # Beyond a finger's own hinges the last frame stands again, so that -1 is right for all.
+        # Padded with the last frame, so that index -1 is valid for all fingers.
         last = frames[:, :, -1]
         tips = last[..., :3, :3] @ self._tips[:, :, None]
         tip_points = tips[..., 0] + last[..., :3, 3]

@@ -1,4 +1,4 @@
-"""The 25 nodes of a tracked human hand, named by chain and joint, never by position in a packet."""
+"""Human hand skeleton of 25 tracked keypoints, identified by chain and joint."""
 
 from typing import Final
 

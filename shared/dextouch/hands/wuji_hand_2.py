@@ -1,10 +1,10 @@
-"""Wuji Hand 2 (Beta 2) joint tables: left and right kept apart since they are no exact mirror.
+"""Kinematic tables of the Wuji Hand 2 (Beta 2), left and right, which are not exact mirrors.
 
-Figures from the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on PyPI), to
-its last digit; fingertips are its sites `*_tip` (tests/accuracy/test_hand_model.py compares).
-Wrist frame: fingers point along -z, the thumb side is +x, the right palm faces +y, the left -y.
-Each row: the joint's frame in its parent (position in metres, quaternion w x y z), its axis, its
-limits in radians.
+Values are copied exactly from the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji`
+0.1.0 on PyPI); fingertips are its sites `*_tip` (tests/accuracy/test_hand_model.py compares). Wrist
+frame: fingers point along -z, the thumb side is +x, the right palm faces +y, the left -y. Each row:
+the joint's frame in its parent (position in metres, quaternion w x y z), its axis, its limits in
+radians.
 """
 
 from typing import Final

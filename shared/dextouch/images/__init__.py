@@ -1,1 +1,1 @@
-"""Still images as JPEG bytes."""
+"""JPEG encoding of still images."""

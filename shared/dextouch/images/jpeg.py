@@ -1,4 +1,4 @@
-"""Images [h, w, 3] uint8 RGB ↔ JPEG bytes: the one still-image codec."""
+"""JPEG codec for uint8 RGB images [h, w, 3]."""
 
 import numpy as np
 import simplejpeg
@@ -10,7 +10,7 @@ DEFAULT_QUALITY = 90
 
 
 def encode_jpeg(image: np.ndarray, *, quality: int = DEFAULT_QUALITY) -> bytes:
-    """JPEG bytes of one RGB image, without chroma subsampling.
+    """Encode one RGB image as JPEG, without chroma subsampling.
 
     Raises:
         ShapeError: not uint8 [h ≥ 1, w ≥ 1, 3].
@@ -21,10 +21,10 @@ def encode_jpeg(image: np.ndarray, *, quality: int = DEFAULT_QUALITY) -> bytes:
 
 
 def decode_jpeg(data: bytes, *, where: str = "image") -> UInt8[np.ndarray, "h w 3"]:
-    """The RGB image of JPEG bytes.
+    """Decode a JPEG to an RGB image.
 
     Raises:
-        CorruptDataError: bytes that are no whole JPEG image; `where` names them.
+        CorruptDataError: not a complete JPEG image; `where` names it in the message.
     """
     try:
         return simplejpeg.decode_jpeg(data, colorspace="RGB")
@@ -33,10 +33,10 @@ def decode_jpeg(data: bytes, *, where: str = "image") -> UInt8[np.ndarray, "h w 
 
 
 def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
-    """Height and width (pixels) announced by JPEG bytes; only the header is read.
+    """Height and width (pixels) of a JPEG, from its header.
 
     Raises:
-        CorruptDataError: no JPEG header.
+        CorruptDataError: not a JPEG header.
     """
     try:
         height_px, width_px, _, _ = simplejpeg.decode_jpeg_header(data)

@@ -1,1 +1,1 @@
-"""Numbers that compare what was predicted, reached or imagined with what was true."""
+"""Metrics of predictions, trajectories and policies against ground truth."""

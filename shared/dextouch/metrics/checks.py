@@ -1,4 +1,4 @@
-"""Pairs of arrays in, the same pairs checked out: one shape, finite numbers, never empty."""
+"""Validation of array pairs before they are compared."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -9,12 +9,12 @@ from dextouch.errors import NonFiniteError, ShapeError
 def checked_pair(
     first: np.ndarray, second: np.ndarray, *, what: str, tail: tuple[int | None, ...]
 ) -> tuple[Float64[np.ndarray, "..."], Float64[np.ndarray, "..."]]:
-    """Both arrays as float64.
+    """Validate two arrays of equal shape and return them as float64.
 
     Args:
         first: one side of the comparison.
         second: the other side, of the same shape.
-        what: name for the message.
+        what: name in error messages.
         tail: expected last axes; None stands for any length of at least one.
 
     Raises:

@@ -1,6 +1,6 @@
-"""Predicted and true 8-bit colour images in; PSNR (dB) and SSIM out.
+"""PSNR (dB) and SSIM of predicted 8-bit colour images.
 
-Both are means over images: a clip's figure is the mean of its images' figures.
+Both are averaged over images, so the value of a clip is the mean over its images.
 """
 
 import numpy as np
@@ -10,7 +10,7 @@ from dextouch.errors import ShapeError
 from dextouch.metrics.checks import checked_pair
 
 PEAK = 255.0
-# An exact image has an infinite PSNR; it counts as this much, so that means stay finite.
+# Cap for exact images, whose PSNR is infinite, so that means stay finite.
 MAX_PSNR_DB = 100.0
 SSIM_WINDOW_PX = 11
 _SSIM_SIGMA_PX = 1.5
@@ -43,7 +43,7 @@ def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
     """Mean structural similarity, 1 for equal images.
 
     Wang et al. 2004: Gaussian window 11×11 with σ = 1.5 px, K1 = 0.01, K2 = 0.03, range 255,
-    each colour by itself, only where the whole window lies inside the image.
+    each channel separately, only where the whole window lies inside the image.
 
     Args:
         predicted: images [..., h, w, 3] in 0 … 255, at least 11 px high and wide.
@@ -73,7 +73,7 @@ def ssim(*, predicted: np.ndarray, true: np.ndarray) -> float:
 
 
 def _smooth(images: np.ndarray) -> np.ndarray:
-    """Gaussian means over rows and columns, inside the image only."""
+    """Gaussian filter over rows and columns, valid region only."""
     offsets = np.arange(SSIM_WINDOW_PX) - SSIM_WINDOW_PX // 2
     kernel = np.exp(-0.5 * (offsets / _SSIM_SIGMA_PX) ** 2)
     kernel /= kernel.sum()

@@ -1,7 +1,7 @@
-"""Scores of the same policies in reality and in imagination in; how well they agree out.
+"""Agreement between policy scores in reality and in imagination: correlations, MMRV, bias.
 
-Arguments are keyword-only: MMRV is not symmetric, and swapping real and imagined is the usual
-mistake. A figure that is not defined is NaN, never 0 or 1.
+Arguments are keyword-only: MMRV is not symmetric, and swapping real and imagined is an easy
+mistake. Undefined values are NaN, never 0 or 1.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ def pearson(*, real: np.ndarray, imagined: np.ndarray) -> float:
     if len(a) < 2 or np.ptp(a) == 0 or np.ptp(b) == 0:
         return float("nan")
     a, b = a - a.mean(), b - b.mean()
-    # Squares of tiny or huge numbers leave float64.
+    # Squares of tiny or huge numbers under- or overflow float64.
     a, b = a / np.abs(a).max(), b / np.abs(b).max()
     r = np.dot(a / np.linalg.norm(a), b / np.linalg.norm(b))
     return float(np.clip(r, -1.0, 1.0))
@@ -39,7 +39,7 @@ def spearman(*, real: np.ndarray, imagined: np.ndarray) -> float:
 
 
 def kendall(*, real: np.ndarray, imagined: np.ndarray) -> float:
-    """Kendall's τ-b: pairs in the same order less pairs in opposite order, corrected for ties.
+    """Kendall's τ-b: concordant minus discordant pairs, corrected for ties.
 
     NaN when undefined: fewer than two policies, or all scores of one side equal.
     """
@@ -81,7 +81,7 @@ def mmrv(*, real: np.ndarray, imagined: np.ndarray, ties: str = "paper") -> floa
 
 
 def bias(*, real: np.ndarray, imagined: np.ndarray) -> float:
-    """Mean of imagined − real: positive where imagination flatters."""
+    """Mean of imagined − real: positive where imagination overestimates."""
     a, b = _scores(real, imagined, "bias")
     return float(np.mean(b - a))
 

@@ -1,7 +1,7 @@
-"""Predicted and true taxel pressures [..., 320] in kPa in; errors and contact agreement out.
+"""Tactile errors (kPa) and contact agreement of predicted taxel pressures [..., 320].
 
 Everything pools over all given samples, hands and taxels (micro average). Contact is pressure of
-at least 2 kPa (`dextouch.tactile.contact`). Leave invalid hands out before calling: NaN is refused.
+at least 2 kPa (`dextouch.tactile.contact`). Exclude invalid hands before calling: NaN is refused.
 """
 
 import numpy as np
@@ -35,7 +35,8 @@ def mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
 def psnr(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
     """10 log10(peak² / MSE) in dB of the pooled MSE, at most 100 dB.
 
-    Pooled, since most samples of an untouched hand are exact and would fill a mean with the cap.
+    Pooled, since samples of an untouched hand are mostly exact and a mean would be dominated by the
+    cap.
     """
     a, b = _pair(predicted_kpa, true_kpa, "PSNR")
     return float(decibels(np.mean((a - b) ** 2), peak=peak_kpa))
@@ -44,9 +45,9 @@ def psnr(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = P
 def ssim(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray, peak_kpa: float = PEAK_KPA) -> float:
     """Mean structural similarity of the six pads of a hand, 1 for equal pads.
 
-    Never across pads: uniform windows of 4×4 taxels (one fingertip) inside each pad, K1 = 0.01,
-    K2 = 0.03, range 0 … `peak_kpa`; each of the five fingertips and the palm counts the same.
-    An untouched pad predicted as untouched scores 1.
+    Computed within pads only: uniform windows of 4×4 taxels (one fingertip) inside each pad, K1 =
+    0.01, K2 = 0.03, range 0 … `peak_kpa`; each of the five fingertips and the palm has the same
+    weight. An untouched pad predicted as untouched scores 1.
     """
     a, b = _pair(predicted_kpa, true_kpa, "SSIM")
     tips_a, palm_a = split_pads(a)
@@ -72,9 +73,9 @@ def _pad_similarity(a: np.ndarray, b: np.ndarray, peak: float) -> np.ndarray:
 
 
 def contact_mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
-    """Mean absolute error in kPa over the taxels that truly are in contact.
+    """Mean absolute error in kPa over the taxels in true contact.
 
-    NaN when nothing truly is in contact: there is no error to tell.
+    NaN when no taxel is in true contact.
     """
     a, b = _pair(predicted_kpa, true_kpa, "contact MAE")
     touched = in_contact(b)
@@ -82,10 +83,7 @@ def contact_mae(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
 
 
 def contact_iou(*, predicted_kpa: np.ndarray, true_kpa: np.ndarray) -> float:
-    """Contact taxels on both sides over those on either side.
-
-    1 when neither side has contact: the prediction that nothing touches was right.
-    """
+    """Intersection over union of contact taxels; 1 when neither side has contact."""
     a, b = _pair(predicted_kpa, true_kpa, "contact IoU")
     both, either = _overlap(a, b)
     return both / either if either else 1.0

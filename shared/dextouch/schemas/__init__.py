@@ -1,1 +1,1 @@
-"""Every HTTP body of the services, as pydantic models that need no web framework."""
+"""HTTP bodies of the services as pydantic models, independent of the web framework."""

@@ -1,4 +1,4 @@
-"""What an episode says about itself, and the catalog's answers: pydantic models in and out."""
+"""Schemas of episodes: attributes, lineage, clock reports, and the catalog's responses."""
 
 from operator import not_
 from typing import Annotated, Any, Final, Literal
@@ -20,12 +20,12 @@ from dextouch.streams.descriptors import StreamDescriptor
 FORMAT_VERSION: Final = 1
 ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"
 
-# What dates a stream's samples: the device's stamps, its sequence numbers, the count of those that
-# it must have sent, or the arrivals as they are.
+# Source of a stream's time stamps: the device's stamps, its sequence numbers, counting of samples,
+# or plain arrival times.
 ClockMethod = Literal["device", "sequence", "counting", "arrival"]
-# Why the times of a stream are in doubt: its clock is far off its nominal rate, even the promptest
-# samples arrive later than the fit says by more than a sample period, or a stop of the clock cannot
-# be told from a path that got longer.
+# Reasons to doubt the times of a stream: its clock is far off its nominal rate, even the promptest
+# samples arrive more than a sample period later than fitted, or a stop of the clock cannot be
+# distinguished from an increase of the path delay.
 ClockWarning = Literal["skew", "residual", "stop"]
 StoreId = Annotated[str, Field(pattern=ID_PATTERN)]
 Domain = Literal["human", "robot"]
@@ -37,7 +37,7 @@ Box = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat, Fin
 
 
 def matrix_rows(matrix: np.ndarray) -> Matrix:
-    """A two-dimensional array as nested tuples, the way attributes keep it."""
+    """Convert a two-dimensional array to nested tuples, as stored in attributes."""
     return tuple(tuple(float(value) for value in row) for row in np.asarray(matrix))
 
 
@@ -49,7 +49,7 @@ def _check_matrix(rows: Matrix, shape: tuple[int, int]) -> Matrix:
 
 
 class StoredAnchor(BaseModel):
-    """The absolute poses of step 0 that an episode's actions are relative to, as 4×4 rows."""
+    """Absolute poses of step 0, the anchor of an episode's actions, as 4×4 matrices."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -85,7 +85,7 @@ class StoredAnchor(BaseModel):
 
 
 class LineageEntry(BaseModel):
-    """One thing that another was made from, by id and content hash."""
+    """A source of derived data, by id and content hash."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -95,12 +95,12 @@ class LineageEntry(BaseModel):
 
 
 class ClockReport(BaseModel):
-    """How well one stream's clock was fitted to the reference clock.
+    """Quality of the clock fit of one stream against the reference clock.
 
-    `method` is what dates the samples, None where the episode does not say. `latency_ms` is the
-    constant path delay that was taken away; `latency_sigma_ms` says how well it is known, None
-    where nobody measured it. `num_steps` counts where the device's clock jumped or stood still and
-    the fit was cut; `warnings` say why the times are in doubt.
+    `method` is the source of the time stamps, None where unknown. `latency_ms` is the constant path
+    delay that was subtracted; `latency_sigma_ms` its standard deviation, None where not measured.
+    `num_steps` counts jumps and stops of the device's clock, where the fit was split; `warnings`
+    are reasons to doubt the times.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -118,14 +118,15 @@ class ClockReport(BaseModel):
 
 
 class EpisodeAttributes(BaseModel):
-    """Everything about an episode that is not a sample.
+    """Metadata of an episode.
 
     `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
     `calibration` holds named matrices such as `T_tracker_left_wrist_left`; `quality` named figures;
-    `recovered` says that the writer died and this is what its journals vouch for. `object_boxes_m`
-    has one box an object, centre and half sizes in the object's own frame. `event_times_s` says
-    when each milestone of the task first held, in seconds from step 0; milestones never reached
-    are absent. Where these two are empty they are not written, so that older releases read it.
+    `recovered` marks an episode recovered after its writer crashed. `object_boxes_m` has one box
+    per object, centre and half sizes in the object's own frame. `event_times_s` is the time at
+    which each milestone of the task was first reached, in seconds from step 0; milestones never
+    reached are absent. If empty, these two are not written, so that older releases can read the
+    episode.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -187,7 +188,7 @@ class EpisodeSummary(BaseModel):
 class EpisodeList(BaseModel):
     """One page of the catalog and how many episodes match in all.
 
-    `next_after` is the id to ask on from; None on the last page.
+    `next_after` is the cursor of the next page; None on the last page.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -198,7 +199,7 @@ class EpisodeList(BaseModel):
 
 
 class HoursRow(BaseModel):
-    """How much there is of one task in one domain from one origin."""
+    """Total duration of one task in one domain from one origin."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -231,7 +232,7 @@ class EpisodeDetail(BaseModel):
 
 
 class Verification(BaseModel):
-    """What `verify` read and found whole."""
+    """Result of a successful `verify`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -1,4 +1,4 @@
-"""The bodies of /healthz and /readyz: is the process alive, and may work be sent to it."""
+"""Bodies of the liveness and readiness probes /healthz and /readyz."""
 
 from typing import Literal
 
@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict
 
 
 class Health(BaseModel):
-    """The process answers."""
+    """Liveness: the process responds."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -16,7 +16,7 @@ class Health(BaseModel):
 
 
 class Readiness(BaseModel):
-    """Whether work may be sent; `waiting_for` names what is missing (empty when ready)."""
+    """Readiness for requests; `waiting_for` names what is missing (empty when ready)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

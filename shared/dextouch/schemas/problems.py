@@ -1,4 +1,4 @@
-"""An error of ours to a problem+json body (RFC 9457) and back, the same on server and client."""
+"""Conversion between DexTouch errors and problem+json bodies (RFC 9457)."""
 
 from typing import Any
 
@@ -23,9 +23,9 @@ from dextouch.errors import (
 PROBLEM_MEDIA_TYPE = "application/problem+json"
 TYPE_PREFIX = "urn:dextouch:error:"
 
-# Names that the constructor of an error takes itself.
+# Names of the error constructor's own parameters.
 RESERVED = frozenset({"self", "message"})
-# The first class that fits decides; the tree's leaves stand before their parents.
+# The first matching class decides; leaves of the tree precede their parents.
 STATUS_OF_CLASS: tuple[tuple[type[DexTouchError], int], ...] = (
     (PacketError, 400),
     (InvalidInputError, 422),
@@ -59,9 +59,9 @@ CLASS_OF_STATUS: dict[int, type[DexTouchError]] = {
 
 
 class Problem(BaseModel):
-    """The body of every answer with a status of 400 or more.
+    """Body of every response with a status of 400 or more.
 
-    `type` names the class of `dextouch.errors` behind `urn:dextouch:error:`; `details` holds the
+    `type` is `urn:dextouch:error:` followed by the class in `dextouch.errors`; `details` holds the
     facts of `detail` as data (`expected`, `got`, `valid`, `retry_after_s`, …).
     """
 
@@ -79,9 +79,9 @@ class Problem(BaseModel):
 def status_of(error: DexTouchError) -> int:
     """The HTTP status of an error.
 
-    Two classes answer by their details: a limit that waiting helps against (`retry_after_s`) is
-    429, any other 413; a refusal by its `reason`: a missing or unknown key is 401, a missing scope
-    or a foreign origin 403, a foreign host name 421.
+    Two classes depend on their details: a temporary limit (`retry_after_s`) is 429, any other 413;
+    a refusal depends on its `reason`: a missing or unknown key is 401, a missing scope or a foreign
+    origin 403, a foreign host name 421.
     """
     if isinstance(error, LimitExceededError) and "retry_after_s" in error.details:
         return 429
@@ -91,7 +91,7 @@ def status_of(error: DexTouchError) -> int:
 
 
 def problem_from_error(error: DexTouchError, *, instance: str, request_id: str) -> Problem:
-    """The body that tells a client about an error; details become plain JSON."""
+    """Convert an error to a response body; details become plain JSON."""
     name = type(error).__name__
     details = from_json(to_json(error.details, fallback=str, inf_nan_mode="strings"))
     return Problem(
@@ -106,7 +106,7 @@ def problem_from_error(error: DexTouchError, *, instance: str, request_id: str) 
 
 
 def error_from_problem(problem: Problem) -> DexTouchError:
-    """The error that a server meant: its own class where known, else one that fits the status."""
+    """Convert a response body to an error: the named class if known, otherwise one by status."""
     name = problem.type.removeprefix(TYPE_PREFIX)
     named = getattr(errors, name, None)
     if isinstance(named, type) and issubclass(named, DexTouchError):
@@ -121,9 +121,9 @@ def error_from_problem(problem: Problem) -> DexTouchError:
 
 
 def first_problems(error: ValidationError, *, limit: int = 5) -> str:
-    """What pydantic found, in one line, without the input itself.
+    """Summarize pydantic's errors in one line, without the input.
 
-    Pydantic puts "Value error, " before what our own validators say.
+    Strips the prefix "Value error, " that pydantic adds to messages of validators.
     """
     items = error.errors(include_input=False, include_url=False)[:limit]
     return "; ".join(

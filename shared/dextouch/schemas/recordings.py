@@ -1,4 +1,4 @@
-"""What a raw take says about itself, and the bodies a station exchanges with the store."""
+"""Schemas of recordings: attributes, and the bodies of uploads to the store."""
 
 from typing import Literal
 
@@ -13,7 +13,7 @@ from dextouch.schemas.episodes import (
 )
 from dextouch.streams.descriptors import StreamDescriptor
 
-# Reason of the store's ConflictError where another recording has the id.
+# Reason of the store's ConflictError when another recording has the id.
 ID_TAKEN = "id_taken"
 
 
@@ -29,11 +29,11 @@ class LedgerEntry(BaseModel):
 
 
 class RecordingAttributes(BaseModel):
-    """Everything about a raw take that is not a sample.
+    """Metadata of a raw take.
 
     `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
-    matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` what went wrong, counted;
-    `quality` named figures; `recovered` says that the station died during the take.
+    matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` the counted faults; `quality`
+    named figures; `recovered` marks a take that the station did not finish.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -57,13 +57,13 @@ class RecordingAttributes(BaseModel):
     streams: tuple[StreamDescriptor, ...] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":
-        """The same for a take that broke off: `recovered`, and every stream's ledger says so."""
+        """Mark the take as interrupted: set `recovered`, and note it in every stream's ledger."""
         marks = [LedgerEntry(stream=s.name, event="interrupted", count=1) for s in self.streams]
         return self.model_copy(update={"ledger": (*self.ledger, *marks), "recovered": True})
 
 
 class RecordingStatus(BaseModel):
-    """Where an upload stands: the batch number that each stream expects next."""
+    """Progress of an upload: the batch number that each stream expects next."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -73,7 +73,7 @@ class RecordingStatus(BaseModel):
 
 
 class BatchReceipt(BaseModel):
-    """The store holds this batch; `replayed` when it already did."""
+    """Acknowledgement of a batch; `replayed` if it was stored before."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -85,7 +85,7 @@ class BatchReceipt(BaseModel):
 
 
 class FinishRecording(BaseModel):
-    """The end of an upload: how many batches each stream has, and what is known only now."""
+    """The end of an upload: number of batches per stream, and attributes known only at the end."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -97,7 +97,7 @@ class FinishRecording(BaseModel):
 class RecordingSummary(BaseModel):
     """One row of the list of recordings.
 
-    `duration_s` is that of the longest stream at its nominal rate; `num_bytes` what lies on disk.
+    `duration_s` is that of the longest stream at its nominal rate; `num_bytes` the size on disk.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -120,7 +120,7 @@ class RecordingSummary(BaseModel):
 class RecordingList(BaseModel):
     """One page of the finished recordings, by id, and how many there are in all.
 
-    `next_after` is the id to ask on from; None on the last page.
+    `next_after` is the cursor of the next page; None on the last page.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -131,7 +131,7 @@ class RecordingList(BaseModel):
 
 
 class UploadSummary(BaseModel):
-    """An upload that is not finished, and how long nothing has come."""
+    """An unfinished upload and how long it has been idle."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -143,7 +143,7 @@ class UploadSummary(BaseModel):
 
 
 class UploadList(BaseModel):
-    """Uploads that are not finished, by id."""
+    """Unfinished uploads, by id."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -151,7 +151,7 @@ class UploadList(BaseModel):
 
 
 class ExpireUploads(BaseModel):
-    """The request to drop every upload for which nothing has come for so long."""
+    """Request to drop every upload that has been idle for at least `idle_s`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

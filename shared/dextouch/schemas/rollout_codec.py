@@ -1,4 +1,4 @@
-"""Starts and answers of a rollout ↔ msgpack packing; one codec for server, client and store."""
+"""Binary codec of rollout requests and responses, shared by server, client and store."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class ObservationFields(BaseModel):
-    """What of an observation is no array."""
+    """The non-array fields of an observation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -39,7 +39,7 @@ class ObservationFields(BaseModel):
 
 
 class AnswerFields(BaseModel):
-    """The fields of an answer that carries an observation."""
+    """The fields of a response with an observation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -49,7 +49,7 @@ class AnswerFields(BaseModel):
 
 
 class StartFields(BaseModel):
-    """The fields of a start that carries an observation."""
+    """The fields of a start request with an observation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -59,7 +59,7 @@ class StartFields(BaseModel):
 
 @dataclass(frozen=True)
 class Origin:
-    """What action poses refer to and images were taken with: given with every first observation."""
+    """Anchor poses and camera matrix of a rollout, given with its first observation."""
 
     anchor: AnchorPoses
     K_head: Float64[np.ndarray, "3 3"]
@@ -67,7 +67,7 @@ class Origin:
 
 @dataclass(frozen=True)
 class RolloutAnswer:
-    """A decoded answer; `origin` only with the first observation of a rollout."""
+    """A decoded response; `origin` only with the first observation of a rollout."""
 
     rollout: RolloutInfo
     observation: Observation
@@ -83,7 +83,7 @@ def encode_answer(
     info: dict[str, float] | None = None,
     origin: Origin | None = None,
 ) -> bytes:
-    """An observation with where the rollout stands, as bytes; without `tactile`, without touch."""
+    """Encode an observation with the rollout's progress; without touch unless `tactile`."""
     arrays = _observation_arrays(observation)
     if not tactile:
         del arrays["tactile_kpa"]
@@ -94,10 +94,10 @@ def encode_answer(
 
 
 def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
-    """Inverse of `encode_answer` with tactile.
+    """Decode the result of `encode_answer` with tactile.
 
     Raises:
-        InvalidInputError: bytes that are no such answer.
+        InvalidInputError: not a valid response.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = _validated(AnswerFields, raw, where="answer")
@@ -107,7 +107,7 @@ def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
 
 
 def encode_observation(observation: Observation) -> bytes:
-    """An observation alone, for a world's snapshot."""
+    """Encode an observation alone, for a world's snapshot."""
     return pack(_fields_of(observation).model_dump(mode="json"), _observation_arrays(observation))
 
 
@@ -115,7 +115,7 @@ def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
     """Inverse of `encode_observation`.
 
     Raises:
-        InvalidInputError: bytes that are no observation.
+        InvalidInputError: not a valid observation.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = _validated(ObservationFields, raw, where="observation")
@@ -137,10 +137,10 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
 
 
 def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
-    """Inverse of `encode_start`, for bytes from somewhere that is not trusted.
+    """Decode and validate a start request from an untrusted source.
 
     Raises:
-        InvalidInputError: bytes that are no such start.
+        InvalidInputError: not a valid start request.
     """
     raw, arrays = unpack(data, max_bytes=max_bytes)
     fields = _validated(StartFields, raw, where="start")
@@ -154,7 +154,7 @@ def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutS
 def start_from(
     request: StartRequest, *, observation: Observation | None = None, origin: Origin | None = None
 ) -> RolloutStart:
-    """The start that a request (and an observation beside it) describes."""
+    """Build the start from a request and an optional observation."""
     return RolloutStart(
         task=request.task,
         seed=request.seed,

@@ -1,4 +1,4 @@
-"""The nouns of a rollout: worlds and starts as requests, observations and progress as answers."""
+"""Schemas of rollouts: world descriptions, start requests, observations and progress."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -14,15 +14,15 @@ from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 ActionKind = Literal["measured", "commanded"]
 WorldKind = Literal["twin", "model", "baseline", "robot"]
 MAX_SEED = 2**63 - 1
-# Of the length of a unit quaternion in float32.
+# Tolerance of the norm of a unit quaternion in float32.
 QUATERNION_TOLERANCE: Final = 1e-3
 
 
 class WorldDescription(BaseModel):
-    """What a world is and accepts: the handshake before a rollout.
+    """Capabilities of a world, exchanged before a rollout.
 
-    `object_names` are, by task, the objects whose poses its observations hold, in their order;
-    a world that gives no poses leaves it empty.
+    `object_names` lists, by task, the objects whose poses are in its observations; empty for a
+    world without object poses.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -44,9 +44,9 @@ class WorldDescription(BaseModel):
 
 
 class ReturnSelector(BaseModel):
-    """Which part of an observation is asked for.
+    """Requested part of an observation.
 
-    `cameras` None means all that the world has, an empty list none; in a query, where an empty
+    `cameras` None means all cameras of the world, an empty list none; in a query, where an empty
     list cannot be written, none is `cameras=`.
     """
 
@@ -62,7 +62,7 @@ class ReturnSelector(BaseModel):
         return () if cameras == ("",) else cameras
 
     def wants(self, camera: str) -> bool:
-        """Whether images of this camera are asked for."""
+        """Whether images of this camera are requested."""
         return self.cameras is None or camera in self.cameras
 
 
@@ -70,15 +70,15 @@ EVERYTHING: Final = ReturnSelector()
 
 
 class Doubt(BaseModel):
-    """How far an imagining world trusts what it answers.
+    """Uncertainty of an imagining world about its prediction.
 
-    Both numbers are 0 or more, and comparable within one world digest only.
+    Both numbers are non-negative, and comparable within one world digest only.
 
     Attributes:
-        disagreement: of several predictions of the same steps.
-        distance: of where the rollout is from what the world was trained on.
-        outside: the world's own bound is passed: what it shows is no longer to be believed.
-        reason: why it is outside, in words; None as long as it is not.
+        disagreement: between several predictions of the same steps.
+        distance: of the rollout from the training distribution.
+        outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
+        reason: why it is outside; None otherwise.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -100,14 +100,13 @@ class Doubt(BaseModel):
 
 @dataclass(frozen=True)
 class Observation:
-    """What is seen, felt and measured over n consecutive steps of the model grid.
+    """Images, touch and measurements over n consecutive steps of the model grid.
 
     `action_reached` is the pose and joint reading as an action, relative to the rollout's step 0:
-    measured by a twin or a robot; in an imagined world, which senses no joints, the actions it was
-    given (`reached_is_measured` says which). `object_poses` are T_world_object (x y z in m,
-    qw qx qy qz) as an imagined world believes them, in the order of the description's
-    `object_names`; None where the world knows of no objects, as a robot does. `doubt` is about the
-    whole chunk.
+    measured by a twin or a robot; in an imagined world, which does not sense joints, the commanded
+    actions (`reached_is_measured` says which). `object_poses` are T_world_object (x y z in m, qw qx
+    qy qz) as estimated by an imagined world, in the order of the description's `object_names`; None
+    in worlds without object poses, such as a robot. `doubt` is about the whole chunk.
     """
 
     first_step: int
@@ -123,7 +122,7 @@ class Observation:
         return len(self.tactile_kpa)
 
     def last(self) -> "Observation":
-        """Its last step alone."""
+        """The last step only."""
         return replace(
             self,
             first_step=self.first_step + len(self) - 1,
@@ -134,11 +133,10 @@ class Observation:
         )
 
     def selected(self, selector: ReturnSelector) -> "Observation":
-        """What a selector asks for: the wanted cameras, and all steps or the last one.
+        """Apply a selector: the requested cameras, and all steps or the last one.
 
-        Of the last step alone everything is left out that belongs to the others: it is an
-        observation of one step that begins where the chunk ends. Touch stays; whether it is sent
-        is decided by who sends.
+        The last step is an observation of one step that begins where the chunk ends. Touch is
+        always kept; whether it is sent is decided by the sender.
         """
         shown = self.last() if selector.steps == "last" else self
         wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
@@ -147,7 +145,7 @@ class Observation:
 
 @dataclass(frozen=True)
 class RolloutStart:
-    """Where a future begins: a task and seed, or an observation made elsewhere.
+    """Start of a rollout: a task and seed, or an observation made elsewhere.
 
     `anchor` are the absolute poses of step 0, `K_head` the head camera's matrix in pixels; both
     come with `observation` (one step), and with every first observation that a world gives.
@@ -163,7 +161,7 @@ class RolloutStart:
 
 
 class WorldList(BaseModel):
-    """Answer of GET /v1/worlds."""
+    """Response of GET /v1/worlds."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -171,7 +169,7 @@ class WorldList(BaseModel):
 
 
 class StartRequest(BaseModel):
-    """The fields of POST /v1/rollouts; an observation to start from travels as arrays beside it."""
+    """The fields of POST /v1/rollouts; an observation to start from is sent as arrays."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -191,9 +189,9 @@ class ForkRequest(BaseModel):
 
 
 class RolloutInfo(BaseModel):
-    """Where a rollout stands; `next_chunk` is the only number that is accepted next.
+    """State of a rollout; `next_chunk` is the only chunk number accepted next.
 
-    `ended` is why its world goes no further with it, and left out as long as it does.
+    `ended` is why its world cannot continue it, omitted while it can.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -212,7 +210,7 @@ class RolloutInfo(BaseModel):
 
 
 def check_observation(observation: Observation, *, where: str) -> None:
-    """Refuse an observation that `check_observation_arrays` refuses."""
+    """Validate an observation with `check_observation_arrays`."""
     check_observation_arrays(
         images=observation.images,
         tactile_kpa=observation.tactile_kpa,
@@ -230,10 +228,10 @@ def check_observation_arrays(
     object_poses: np.ndarray | None = None,
     where: str,
 ) -> None:
-    """Refuse arrays that do not fit each other or hold NaN or infinity.
+    """Check that the arrays of an observation are consistent and finite.
 
     Raises:
-        ShapeError: kinds of number, lengths or shapes that do not fit.
+        ShapeError: inconsistent dtypes, lengths or shapes.
         NonFiniteError: in touch, actions or object poses.
         DegenerateRotationError: an object's quaternion is not of length 1.
     """

@@ -1,1 +1,1 @@
-"""Building blocks of every service: application factory, settings, logs, API keys and state."""
+"""Building blocks of the HTTP services: application factory, settings, logging, access, state."""

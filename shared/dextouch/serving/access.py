@@ -1,4 +1,4 @@
-"""A bearer key to the scopes it has, or a refusal; compared in constant time."""
+"""Access control by bearer keys and scopes, compared in constant time."""
 
 import hashlib
 import hmac
@@ -11,30 +11,30 @@ from dextouch.serving.settings import ApiKey
 
 
 def not_signed_in() -> AccessDeniedError:
-    """The refusal of a browser without a session."""
+    """Error for a browser without a session."""
     return AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
 
 
 class AccessControl:
-    """The keys of one service; without keys (loopback only, see settings) everyone may."""
+    """The keys of one service; without keys (loopback only, see settings) access is open."""
 
     def __init__(self, api_keys: Sequence[ApiKey]) -> None:
         self._keys = [(_digest(key.key.get_secret_value()), key) for key in api_keys]
 
     @property
     def has_keys(self) -> bool:
-        """Whether a key is needed at all."""
+        """Whether the service requires a key."""
         return bool(self._keys)
 
     def knows(self, authorization: str | None) -> bool:
-        """Whether the header holds one of the keys."""
+        """Whether the header contains a valid key."""
         return self._find(authorization) is not None
 
     def identify(self, authorization: str | None) -> ApiKey:
         """The key in the header.
 
         Raises:
-            AccessDeniedError: no key, or an unknown one (`reason` tells which).
+            AccessDeniedError: no key, or an unknown one (see `reason`).
         """
         if _token(authorization) is None:
             raise AccessDeniedError(
@@ -46,11 +46,10 @@ class AccessControl:
         return key
 
     def check(self, authorization: str | None, scope: str) -> str:
-        """The name of the key that may.
+        """Check a key and its scope, and return the key's name.
 
         Raises:
-            AccessDeniedError: no key, an unknown one (`reason` tells which), or one without
-                the scope.
+            AccessDeniedError: no key, an unknown one (see `reason`), or one without the scope.
         """
         if not self._keys:
             return "loopback"
@@ -68,13 +67,13 @@ class AccessControl:
         if token is None:
             return None
         presented = _digest(token)
-        # Every key is compared, so that the time tells nothing about which one was near.
+        # Every key is compared, to avoid a timing side channel.
         matches = [key for digest, key in self._keys if hmac.compare_digest(digest, presented)]
         return matches[0] if matches else None
 
 
 class RequireScope:
-    """A route dependency: `dependencies=[Depends(RequireScope("rollout"))]`."""
+    """Route dependency that requires a scope: `dependencies=[Depends(RequireScope("rollout"))]`."""
 
     def __init__(self, scope: str) -> None:
         self.scope = scope

@@ -1,4 +1,4 @@
-"""Routers to one service application: errors as problem+json, health, metrics, keys, limits."""
+"""Factory of service applications: problem+json errors, health, metrics, access and body limits."""
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
@@ -29,7 +29,7 @@ from dextouch.serving.settings import ServiceSettings
 logger = structlog.get_logger(__name__)
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
-# What is still missing before work may be sent, by name; empty when ready.
+# Names of what is missing before requests are accepted; empty when ready.
 ReadinessCheck = Callable[[], Awaitable[Sequence[str]]]
 
 
@@ -42,19 +42,19 @@ def create_service_app(
     readiness: ReadinessCheck | None = None,
     admits: Admits | None = None,
 ) -> FastAPI:
-    """One service.
+    """Create the application of one service.
 
     Args:
         name: of the service, in health, logs and titles.
-        settings: keys, limits, host names and origins are taken from here.
-        routers: what the service offers; their routes raise our errors only.
-        lifespan: what lives as long as the application (pools, workers).
-        readiness: asked at /readyz; names of what is missing.
-        admits: who may act without a key although there are keys (browsers that signed in).
+        settings: keys, limits, host names and origins.
+        routers: routes of the service; they raise DexTouch errors only.
+        lifespan: context of the application (pools, workers).
+        readiness: called by /readyz; returns the names of what is missing.
+        admits: accepts requests without a key, such as those of signed-in browsers.
 
     Returns:
-        The application; `app.state.registry` takes further metrics of the service, and
-        `app.state.refusal_page` makes a page of a refusal that a person is to see.
+        The application; `app.state.registry` accepts further metrics, and `app.state.refusal_page`
+        renders a refusal as an HTML page.
     """
     app = FastAPI(
         title=name, version=__version__, docs_url=None, redoc_url=None, lifespan=_started(lifespan)
@@ -69,7 +69,8 @@ def create_service_app(
         refuse=_refusal,
         admits=admits,
     )
-    # What is added last is outermost: refusals of the guard have request ids and are counted.
+    # The last one added is outermost, so that refusals of the guard have request ids and are
+    # counted.
     app.add_middleware(GuardMiddleware, guard=guard)
     app.add_middleware(RequestMiddleware, metrics=RequestMetrics(app.state.registry))
     _add_error_handlers(app)
@@ -80,7 +81,7 @@ def create_service_app(
 
 
 def _started(lifespan: Lifespan | None) -> Lifespan:
-    """Mark the application as running exactly while its own lifespan is."""
+    """Mark the application as running during its lifespan."""
 
     @asynccontextmanager
     async def around(app: FastAPI) -> AsyncIterator[None]:
@@ -102,12 +103,12 @@ def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
 
     @router.get("/healthz")
     async def healthz() -> Health:
-        """The process answers."""
+        """Liveness probe."""
         return Health(service=name, version=__version__)
 
     @router.get("/readyz", responses={503: {"model": Readiness}})
     async def readyz(request: Request, response: Response) -> Readiness:
-        """Whether work may be sent."""
+        """Readiness probe."""
         waiting = [] if request.app.state.running else ["start"]
         if not waiting and readiness is not None:
             waiting = list(await readiness())
@@ -116,7 +117,7 @@ def _health_router(name: str, readiness: ReadinessCheck | None) -> APIRouter:
 
     @router.get("/metrics", include_in_schema=False)
     async def metrics(request: Request) -> Response:
-        """Prometheus text."""
+        """Metrics in Prometheus text format."""
         text = generate_latest(request.app.state.registry)
         return Response(text, headers={"content-type": CONTENT_TYPE_LATEST})
 
@@ -138,7 +139,7 @@ def _add_error_handlers(app: FastAPI) -> None:
 
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
-        # Starlette raises it again behind this answer, for the server's log.
+        # Starlette re-raises it after this response, for the server's log.
         logger.error("answer_failed", path=request.url.path, error=type(error).__name__)
         ours = DexTouchError("unexpected error in the service; its log tells more by request id")
         response = _problem_response(request, ours)

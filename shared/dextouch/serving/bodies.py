@@ -1,4 +1,4 @@
-"""How large a request body a route takes, and of which media types; enforced before it is read."""
+"""Limits of request bodies by route and media type, enforced before a body is read."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ MSGPACK = "application/msgpack"
 OCTETS = "application/octet-stream"
 FORM = "application/x-www-form-urlencoded"
 KIB = 2**10
-# For bodies that grow with what they hold: as large as the setting max_body_bytes allows.
+# For bodies of variable size: the limit is the setting max_body_bytes.
 AS_SET = 2**63
 RULE_ATTRIBUTE = "__dextouch_body_rule__"
 EndpointT = TypeVar("EndpointT", bound=Callable[..., object])
@@ -25,29 +25,29 @@ EndpointT = TypeVar("EndpointT", bound=Callable[..., object])
 
 @dataclass(frozen=True)
 class BodyRule:
-    """Largest body in bytes by media type; `needs_key` is False for a sign-in only."""
+    """Maximum body size in bytes by media type; `needs_key` is False only for signing in."""
 
     max_bytes: Mapping[str, int]
     needs_key: bool = True
 
 
-# Of routes that declare nothing: room for names and options, none for data.
+# Default limit: room for names and options, not for data.
 DEFAULT_RULE = BodyRule({JSON: 64 * KIB})
-# The router answers with 404 or 405 and reads nothing.
+# The router responds with 404 or 405 without reading the body.
 NO_ROUTE = BodyRule({})
 
 
 def takes(
     max_bytes: Mapping[str, int], *, needs_key: bool = True
 ) -> Callable[[EndpointT], EndpointT]:
-    """Declare what the body of a route may be; stands directly above the route's function.
+    """Decorator that declares the bodies a route accepts, placed directly above the function.
 
-    Routes without it take JSON of at most 64 KiB. Other media types are refused with 415, larger
+    Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, larger
     bodies with 413, both before the body is read.
 
     Args:
-        max_bytes: largest body by media type, such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`.
-        needs_key: False where a service with keys is to be asked without one.
+        max_bytes: maximum size by media type, such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`.
+        needs_key: False if the route can be called without a key.
     """
 
     def mark(endpoint: EndpointT) -> EndpointT:
@@ -74,17 +74,17 @@ class BodyRules:
         self._max_body_bytes = max_body_bytes
 
     def rule_of(self, scope: Scope) -> BodyRule:
-        """The rule of the route that a request is for."""
+        """The rule of the route that matches a request."""
         for path_regex, methods, rule in self._rules:
             if scope["method"] in methods and path_regex.match(scope["path"]):
                 return rule
         return NO_ROUTE
 
     def limit(self, headers: Headers, rule: BodyRule) -> int:
-        """Bytes that may be read of this request's body.
+        """Maximum size of this request's body.
 
         Raises:
-            HTTPException: 415, a media type that the route does not take.
+            HTTPException: 415, a media type that the route does not accept.
         """
         if not rule.max_bytes:
             return self._max_body_bytes
@@ -102,8 +102,7 @@ class BodyRules:
 def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
     """A Content-Type's media type and parameters in lower case; "none" where there is none.
 
-    Extended parameters (`name*=charset'language'value`), which no media type here has, are left
-    out.
+    Extended parameters (`name*=charset'language'value`) are ignored.
     """
     header = Message()
     header["content-type"] = content_type or "none/none"
@@ -116,7 +115,7 @@ def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
 
 
 class BodyLimit:
-    """A `receive` that refuses more than the limit, announced or not."""
+    """Wraps `receive` to enforce the limit, with or without Content-Length."""
 
     def __init__(self, receive: Receive, headers: Headers, max_bytes: int) -> None:
         self._receive = receive

@@ -1,8 +1,8 @@
-"""Checks of every request and WebSocket before a route sees it: its page, its key, its body.
+"""Admission of requests and WebSockets: host name, origin, key and body limit.
 
-A browser lets any page send requests to any address, only not read the answers; by DNS rebinding a
-page even reads them, under a host name of its own. So a request without a key must come from a page
-of this service, or from no page at all.
+Browsers let any page send requests to any address (CSRF), and with DNS rebinding a page can even
+read the responses. So a request without a key must come from a page of this service, or not from a
+page at all.
 """
 
 import re
@@ -29,34 +29,34 @@ from dextouch.serving.settings import (
 logger = structlog.get_logger(__name__)
 
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-# Health checks and Prometheus ask without a key, under names of containers.
+# Health checks and Prometheus have no key, and use container names as host.
 PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
 HTTP_SCHEMES = {"ws": "http", "wss": "https"}
 HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 POLICY_VIOLATION = 1008
 MAX_REASON_BYTES = 123
 
-# Whether a request without a key comes from someone who is signed in.
+# Whether a request without a key comes from a signed-in browser.
 Admits = Callable[[HTTPConnection], bool]
 Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
 
 
 class SitePolicy:
-    """Which host names and origins are the service's own."""
+    """The service's own host names and origins."""
 
     def __init__(self, settings: ServiceSettings) -> None:
         self._hosts = frozenset(settings.allowed_hosts)
         self._origins = frozenset(settings.allowed_origins)
 
     def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
-        """Refuse what another site's page sends.
+        """Refuse requests from pages of other sites.
 
         Args:
             connection: the request.
-            is_unsafe: it may change something, or opens a WebSocket.
+            is_unsafe: whether it may change state or opens a WebSocket.
 
         Raises:
-            AccessDeniedError: a foreign host name or origin (`reason` tells which).
+            AccessDeniedError: a foreign host name or origin (see `reason`).
         """
         host = ", ".join(connection.headers.getlist("host")).lower()
         self._check_host(host)
@@ -91,9 +91,9 @@ class SitePolicy:
 
 @dataclass(frozen=True)
 class Guard:
-    """What a service asks of every request, and the answer of a refusal.
+    """Admission checks of a service, and the response to a refused request.
 
-    `admits` is None where nothing is to be had without a key.
+    `admits` is None if every request needs a key.
     """
 
     access: AccessControl
@@ -103,14 +103,14 @@ class Guard:
     admits: Admits | None = None
 
     def check_sender(self, connection: HTTPConnection, *, needs_key: bool, is_unsafe: bool) -> None:
-        """Refuse foreign pages, and what may change something without a key.
+        """Refuse foreign pages, and unsafe requests without a key.
 
         Raises:
             AccessDeniedError: with the reason.
         """
         if self.access.has_keys:
             authorization = connection.headers.get("authorization")
-            # No foreign page knows a key, so host and origin of who has one do not matter.
+            # A foreign page cannot know a key, so host and origin do not matter with one.
             if connection.scope["path"] in PROBES or self.access.knows(authorization):
                 return
             signed_in = self.admits is not None and self.admits(connection)
@@ -124,14 +124,14 @@ class Guard:
 
 
 class GuardMiddleware:
-    """Applies a guard; plain ASGI, so that no byte of a refused body is read."""
+    """ASGI middleware that applies a guard before the body is read."""
 
     def __init__(self, app: ASGIApp, *, guard: Guard) -> None:
         self._app = app
         self._guard = guard
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request or WebSocket."""
+        """Handle one request or WebSocket."""
         if scope["type"] == "http":
             await self._http(scope, receive, send)
         elif scope["type"] == "websocket":

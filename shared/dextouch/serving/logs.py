@@ -1,4 +1,4 @@
-"""Log events of a service to one line each: JSON in a container, colours at a terminal."""
+"""Logging configuration: one line per event, JSON in containers, coloured at a terminal."""
 
 import logging
 import sys
@@ -11,12 +11,12 @@ from structlog.typing import Processor
 def configure_logging(
     *, service: str, log_format: Literal["auto", "json", "console"], level: str
 ) -> None:
-    """Send structlog and the standard library's loggers (uvicorn) to stderr, one way.
+    """Route structlog and the standard library's loggers (uvicorn) to stderr in one format.
 
     Args:
         service: bound to every event.
         log_format: auto is console when stderr is a terminal, JSON otherwise.
-        level: lowest level that is shown.
+        level: minimum level.
     """
     console = log_format == "console" or (log_format == "auto" and sys.stderr.isatty())
     shared: list[Processor] = [
@@ -26,7 +26,7 @@ def configure_logging(
         structlog.processors.TimeStamper(fmt="iso", utc=True),
     ]
     last: list[Processor] = (
-        # Plain tracebacks: the richer ones print local variables, and with them keys.
+        # Plain tracebacks: rich ones print local variables, which may contain keys.
         [
             structlog.dev.ConsoleRenderer(
                 colors=sys.stderr.isatty(), exception_formatter=structlog.dev.plain_traceback
@@ -51,6 +51,6 @@ def configure_logging(
     root = logging.getLogger()
     root.handlers[:] = [handler]
     root.setLevel(level.upper())
-    # One line for every request to another service would drown the rest.
+    # Request logs of HTTP clients would drown the rest.
     logging.getLogger("httpx").setLevel(logging.WARNING)
     structlog.contextvars.bind_contextvars(service=service)

@@ -1,4 +1,4 @@
-"""Around every request: an id, timing and counters; plain ASGI, bodies not copied."""
+"""Request middleware: request ids, Server-Timing and Prometheus counters."""
 
 import re
 import time
@@ -17,7 +17,7 @@ SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 
 
 
 class RequestMetrics:
-    """Counters of one service, in its own registry."""
+    """Prometheus metrics of one service, in its own registry."""
 
     def __init__(self, registry: CollectorRegistry) -> None:
         self.requests = Counter(
@@ -36,14 +36,14 @@ class RequestMetrics:
 
 
 class RequestMiddleware:
-    """Gives `request.state.request_id` and `.timings_s`, and the headers made of them."""
+    """Sets `request.state.request_id` and `.timings_s`, and the response headers for them."""
 
     def __init__(self, app: ASGIApp, *, metrics: RequestMetrics) -> None:
         self._app = app
         self._metrics = metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """One request; anything else (lifespan, websocket) passes."""
+        """Handle one request; other scopes (lifespan, websocket) pass through."""
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
@@ -66,7 +66,7 @@ class RequestMiddleware:
             await self._app(scope, receive, send_with_headers)
 
     def _count(self, scope: Scope, status: int, duration_s: float) -> None:
-        # The template, never the path: one counter a route, not one an id.
+        # The route template, not the path, to keep the number of labels bounded.
         route = getattr(scope.get("route"), "path", "unmatched")
         method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
         self._metrics.requests.labels(method, route, str(status)).inc()
@@ -78,7 +78,7 @@ KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPT
 
 @contextmanager
 def timed(request: Request, part: str) -> Iterator[None]:
-    """Measure a part of a request (`queue`, `device`, `encode`, …) for its Server-Timing."""
+    """Time a part of a request (`queue`, `device`, `encode`, …) for its Server-Timing header."""
     started = time.perf_counter()
     try:
         yield

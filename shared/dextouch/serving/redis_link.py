@@ -1,4 +1,4 @@
-"""Commands to a Redis server: binary answers, its failures as our errors; the only redis user."""
+"""Redis connection with binary replies and mapped errors; the only user of redis-py."""
 
 import asyncio
 from collections.abc import Awaitable, Callable, Iterator, Sequence
@@ -20,26 +20,26 @@ Script = Callable[[Sequence[str], Sequence[Argument]], Awaitable[Any]]
 
 
 class RedisLink:
-    """One pool of connections."""
+    """A connection pool."""
 
     def __init__(self, client: "redis.asyncio.Redis", url: str) -> None:
         self._client = client
-        # Keys and passwords of the address stay out of messages.
+        # Credentials in the URL are kept out of messages.
         self._where = url.rsplit("@", 1)[-1]
 
     async def call(self, *command: Argument) -> Any:  # noqa: ANN401 - Redis answers by command
-        """The answer of one command, strings as bytes."""
+        """Execute a command; strings are returned as bytes."""
         task = asyncio.current_task()
         cancels_before = 0 if task is None else task.cancelling()
         with self._as_our_errors():
             answer = await self._client.execute_command(*command)  # type: ignore[no-untyped-call]
         if task is not None and task.cancelling() > cancels_before:
-            # redis-py 8.1 loses a cancellation that comes while it takes a connection.
+            # redis-py 8.1 loses a cancellation that arrives while it acquires a connection.
             raise asyncio.CancelledError
         return answer
 
     def script(self, source: str) -> Script:
-        """A Lua script that runs atomically, as a function of keys and arguments."""
+        """Register a Lua script, which runs atomically, as a function of keys and arguments."""
         registered = self._client.register_script(source)
 
         async def run(keys: Sequence[str], arguments: Sequence[Argument]) -> Any:  # noqa: ANN401
@@ -68,10 +68,10 @@ class RedisLink:
 
 
 def open_redis(url: str) -> RedisLink:
-    """A link to the server behind redis://HOST:PORT/DB; connects at the first command.
+    """Open redis://HOST:PORT/DB; connects lazily.
 
     Raises:
-        InvalidInputError: no such address.
+        InvalidInputError: an invalid URL.
     """
     try:
         client = redis.asyncio.Redis.from_url(

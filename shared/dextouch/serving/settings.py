@@ -1,4 +1,4 @@
-"""Environment and flags to one frozen settings object per service, and a service to a socket."""
+"""Service settings from flags and environment, and running a service from them."""
 
 import ipaddress
 import re
@@ -20,9 +20,9 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas.problems import first_problems
 
 MIN_KEY_CHARACTERS = 16
-# A policy may think this long between two chunks without losing its connection.
+# Keep-alive, so that a policy may take this long between two chunks.
 KEEP_ALIVE_S = 75
-# Of one message from a browser; the server closes the connection before it is read whole.
+# Maximum size of a WebSocket message; the server closes the connection on larger ones.
 MAX_WEBSOCKET_BYTES = 2**16
 HOST_NAME = re.compile(r"[a-z0-9_.-]+")
 ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
@@ -34,7 +34,7 @@ def canonical_host(text: str) -> str:
     """A host name as browsers write it: in lower case, an IPv6 address short and without brackets.
 
     Raises:
-        ValueError: no host name; also one with a port.
+        ValueError: not a host name, or one with a port.
     """
     name = text.lower()
     if HOST_NAME.fullmatch(name):
@@ -52,7 +52,7 @@ def canonical_origin(text: str) -> str:
     """An origin as browsers write it: in lower case, without the default port of its scheme.
 
     Raises:
-        ValueError: no origin of a web page.
+        ValueError: not an origin.
     """
     parts = ORIGIN.fullmatch(text.lower())
     if parts is None or int(parts[4] or 0) > MAX_PORT:
@@ -71,7 +71,7 @@ SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
 class ApiKey(BaseModel):
-    """One key and what it may do; `name` appears in logs, the key never."""
+    """A key and its scopes; `name` appears in logs, the key never."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -81,12 +81,12 @@ class ApiKey(BaseModel):
 
 
 class ServiceSettings(BaseSettings):
-    """What every service has; a service derives its own class from it.
+    """Settings common to all services; each service subclasses it.
 
-    `host` other than loopback needs `api_keys`. Port 0 takes any free port. Routes have limits of
-    their own for bodies, none is above `max_body_bytes`. Requests without a key must name the
-    service by a loopback name or one of `allowed_hosts` (without port), and those that change
-    something must come from no web page, one of the service itself, or one of `allowed_origins`.
+    `host` other than loopback needs `api_keys`. Port 0 selects a free port. Routes have their own
+    body limits, capped by `max_body_bytes`. Requests without a key must address the service by a
+    loopback name or one of `allowed_hosts` (without port), and those that change state must not
+    come from a web page, except of the service itself or of `allowed_origins`.
     """
 
     model_config = SettingsConfigDict(
@@ -99,11 +99,11 @@ class ServiceSettings(BaseSettings):
     max_body_bytes: int = Field(default=16 * 2**20, ge=1024)
     allowed_hosts: tuple[HostName, ...] = Field(
         default=(),
-        description="names besides loopback under which requests without a key are answered",
+        description="host names besides loopback that are accepted without a key",
     )
     allowed_origins: tuple[Origin, ...] = Field(
         default=(),
-        description="what browsers call the service behind a TLS proxy, as https://lab.example",
+        description="origins of the service behind a TLS proxy, such as https://lab.example",
     )
     log_format: Literal["auto", "json", "console"] = "auto"
     log_level: Literal["debug", "info", "warning", "error"] = "info"
@@ -135,10 +135,10 @@ def service_config(service: str) -> SettingsConfigDict:
 
 
 def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
-    """Settings from flags, then the environment, then defaults.
+    """Load settings from flags, then the environment, then defaults.
 
     Raises:
-        InvalidInputError: a value that does not fit; every one of them is named.
+        InvalidInputError: invalid values; all of them are listed.
         SystemExit: an unknown flag, or --help (after printing the usage).
     """
     try:

@@ -1,4 +1,4 @@
-"""Small versioned values that processes share (rollouts, leases): memory:// or redis://."""
+"""Versioned key-value state shared by processes (rollouts, leases), in memory or in Redis."""
 
 import time
 from collections.abc import Callable
@@ -13,7 +13,7 @@ REDIS_PREFIX = "dextouch:state:"
 
 @dataclass(frozen=True)
 class Versioned:
-    """A value and how often it was written since it came to be (1 at first)."""
+    """A value and its version, which starts at 1 and counts writes."""
 
     value: bytes
     version: int
@@ -21,39 +21,39 @@ class Versioned:
 
 @runtime_checkable
 class StateStore(Protocol):
-    """Values that expire. Writes go through compare-and-set, so no process overwrites unseen."""
+    """Expiring values with compare-and-set writes, so that no update is lost."""
 
     async def get(self, key: str) -> Versioned | None:
         """The value, or None when absent or expired."""
         ...
 
     async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
-        """Write if the version is the expected one (0: absent), and start the time to live anew.
+        """Write if the version is the expected one (0: absent), and renew the time to live.
 
         Returns:
             The new version.
 
         Raises:
-            ConflictError: another version is stored; `expected` and `got` tell both.
+            ConflictError: another version is stored; see `expected` and `got`.
         """
         ...
 
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
-        """Write a new value unless `limit` live keys start with `within`; False if so many do.
+        """Write a new value unless `limit` live keys start with `within`; False if they do.
 
-        Counting and writing are one step, so callers at once never exceed the limit together.
+        Counting and writing are atomic, so concurrent callers never exceed the limit.
 
         Raises:
-            ConflictError: the key is there already.
+            ConflictError: the key exists.
         """
         ...
 
     async def touch(self, key: str, *, ttl_s: float) -> bool:
-        """Start the time to live anew; False when absent."""
+        """Renew the time to live; False if absent."""
         ...
 
     async def delete(self, key: str) -> bool:
-        """Whether there was something to delete."""
+        """Delete a key; False if absent."""
         ...
 
     async def keys(self, prefix: str) -> list[str]:
@@ -65,15 +65,15 @@ class StateStore(Protocol):
         ...
 
     async def close(self) -> None:
-        """Give connections back."""
+        """Close connections."""
         ...
 
 
 def open_state(url: str) -> StateStore:
-    """The store behind `memory://` or `redis://host:port/db`.
+    """Open the store at `memory://` or `redis://host:port/db`.
 
     Raises:
-        InvalidInputError: another kind of address.
+        InvalidInputError: an unsupported URL.
     """
     if url == "memory://":
         return MemoryState()
@@ -108,7 +108,7 @@ class MemoryState:
 
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
         """See StateStore."""
-        # Nothing here waits, so nobody else runs between counting and writing.
+        # No await between counting and writing, hence atomic in one event loop.
         if key not in self._entries and len(await self.keys(within)) >= limit:
             return False
         await self.set(key, value, expected_version=0, ttl_s=ttl_s)
@@ -133,10 +133,10 @@ class MemoryState:
         return sorted(key for key in self._entries if key.startswith(prefix))
 
     async def ping(self) -> None:
-        """Memory is always there."""
+        """Always succeeds."""
 
     async def close(self) -> None:
-        """Forget everything."""
+        """Drop all values."""
         self._entries.clear()
 
     def _expire(self) -> None:
@@ -167,7 +167,7 @@ return 1
 
 
 class RedisState:
-    """A store that several processes share; one hash a key, written by one script."""
+    """A store shared by several processes; one hash per key, written by a Lua script."""
 
     def __init__(self, link: RedisLink) -> None:
         self._link = link
@@ -247,5 +247,5 @@ def _milliseconds(ttl_s: float) -> int:
 
 
 def _literal(text: str) -> str:
-    """The text as a Redis pattern that matches only itself."""
+    """Escape a text to a Redis pattern that matches only itself."""
     return "".join("\\" + letter if letter in "*?[]^\\" else letter for letter in text)

@@ -1,1 +1,1 @@
-"""Samples of a sensor stream, what a stream is, and how batches of samples become bytes."""
+"""Sensor streams: samples, stream descriptors, and the binary encoding of batches."""

@@ -1,4 +1,4 @@
-"""A batch and its stream's descriptor → nothing, or the refusal that says what does not fit."""
+"""Validation of sample batches against the descriptor of their stream."""
 
 import numpy as np
 
@@ -9,23 +9,23 @@ from dextouch.streams.samples import SampleBatch
 
 JPEG_UNIT = "jpeg"
 H264_UNIT = "h264"
-# Values of these units are bytes, one an image.
+# Values of these units are encoded images (bytes).
 ENCODED_UNITS = (JPEG_UNIT, H264_UNIT)
-# Every access unit of H.264 as a byte stream begins so (ITU-T H.264, Annex B), with a zero before.
+# Start code of H.264 access units (ITU-T H.264, Annex B), optionally preceded by a zero byte.
 _START_CODES = (b"\x00\x00\x00\x01", b"\x00\x00\x01")
 
 
 def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
-    """Refuse a batch that is not of this stream.
+    """Check that a batch matches its stream.
 
     Args:
         descriptor: of the stream.
         batch: values of the descriptor's dtype and shape; for the units `jpeg` and `h264` an
-            object array of bytes; `t_host_ns` never decreases.
+            object array of bytes; `t_host_ns` is non-decreasing.
 
     Raises:
         ShapeError: another dtype or shape.
-        InvalidInputError: stamps that go back, or bytes that are no image of the unit.
+        InvalidInputError: stamps that go back, or invalid image data.
     """
     values, name = batch.values, descriptor.name
     for stamp in ("t_host_ns", "t_device_ns", "sequence"):
@@ -43,7 +43,7 @@ def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
         return
     if len(batch) == 1:
         return
-    # Compared, not subtracted: the difference of two extreme stamps can come round.
+    # Compared, not subtracted: the difference of two extreme stamps can overflow.
     back = np.flatnonzero(batch.t_host_ns[1:] < batch.t_host_ns[:-1])
     if len(back):
         raise InvalidInputError(
@@ -53,7 +53,7 @@ def check_batch(descriptor: StreamDescriptor, batch: SampleBatch) -> None:
 
 
 def check_follows(name: str, t_host_ns: int, last_t_host_ns: int | None) -> None:
-    """Refuse a batch whose first stamp lies before the last one of its stream.
+    """Check that a batch does not start before the last sample of its stream.
 
     Raises:
         InvalidInputError: it does.
@@ -77,13 +77,13 @@ def _check_images(descriptor: StreamDescriptor, values: np.ndarray) -> None:
 
 
 def check_encoded_image(descriptor: StreamDescriptor, data: object, *, where: str) -> None:
-    """Refuse bytes that are no image of a stream with the unit `jpeg` or `h264`.
+    """Check an encoded image of a stream with the unit `jpeg` or `h264`.
 
-    Of H.264 only the start code is looked at; the size is seen when it is decoded.
+    For H.264 only the start code is checked; the size is known after decoding.
 
     Raises:
-        ShapeError: no bytes, or an image of another size.
-        InvalidInputError: bytes of another kind.
+        ShapeError: not bytes, or an image of another size.
+        InvalidInputError: another format.
     """
     if not isinstance(data, bytes):
         raise ShapeError(f"{where} is {type(data).__name__}, expected bytes")

@@ -1,4 +1,4 @@
-"""What a stream is: its rate, shape, unit, clock and what its device can prove about itself."""
+"""Descriptor of a stream: rate, shape, unit, coordinate frame and clock capabilities."""
 
 import math
 from typing import Annotated, Literal
@@ -6,19 +6,19 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-# Batches and windows add an axis to those of a sample, and a packed array has eight at most.
+# Batches and windows add an axis to those of a sample, and a packed array has at most eight.
 MAX_SAMPLE_AXES = 7
-# More than the largest picture of H.264 (level 6.2), three bytes a pixel.
+# More than the largest H.264 picture (level 6.2) at three bytes per pixel.
 MAX_SAMPLE_BYTES = 1 << 27
 MIN_RATE_HZ = 1e-6
-# Of a new recording or episode; each keeps up to eight files open while it is written. What older
-# releases wrote may have more.
+# Limit for new recordings and episodes, since each stream keeps up to eight files open while it is
+# written. Those of older releases may have more.
 MAX_STREAMS = 100
 StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
 
 
 class ClockCapabilities(BaseModel):
-    """What a device tells about time and loss; quality degrades honestly without it."""
+    """Time stamps and sequence numbers that a device provides; timing quality depends on them."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -33,9 +33,9 @@ class ClockCapabilities(BaseModel):
 class StreamDescriptor(BaseModel):
     """One stream of a recording or an episode.
 
-    `shape` is that of one sample's payload, of at most MAX_SAMPLE_BYTES; `unit` of its numbers
-    (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` the coordinate system of the
-    numbers, if any.
+    `shape` is that of one sample's payload, at most MAX_SAMPLE_BYTES; `unit` that of its values
+    (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` their coordinate system, if
+    any.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -61,7 +61,7 @@ class StreamDescriptor(BaseModel):
         return self
 
     def sample_bytes(self) -> int:
-        """Size of one sample's numbers in memory."""
+        """Size of one sample in memory."""
         return math.prod(self.shape) * self.numpy_dtype().itemsize
 
     def numpy_dtype(self) -> np.dtype[np.generic]:
@@ -69,5 +69,5 @@ class StreamDescriptor(BaseModel):
         return np.dtype(self.dtype).newbyteorder("<")
 
     def period_ns(self) -> int:
-        """Nominal distance of two samples."""
+        """Nominal sample period."""
         return round(1e9 / self.nominal_rate_hz)

@@ -1,4 +1,4 @@
-"""Named numpy arrays and plain fields as msgpack bytes: what chunks and observations travel in."""
+"""Serialization of named numpy arrays and plain fields with msgpack."""
 
 import math
 from collections.abc import Mapping, Sized
@@ -11,12 +11,12 @@ from dextouch.errors import InvalidInputError, LimitExceededError
 
 MAX_ARRAYS = 64
 MAX_DIMENSIONS = 8
-# Of one list or map, and of all lists and maps of a message together: fields are small, and what
-# is large travels as an array. A list takes 56 bytes of memory and one byte of a message.
+# Limits of items of one list or map, and of all of them in a message: fields are small, large data
+# goes into arrays. A list takes 56 bytes of memory but one byte of a message.
 MAX_ITEMS_A_CONTAINER = 1024
 MAX_ITEMS = 16_384
-# Numbers of one array, an axis of length zero counted as one: numpy cannot hold every shape even
-# of an array without numbers.
+# Limit of elements of one array, counting an axis of length zero as one: numpy refuses some shapes
+# even of empty arrays.
 MAX_NUMBERS = 1 << 31
 DTYPES = ("uint8", "uint16", "int32", "int64", "float32", "float64", "bool")
 
@@ -25,10 +25,10 @@ C = TypeVar("C", bound=Sized)
 
 
 def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
-    """Bytes of JSON-like fields and arrays (little endian, C order).
+    """Serialize JSON-like fields and arrays (little endian, C order).
 
     Raises:
-        InvalidInputError: an array of a kind, or a whole number of a size, that does not travel.
+        InvalidInputError: an unsupported dtype, or an integer beyond 64 bits.
     """
     packed = {}
     for name, array in arrays.items():
@@ -44,15 +44,15 @@ def pack(fields: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> bytes:
 
 
 def unpack(data: bytes, *, max_bytes: int) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Inverse of `pack`; arrays are read-only views into `data`.
+    """Deserialize and validate; arrays are read-only views into `data`.
 
     Args:
-        data: bytes from somewhere that is not trusted.
-        max_bytes: the most that is accepted.
+        data: from an untrusted source.
+        max_bytes: size limit.
 
     Raises:
         LimitExceededError: more bytes, arrays, or items of lists and maps than allowed.
-        InvalidInputError: no msgpack, or not of this layout.
+        InvalidInputError: not msgpack, or not of this layout.
     """
     if len(data) > max_bytes:
         raise LimitExceededError(f"body: got {len(data)} bytes, expected at most {max_bytes}")

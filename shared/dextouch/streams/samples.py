@@ -1,4 +1,4 @@
-"""One timed reading of a sensor, and consecutive readings stacked into a batch."""
+"""A timed reading of a sensor, and batches of consecutive readings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from jaxtyping import Int64, Shaped
 
 from dextouch.errors import ShapeError
 
-# Written where a device gives no stamp or no sequence number.
+# Placeholders where a device provides no time stamp or no sequence number.
 NO_DEVICE_TIME = -1
 NO_SEQUENCE = -1
 
@@ -59,7 +59,7 @@ class SampleBatch:
         )
 
     def to_samples(self) -> list[Sample]:
-        """One object a sample (for tests and small batches)."""
+        """Split into single samples (for tests and small batches)."""
         return [
             Sample(int(host), value, int(device), int(sequence))
             for host, device, sequence, value in zip(
@@ -69,7 +69,7 @@ class SampleBatch:
 
 
 def encoded_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
-    """Encoded images, bytes each, as the `values` of a batch of a `jpeg` or `h264` stream."""
+    """Pack encoded images into the `values` of a batch of a `jpeg` or `h264` stream."""
     values = np.empty(len(images), dtype=object)
     values[:] = images
     return values

@@ -1,4 +1,4 @@
-"""A numbered batch of samples of one stream ↔ bytes: what a station sends to the store.
+"""Wire format of a numbered batch of samples, sent from a station to the store.
 
 Layout (little endian): magic `DXTB`, version u16, flags u16 (0), body length u32, crc32c of the
 body u32, then the body: `dextouch.streams.packing` of fields and arrays. See docs/wire_format.md.
@@ -26,7 +26,7 @@ _FIELDS = {"stream", "number"}
 
 
 def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: int) -> bytes:
-    """Bytes of a batch; equal batches give equal bytes.
+    """Encode a batch; equal batches give equal bytes.
 
     Args:
         descriptor: of the stream.
@@ -34,8 +34,8 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
         number: of the batch within its stream, from 0.
 
     Raises:
-        InvalidInputError: a batch that is empty or not of this stream.
-        LimitExceededError: more samples or bytes than travel in one batch.
+        InvalidInputError: an empty batch, or one of another stream.
+        LimitExceededError: more samples or bytes than one batch may hold.
     """
     check_batch(descriptor, batch)
     _check_count(descriptor, len(batch))
@@ -57,17 +57,17 @@ def encode_batch(descriptor: StreamDescriptor, batch: SampleBatch, *, number: in
 
 
 def decode_batch(data: bytes, descriptor: StreamDescriptor, *, number: int) -> SampleBatch:
-    """The batch of bytes that came from somewhere not trusted.
+    """Decode and validate a batch from an untrusted source.
 
     Args:
         data: of `encode_batch`.
-        descriptor: of the stream that the bytes must be of.
-        number: that the bytes must carry.
+        descriptor: of the expected stream.
+        number: expected batch number.
 
     Raises:
-        PacketError: no batch of this version, or damaged on its way.
+        PacketError: not a batch of this version, or damaged in transit.
         LimitExceededError: larger than allowed.
-        InvalidInputError: a batch of another stream or number, or one that does not fit.
+        InvalidInputError: a batch of another stream or number, or inconsistent arrays.
     """
     fields, arrays = unpack(_checked_body(data), max_bytes=MAX_BATCH_BYTES)
     where = f"batch of {descriptor.name!r}"
@@ -146,7 +146,7 @@ def _images(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
     if len(ends) > MAX_BATCH_SAMPLES:
         raise _too_many(where, len(ends))
     bounds = np.concatenate([np.zeros(1, dtype=np.int64), ends])
-    # Compared, not subtracted: the difference of two forged numbers can come round.
+    # Compared, not subtracted: the difference of two forged numbers can overflow.
     if (bounds[1:] <= bounds[:-1]).any() or int(bounds[-1]) != len(data):
         raise InvalidInputError(
             f"{where}: image_end must rise and end at {len(data)}, the number of bytes"

@@ -1,1 +1,1 @@
-"""Taxel layout, contact decision and heat maps of a hand."""
+"""Tactile sensing of a hand: taxel layout, contact threshold, pad forces and heat maps."""

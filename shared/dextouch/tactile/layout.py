@@ -1,4 +1,4 @@
-"""Which of a glove's 360 raw cells are taxels, and where each of the 320 taxels sits on the hand.
+"""Layout of a glove's 320 taxels on the hand, and their mapping to its 360 raw cells.
 
 Anatomical order, the same for both hands: thumb, index, middle, ring and little fingertip, 4×4
 each, then the palm, 15×16. Inside every pad axis 0 runs from distal to proximal and axis 1 from
@@ -44,7 +44,7 @@ def raw_indices(*, side: Side, glove_model: str = "dextouch_v1") -> Int64[np.nda
     """Raw cell of each taxel.
 
     `dextouch_v1` scans 18 rows × 20 columns. Rows 0–3 hold the five fingertips side by side,
-    rows 4–15 the palm row after row, rows 16–17 nothing (40 cells). The left glove is wired as
+    rows 4–15 the palm row by row, rows 16–17 are unused (40 cells). The left glove is wired as
     the mirror image: its columns run the other way.
     """
     if glove_model not in GLOVE_MODELS:

@@ -1,4 +1,4 @@
-"""Pressures of a hand's taxels in, the normal force on each fingertip and on the palm out."""
+"""Normal forces on the fingertips and the palm, integrated from taxel pressures."""
 
 from typing import Final
 
@@ -16,7 +16,7 @@ _PASCAL_PER_KPA: Final = 1000.0
 def pad_forces_n(tactile_kpa: np.ndarray) -> Float64[np.ndarray, "time 6"]:
     """Normal force (N) on thumb … little fingertip and palm: pressure times area.
 
-    Only taxels in contact count (`in_contact`), so that noise of the many others adds up to none.
+    Only taxels in contact count (`in_contact`), so that noise of the others does not add up.
 
     Args:
         tactile_kpa: [T, 320], anatomical order.

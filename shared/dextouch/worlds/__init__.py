@@ -1,1 +1,1 @@
-"""Worlds in which policies act: the protocol, its rollouts and their HTTP routes."""
+"""Worlds in which policies act: the protocol, rollouts, and their HTTP routes."""

@@ -1,4 +1,4 @@
-"""Requests and answers of a rollout against what its world says of itself: pass, or a refusal."""
+"""Validation of rollout requests and world responses against a world's description."""
 
 from dataclasses import replace
 
@@ -25,12 +25,12 @@ from dextouch.schemas.rollouts import (
 
 
 def check_start(start: RolloutStart, description: WorldDescription) -> RolloutStart:
-    """The start with images of this world's cameras only, or a refusal.
+    """Validate a start and keep only images of this world's cameras.
 
     Raises:
         UnknownNameError: task or action kind.
-        InvalidInputError: an observation where a seed is needed or the other way round.
-        ShapeError: an observation that does not fit the world.
+        InvalidInputError: an observation where a seed is required, or vice versa.
+        ShapeError: an observation of another size than the world's.
     """
     if start.task not in description.tasks:
         raise UnknownNameError("task", start.task, list(description.tasks))
@@ -56,12 +56,12 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
 def check_chunk(
     actions: np.ndarray, description: WorldDescription
 ) -> Float64[np.ndarray, "steps 67"]:
-    """The chunk as float64, or a refusal.
+    """Validate an action chunk and return it as float64.
 
     Raises:
-        ShapeError: not [K, 67], or K no multiple of the world's chunk.
+        ShapeError: not [K, 67], or K is not a multiple of the world's chunk.
         NonFiniteError: NaN or infinity.
-        LimitExceededError: longer than the world takes at once.
+        LimitExceededError: longer than the world's maximum.
     """
     checked = check_actions(actions, where="chunk")
     if len(checked) % description.chunk_multiple:
@@ -80,7 +80,7 @@ def check_chunk(
 
 
 def check_selector(selector: ReturnSelector, description: WorldDescription) -> None:
-    """Refuse cameras that the world does not have."""
+    """Refuse cameras that the world lacks."""
     for camera in selector.cameras or ():
         if camera not in description.cameras:
             raise UnknownNameError("camera", camera, list(description.cameras))
@@ -94,7 +94,7 @@ def check_answer(
     num_steps: int,
     selector: ReturnSelector = EVERYTHING,
 ) -> None:
-    """Refuse what a world must not answer.
+    """Validate a world's response.
 
     Args:
         observation: what it gave for a chunk.
@@ -104,8 +104,8 @@ def check_answer(
         selector: what was asked for: of `steps="last"` one step, the chunk's last, is expected.
 
     Raises:
-        NonFiniteError: NaN or infinity in what it gives, as wild actions may bring about.
-        DexTouchError: wrong length, size or place: the world broke its promise.
+        NonFiniteError: NaN or infinity in the response, as extreme actions may cause.
+        DexTouchError: wrong length, size or step: the world violates its description.
     """
     if selector.steps == "last":
         first_step, num_steps = first_step + num_steps - 1, 1

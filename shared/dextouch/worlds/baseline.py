@@ -1,4 +1,4 @@
-"""The baseline that every world must beat: it repeats the first image and touch for ever."""
+"""Baseline world that repeats the first image and touch; every world model must beat it."""
 
 import hashlib
 from dataclasses import replace
@@ -22,9 +22,9 @@ MAX_SNAPSHOT_BYTES = 2**28
 
 
 class CopyFirstWorld:
-    """Starts from an observation and repeats it; the actions it was given count as reached.
+    """Starts from an observation and repeats it; commanded actions count as reached.
 
-    Its state is what was seen last, as an observation of one step.
+    Its state is the last observation, of one step.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class CopyFirstWorld:
 
     @staticmethod
     def beside(other: WorldDescription) -> "CopyFirstWorld":
-        """The baseline for the tasks and cameras of another world."""
+        """Create the baseline for the tasks and cameras of another world."""
         return CopyFirstWorld(
             tasks=other.tasks,
             cameras=other.cameras,

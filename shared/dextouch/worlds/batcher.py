@@ -1,4 +1,4 @@
-"""Steps of many rollouts to one world's own thread: whatever waits is taken together, no timer."""
+"""Worker thread of a world that batches the pending steps of several rollouts."""
 
 import asyncio
 import time
@@ -26,7 +26,7 @@ ResultT = TypeVar("ResultT")
 
 @dataclass(frozen=True)
 class StepJob(Generic[State]):
-    """One rollout's next chunk and what is asked to be seen of it."""
+    """One rollout's next chunk and the requested part of its observation."""
 
     state: State
     actions: Float64[np.ndarray, "steps 67"]
@@ -36,7 +36,7 @@ class StepJob(Generic[State]):
 
 @dataclass(frozen=True)
 class StepOutcome(Generic[State]):
-    """The step, its state as bytes, and where the time went."""
+    """Result of a step, its serialized state, and timings."""
 
     stepped: SteppedRollout[State]
     snapshot: bytes
@@ -54,8 +54,8 @@ class _Waiting(Generic[State]):
 class WorldWorker(Generic[State]):
     """One world, one thread, one queue.
 
-    A world with `step_batch` gets all waiting chunks of one length at once; others one by one.
-    Belongs to the event loop that first uses it.
+    A world with `step_batch` gets all pending chunks of one length at once, without waiting for
+    more; other worlds get them one by one. Bound to the event loop that first uses it.
     """
 
     def __init__(self, world: World[State], *, max_waiting: int = 256, max_batch: int = 32) -> None:
@@ -69,7 +69,7 @@ class WorldWorker(Generic[State]):
         )
 
     async def call(self, function: Callable[..., ResultT], *arguments: Any) -> ResultT:  # noqa: ANN401
-        """Run a function that uses the world in the world's thread."""
+        """Run a function in the world's thread."""
         loop = asyncio.get_running_loop()
         return await loop.run_in_executor(self._executor, function, *arguments)
 
@@ -77,8 +77,8 @@ class WorldWorker(Generic[State]):
         """Advance one rollout.
 
         Raises:
-            LimitExceededError: too many chunks wait already.
-            DexTouchError: what the world raised.
+            LimitExceededError: the queue is full.
+            DexTouchError: raised by the world.
         """
         if len(self._waiting) >= self._max_waiting:
             raise LimitExceededError(
@@ -93,7 +93,7 @@ class WorldWorker(Generic[State]):
         return await outcome
 
     def close(self) -> None:
-        """Let the running step end, start no other."""
+        """Finish the running step and reject pending ones."""
         if self._drain is not None:
             self._drain.cancel()
         while self._waiting:
@@ -114,7 +114,7 @@ class WorldWorker(Generic[State]):
                 await self._one_by_one(batch)
 
     def _take_batch(self) -> list[_Waiting[State]]:
-        """The oldest waiting chunk and, up to the limit, others of its length."""
+        """The oldest pending chunk and, up to the limit, others of its length."""
         num_steps = len(self._waiting[0].job.actions)
         batch: list[_Waiting[State]] = []
         others: deque[_Waiting[State]] = deque()
@@ -126,7 +126,7 @@ class WorldWorker(Generic[State]):
         return batch
 
     async def _one_by_one(self, batch: Sequence[_Waiting[State]]) -> None:
-        """After a failed batch: who failed fails alone."""
+        """Repeat a failed batch one by one, so that only the faulty rollout fails."""
         for entry in batch:
             (result,) = await asyncio.gather(
                 self.call(self._step_all, [entry.job]), return_exceptions=True
@@ -139,7 +139,7 @@ class WorldWorker(Generic[State]):
     def _step_all(
         self, jobs: Sequence[StepJob[State]]
     ) -> tuple[float, float, list[tuple[SteppedRollout[State], bytes]]]:
-        """In the world's thread: when it began, how long it took, steps and snapshots."""
+        """Runs in the world's thread; returns start time, duration, steps and snapshots."""
         began_s = time.perf_counter()
         if isinstance(self.world, BatchWorld) and len(jobs) > 1:
             stepped = self.world.step_batch(

@@ -1,4 +1,4 @@
-"""A rollout as its store keeps it: where it stands, the world's snapshot, and the last answer."""
+"""Persistent record of a rollout: progress, the world's snapshot, and the last response."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, suppress
@@ -13,13 +13,13 @@ from dextouch.streams.packing import pack, unpack
 
 KEY_PREFIX = "rollout:"
 MAX_RECORD_BYTES = 2**30
-# A start may wait for others and for its world; after a crash its place is held so long.
+# Time that a start may wait for others and for its world; after a crash its slot is held that long.
 PLACE_TTL_S = 600.0
 
 
 @dataclass(frozen=True)
 class LastAnswer:
-    """What the newest chunk was asked and answered, for a client that missed the answer."""
+    """Request and response of the newest chunk, for a client that missed the response."""
 
     request_sha256: str
     payload: bytes
@@ -27,14 +27,14 @@ class LastAnswer:
 
 @dataclass(frozen=True)
 class RolloutRecord:
-    """Everything another process needs to go on with a rollout."""
+    """Everything that another process needs to continue a rollout."""
 
     info: RolloutInfo
     snapshot: bytes
     last_answer: LastAnswer | None = None
 
     def to_bytes(self) -> bytes:
-        """Inverse of `from_bytes`."""
+        """Serialize the record."""
         last = self.last_answer
         arrays = {"snapshot": np.frombuffer(self.snapshot, np.uint8)}
         if last is not None:
@@ -47,7 +47,7 @@ class RolloutRecord:
 
     @staticmethod
     def from_bytes(data: bytes) -> "RolloutRecord":
-        """The record that a store kept."""
+        """Deserialize a record."""
         fields, arrays = unpack(data, max_bytes=MAX_RECORD_BYTES)
         last = None
         if fields["request_sha256"] is not None:
@@ -58,14 +58,14 @@ class RolloutRecord:
 
 @dataclass(frozen=True)
 class StoredRecord:
-    """A record with the version it has in the store."""
+    """A record with its version in the store."""
 
     record: RolloutRecord
     version: int
 
 
 class RecordStore:
-    """Rollout records in a state store; every write starts their time to live anew."""
+    """Rollout records in a state store; every write renews their time to live."""
 
     def __init__(self, store: StateStore, *, ttl_s: float) -> None:
         self._store = store
@@ -75,7 +75,7 @@ class RecordStore:
         """The newest record.
 
         Raises:
-            NotFoundError: there is none (any more).
+            NotFoundError: unknown, deleted or expired.
         """
         stored = await self._store.get(KEY_PREFIX + rollout_id)
         if stored is None:
@@ -86,18 +86,18 @@ class RecordStore:
         """Write a new rollout, as version 1.
 
         Raises:
-            LimitExceededError: as many as `limit` are alive or about to begin.
+            LimitExceededError: `limit` rollouts are active or starting.
         """
         await self._add(record.info.id, record.to_bytes(), limit=limit, ttl_s=self._ttl_s)
 
     @asynccontextmanager
     async def place(self, rollout_id: str, *, limit: int) -> AsyncIterator[int]:
-        """Hold the place of a rollout that is about to begin; gives the version to write over.
+        """Reserve a slot for a rollout that is starting; yields the version to overwrite.
 
-        The place is free again if what is done with it fails.
+        The slot is released if the block fails.
 
         Raises:
-            LimitExceededError: as many as `limit` are alive or about to begin.
+            LimitExceededError: `limit` rollouts are active or starting.
         """
         await self._add(rollout_id, b"", limit=limit, ttl_s=max(self._ttl_s, PLACE_TTL_S))
         try:
@@ -107,7 +107,7 @@ class RecordStore:
             raise
 
     async def write(self, record: RolloutRecord, *, over_version: int) -> int:
-        """Write over the version it was computed from; the new version.
+        """Replace the version a record was computed from (compare and set); returns the new one.
 
         Raises:
             ConflictError: another version is stored.
@@ -137,7 +137,7 @@ class RecordStore:
         try:
             added = await self._store.add(key, value, within=KEY_PREFIX, limit=limit, ttl_s=ttl_s)
         except BaseException:
-            # It may be written although the answer was lost.
+            # It may have been written although the reply was lost.
             await self._give_up(rollout_id)
             raise
         if not added:
@@ -148,7 +148,7 @@ class RecordStore:
             )
 
     async def _give_up(self, rollout_id: str) -> None:
-        """Delete a rollout that nobody knows of; what cannot be deleted now expires."""
+        """Delete a rollout that no client knows; if that fails, it expires."""
         with suppress(StorageError, UnavailableError):
             await self._store.delete(KEY_PREFIX + rollout_id)
 

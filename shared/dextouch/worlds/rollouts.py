@@ -1,7 +1,7 @@
-"""Starts and numbered action chunks to observations: commit, replay, branch and expiry.
+"""Rollout service: idempotent steps by numbered action chunks, forking, limits and expiry.
 
-The state store is the truth, the live state in this process only saves a restore. A chunk counts
-when its record was written over the version it was computed from; until then nothing happened.
+The state store is authoritative; the live state in this process only saves a restore. A chunk is
+committed when its record replaces the version it was computed from (compare and set).
 """
 
 import asyncio
@@ -42,7 +42,7 @@ logger = structlog.get_logger(__name__)
 
 
 class RolloutLimits(BaseModel):
-    """What this installation allows; `ttl_s` begins anew with every chunk."""
+    """Limits of this installation; every chunk renews `ttl_s`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -53,7 +53,7 @@ class RolloutLimits(BaseModel):
 
 @dataclass(frozen=True)
 class Answer:
-    """An encoded answer; `replayed` when it was computed for an earlier, equal request."""
+    """An encoded response; `replayed` if it was computed for an earlier, equal request."""
 
     payload: bytes
     replayed: bool = False
@@ -63,21 +63,21 @@ class Answer:
 
 @dataclass(frozen=True)
 class _ChunkRequest:
-    """A checked chunk and what is to be told about it."""
+    """A validated chunk and the requested part of its observation."""
 
     actions: Float64[np.ndarray, "steps 67"]
     selector: ReturnSelector
 
     def sha256(self) -> str:
-        """Equal for equal requests only."""
+        """Hash of the request, for replay detection."""
         asked = self.selector.model_dump_json().encode()
         return hashlib.sha256(asked + self.actions.astype("<f8").tobytes()).hexdigest()
 
 
 class RolloutService:
-    """Every rollout of one process; several processes may share one store.
+    """All rollouts of one process; several processes may share one store.
 
-    Belongs to one event loop. `close` ends the worlds' threads, not the store.
+    Bound to one event loop. `close` ends the worlds' threads, not the store.
     """
 
     def __init__(
@@ -93,7 +93,7 @@ class RolloutService:
         self._locks: WeakValueDictionary[str, asyncio.Lock] = WeakValueDictionary()
 
     def worlds(self) -> list[WorldDescription]:
-        """What can be asked for, by the names that starts take."""
+        """Descriptions of the available worlds."""
         return [
             worker.world.description.model_copy(update={"name": name})
             for name, worker in self._workers.items()
@@ -104,12 +104,12 @@ class RolloutService:
         await self._records.ping()
 
     async def start(self, world: str, start: RolloutStart, selector: ReturnSelector) -> Answer:
-        """Begin a rollout.
+        """Start a rollout.
 
         Raises:
             UnknownNameError: world, task, camera or action kind.
             InvalidInputError: a start the world cannot begin from.
-            LimitExceededError: as many rollouts as allowed are alive.
+            LimitExceededError: the maximum number of rollouts is active.
         """
         worker = self._worker(world)
         description = worker.world.description
@@ -145,20 +145,20 @@ class RolloutService:
         return Answer(encode_answer(info, shown, tactile=selector.tactile, origin=origin))
 
     async def get(self, rollout_id: str) -> RolloutInfo:
-        """Where a rollout stands; does not prolong its life."""
+        """State of a rollout; does not renew its time to live."""
         return (await self._records.read(rollout_id)).record.info
 
     async def step(
         self, rollout_id: str, chunk: int, actions: np.ndarray, selector: ReturnSelector
     ) -> Answer:
-        """Advance by a numbered chunk, or give the newest one's answer again.
+        """Advance by a numbered chunk, or repeat the response of the newest one.
 
         Raises:
-            NotFoundError: no such rollout (any more).
-            ConflictError: another chunk is expected; `expected` tells which.
-            ShapeError, NonFiniteError, InvalidInputError: actions that do not fit.
-            EndedError: the world goes no further; it stays so for every later chunk.
-            LimitExceededError: the rollout is as long as allowed, or too much waits.
+            NotFoundError: unknown, deleted or expired.
+            ConflictError: another chunk number is expected, see `expected`.
+            ShapeError, NonFiniteError, InvalidInputError: invalid actions.
+            EndedError: the world cannot continue; later chunks get the same error.
+            LimitExceededError: the rollout has its maximum length, or the queue is full.
         """
         lock = self._locks.setdefault(rollout_id, asyncio.Lock())
         async with lock:
@@ -179,19 +179,19 @@ class RolloutService:
             except EndedError as error:
                 raise await self._end(stored, error) from error
             except ConflictError:
-                # Another process was faster: its answer stands, if it was to the same request.
+                # Another process was faster: its response is valid if the request was the same.
                 replayed = _replay((await self._records.read(rollout_id)).record, chunk, request)
                 if replayed is None:
                     raise
                 return replayed
 
     async def fork(self, rollout_id: str, *, seed: int | None = None) -> RolloutInfo:
-        """Branch at the current step: the copy has the same past and goes on by itself.
+        """Branch at the current step: the copy shares the past and continues independently.
 
-        A rollout that is over branches where it stood before the chunk that ended it.
+        An ended rollout branches before the chunk that ended it.
 
         Args:
-            rollout_id: of the rollout that is branched; it stays as it is.
+            rollout_id: of the rollout to branch; it is unchanged.
             seed: of the branch's noise; None keeps the rollout's own.
         """
         parent = (await self._records.read(rollout_id)).record
@@ -212,14 +212,14 @@ class RolloutService:
         logger.info("rollout_deleted", rollout_id=rollout_id)
 
     def close(self) -> None:
-        """End the worlds' threads; rollouts stay in the store."""
+        """End the worlds' threads; rollouts remain in the store."""
         for worker in self._workers.values():
             worker.close()
 
     async def _advance(
         self, stored: StoredRecord, worker: WorldWorker[Any], request: _ChunkRequest
     ) -> Answer:
-        """Compute a chunk and write it over the version it was computed from."""
+        """Compute a chunk and commit its record."""
         before = stored.record.info
         state = self._live.get(before.id, stored.version)
         if state is None:
@@ -249,7 +249,7 @@ class RolloutService:
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
 
     async def _end(self, stored: StoredRecord, error: EndedError) -> EndedError:
-        """Keep with the rollout that it is over; the error that all its later chunks get."""
+        """Mark a rollout as ended; returns the error that later chunks get."""
         record = stored.record
         info = record.info.model_copy(update={"ended": error.reason})
         await self._records.write(replace(record, info=info), over_version=stored.version)
@@ -283,31 +283,31 @@ class RolloutService:
 
 
 class _LiveStates:
-    """The newest states of the rollouts of this process; the least recently used go first."""
+    """LRU cache of the newest states of this process's rollouts."""
 
     def __init__(self, *, capacity: int) -> None:
         self._capacity = capacity
         self._states: OrderedDict[str, tuple[int, Any]] = OrderedDict()
 
     def get(self, rollout_id: str, version: int) -> Any | None:  # noqa: ANN401 - states are opaque
-        """The state of exactly this version, if it is here."""
+        """The cached state of exactly this version, if any."""
         held, state = self._states.get(rollout_id, (0, None))
         return state if held == version else None
 
     def put(self, rollout_id: str, version: int, state: object) -> None:
-        """Keep a state."""
+        """Cache a state."""
         self._states[rollout_id] = (version, state)
         self._states.move_to_end(rollout_id)
         if len(self._states) > self._capacity:
             self._states.popitem(last=False)
 
     def drop(self, rollout_id: str) -> None:
-        """Forget a state, if it is here."""
+        """Remove a state, if cached."""
         self._states.pop(rollout_id, None)
 
 
 def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:
-    """Seed of a chunk's noise: the same whoever computes it, whatever else is computed."""
+    """Deterministic seed of a chunk's noise, independent of process and batching."""
     text = f"{rollout_seed}/{chunk}/{world_digest}".encode()
     return int.from_bytes(hashlib.sha256(text).digest()[:8], "big") & MAX_SEED
 
@@ -325,7 +325,7 @@ def _over(info: RolloutInfo) -> EndedError:
 
 
 def _replay(record: RolloutRecord, chunk: int, request: _ChunkRequest) -> Answer | None:
-    """The kept answer if it was to this very request; None if the chunk is the next one."""
+    """The stored response if the request is a repetition; None if the chunk is the next one."""
     info, last = record.info, record.last_answer
     if chunk == info.next_chunk:
         return None

@@ -1,7 +1,4 @@
-"""The HTTP resource /v1/rollouts: requests to the rollout service, its answers to bytes.
-
-Documented in docs/rollout_api.md.
-"""
+"""HTTP routes of /v1/rollouts, documented in docs/rollout_api.md."""
 
 import base64
 import json
@@ -34,7 +31,7 @@ from dextouch.worlds.rollouts import Answer, RolloutService
 SCOPE = "rollout"
 REPLAYED_HEADER = "dextouch-replayed"
 MAX_BODY_BYTES = 2**28
-# 1000 rows of float64, or some hundred rows as JSON.
+# Room for 1000 rows of float64, or some hundred rows as JSON.
 MAX_CHUNK_BYTES = 2**20
 BodyT = TypeVar("BodyT", bound=BaseModel)
 
@@ -52,18 +49,18 @@ Selector = Annotated[ReturnSelector, Query()]
 
 
 def rollout_router(service: RolloutService) -> APIRouter:
-    """The routes of one rollout service."""
+    """Router of one rollout service."""
     router = APIRouter(prefix="/v1", tags=["rollouts"], dependencies=[Depends(RequireScope(SCOPE))])
 
     @router.get("/worlds")
     async def worlds() -> WorldList:
-        """What can be rolled out here."""
+        """List the available worlds."""
         return WorldList(worlds=tuple(service.worlds()))
 
     @router.post("/rollouts", status_code=201)
     @takes({JSON: 16 * KIB, MSGPACK: AS_SET})
     async def start(request: Request, selector: Selector) -> Response:
-        """Begin a future from a task and seed, or from an observation."""
+        """Start a rollout from a task and seed, or from an observation."""
         with timed(request, "decode"):
             asked, begin = await _start_of(request)
         with timed(request, "world"):
@@ -72,7 +69,7 @@ def rollout_router(service: RolloutService) -> APIRouter:
 
     @router.get("/rollouts/{rollout_id}")
     async def get(rollout_id: str) -> RolloutInfo:
-        """Where a rollout stands."""
+        """Get the state of a rollout."""
         return await service.get(rollout_id)
 
     @router.delete("/rollouts/{rollout_id}", status_code=204)
@@ -103,7 +100,7 @@ async def _start_of(request: Request) -> tuple[StartRequest, RolloutStart]:
     kind, _ = media_type(request.headers.get("content-type"))
     body = await request.body()
     if kind == MSGPACK:
-        # Megabytes of images would stop the event loop.
+        # Encoding megabytes of images would block the event loop.
         return await run_in_threadpool(decode_start, body, max_bytes=MAX_BODY_BYTES)
     asked = _from_json(StartRequest, body)
     return asked, start_from(asked)
@@ -144,7 +141,7 @@ def _response(request: Request, answer: Answer, *, status: int = 200) -> Respons
 
 
 def _as_json(payload: bytes) -> bytes:
-    """The same answer to look at: the packing's layout, the data of each array in base64."""
+    """A response as JSON: the packing's layout with array data in base64."""
     fields, arrays = unpack(payload, max_bytes=len(payload))
     shown = {
         name: {

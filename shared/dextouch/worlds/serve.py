@@ -1,4 +1,4 @@
-"""Worlds and settings to a rollout service: the application, or a process that serves it."""
+"""Application and process that serve worlds over HTTP."""
 
 from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
@@ -16,7 +16,7 @@ from dextouch.worlds.world import World
 
 
 class WorldServiceSettings(ServiceSettings):
-    """What a service that serves worlds has; derive to add the world's own."""
+    """Settings of a service of worlds; subclass to add those of a world."""
 
     state_url: str = "memory://"
     limits: RolloutLimits = RolloutLimits()
@@ -25,7 +25,7 @@ class WorldServiceSettings(ServiceSettings):
 def create_world_app(
     worlds: Mapping[str, World[Any]], settings: WorldServiceSettings, *, name: str = "worlds"
 ) -> FastAPI:
-    """The application that serves worlds; shutting it down ends their threads."""
+    """Create the application; its shutdown ends the worlds' threads."""
     store = open_state(settings.state_url)
     service = RolloutService(worlds, store, settings.limits)
 

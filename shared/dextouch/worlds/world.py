@@ -1,8 +1,8 @@
-"""The World protocol: what the twin, every world model and, one day, a real robot implement.
+"""The World protocol, implemented by the twin, world models and, one day, a real robot.
 
-A world is functional: `step` takes a state and gives a new one, so that a failed step leaves the
-old state as it was, a step can be replayed, and a rollout can branch. States are opaque to the
-caller; `snapshot` and `restore` turn them into bytes for another process.
+A world is functional: `step` maps a state to a new one, so that a failed step leaves the old state
+unchanged, a step can be replayed, and a rollout can branch. States are opaque to the caller;
+`snapshot` and `restore` turn them into bytes for another process.
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class StartedRollout(Generic[State]):
-    """A world's answer to a start: its state, what is seen, and the poses actions refer to."""
+    """Result of a start: state, first observation, and the anchor poses of actions."""
 
     state: State
     observation: Observation
@@ -53,7 +53,7 @@ class StartedRollout(Generic[State]):
 
 @dataclass(frozen=True)
 class SteppedRollout(Generic[State]):
-    """A world's answer to an action chunk: the new state and what was asked for of the K steps."""
+    """Result of an action chunk: the new state and the requested observation of its K steps."""
 
     state: State
     observation: Observation
@@ -62,19 +62,19 @@ class SteppedRollout(Generic[State]):
 
 @runtime_checkable
 class World(Protocol[State]):
-    """One world. Implementations are used by one thread at a time."""
+    """A world. Implementations need not be thread-safe."""
 
     @property
     def description(self) -> WorldDescription:
-        """What this world is and accepts."""
+        """Capabilities of this world."""
         ...
 
     def reset(self, start: RolloutStart) -> StartedRollout[State]:
-        """Begin a future.
+        """Start a rollout.
 
         Raises:
-            UnknownNameError: a task this world does not have.
-            InvalidInputError: a start this world cannot begin from.
+            UnknownNameError: a task that this world lacks.
+            InvalidInputError: an unsupported kind of start.
         """
         ...
 
@@ -86,40 +86,40 @@ class World(Protocol[State]):
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[State]:
-        """Advance by one checked action chunk.
+        """Advance by one validated action chunk.
 
         Args:
             state: from `reset`, `step` or `restore`; it is not changed.
             actions: [K, 67], row i the pose at step i+1 of the chunk, relative to the rollout's
                 step 0 (measured poses), of the action kind the rollout was started with.
-            seed: of the noise of this chunk; the same state, actions and seed give the same
-                observation whatever else the world is doing.
-            selector: what the observation holds: it equals `Observation.selected` of the one that
-                holds everything, so a world need not draw images that nobody asks for. The new
-                state does not depend on it.
+            seed: of the noise of this chunk; equal state, actions and seed give an equal
+                observation, regardless of other rollouts.
+            selector: part of the observation to return. The result equals `Observation.selected` of
+                the full one, so a world can skip rendering unrequested images. The new state does
+                not depend on it.
 
         Raises:
-            EndedError: the world goes no further from this state, for the reason it names, rather
-                than answer with noise; the state stays good for `snapshot`.
+            EndedError: the world cannot continue from this state, for the given reason; the state
+                remains valid for `snapshot`.
         """
         ...
 
     def snapshot(self, state: State) -> bytes:
-        """The state as bytes (no pickle) that `restore` of the same world accepts."""
+        """Serialize a state (without pickle) for `restore` of the same world."""
         ...
 
     def restore(self, data: bytes) -> State:
-        """The state of a snapshot.
+        """Restore the state of a snapshot.
 
         Raises:
-            InvalidInputError: bytes that are no snapshot of this world.
+            InvalidInputError: not a snapshot of this world.
         """
         ...
 
 
 @runtime_checkable
 class BatchWorld(World[State], Protocol[State]):
-    """A world that advances several rollouts together for less than the sum of their times."""
+    """A world that advances several rollouts together faster than one by one."""
 
     def step_batch(
         self,
@@ -129,12 +129,12 @@ class BatchWorld(World[State], Protocol[State]):
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[State]]:
-        """`step` for each entry; who else is in the batch changes no answer.
+        """`step` for each entry; results do not depend on the other entries.
 
         Args:
-            states: one a rollout.
+            states: one per rollout.
             actions: chunks of one length.
-            seeds: one a rollout.
-            selectors: one a rollout; None asks for everything.
+            seeds: one per rollout.
+            selectors: one per rollout; None requests everything.
         """
         ...

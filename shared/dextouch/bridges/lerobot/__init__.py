@@ -1,4 +1,4 @@
-"""Episodes of the store ↔ folders of LeRobotDataset v3.0."""
+"""LeRobotDataset v3.0 import and export."""
 
 from dextouch.bridges.lerobot.exporting import ExportOptions, export_lerobot
 from dextouch.bridges.lerobot.importing import ImportOptions, import_lerobot

@@ -1,4 +1,4 @@
-"""One episode of a dataset in, its numbers and the places of its images out."""
+"""Contents of one episode of a LeRobot dataset: actions, tactile rows and image locations."""
 
 from dataclasses import dataclass
 
@@ -26,7 +26,7 @@ _OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
 
 @dataclass(frozen=True)
 class CameraContent:
-    """Where a camera's images lie, and the stamp of the image of each frame.
+    """Location of a camera's images, and the image stamp of each frame.
 
     A stamp that comes twice is one image that was the nearest to two frames.
     """

@@ -1,4 +1,4 @@
-"""Frames and videos of episodes in, the files of a LeRobotDataset v3.0 and its metadata out."""
+"""Writer of a LeRobotDataset v3.0: data and video files, episode table, metadata and card."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -18,17 +18,17 @@ from dextouch.errors import InvalidInputError
 
 
 class DatasetWriter:
-    """One dataset that grows by episodes; `finish` writes what only the end knows.
+    """Writes one dataset episode by episode; `finish` writes the metadata.
 
     Args:
         folder: of the dataset, new.
         cameras: shape [height, width, 3] of each camera's images.
         fps: frames a second.
-        has_measured: actions are commanded ones and measured ones stand beside them.
+        has_measured: actions are commanded ones, and measured ones are stored beside them.
         robot_type: as the dataset names it.
 
     Raises:
-        InvalidInputError: a rate that no dataset can have.
+        InvalidInputError: a rate outside 1 … 1000.
     """
 
     def __init__(
@@ -70,12 +70,12 @@ class DatasetWriter:
             frames: of the episode.
             videos: access units of each camera, one a frame.
             image_statistics: of each camera's feature.
-            sidecar: what else belongs to the episode.
+            sidecar: DexTouch attributes that LeRobot has no field for.
 
         Raises:
-            InvalidInputError: an episode that does not fit to those before it.
-            CorruptDataError: video that is none.
-            StorageError: the disk does not take it.
+            InvalidInputError: an episode that is inconsistent with those before it.
+            CorruptDataError: invalid video data.
+            StorageError: the write failed.
         """
         attributes = sidecar.attributes
         where = f"episode {attributes.episode_id!r}"
@@ -147,7 +147,7 @@ class DatasetWriter:
             repo_id: name of the dataset, for its card.
 
         Raises:
-            StorageError: the disk does not take it.
+            StorageError: the write failed.
         """
         write_tasks(self._folder / layout.TASKS_FILE, list(self._tasks))
         statistics = {
@@ -190,5 +190,5 @@ def _card(repo_id: str) -> str:
     )
     return (
         f"{front}\n# {repo_id}\n\nA LeRobotDataset {layout.CODEBASE_VERSION} exported from "
-        "DexTouch episodes. What LeRobot has no place for is in `meta/dextouch`.\n"
+        "DexTouch episodes. What LeRobot has no field for is in `meta/dextouch`.\n"
     )

@@ -1,4 +1,4 @@
-"""Episodes in, a LeRobotDataset v3.0 folder out that is there whole or not at all."""
+"""Export of episodes to a LeRobotDataset v3.0 folder, which appears complete or not at all."""
 
 import re
 import shutil
@@ -29,7 +29,7 @@ REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
 @dataclass(frozen=True)
 class ExportOptions:
-    """How episodes become a dataset.
+    """Options of an export.
 
     `fps`: frames a second, a whole number; without it the model rate of the first episode.
     `cameras`: whose images go along, the first of them setting the frames' times when `fps` is its
@@ -54,21 +54,21 @@ def export_lerobot(
     repo_id: str,
     options: ExportOptions = DEFAULTS,
 ) -> int:
-    """Write episodes as one LeRobotDataset v3.0; the number of frames comes back.
+    """Write episodes as one LeRobotDataset v3.0 and return the number of frames.
 
     Args:
-        readers: of the episodes, in the order that they shall have; opened one by one.
+        readers: of the episodes, in the order of the dataset; opened one at a time.
         folder: of the dataset; must not exist.
         repo_id: name of the dataset, `user/name`.
         options: rate, cameras, quality.
 
     Raises:
         ConflictError: the folder exists.
-        InvalidInputError: no episodes, a rate that is no whole number, or episodes that do not fit
-            into one dataset.
+        InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
+            one dataset.
         UnknownNameError: a camera that an episode does not have.
         CorruptDataError: a damaged episode.
-        StorageError: the disk does not take it.
+        StorageError: the write failed.
     """
     if not REPO_ID.fullmatch(repo_id):
         raise InvalidInputError(f"repo_id: got {repo_id!r}, expected a name like 'user/name'")
@@ -179,9 +179,9 @@ def _add_episode(
 
 
 def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> list[bytes] | None:
-    """The stored access units of a camera, if exactly these images in a row make up a video.
+    """The stored access units of a camera, where they can be remuxed without encoding.
 
-    None where the stream is no H.264, images are left out or repeated, or the first one cannot be
+    None where the stream is not H.264, images are skipped or repeated, or the first one cannot be
     decoded without those before it.
     """
     consecutive = bool((np.diff(indices) == 1).all())

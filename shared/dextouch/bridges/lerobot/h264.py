@@ -1,4 +1,4 @@
-"""Images in, H.264 access units (Annex B) out; and what access units say about themselves."""
+"""H.264 encoding to Annex B access units, and inspection of their NAL units."""
 
 from collections.abc import Iterable, Iterator
 from fractions import Fraction
@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from dextouch.errors import CorruptDataError, ShapeError
 
 _IDR, _SPS, _PPS = 5, 7, 8
-# As the store's own video does it, so that an image comes out of both alike.
+# Same settings as the store's video, so that both give the same image.
 TO_YUV, TO_RGB = "AREA", "BICUBIC"
 
 
@@ -32,20 +32,20 @@ def parameter_sets(access_unit: bytes) -> tuple[bytes, ...]:
 
 
 def is_entry_point(access_unit: bytes) -> bool:
-    """Whether decoding can start here: an IDR picture with its parameter sets."""
+    """Whether decoding can start at this access unit: an IDR picture with its parameter sets."""
     kinds = {unit[0] & 0x1F for unit in nal_units(access_unit)}
     return {_IDR, _SPS, _PPS} <= kinds
 
 
 def holds_idr(access_unit: bytes) -> bool:
-    """Whether an access unit holds an IDR picture, with its headers or without."""
+    """Whether an access unit contains an IDR picture, with or without parameter sets."""
     return any(unit[0] & 0x1F == _IDR for unit in nal_units(access_unit))
 
 
 def encode_images(
     images: Iterable[UInt8[np.ndarray, "h w 3"]], *, fps: int, crf: int, group: int
 ) -> Iterator[bytes]:
-    """Access units of RGB images, one an image: x264, 4:2:0, closed groups, no B-frames.
+    """Encode RGB images, one access unit each: x264, 4:2:0, closed GOPs, no B-frames.
 
     Args:
         images: all of one size, with even sides.
@@ -81,7 +81,7 @@ def _encoder(shape: tuple[int, ...], *, fps: int, crf: int, group: int) -> av.Vi
     encoder.width, encoder.height, encoder.pix_fmt = width_px, height_px, "yuv420p"
     encoder.time_base, encoder.framerate = Fraction(1, fps), Fraction(fps)
     encoder.gop_size, encoder.max_b_frames = group, 0
-    # One thread: equal images give equal bytes on every machine.
+    # One thread, so that equal images give equal bytes on every machine.
     encoder.thread_count = 1
     encoder.options = {
         "preset": "veryfast",
@@ -94,10 +94,10 @@ def _encoder(shape: tuple[int, ...], *, fps: int, crf: int, group: int) -> av.Vi
 def decode_entry_points(
     access_units: Iterable[bytes], *, where: str
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """RGB images of access units that each can be decoded alone.
+    """Decode access units that are each decodable on their own to RGB images.
 
     Raises:
-        CorruptDataError: one that can not.
+        CorruptDataError: an access unit that cannot be decoded.
     """
     for index, data in enumerate(access_units):
         decoder = av.CodecContext.create("h264", "r")

@@ -1,4 +1,4 @@
-"""A LeRobotDataset v3 folder in, episodes of the store out."""
+"""Import of LeRobotDataset v3 folders as episodes of the store."""
 
 import hashlib
 import re
@@ -29,7 +29,7 @@ from dextouch.schemas.episodes import (
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """What a dataset does not say itself.
+    """Options of an import: information that the dataset itself lacks.
 
     `mapping`: our name → the dataset's feature. `id_prefix`: put before every id (needed when ids
     exist already); `images`: the unit that images are stored in. Only for datasets of other origin:
@@ -50,20 +50,20 @@ DEFAULTS = ImportOptions()
 def import_lerobot(
     folder: Path, store: EpisodeStore, *, options: ImportOptions = DEFAULTS
 ) -> list[str]:
-    """Write every episode of a dataset into the store; their ids come back.
+    """Write every episode of a dataset into the store and return their ids.
 
-    Each episode appears whole or not at all; after an error those before it stay.
+    Each episode appears complete or not at all; after an error, earlier episodes remain.
 
     Args:
         folder: root of the dataset; nothing outside it is read.
-        store: that takes the episodes.
-        options: names of features, ids, images, and what other datasets do not say.
+        store: destination.
+        options: feature names, ids, image unit, and values missing in foreign datasets.
 
     Raises:
         NotFoundError: a file is missing.
         InvalidInputError: another version of the format, or features that do not fit.
         CorruptDataError: damaged or truncated files, or paths that lead out of the folder.
-        LimitExceededError: larger than this reader takes.
+        LimitExceededError: larger than the limits of this reader.
         ConflictError: an id exists already.
     """
     source = LeRobotFolder(folder)
@@ -88,7 +88,7 @@ def import_lerobot(
 def _known_attributes(
     source: LeRobotFolder, content: EpisodeContent, sidecar: Sidecar, options: ImportOptions
 ) -> EpisodeAttributes:
-    """As they were, with the anchor of the first frame and the origin in the lineage."""
+    """The exported attributes, with the anchor of the first frame and the source in the lineage."""
     known = sidecar.attributes
     came_from = LineageEntry(kind="episode", id=known.episode_id, sha256=sidecar.content_sha256)
     changes = {

@@ -1,4 +1,4 @@
-"""Nothing or a template in, the names, shapes and paths of a LeRobotDataset v3.0 out."""
+"""Feature names, shapes, paths and constants of the LeRobotDataset v3.0 layout."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -45,7 +45,7 @@ def pose_names(name: str) -> list[str]:
 
 
 def action_names() -> list[str]:
-    """Names of the 67 numbers of an action or a state, in their order."""
+    """Names of the 67 components of an action or a state, in order."""
     joints = [f"{name}_rad" for side in ("left", "right") for name in RobotHand(side).joint_names]
     wrists = [*pose_names("wrist_left"), *pose_names("wrist_right")]
     return [*wrists, *joints, *pose_names("camera_head")]
@@ -78,7 +78,7 @@ def dataset_features(
     Args:
         cameras: shape of each camera's images.
         fps: frames a second of the dataset.
-        has_measured: actions are commanded ones, so measured ones stand beside them.
+        has_measured: actions are commanded ones, and measured ones are stored beside them.
     """
     names = action_names()
     features = {IMAGES + name: video_feature(shape, fps) for name, shape in cameras.items()}
@@ -103,7 +103,7 @@ def file_place(number: int) -> tuple[int, int]:
 
 
 def fill_path(template: str, **values: int | str) -> str:
-    """A path template with its fields filled in; nothing but plain fields is understood.
+    """Substitute the fields of a path template; only plain fields are supported.
 
     Raises:
         InvalidInputError: a field that is not among `values`, or any other brace.
@@ -126,7 +126,7 @@ def fill_path(template: str, **values: int | str) -> str:
 
 
 def confined(folder: Path, relative: str) -> Path:
-    """A path below `folder`, links followed.
+    """Resolve a path below `folder`, following links.
 
     Raises:
         CorruptDataError: it leads out of the folder.
@@ -136,7 +136,5 @@ def confined(folder: Path, relative: str) -> Path:
         raise CorruptDataError(f"{folder}: got a path with a zero byte")
     path = (root / relative).resolve()
     if not path.is_relative_to(root):
-        raise CorruptDataError(
-            f"{folder}: path {relative!r} leads out of the dataset; such a dataset is not read"
-        )
+        raise CorruptDataError(f"{folder}: path {relative!r} leads out of the dataset; refused")
     return path

@@ -1,4 +1,4 @@
-"""Features of any LeRobot dataset and a few names in, which of them are what of an episode out."""
+"""Mapping from the features of any LeRobot dataset to the streams of an episode."""
 
 import re
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ _SHAPES = {ACTION: (ACTION_DIM,), STATE: (ACTION_DIM,), TACTILE: (2, NUM_TAXELS)
 
 @dataclass(frozen=True)
 class FeatureMap:
-    """Feature names of what was found; None where a dataset has no such thing."""
+    """Feature names by role; None where the dataset has no such feature."""
 
     action: str
     state: str | None
@@ -33,13 +33,13 @@ def map_features(info: DatasetInfo, names: Mapping[str, str]) -> FeatureMap:
 
     Args:
         info: of the dataset.
-        names: our name → the dataset's feature, for what is called otherwise there: `action`,
+        names: our name → the dataset's feature, for features under other names: `action`,
             `state`, `tactile` and cameras (`camera_head`, `camera_wrist_left`, …).
 
     Raises:
-        UnknownNameError: a name of ours that is none, or a feature that the dataset does not have.
-        InvalidInputError: needed features that are missing or have another shape, all of them
-            listed, with what the dataset has instead.
+        UnknownNameError: an unknown name of ours, or a feature that the dataset lacks.
+        InvalidInputError: required features that are missing or have another shape; all are listed,
+            with what the dataset has.
     """
     for ours, theirs in names.items():
         if ours not in _DEFAULTS and not _CAMERA_NAME.fullmatch(ours):
@@ -72,7 +72,7 @@ def map_features(info: DatasetInfo, names: Mapping[str, str]) -> FeatureMap:
 
 
 def _cameras(info: DatasetInfo, names: Mapping[str, str]) -> dict[str, str]:
-    """Cameras that keep our names, and those that the mapping names."""
+    """Cameras under our own names, and those given by the mapping."""
     taken = set(names.values())
     cameras = {
         name.removeprefix(layout.IMAGES): name

@@ -1,4 +1,4 @@
-"""An episode and a frame rate in, the rows of its LeRobot frames out."""
+"""Resampling of an episode to LeRobot frames: one row of state, action and touch per frame."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -29,7 +29,7 @@ WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 
 @dataclass(frozen=True)
 class EpisodeFrames:
-    """One row a frame; `image_indices` say which stored image of each camera a frame shows.
+    """One row per frame; `image_indices` gives the stored image of each camera in a frame.
 
     `state` holds absolute measured poses and joints; `action` and `measured` are relative to the
     measured poses of the episode's step 0. `image_dt_ns` is the image's stamp minus the frame's.
@@ -129,7 +129,7 @@ def _frame_times(
 def _at(
     reader: EpisodeReader, actions: np.ndarray, steps_ns: np.ndarray, t_ns: np.ndarray
 ) -> np.ndarray:
-    """Actions at other times; at the steps themselves they are given back as they are."""
+    """Actions interpolated at other times; unchanged at the steps themselves."""
     if np.array_equal(steps_ns, t_ns) or len(steps_ns) < 2:
         return np.repeat(actions, len(t_ns), axis=0) if len(actions) != len(t_ns) else actions
     anchor = reader.attributes.anchor.to_poses()
@@ -168,7 +168,7 @@ def images_at(
     Raises:
         CorruptDataError: damaged bytes.
     """
-    # JPEG images are decoded one by one, so that left out ones cost nothing.
+    # JPEG images are decoded individually, so that skipped ones cost nothing.
     is_jpeg = reader.streams[camera].unit == "jpeg"
     for start in range(0, len(indices), BLOCK_IMAGES):
         wanted = [int(index) for index in indices[start : start + BLOCK_IMAGES]]

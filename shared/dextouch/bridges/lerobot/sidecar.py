@@ -1,4 +1,4 @@
-"""What LeRobot has no place for in, one JSON file an episode out; and back, checked."""
+"""One JSON file per episode with the DexTouch attributes that LeRobot has no field for."""
 
 import json
 from pathlib import Path
@@ -19,7 +19,7 @@ MAX_SIDECAR_BYTES: Final = 1 << 22
 class Sidecar(BaseModel):
     """An episode's attributes, its content hash, and how its frames were made.
 
-    `cameras` says whether a camera's video was `remuxed` (bytes as they were) or `encoded` anew.
+    `cameras` says whether a camera's video was `remuxed` (bytes unchanged) or `encoded` again.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -34,10 +34,10 @@ class Sidecar(BaseModel):
 
 
 def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
-    """Put an episode's file into a dataset.
+    """Write an episode's sidecar file.
 
     Raises:
-        StorageError: the disk does not take it.
+        StorageError: the write failed.
     """
     path = folder / fill_path(SIDECAR_PATH, episode_index=sidecar.episode_index)
     with disk_errors(f"write {path}"):
@@ -46,10 +46,10 @@ def write_sidecar(folder: Path, sidecar: Sidecar) -> None:
 
 
 def read_sidecar(folder: Path, episode_index: int) -> Sidecar | None:
-    """An episode's file; None where the dataset has none, being of other origin.
+    """An episode's sidecar; None where the dataset was not written by DexTouch.
 
     Raises:
-        CorruptDataError: one that is no such file.
+        CorruptDataError: an invalid sidecar file.
     """
     path = confined(folder, fill_path(SIDECAR_PATH, episode_index=episode_index))
     if not path.is_file():

@@ -1,4 +1,4 @@
-"""A folder that claims to be a LeRobotDataset v3 in, its checked metadata and episodes out."""
+"""Reader of LeRobotDataset v3 folders of any origin, with validated metadata."""
 
 import json
 from collections.abc import Iterator
@@ -31,14 +31,14 @@ class FeatureInfo(BaseModel):
     names: Any = None
 
     def numbers(self) -> tuple[int, ...]:
-        """Shape of a row, images as [height, width, channels] whatever their order is."""
+        """Shape of a row; images always as [height, width, channels]."""
         if self.dtype == "video" and len(self.shape) == 3 and self.shape[0] == 3 != self.shape[2]:
             return (self.shape[1], self.shape[2], 3)
         return self.shape
 
 
 class DatasetInfo(BaseModel):
-    """What a reader needs from `info.json`."""
+    """The fields of `info.json` that this reader uses."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -62,7 +62,7 @@ class EpisodeEntry:
 
 
 class LeRobotFolder:
-    """A dataset on disk; only its metadata is read before something is asked for.
+    """A dataset on disk; only its metadata is read up front.
 
     Args:
         folder: root of the dataset.
@@ -70,7 +70,7 @@ class LeRobotFolder:
     Raises:
         NotFoundError: a file of the metadata is missing.
         InvalidInputError: another version of the format.
-        CorruptDataError: metadata that is damaged or leads out of the folder.
+        CorruptDataError: metadata that is damaged or has paths that leave the folder.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -111,10 +111,10 @@ class LeRobotFolder:
         return self._path(self.info.data_path, entry, "data")
 
     def span(self, entry: EpisodeEntry, key: str) -> VideoSpan:
-        """Where the images of an episode's camera are.
+        """File and time span of an episode's images of one camera.
 
         Raises:
-            CorruptDataError: the table of episodes does not say.
+            CorruptDataError: missing from the table of episodes.
         """
         if self.info.video_path is None:
             raise CorruptDataError(f"{self.folder}: has video features but no video_path")
@@ -137,7 +137,7 @@ class LeRobotFolder:
         return layout.confined(self.folder, layout.fill_path(template, **places, **values))
 
     def _rows(self, path: Path, entry: EpisodeEntry) -> pa.Table:
-        # Episodes share files and come in order: the last file is most often the next one, too.
+        # Consecutive episodes usually share a file, so the last table is cached.
         if self._table is None or self._table[0] != path:
             wanted = [n for n, f in self.info.features.items() if f.dtype != "video"]
             self._table = path, read_table(path, wanted)
@@ -176,7 +176,7 @@ def _read_info(folder: Path) -> DatasetInfo:
 def _read_tasks(folder: Path) -> list[str]:
     path = layout.confined(folder, layout.TASKS_FILE)
     table = read_table(path)
-    # Older writers call the index column as pandas does when it has no name.
+    # Older writers use the name that pandas gives an unnamed index column.
     text = next((n for n in ("task", "__index_level_0__") if n in table.column_names), None)
     if text is None or "task_index" not in table.column_names:
         raise CorruptDataError(

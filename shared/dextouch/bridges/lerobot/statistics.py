@@ -1,4 +1,4 @@
-"""Values or images of an episode in, the statistics that LeRobot keeps of each feature out."""
+"""Per-feature statistics as LeRobot stores them, of numbers and of images."""
 
 from collections.abc import Iterable, Sequence
 from typing import Final
@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Shaped, UInt8
 
 QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
-# Images that one episode's statistics look at, at most, and the length their sides are thinned to.
+# Maximum number of images per episode, and the side length they are subsampled to.
 SAMPLED_IMAGES: Final = 100
 SAMPLED_SIDE_PX: Final = 320
 
@@ -36,14 +36,14 @@ def value_statistics(values: np.ndarray) -> Statistics:
 
 
 class ImageStatistics:
-    """Counts of the 256 levels of each channel: exact statistics of any number of images."""
+    """Histogram of each channel over 256 levels: exact statistics of any number of images."""
 
     def __init__(self) -> None:
         self._counts = np.zeros((3, 256), dtype=np.int64)
         self._num_images = 0
 
     def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Take one image into account, thinned out when it is large."""
+        """Add one image, subsampled if it is large."""
         step = max(1, -(-max(image.shape[:2]) // SAMPLED_SIDE_PX))
         thin = image[::step, ::step]
         for channel in range(3):
@@ -51,7 +51,7 @@ class ImageStatistics:
         self._num_images += 1
 
     def statistics(self) -> Statistics:
-        """Of what was added, levels scaled to 0 … 1, each of shape [3, 1, 1].
+        """Statistics of all added images, levels scaled to 0 … 1, each of shape [3, 1, 1].
 
         At least one image must have been added.
         """
@@ -67,7 +67,7 @@ class ImageStatistics:
             "std": np.sqrt(np.maximum(0.0, share @ level**2 - mean**2)),
         }
         for name, q in QUANTILES.items():
-            # The least level with at least that share of the pixels at or below it.
+            # The lowest level with at least that share of the pixels at or below it.
             numbers[name] = level[(cumulative < q - 1e-12).sum(axis=1)]
         result: Statistics = {name: _per_channel(value) for name, value in numbers.items()}
         result["count"] = np.array([self._num_images], dtype=np.int64)

@@ -1,4 +1,4 @@
-"""An episode's content in, a committed episode of the store out."""
+"""Writing of imported LeRobot episodes into the store, copying H.264 where possible."""
 
 from collections.abc import Iterator
 from itertools import islice
@@ -28,14 +28,14 @@ def store_episode(
     *,
     images: ImageUnit,
 ) -> None:
-    """Write an episode into the store, whole or not at all.
+    """Write an episode into the store, atomically.
 
     Args:
-        store: that takes it.
+        store: destination.
         attributes: of the episode, without streams; the model rate is that of the frames.
         content: its frames.
-        images: unit of the camera streams. Video that is H.264 in the store's groups already goes
-            into `h264` streams as it is; everything else is decoded and encoded anew.
+        images: unit of the camera streams. Video that is H.264 in the store's groups already is
+            copied into `h264` streams; everything else is decoded and encoded again.
 
     Raises:
         CorruptDataError: damaged video.
@@ -91,7 +91,7 @@ def _announce(
 def _store_images(
     writer: EpisodeWriter, camera: str, found: CameraContent, unit: ImageUnit
 ) -> None:
-    # Of an image that was the nearest to several frames the first copy stays.
+    # An image that is the nearest one to several frames is stored once.
     fresh = np.diff(found.t_ref_ns, prepend=found.t_ref_ns[0] - 1) > 0
     units = read_units(found.span) if unit == "h264" and fresh.all() else None
     if units is not None and _in_groups(units):
@@ -102,7 +102,7 @@ def _store_images(
     for start in range(0, len(stamps), BLOCK_IMAGES):
         block = np.stack(list(islice(images, BLOCK_IMAGES)))
         writer.append(camera, values=block, t_ref_ns=stamps[start : start + BLOCK_IMAGES])
-    # Runs the reader to its end, so that a file that is too short is refused.
+    # Exhausts the reader, so that a file that is too short is refused.
     for _ in images:
         pass
 
@@ -114,5 +114,5 @@ def _kept(
 
 
 def _in_groups(units: list[bytes]) -> bool:
-    """Whether access units come in the groups that the store keeps."""
+    """Whether access units form the closed groups that the store requires."""
     return all(holds_idr(data) == (index % GOP_IMAGES == 0) for index, data in enumerate(units))

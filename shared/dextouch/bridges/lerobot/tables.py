@@ -1,4 +1,4 @@
-"""Columns of a dataset in, parquet files out; and back, with every size checked first."""
+"""Parquet files of a dataset: typed columns, written per episode and read with size limits."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -36,7 +36,7 @@ def column_type(dtype: str, shape: Sequence[int]) -> pa.DataType:
 
 
 def data_schema(features: Features) -> pa.Schema:
-    """Schema of the data files: every feature that is no video."""
+    """Schema of the data files: every feature except video."""
     return pa.schema(
         [
             (name, column_type(feature["dtype"], feature["shape"]))
@@ -59,7 +59,7 @@ def nested(values: np.ndarray, *, fixed: bool) -> pa.Array:
 
 
 class DataFiles:
-    """The data files of a dataset: one row group an episode, a new file when one is large.
+    """The data files of a dataset: one row group per episode, a new file above a size limit.
 
     Args:
         folder: root of the dataset.
@@ -77,10 +77,10 @@ class DataFiles:
         self._file_number = -1
 
     def append(self, columns: Mapping[str, np.ndarray]) -> int:
-        """Write one episode's columns [n, *shape] by feature; the number of its file comes back.
+        """Write one episode's columns [n, *shape] by feature and return its file number.
 
         Raises:
-            StorageError: the disk does not take it.
+            StorageError: the write failed.
         """
         with disk_errors("write the frames of an episode"):
             if self._writer is None or self._path.stat().st_size >= self._file_bytes:
@@ -112,7 +112,7 @@ class DataFiles:
 
 
 class EpisodeRows:
-    """The table of episodes: one row each, arrays as nested lists; written a hundred at a time.
+    """The table of episodes: one row each, arrays as nested lists; written in batches of 100.
 
     Args:
         path: of the file.
@@ -129,14 +129,14 @@ class EpisodeRows:
         """Add an episode; every row has the columns of the first.
 
         Raises:
-            StorageError: the disk does not take it.
+            StorageError: the write failed.
         """
         self._rows.append(row)
         if len(self._rows) >= self.BUFFERED:
             self._flush()
 
     def close(self) -> None:
-        """Write what is left."""
+        """Write the remaining rows and close the file."""
         self._flush()
         if self._writer is not None:
             with disk_errors(f"complete {self._path}"):
@@ -164,7 +164,7 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     """Write `tasks.parquet`: a table whose pandas index is the task's text.
 
     Raises:
-        StorageError: the disk does not take it.
+        StorageError: the write failed.
     """
     kinds = {"task_index": ("int64", "int64"), "task": ("unicode", "str")}
     described = [
@@ -182,12 +182,12 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
-    """A parquet file's columns, if it is of a bearable size; absent columns are left out.
+    """Read columns of a parquet file within the size limits; absent columns are omitted.
 
     Raises:
         NotFoundError: no such file.
-        CorruptDataError: no parquet file, or a damaged or truncated one.
-        LimitExceededError: it says that it holds more than this reader takes.
+        CorruptDataError: not a parquet file, or a damaged or truncated one.
+        LimitExceededError: it declares more than the limits of this reader.
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: is missing from the dataset")
@@ -210,7 +210,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
 
 
 def table_rows(table: pa.Table, *, where: str) -> list[dict[str, Any]]:
-    """A small table as plain rows.
+    """Convert a small table to plain rows.
 
     Raises:
         CorruptDataError: values that cannot be represented.
@@ -225,8 +225,8 @@ def column_values(table: pa.Table, name: str, shape: Sequence[int], *, where: st
     """A column as an array [n, *shape]; shape [1] gives [n].
 
     Raises:
-        CorruptDataError: no such column, rows that are missing values or have another shape, or
-            values that are no numbers.
+        CorruptDataError: no such column, missing values, rows of another shape, or values that are
+            not numbers.
     """
     if name not in table.column_names:
         raise CorruptDataError(f"{where}: has no column {name!r}, which info.json promises")

@@ -1,4 +1,4 @@
-"""H.264 access units of many episodes in, mp4 files with a place for each episode out."""
+"""Muxing of H.264 access units into the mp4 files of a dataset."""
 
 import io
 from collections.abc import Sequence
@@ -18,7 +18,7 @@ from dextouch.errors import CorruptDataError, ShapeError
 
 @dataclass(frozen=True)
 class VideoPlace:
-    """Where one episode's images lie: the n-th file of the camera, and seconds within it."""
+    """Location of one episode's images: file number of the camera and seconds within it."""
 
     file_number: int
     from_timestamp_s: float
@@ -28,7 +28,7 @@ class VideoPlace:
 class CameraVideo:
     """The mp4 files of one camera, one episode after the other.
 
-    Access units are muxed as they are. A new file starts when the next episode would make the file
+    Access units are muxed unchanged. A new file starts when the next episode would make the file
     too large, or was encoded with other parameter sets than the file's header holds.
 
     Args:
@@ -60,13 +60,13 @@ class CameraVideo:
         """Mux one episode.
 
         Args:
-            access_units: one an image, the first an entry point; without B-frames.
+            access_units: one per image, the first an entry point; without B-frames.
             where: names the episode and camera in errors.
 
         Raises:
-            CorruptDataError: the first image is no entry point.
+            CorruptDataError: the first image is not an entry point.
             ShapeError: images of another size.
-            StorageError: the disk does not take it.
+            StorageError: the write failed.
         """
         if not access_units or not is_entry_point(access_units[0]):
             raise CorruptDataError(f"{where}: does not begin with an IDR image and its headers")

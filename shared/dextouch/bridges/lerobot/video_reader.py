@@ -1,4 +1,4 @@
-"""An mp4 file and a span of it in, exactly that many images or access units out."""
+"""Frame-exact reading of a span of an mp4 file, as images or as access units."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -34,7 +34,7 @@ class VideoSpan:
 
 
 def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """The images of a span, decoded one by one; of any codec that this build decodes.
+    """Decode the images of a span one by one; any codec that PyAV's build supports.
 
     Raises:
         NotFoundError: no such file.
@@ -60,9 +60,9 @@ def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
 
 
 def read_units(span: VideoSpan) -> list[bytes] | None:
-    """The access units of a span as they are (Annex B), if it can be copied without decoding.
+    """Copy the access units of a span (Annex B) without decoding, where possible.
 
-    None where the video is no 4:2:0 H.264, begins in the middle of a group, or has B-frames.
+    None where the video is not 4:2:0 H.264, begins in the middle of a GOP, or has B-frames.
 
     Raises:
         NotFoundError: no such file.
@@ -74,7 +74,7 @@ def read_units(span: VideoSpan) -> list[bytes] | None:
             return None
         annexb = BitStreamFilterContext("h264_mp4toannexb", stream)
         for packet in container.demux(stream):
-            # The filter takes the packet's bytes, so that its times must be read before.
+            # The filter consumes the packet, so its time stamps must be read first.
             times = packet.pts, packet.dts
             data = b"".join(bytes(part) for part in annexb.filter(packet)) if packet.size else b""
             place = _place(span, stream, times[0]) if data else -1

@@ -1,4 +1,4 @@
-"""Episodes and recordings ↔ MCAP files with Foxglove schemas."""
+"""MCAP import and export of episodes and recordings, with Foxglove schemas."""
 
 from dextouch.bridges.mcap.reading import import_mcap
 from dextouch.bridges.mcap.writing import export_mcap

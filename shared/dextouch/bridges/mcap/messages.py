@@ -1,4 +1,4 @@
-"""One sample of a stream ↔ the bytes of its MCAP message, every number exact."""
+"""Lossless codec between samples of a stream and their MCAP message."""
 
 from dataclasses import dataclass
 from typing import cast
@@ -31,7 +31,7 @@ _NS_PER_S = 1_000_000_000
 
 @dataclass(frozen=True)
 class Sent:
-    """What a message says: its time, the device's own words where there are any, and the value."""
+    """Content of a message: time stamp, device stamp and counter if any, and value."""
 
     t_ns: int
     t_device_ns: int
@@ -100,10 +100,10 @@ class MessageCodec:
         return encode(TABLE, self.message, values)
 
     def decode(self, data: bytes) -> Sent:
-        """Inverse of `encode`; a missing device field comes back as 0.
+        """Decode a message; a missing device field becomes 0.
 
         Raises:
-            CorruptDataError: bytes that are no message of this stream.
+            CorruptDataError: bytes that are not a message of this stream.
         """
         values = decode(TABLE, self.message, data)
         try:
@@ -182,12 +182,12 @@ def _nanoseconds(values: Values) -> int:
 def calibration_message(
     K: np.ndarray, distortion: np.ndarray, *, t_ns: int, frame: str, shape_px: tuple[int, int]
 ) -> bytes:
-    """A foxglove.CameraCalibration of a camera whose images are as the lens gave them.
+    """A foxglove.CameraCalibration for unrectified images.
 
     Args:
         K: camera matrix in pixels, 3×3.
-        distortion: k1 k2 p1 p2 k3; zeros of a pinhole.
-        t_ns: from when it holds.
+        distortion: k1 k2 p1 p2 k3; zeros for a pinhole.
+        t_ns: start of its validity.
         frame: of the camera.
         shape_px: height and width of its images.
     """

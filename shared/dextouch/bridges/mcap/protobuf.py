@@ -1,6 +1,6 @@
-"""Tables of protobuf messages and plain values in, proto3 bytes and descriptors out, and back.
+"""Minimal proto3 encoder and decoder, driven by tables of message fields.
 
-Only what our messages need: numbers, strings, bytes, packed arrays and nested messages
+Supports only what our messages need: numbers, strings, bytes, packed arrays and nested messages
 (https://protobuf.dev/programming-guides/encoding). The tables describe themselves: the
 `FileDescriptorSet` that an MCAP schema carries is encoded by the same code.
 """
@@ -85,7 +85,7 @@ def encode(table: Table, message: str, values: Mapping[str, object]) -> bytes:
     Args:
         table: all messages by full name.
         message: which of them.
-        values: by field name; a missing field is left out, repeated numbers are arrays,
+        values: by field name; a missing field is omitted, repeated numbers are arrays,
             repeated messages lists of mappings.
 
     Raises:
@@ -122,7 +122,7 @@ def _signed(number: int) -> int:
 
 
 def _take(data: bytes, at: int) -> tuple[int, int, int | bytes, int]:
-    """Field number, wire type, raw value and where the next field starts."""
+    """Field number, wire type, raw value and offset of the next field."""
     key, at = _read_varint(data, at)
     number, wire = key >> 3, key & 7
     if wire == _VARINT:
@@ -169,10 +169,10 @@ def _decode_bytes(table: Table, field: Field, raw: bytes) -> object:
 
 
 def decode(table: Table, message: str, data: bytes) -> Values:
-    """The fields that are there, by name; unknown ones are skipped. Inverse of `encode`.
+    """Decode the fields that are present, by name; unknown ones are skipped.
 
     Raises:
-        CorruptDataError: bytes that are no such message.
+        CorruptDataError: bytes that are not a valid message.
     """
     fields = {field.number: field for field in table[message]}
     values: Values = {}

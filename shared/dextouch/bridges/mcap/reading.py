@@ -1,4 +1,4 @@
-"""An MCAP file that `export_mcap` wrote in, an equal episode or recording in a store out."""
+"""Import of MCAP files written by `export_mcap`, without loss."""
 
 import json
 from dataclasses import dataclass, field
@@ -24,7 +24,7 @@ _BLOCK_BYTES: Final = 1 << 24
 
 @dataclass
 class _About:
-    """What a file says before its samples matter."""
+    """Metadata of a file that is needed before its samples."""
 
     kind: str = ""
     attributes: EpisodeAttributes | RecordingAttributes | None = None
@@ -32,7 +32,7 @@ class _About:
 
 
 def import_mcap(path: Path, store: EpisodeStore) -> str:
-    """Read an MCAP file that came from `export_mcap` into a store.
+    """Import an MCAP file written by `export_mcap` into a store.
 
     Args:
         path: of the file; it may come from anywhere.
@@ -43,9 +43,9 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
 
     Raises:
         NotFoundError: no such file.
-        InvalidInputError: no MCAP file, or not one of ours.
-        CorruptDataError: truncated or damaged; the store stays as it was.
-        LimitExceededError: a record is larger than any that we write.
+        InvalidInputError: not an MCAP file, or not written by DexTouch.
+        CorruptDataError: truncated or damaged; the store is unchanged.
+        LimitExceededError: a record exceeds the size limit.
         ConflictError: the id is in the store already.
     """
     about = _about(path)
@@ -59,7 +59,7 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
             f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
             "`dextouch export --format mcap` wrote can be imported"
         )
-    # A killed import is done again from its file; half of one must not pass for a recovered take.
+    # A killed import is repeated from its file; a partial one must not look like a recovered take.
     options = WriteOptions(recoverable=False)
     with store.writer(kind="recording", attributes=attributes, options=options) as writer:
         _Import(path, about, writer).run()
@@ -105,7 +105,7 @@ def _attributes(path: Path, kind: str, text: bytes) -> EpisodeAttributes | Recor
 
 
 class _Pending:
-    """Samples of one stream that wait to be written together."""
+    """Buffered samples of one stream, written together."""
 
     def __init__(self, codec: MessageCodec, writer: EpisodeWriter, *, is_episode: bool) -> None:
         self.codec, self._writer, self._is_episode = codec, writer, is_episode
@@ -114,7 +114,7 @@ class _Pending:
         self._num_bytes = 0
 
     def add(self, data: bytes) -> None:
-        """One message."""
+        """Add one message."""
         self._sent.append(self.codec.decode(data))
         self.num_samples += 1
         self._num_bytes += len(data)
@@ -122,7 +122,7 @@ class _Pending:
             self.flush()
 
     def flush(self) -> None:
-        """Write what waits."""
+        """Write the buffered samples."""
         sent, descriptor = self._sent, self.codec.descriptor
         self._sent, self._num_bytes = [], 0
         if not sent:
@@ -145,7 +145,7 @@ class _Pending:
 
 
 class _Import:
-    """One file on its way into a writer."""
+    """Import of one file into a writer."""
 
     def __init__(self, path: Path, about: _About, writer: EpisodeWriter) -> None:
         self._path, self._counts = path, about.counts
@@ -160,7 +160,7 @@ class _Import:
         self._channels: dict[int, _Pending | None] = {}
 
     def run(self) -> None:
-        """All messages, then the count of each stream."""
+        """Read all messages, then check the count of each stream."""
         for record in records(self._path):
             self._take(record)
         for topic, pending in self._pending.items():
@@ -187,7 +187,7 @@ class _Import:
                 pending.add(record.data)
 
     def _known(self, channel: Channel) -> _Pending | None:
-        """The stream of a channel; channels that others added carry none of our samples."""
+        """The stream of a channel; None for channels added by other tools."""
         pending = self._pending.get(channel.topic)
         if pending is None:
             return None

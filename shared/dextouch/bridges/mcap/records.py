@@ -1,4 +1,4 @@
-"""An MCAP file of unknown origin in, its records one by one out, with every size bounded."""
+"""Record-by-record reading of untrusted MCAP files, with bounded allocations."""
 
 import struct
 from collections.abc import Iterator
@@ -42,9 +42,9 @@ def records(path: Path) -> Iterator[McapRecord]:
 
     Raises:
         NotFoundError: no such file.
-        InvalidInputError: no MCAP file, or one with a compression that is not supported.
-        CorruptDataError: truncated, or a checksum does not hold.
-        LimitExceededError: a record is larger than any that we write.
+        InvalidInputError: not an MCAP file, or an unsupported compression.
+        CorruptDataError: truncated, or a checksum mismatch.
+        LimitExceededError: a record exceeds the size limit.
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file; expected an MCAP file")
@@ -81,7 +81,7 @@ def _records(file: BinaryIO, path: Path) -> Iterator[McapRecord]:
 
 
 def _opened(chunk: Chunk, path: Path) -> Chunk:
-    """A chunk with its bytes decompressed, once their announced size is known to be sane."""
+    """Decompress a chunk after checking its declared size."""
     if chunk.uncompressed_size > MAX_RECORD_BYTES:
         raise LimitExceededError(
             f"{path}: a chunk announces {chunk.uncompressed_size} bytes, expected at most "
@@ -91,7 +91,7 @@ def _opened(chunk: Chunk, path: Path) -> Chunk:
         data = chunk.data
     elif chunk.compression == "zstd":
         with zstandard.ZstdDecompressor().stream_reader(chunk.data) as stream:
-            # One byte more than announced, never the whole of what may unfold.
+            # At most one byte more than declared, never an unbounded output.
             data = stream.read(chunk.uncompressed_size + 1)
     else:
         raise InvalidInputError(

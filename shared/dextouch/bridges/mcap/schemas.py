@@ -1,8 +1,9 @@
-"""A stream's descriptor in, the protobuf message that carries its samples in MCAP out.
+"""Protobuf message types of the streams in MCAP.
 
-Pictures and poses use the public Foxglove messages (https://docs.foxglove.dev/docs/sdk/schemas),
-everything else an array message of our own. Fields 1001 and 1002 are ours in all of them: what a
-device said about a sample of a recording, where MCAP's own columns are too narrow.
+Images and poses use the public Foxglove messages (https://docs.foxglove.dev/docs/sdk/schemas),
+everything else an array message of our own. Fields 1001 and 1002 are our extension of every
+message: the device stamp and counter of a recorded sample, for which MCAP's own fields are too
+narrow.
 """
 
 from typing import Final
@@ -20,7 +21,7 @@ COMPRESSED_VIDEO: Final = "foxglove.CompressedVideo"
 RAW_IMAGE: Final = "foxglove.RawImage"
 FRAME_TRANSFORM: Final = "foxglove.FrameTransform"
 POSES_IN_FRAME: Final = "foxglove.PosesInFrame"
-# The message and the wire number of each dtype; all are packed, so that a row is copied as it is.
+# The message and wire type of each dtype; all are packed, so that a row is copied verbatim.
 ARRAYS: Final = {
     "float32": ("dextouch.Float32Array", "float"),
     "float64": ("dextouch.Float64Array", "double"),
@@ -116,24 +117,24 @@ def message_of(descriptor: StreamDescriptor) -> str:
 
 
 def raw_encoding(descriptor: StreamDescriptor) -> str:
-    """Foxglove's name of uncompressed pixels of this kind; empty where it has none."""
+    """Foxglove's name of the pixel format; empty where it has none."""
     shape = descriptor.shape
     encoding = RAW_ENCODINGS.get((descriptor.dtype, len(shape)), "")
     return "" if encoding == "rgb8" and shape[2] != 3 else encoding
 
 
 def frame_of(descriptor: StreamDescriptor) -> str:
-    """The frame whose pose a pose stream gives, or in which other numbers are."""
+    """The child frame of a pose stream, or the frame in which other values are expressed."""
     if descriptor.kind == "pose":
         return "camera_head" if descriptor.name == "head" else descriptor.name
     return descriptor.frame or descriptor.name
 
 
 def parent_of(descriptor: StreamDescriptor) -> str:
-    """The frame in which the poses of a pose stream are."""
+    """The parent frame of a pose stream."""
     return descriptor.frame or "world"
 
 
 def num_elements(descriptor: StreamDescriptor) -> int:
-    """Numbers in one sample."""
+    """Number of elements of one sample."""
     return int(np.prod(descriptor.shape, dtype=np.int64))

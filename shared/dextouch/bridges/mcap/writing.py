@@ -1,4 +1,4 @@
-"""An episode or recording of a store in, an MCAP file that Foxglove shows and we read back, out."""
+"""Export of an episode or recording to an MCAP file that Foxglove displays."""
 
 import heapq
 import json
@@ -33,7 +33,7 @@ _SEQUENCE_BITS = 0xFFFF_FFFF
 
 
 class _Message(NamedTuple):
-    """What is merged by time; the order of channels decides between equal times."""
+    """A message in the merge by time; ties are ordered by channel."""
 
     log_time: int
     order: int
@@ -48,22 +48,21 @@ def export_mcap(
     """Write one episode or recording as MCAP.
 
     `log_time` is t_ref_ns (episode) or t_host_ns (recording), `publish_time` the device's stamp
-    where there is one. Images that are stored encoded are copied as they are.
+    where there is one. Encoded images are copied unchanged.
 
     Args:
         reader: of the episode or recording.
         path: of the new file.
         overwrite: whether an existing file is replaced.
-        jpeg_quality: 1 … 100 turns `rgb8` images into JPEG, which loses detail; None keeps
-            every pixel.
+        jpeg_quality: 1 … 100 encodes `rgb8` images as JPEG, which is lossy; None keeps raw pixels.
 
     Returns:
-        How many messages were written.
+        Number of messages.
 
     Raises:
         ConflictError: the file exists.
         InvalidInputError: a quality outside 1 … 100.
-        StorageError: the disk does not take it.
+        StorageError: the write failed.
     """
     if jpeg_quality is not None and not 1 <= jpeg_quality <= 100:
         raise InvalidInputError(f"JPEG quality: got {jpeg_quality}, expected 1 … 100")
@@ -94,7 +93,7 @@ class _Export:
         return stream if is_encoded(stream) else stream.model_copy(update={"unit": "jpeg"})
 
     def run(self) -> int:
-        """Everything in the order that a reader wants it."""
+        """Write schemas, channels, attachments and messages, in this order."""
         self._writer.start(profile=PROFILE, library=f"dextouch {__version__}")
         self._write_about()
         sources = [self._messages(order) for order in range(len(self._streams))]

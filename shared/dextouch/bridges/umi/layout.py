@@ -1,4 +1,4 @@
-"""Names of the arrays of a UMI-style replay buffer, and which of our data each holds."""
+"""Array names of a UMI-style replay buffer and the data that each holds."""
 
 from typing import Final
 
@@ -12,12 +12,12 @@ CHUNK_ROWS: Final = 256
 
 
 def camera_array(index: int) -> str:
-    """Images of the index-th camera."""
+    """Name of the image array of a camera."""
     return f"data/camera{index}_rgb"
 
 
 def camera_dt_array(index: int) -> str:
-    """How much later than its step each image was taken."""
+    """Name of the array of image time minus step time, for a camera."""
     return f"data/camera{index}_dt_ns"
 
 

@@ -1,4 +1,4 @@
-"""A zip file that `export_umi` wrote in, its episodes on the model grid in a store out."""
+"""Import of zip files written by `export_umi`, as episodes on the model grid."""
 
 import json
 import math
@@ -47,9 +47,9 @@ class _Meta(BaseModel):
 
 
 def import_umi(path: Path, store: EpisodeStore) -> list[str]:
-    """Read a zip file that came from `export_umi` into a store.
+    """Import a zip file written by `export_umi` into a store.
 
-    The episodes come back on the model grid: what lay between the steps is not in the file.
+    The episodes are on the model grid: samples between the steps are not in the file.
 
     Args:
         path: of the file; it may come from anywhere.
@@ -60,9 +60,9 @@ def import_umi(path: Path, store: EpisodeStore) -> list[str]:
 
     Raises:
         NotFoundError: no such file.
-        InvalidInputError: a replay buffer that is not ours.
+        InvalidInputError: a replay buffer not written by DexTouch.
         CorruptDataError: truncated or damaged; episodes before the damage may be in the store.
-        LimitExceededError: larger than anything that we write.
+        LimitExceededError: larger than the limits of this reader.
         ConflictError: an id is in the store already.
     """
     with ZarrZipReader(path) as archive:
@@ -124,7 +124,7 @@ def _ends(archive: ZarrZipReader, path: Path, meta: _Meta) -> list[int]:
 
 
 class _Import:
-    """One episode on its way into the store."""
+    """Import of one episode into the store."""
 
     def __init__(
         self, archive: ZarrZipReader, store: EpisodeStore, cameras: tuple[str, ...]
@@ -189,7 +189,7 @@ class _Import:
         index, start = where
         stop, name = start + len(t_ref_ns), camera_array(index)
         stamps = t_ref_ns + self._archive.read(camera_dt_array(index), start, stop)
-        # A camera slower than the grid shows one image at several steps; it is kept once.
+        # A camera slower than the grid repeats an image at several steps; it is stored once.
         keep = np.diff(stamps, prepend=stamps[0] - 1) > 0
         shape = self._archive.metadata(name).shape[1:]
         writer.add_stream(

@@ -1,4 +1,4 @@
-"""Episodes of a store in, one zip file in the layout of UMI's replay buffer out."""
+"""Export of episodes to one zip file in the layout of UMI's replay buffer."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -30,7 +30,7 @@ BLOCK_STEPS = 32
 
 
 def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool = False) -> int:
-    """Write episodes end to end on the model grid.
+    """Write episodes one after another on the model grid.
 
     Args:
         readers: of episodes with the same cameras and image sizes; each is read once.
@@ -38,12 +38,12 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
         overwrite: whether an existing file is replaced.
 
     Returns:
-        How many steps were written.
+        Number of steps.
 
     Raises:
         ConflictError: the file exists.
-        InvalidInputError: no episode, or one that does not fit to the first.
-        StorageError: the disk does not take it.
+        InvalidInputError: no episode, or one that is inconsistent with the first.
+        StorageError: the write failed.
     """
     with new_file(path, overwrite=overwrite) as partial:
         writer = ZarrZipWriter(partial)
@@ -57,7 +57,7 @@ def export_umi(readers: Iterable[EpisodeReader], path: Path, *, overwrite: bool 
 
 
 def _signature(reader: EpisodeReader) -> dict[str, tuple[int, ...]]:
-    """What all episodes of one file must share: cameras with image shapes, commanded actions."""
+    """Properties that all episodes of a file share: image shapes by camera, commanded actions."""
     cameras: dict[str, tuple[int, ...]] = {
         c: reader.streams[c].shape for c in MODEL_CAMERAS if c in reader.streams
     }
@@ -154,7 +154,7 @@ class _Export:
         self._writer.append("data/tactile_valid", window.tactile_valid)
 
     def finish(self) -> int:
-        """Write the rest; how many steps there are."""
+        """Complete the file and return the number of steps."""
         if not self._ends:
             raise InvalidInputError("UMI export: got no episode, expected at least one")
         self._writer.append(ENDS, np.array(self._ends, dtype=np.int64))

@@ -1,8 +1,9 @@
-"""Rows of named arrays ↔ a Zarr v2 group inside one zip file, as `zarr.open` reads it.
+"""Zarr v2 groups in one zip file, written and read without zarr; `zarr.open` reads them too.
 
-Written without zarr (https://zarr-specs.readthedocs.io/en/latest/v2/v2.0.html): storage chunks are
-zstd, zip entries are stored as they are. Reading trusts nothing: names, sizes and shapes are
-checked before anything is allocated, and a missing storage chunk is an error, never zeros.
+Storage chunks are zstd, zip entries are uncompressed
+(https://zarr-specs.readthedocs.io/en/latest/v2/v2.0.html). The reader does not trust the file:
+names, sizes and shapes are checked before anything is allocated, and a missing storage chunk is an
+error, never zeros.
 """
 
 import json
@@ -45,7 +46,7 @@ class _Codec(BaseModel):
 
 
 class ArrayMetadata(BaseModel):
-    """`.zarray` of one array; only what is written here can be read."""
+    """`.zarray` of one array; only the features modelled here are supported."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -85,7 +86,7 @@ class _NewArray:
 
 
 class ZarrZipWriter:
-    """Appends rows to the arrays of a new group; memory holds one storage chunk an array.
+    """Appends rows to the arrays of a new group; buffers one storage chunk per array.
 
     Args:
         path: of the new zip file.
@@ -105,7 +106,7 @@ class ZarrZipWriter:
         chunk_rows: int,
         attributes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Announce an array `GROUP/NAME` of one of the types of `ArrayMetadata`."""
+        """Declare an array `GROUP/NAME` of one of the types of `ArrayMetadata`."""
         array = _NewArray(np.dtype(dtype).str, row_shape, chunk_rows)
         array.attributes = dict(attributes or {})
         self._arrays[name] = array
@@ -140,7 +141,7 @@ class ZarrZipWriter:
         self._zip.writestr(zipfile.ZipInfo(name, _DATE), data)
 
     def finish(self, attributes: Mapping[str, Mapping[str, Any]]) -> None:
-        """Write what is left, the metadata and the attributes of groups (by name, "" the root)."""
+        """Write buffered rows, the metadata and the attributes of groups (by name, "" the root)."""
         groups = {"", *attributes, *(name.rpartition("/")[0] for name in self._arrays)}
         for group in sorted(groups):
             prefix = f"{group}/" if group else ""
@@ -156,7 +157,7 @@ class ZarrZipWriter:
         self._zip.close()
 
     def close(self) -> None:
-        """Give the file back; without `finish` it is no zip file that anyone can use."""
+        """Close the file; without a prior `finish` it is not a valid zip file."""
         self._zip.close()
 
 
@@ -166,7 +167,7 @@ def _json(value: object) -> bytes:
 
 @contextmanager
 def zip_errors(path: Path) -> Iterator[None]:
-    """Turn the errors of a bad zip file into ours."""
+    """Context manager that translates zip file errors to DexTouch errors."""
     try:
         with disk_errors(f"read {path}"):
             yield
@@ -179,14 +180,14 @@ def zip_errors(path: Path) -> Iterator[None]:
 
 
 class ZarrZipReader:
-    """Reads rows of arrays of a Zarr v2 group in a zip file from anywhere.
+    """Reads rows of arrays of a Zarr v2 group in an untrusted zip file.
 
     Args:
         path: of the zip file.
 
     Raises:
         NotFoundError: no such file.
-        CorruptDataError: no zip file, or names that are no part of a Zarr group.
+        CorruptDataError: not a zip file, or entries that are not part of a Zarr group.
     """
 
     def __init__(self, path: Path) -> None:
@@ -211,7 +212,7 @@ class ZarrZipReader:
             raise CorruptDataError(f"{self._path}: holds two entries named {name!r}; refused")
 
     def close(self) -> None:
-        """Give the file back."""
+        """Close the file."""
         self._zip.close()
 
     def __enter__(self) -> "ZarrZipReader":
@@ -237,12 +238,12 @@ class ZarrZipReader:
         return value
 
     def metadata(self, name: str) -> ArrayMetadata:
-        """What an array holds.
+        """Metadata of an array.
 
         Raises:
             NotFoundError: no such array.
-            StorageError: an array of a kind that is not supported.
-            CorruptDataError: metadata that does not fit.
+            StorageError: an unsupported kind of array.
+            CorruptDataError: invalid metadata.
         """
         if name not in self._arrays:
             key = f"{name}/.zarray"
@@ -305,7 +306,7 @@ class ZarrZipReader:
         if metadata.compressor is not None:
             try:
                 with zstandard.ZstdDecompressor().stream_reader(data) as stream:
-                    # One byte more than expected, never the whole of what may unfold.
+                    # At most one byte more than expected, never an unbounded output.
                     data = stream.read(num_bytes + 1)
             except zstandard.ZstdError as error:
                 raise CorruptDataError(f"{self._path}: {key} is damaged ({error})") from error

@@ -1,4 +1,4 @@
-"""Hands from files: a URDF or MJCF model and a small mapping file in, a `HandModel` out."""
+"""Loading of robot hands from URDF or MJCF models with a small mapping file."""
 
 from dextouch.hands.hand_files.loading import load_hand
 

@@ -1,7 +1,7 @@
-"""A model's links and a finger's mapping in, the finger's table in our wrist frame out.
+"""Conversion of a model's links to the kinematic table of a finger in our wrist frame.
 
-Fixed steps between hinges are folded into the frame of the next hinge or into the tip, so that
-every hinge keeps the model's own angle.
+Fixed joints between hinges are merged into the frame of the next hinge or into the tip, so that
+hinge angles are those of the model.
 """
 
 from typing import Final
@@ -22,9 +22,9 @@ _NO_TURN: Final = np.eye(3)
 def fixed_links(
     model: ModelFile, wrist: str, T_ours_wrist: Float64[np.ndarray, "4 4"]
 ) -> dict[str, np.ndarray]:
-    """T_ours_link [4, 4] of the wrist link and of every ancestor that it does not move against.
+    """T_ours_link [4, 4] of the wrist link and of all ancestors rigidly attached to it.
 
-    Some models hang the wrist on the palm like another fingertip; fingers then begin at a common
+    Some models attach the wrist to the palm like another fingertip; fingers then start at a common
     ancestor.
     """
     T_ours_link = T_ours_wrist
@@ -43,18 +43,18 @@ def fixed_links(
 def finger_table(
     model: ModelFile, finger: FingerMapping, *, bases: dict[str, np.ndarray], where: str
 ) -> FingerTable:
-    """The table of one finger.
+    """Build the table of one finger.
 
     Args:
-        model: where links, joints and sites are.
-        finger: which of them the finger is.
-        bases: links that stand still in our wrist frame, the wrist link first, with T_ours_link.
-        where: what messages begin with.
+        model: of the hand.
+        finger: its joints and tip in the model.
+        bases: links fixed in our wrist frame, the wrist link first, with T_ours_link.
+        where: prefix of error messages.
 
     Raises:
-        InvalidInputError: the tip does not hang on the wrist; the joints between them are not
-            those of the mapping, or are no hinges with limits.
-        UnknownNameError: names that the model or the finger does not have.
+        InvalidInputError: the tip is not attached to the wrist; the joints between them are not
+            those of the mapping, or are not hinges with limits.
+        UnknownNameError: names that are not in the model or the finger.
     """
     T_link_tip, link = _tip(model, finger.tip, f"{where} tip")
     base, links = _links_between(model, bases, link, where)
@@ -90,7 +90,7 @@ def _tip(model: ModelFile, tip: TipMapping, where: str) -> tuple[np.ndarray, str
 def _links_between(
     model: ModelFile, bases: dict[str, np.ndarray], tip: str, where: str
 ) -> tuple[str, list[str]]:
-    """The base that the tip hangs on, and the links beyond it on the way to the tip."""
+    """The base link of a tip, and the links from there to the tip."""
     links: list[str] = []
     link = tip
     while link not in bases:
@@ -129,11 +129,11 @@ def _check_joints(steps: list[Link], finger: FingerMapping, model: ModelFile, wh
 
 
 def _hinge(joint: Joint, T_frame_link: np.ndarray, where: str) -> tuple[JointRow, np.ndarray]:
-    """A hinge's row, and T_hinge_link: where the link is in the hinge's frame after its turn."""
+    """A hinge's row, and T_hinge_link, the link's pose in the hinge's rotated frame."""
     if joint.limits_rad is None:
         raise InvalidInputError(f"{where}: joint {joint.name!r} has no limits")
     anchor = np.array(joint.anchor_m)
-    # At the joint's zero angle, not at the one the file draws it at; then the turn is added.
+    # At the joint's zero angle, which may differ from the angle of the file's reference pose.
     R_undrawn = rotation_from_vector(-joint.zero_rad * np.array(joint.axis))
     T_frame_hinge = T_frame_link @ transform(R_undrawn, anchor)
     w, x, y, z = quaternion_from_rotation(T_frame_hinge[:3, :3]).tolist()

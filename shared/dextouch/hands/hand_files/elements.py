@@ -1,7 +1,7 @@
-"""XML bytes in, plain elements out that know their file and line; nothing outside is ever read.
+"""Safe XML reader with source locations: no entities, bounded depth and size.
 
-Built on expat's events: a document type, and with it every entity, ends the reading where it
-begins; depth and number of elements are bounded.
+Built on expat: a document type declaration, and with it every entity, is refused; depth and number
+of elements are limited.
 """
 
 import re
@@ -17,9 +17,9 @@ from dextouch.hands.hand_files.reading import read_bounded
 MAX_BYTES: Final = 8 * 2**20
 MAX_DEPTH: Final = 100
 MAX_ELEMENTS: Final = 20_000
-# Far beyond every length, angle or direction; sums and products of such numbers stay finite.
+# Far above any length, angle or direction, yet sums and products stay finite.
 MAX_NUMBER: Final = 1e6
-# float() also takes "nan", "inf", "1_0" and digits of other scripts.
+# float() also accepts "nan", "inf", "1_0" and digits of other scripts.
 _NUMBER: Final = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 
 
@@ -37,18 +37,18 @@ class Element:
         return f"{self.source}: <{self.tag}{f' name={name!r}' if name else ''}>"
 
     def refusal(self, message: str) -> InvalidInputError:
-        """The error to raise about this element."""
+        """An error about this element, to be raised."""
         return InvalidInputError(f"{self}: {message}", element=self.tag)
 
     def each(self, *tags: str) -> Iterator["Element"]:
-        """Children of these tags."""
+        """Iterate over children with these tags."""
         return (child for child in self.children if child.tag in tags)
 
     def child(self, tag: str) -> "Element | None":
-        """The only child of that tag, or none.
+        """The only child with that tag, or None.
 
         Raises:
-            InvalidInputError: there are several.
+            InvalidInputError: several children.
         """
         found = list(self.each(tag))
         if len(found) > 1:
@@ -56,10 +56,10 @@ class Element:
         return found[0] if found else None
 
     def text(self, name: str) -> str:
-        """An attribute that must be there.
+        """A required attribute.
 
         Raises:
-            InvalidInputError: it is not, or empty.
+            InvalidInputError: missing or empty.
         """
         value = self.attributes.get(name)
         if not value:
@@ -67,7 +67,7 @@ class Element:
         return value
 
     def choice(self, name: str, *valid: str) -> str:
-        """An attribute with given values; the first one is the format's default.
+        """An attribute with a fixed set of values; the first one is the default.
 
         Raises:
             UnknownNameError: another value.
@@ -78,10 +78,10 @@ class Element:
         return value
 
     def numbers(self, name: str, count: int) -> tuple[float, ...] | None:
-        """Finite numbers of an attribute, or none where it is absent.
+        """Numbers of an attribute; None if it is absent.
 
         Raises:
-            InvalidInputError: another count, something that is no finite number, or over 1e6.
+            InvalidInputError: another count, or a number that is not finite or above 1e6.
         """
         text = self.attributes.get(name)
         if text is None:
@@ -149,10 +149,10 @@ class _Builder:
 
 
 def read_elements(path: Path) -> Element:
-    """The root element of an XML file.
+    """Read an XML file and return its root element.
 
     Raises:
-        NotFoundError, StorageError: no file, or it cannot be read.
+        NotFoundError, StorageError: a missing or unreadable file.
         LimitExceededError: over 8 MiB, 100 levels or 20 000 elements.
         InvalidInputError: broken XML, or a document type.
     """

@@ -1,7 +1,7 @@
-"""A hand's model file and mapping file in, its `HandModel` in our wrist frame out.
+"""Loading of a hand model file and its mapping file into a `HandModel` in our wrist frame.
 
-What is most often wrong in a mapping shows in the finished hand and is refused: millimetres for
-metres, the thumb on the wrong side, fingers that bend to the back.
+Common mistakes of mappings are detected in the resulting hand: millimetres instead of metres, the
+thumb on the wrong side, fingers that bend backwards.
 """
 
 from itertools import pairwise
@@ -23,34 +23,34 @@ from dextouch.hands.hand_files.urdf import UrdfModel
 from dextouch.hands.robot_hand import HandModel
 from dextouch.hands.skeleton import CHAINS
 
-# Knuckle to tip along the bones, and wrist to first hinge: no hand is outside, millimetres are.
+# Plausible lengths from knuckle to tip and from wrist to first hinge; detects millimetres.
 FINGER_LENGTH_M: Final = (0.01, 0.5)
 MAX_PALM_M: Final = 1.0
 MAX_ANGLE_RAD: Final = 2 * np.pi
-# Cosine of the angle between the two directions of the wrist that counts as a right angle.
+# Tolerance of the right angle between the two wrist directions, as a cosine.
 RIGHT_ANGLE: Final = 1e-3
-# Fingers in the middle of their range lean to the palm; this much of their length to the back is
-# no matter of how the limits lie.
+# Fingers at mid-range bend towards the palm; bending backwards by this share of their length cannot
+# be explained by asymmetric limits.
 MAX_BACKWARD: Final = 0.1
 
 
 def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
-    """The hand that a URDF or MJCF file holds and a mapping file describes.
+    """Load a hand from a URDF or MJCF file and a mapping file.
 
     Args:
-        model_path: URDF (`robot`) or MJCF (`mujoco`), one whole file; meshes are not read.
+        model_path: URDF (`robot`) or MJCF (`mujoco`), a single file; meshes are not read.
         mapping_path: TOML: side, wrist and fingers (docs/hands.md).
 
     Returns:
-        Joints in the mapping's order, angles as the model counts them, wrist frame as ours:
+        The hand with joints in the mapping's order, the model's joint angles, and our wrist frame:
         fingers along -z, thumb side +x.
 
     Raises:
-        NotFoundError, StorageError: a file is not there or cannot be read.
-        LimitExceededError: a file larger than a hand's description needs.
-        UnknownNameError: a name that the model does not have; the valid ones are listed.
-        InvalidInputError: anything else that is no hand; the message names file, element, what was
-            found and what was expected.
+        NotFoundError, StorageError: a missing or unreadable file.
+        LimitExceededError: a file above the size limit.
+        UnknownNameError: a name that is not in the model; the valid ones are listed.
+        InvalidInputError: any other invalid content; the message names file, element, found and
+            expected value.
     """
     root = read_elements(Path(model_path))
     mapping = read_mapping(Path(mapping_path))
@@ -105,7 +105,7 @@ def _wrist_axes(mapping: HandMapping) -> Float64[np.ndarray, "4 4"]:
 
 
 def _length_m(finger: FingerTable) -> float:
-    """Knuckle to tip along the bones; does not change with the joints."""
+    """Length from knuckle to tip along the bones, independent of joint angles."""
     beyond = [row.position_m for row in finger.joints[finger.points[0] + 1 :]]
     return float(np.linalg.norm([*beyond, finger.tip_m], axis=-1).sum())
 
@@ -129,14 +129,14 @@ def _check_units(finger: FingerTable, mapping: HandMapping) -> None:
 
 
 def _middle_points_m(hand: HandModel) -> dict[str, np.ndarray]:
-    """Knuckle, PIP, DIP and tip [4, 3] by chain, every joint in the middle of its range."""
+    """Knuckle, PIP, DIP and tip [4, 3] by chain, with all joints at mid-range."""
     middle = 0.5 * (hand.lower_rad + hand.upper_rad)
     points = hand.chain_points_m(middle[None])[0]
     return {finger.chain: points[index] for index, finger in enumerate(hand.fingers)}
 
 
 def _check_thumb_side(hand: HandModel, mapping: HandMapping) -> None:
-    """Knuckles come one after the other from the thumb's side: index, middle, ring, little."""
+    """Check the order of knuckles from the thumb's side: index, middle, ring, little."""
     points = _middle_points_m(hand)
     chains = [chain for chain in CHAINS[1:] if chain in points]
     across_m = [float(points[chain][0, 0]) for chain in chains]

@@ -1,4 +1,4 @@
-"""A TOML mapping file in, what it says about a model's wrist and fingers out (docs/hands.md)."""
+"""Mapping file (TOML) that names the wrist and fingers of a hand model (docs/hands.md)."""
 
 import tomllib
 from collections.abc import Mapping
@@ -11,7 +11,7 @@ from dextouch.hands.finger_table import Vector3
 from dextouch.hands.hand_files.reading import read_bounded
 
 MAX_BYTES: Final = 64 * 2**10
-# Far beyond every length or direction.
+# Far above any length or direction.
 MAX_NUMBER: Final = 1e6
 _ORIGIN: Final = (0.0, 0.0, 0.0)
 _PLACES: Final = ("link", "body", "site")
@@ -19,7 +19,7 @@ _PLACES: Final = ("link", "body", "site")
 
 @dataclass(frozen=True)
 class TipMapping:
-    """A finger's tip: a link (body) or a site, and an offset in its frame."""
+    """Fingertip: a link (body) or a site, and an offset in its frame."""
 
     link: str | None
     site: str | None
@@ -52,7 +52,7 @@ class HandMapping:
 
 
 class _Table:
-    """A TOML table whose keys are all used once; what is wrong is named with its place."""
+    """A validated TOML table: unknown keys are refused, and errors name their location."""
 
     def __init__(self, where: str, values: Any, keys: tuple[str, ...]) -> None:  # noqa: ANN401
         if not isinstance(values, Mapping):
@@ -114,18 +114,18 @@ class _Table:
 def _is_number(value: object) -> bool:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
-    # Comparisons with NaN are false, and integers of any length compare.
+    # Comparisons with NaN are false, and integers of any size compare.
     return -MAX_NUMBER <= value <= MAX_NUMBER
 
 
 def read_mapping(path: Path) -> HandMapping:
-    """The mapping of one hand.
+    """Read the mapping of one hand.
 
     Raises:
-        NotFoundError, StorageError: no file, or it cannot be read.
+        NotFoundError, StorageError: a missing or unreadable file.
         LimitExceededError: over 64 KiB.
-        InvalidInputError: no TOML, a key missing or of another kind.
-        UnknownNameError: a key that mappings do not have; the valid ones are listed.
+        InvalidInputError: not TOML, or a key that is missing or has the wrong type.
+        UnknownNameError: an unknown key; the valid ones are listed.
     """
     table = _Table(path.name, _parse(path), ("side", "wrist", "fingers"))
     wrist = _Table(
@@ -154,7 +154,7 @@ def _parse(path: Path) -> dict[str, Any]:
         return tomllib.loads(data.decode("utf-8"))
     except UnicodeDecodeError as error:
         raise InvalidInputError(f"{path.name}: got bytes that are no UTF-8: {error}") from error
-    # Deep nesting of brackets ends in the parser's recursion limit.
+    # Deeply nested brackets hit the parser's recursion limit.
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise InvalidInputError(f"{path.name}: got broken TOML: {error}") from error
 

@@ -1,4 +1,4 @@
-"""MJCF settings: units, default classes and orientations, in radians, quaternion-free.
+"""MJCF compiler settings: units, default classes and orientation formats.
 
 https://mujoco.readthedocs.io/en/stable/XMLreference.html: compiler, default, and the five ways to
 write a frame's orientation.
@@ -20,14 +20,14 @@ _TINY: Final = 1e-9
 
 
 class MjcfSettings:
-    """Everything outside the bodies that changes what a body's numbers mean.
+    """Settings outside the bodies that affect the meaning of their attributes.
 
     Args:
         root: the `mujoco` element.
 
     Raises:
-        InvalidInputError: a default class without name or given twice, Euler axes that are none.
-        UnknownNameError: a compiler setting with another value than the format has.
+        InvalidInputError: a default class without a name or given twice, or invalid Euler axes.
+        UnknownNameError: an invalid value of a compiler setting.
     """
 
     def __init__(self, root: Element) -> None:
@@ -48,7 +48,7 @@ class MjcfSettings:
     def _read_class(
         self, element: Element, name: str, inherited: dict[str, dict[str, str]]
     ) -> None:
-        # The main class may stand in several sections, every other one only once.
+        # The main class may appear in several sections, every other one only once.
         tags = {**inherited, **self._classes.get(name, {})}
         for child in element.children:
             if child.tag != "default":
@@ -61,10 +61,10 @@ class MjcfSettings:
             self._read_class(child, nested, tags)
 
     def with_defaults(self, element: Element, inherited_class: str) -> Element:
-        """The element with what its default class says where it says nothing.
+        """Apply the defaults of an element's class.
 
         Raises:
-            UnknownNameError: a class that the file does not have.
+            UnknownNameError: an unknown class.
         """
         name = element.attributes.get("class", inherited_class)
         if name not in self._classes:
@@ -76,7 +76,7 @@ class MjcfSettings:
         """T_parent_element [4, 4] of a body, frame or site: `pos` and one kind of orientation.
 
         Raises:
-            InvalidInputError: several orientations, or one that describes no rotation.
+            InvalidInputError: several orientations, or an invalid one.
         """
         position = element.numbers("pos", 3)
         return transform(self._rotation(element), np.array(position or (0.0, 0.0, 0.0)))
@@ -98,7 +98,7 @@ class MjcfSettings:
         R = np.eye(3)
         for axis, angle in zip(self._axes, values * self.radians_per_unit, strict=True):
             turn = rotation_from_vector(angle * np.eye(3)["xyz".index(axis.lower())])
-            # Lower case turns about the axes that turn along, upper case about the parent's.
+            # Lower case means intrinsic, upper case extrinsic rotations.
             R = R @ turn if axis.islower() else turn @ R
         return R
 
@@ -127,7 +127,7 @@ def _from_xy_axes(values: np.ndarray, _: MjcfSettings) -> np.ndarray | None:
 
 
 def _from_z_axis(values: np.ndarray, _: MjcfSettings) -> np.ndarray | None:
-    """The smallest turn that brings z there; half a turn is taken about x."""
+    """The smallest rotation of z to the given direction; a half turn is about x."""
     z = _unit(values)
     if z is None:
         return None

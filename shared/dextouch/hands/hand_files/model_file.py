@@ -1,4 +1,4 @@
-"""What URDF and MJCF have in common: links (bodies) in a tree, joined by fixed steps and joints."""
+"""Common interface of URDF and MJCF models: a tree of links with joints."""
 
 from collections.abc import Mapping
 from typing import NamedTuple, Protocol, runtime_checkable
@@ -12,13 +12,13 @@ class Joint(NamedTuple):
     """A joint in the frame of its link.
 
     Attributes:
-        name: as the model has it.
-        where: what messages about it begin with.
+        name: in the model.
+        where: prefix of error messages.
         anchor_m: a point of its axis in the link's frame.
         axis: unit vector in the link's frame.
-        limits_rad: lowest and highest angle; none where it is no limited hinge.
-        zero_rad: the angle at which the link stands as the file draws it.
-        refusal: why a finger cannot have this joint; none if it can.
+        limits_rad: lower and upper limit; None if it is not a limited hinge.
+        zero_rad: joint angle of the file's reference pose.
+        refusal: why a finger cannot contain this joint; None if it can.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Joint(NamedTuple):
 
 
 class Link(NamedTuple):
-    """A link: T_parent_link [4, 4] as drawn, and the joints that move it, in their order."""
+    """A link: T_parent_link [4, 4] in the reference pose, and its joints in order."""
 
     T_parent_link: np.ndarray
     joints: tuple[Joint, ...]
@@ -39,7 +39,7 @@ class Link(NamedTuple):
 
 @runtime_checkable
 class ModelFile(Protocol):
-    """A model whose links are read when asked for: only what a finger stands on has to be sound."""
+    """A model whose links are read lazily: only the links of fingers have to be valid."""
 
     @property
     def source(self) -> str:
@@ -48,18 +48,18 @@ class ModelFile(Protocol):
 
     @property
     def parents(self) -> Mapping[str, str | None]:
-        """Every link's parent; none of a root."""
+        """Parent of every link; None for a root."""
         ...
 
     @property
     def sites(self) -> tuple[str, ...]:
-        """Names of marked points (MJCF)."""
+        """Names of sites (MJCF)."""
         ...
 
     def link(self, name: str) -> Link:
-        """One of `parents`."""
+        """A link by name."""
         ...
 
     def site(self, name: str) -> tuple[str, np.ndarray]:
-        """The link of one of `sites`, and T_link_site [4, 4]."""
+        """The link of a site, and T_link_site [4, 4]."""
         ...

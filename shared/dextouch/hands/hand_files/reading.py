@@ -1,4 +1,4 @@
-"""Paths in, bytes of a regular file of bounded size out."""
+"""Size-limited reading of a regular file."""
 
 from pathlib import Path
 
@@ -6,13 +6,13 @@ from dextouch.errors import InvalidInputError, LimitExceededError, NotFoundError
 
 
 def read_bounded(path: Path, max_bytes: int) -> bytes:
-    """The whole file.
+    """Read a whole file.
 
     Raises:
-        NotFoundError: nothing there.
+        NotFoundError: no such file.
         InvalidInputError: a folder, pipe or device.
         LimitExceededError: larger than `max_bytes`.
-        StorageError: it cannot be read.
+        StorageError: not readable.
     """
     try:
         if not path.exists():

@@ -1,6 +1,6 @@
-"""URDF elements in, links with their joints out (https://wiki.ros.org/urdf/XML).
+"""URDF model reader: links with their joints (https://wiki.ros.org/urdf/XML).
 
-Defaults are the format's own: origin zero, axis x, lower and upper limit zero.
+Defaults follow the format: origin zero, axis x, lower and upper limit zero.
 """
 
 from typing import Final
@@ -23,8 +23,8 @@ class UrdfModel:
         root: the `robot` element.
 
     Raises:
-        InvalidInputError: no tree: names given twice, joints to links that are not there, a link
-            with two parents; or xacro that was not run.
+        InvalidInputError: not a tree (duplicate names, unknown links, a link with two parents), or
+            unprocessed xacro.
     """
 
     def __init__(self, root: Element) -> None:
@@ -70,7 +70,7 @@ class UrdfModel:
         """A link with the joint that moves it.
 
         Raises:
-            InvalidInputError: numbers that are none, an axis of zeros.
+            InvalidInputError: invalid numbers, or a zero axis.
         """
         element = self._joints.get(name)
         if element is None:
@@ -109,7 +109,7 @@ def _origin(joint: Element) -> np.ndarray:
     zeros = (0.0, 0.0, 0.0)
     roll, pitch, yaw = _three(origin, "rpy", zeros)
     turns = [[roll, 0, 0], [0, pitch, 0], [0, 0, yaw]]
-    # Fixed axes: first about x, then y, then z.
+    # Extrinsic rotations: about x, then y, then z.
     R_x, R_y, R_z = rotation_from_vector(np.array(turns, dtype=np.float64))
     return transform(R_z @ R_y @ R_x, _three(origin, "xyz", zeros))
 
