@@ -75,7 +75,7 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state
 		--cloned cloned=$(MADE)/cloned.safetensors --cloned "cloned early=$(MADE)/cloned_early.safetensors" \
 		--first-seed 30020 --repeats docs/evaluator.json --keep $(MADE)/evaluator --out $(MADE)/bench
 
-fix: $(VENV)/.dev        ## let the tools mend what they can
+fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 

@@ -1,1 +1,1 @@
-"""The command line: the one place that may know every service."""
+"""Command line `dextouch`, the only package that imports every service."""

@@ -1,4 +1,4 @@
-"""This machine in; a table of what DexTouch can do on it, and what to install for the rest, out."""
+"""Command `dextouch doctor`: checks what DexTouch can do on this machine."""
 
 import argparse
 import ctypes.util
@@ -16,7 +16,7 @@ from services.cli.extras import install_hint
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that was looked at."""
+    """Result of one check."""
 
     what: str
     found: str
@@ -40,7 +40,7 @@ _PACKAGES = {
 
 
 def examine() -> list[Finding]:
-    """Look at Python, packages, disk, devices and optional programs; changes nothing."""
+    """Check Python, packages, disk, devices and optional programs, without changing anything."""
     version = platform.python_version()
     findings = [
         Finding("Python", version, ok=version.startswith("3.11"), do="install Python 3.11"),
@@ -73,9 +73,9 @@ def _with_access(device: Path) -> str:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Print the findings; exit 1 when something needed is missing."""
+    """Print the findings; returns 1 if something required is missing."""
     parser = argparse.ArgumentParser(prog="dextouch doctor", description=__doc__)
-    parser.add_argument("--json", type=Path, help="write the findings here")
+    parser.add_argument("--json", type=Path, help="write the findings to this JSON file")
     arguments = parser.parse_args(list(argv))
     findings = examine()
     width = max(len(finding.what) for finding in findings)

@@ -1,4 +1,4 @@
-"""`dextouch export …` and `dextouch import …`: a store in, files of other tools out, and back."""
+"""Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
 import json
@@ -50,7 +50,7 @@ What each format keeps and loses: docs/bridges.md
 
 
 class _Single(NamedTuple):
-    """A format with one file an episode or recording."""
+    """A format with one file per episode or recording."""
 
     suffix: str
     export: Callable[[Reader, Path, argparse.Namespace], int]
@@ -88,10 +88,10 @@ _JOINT = {"umi": _export_umi, "lerobot": _export_lerobot}
 
 @contextmanager
 def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
-    """Put an existing data set aside; it comes back if the new one fails.
+    """Replace an existing data set, restoring it if the new one fails.
 
     Raises:
-        ConflictError: the folder exists and may not, or must not, be replaced.
+        ConflictError: the folder exists and must not be replaced.
     """
     if not folder.exists():
         yield
@@ -113,7 +113,7 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
 
 
 def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
-    """The named ids, or those that pass the filters.
+    """The given ids, or those that match the filters.
 
     Raises:
         InvalidInputError: both ids and filters, or an id twice.
@@ -145,7 +145,7 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
 
 
 def _progress(items: Iterable[str], total: int, what: str) -> Iterable[str]:
-    """The items, with a bar on stderr where somebody looks at it."""
+    """Iterate with a progress bar on stderr, if it is a terminal."""
     console = Console(stderr=True)
     return track(
         items, total=total, description=what, console=console, disable=not console.is_terminal
@@ -223,7 +223,7 @@ def _import(options: argparse.Namespace) -> Report:
 
 
 def main(argv: Sequence[str]) -> int:
-    """`dextouch export` and `dextouch import`, told apart by the first word."""
+    """Run `dextouch export` or `dextouch import`, selected by the first argument."""
     word, *rest = argv
     options = (_export_parser() if word == "export" else _import_parser()).parse_args(rest)
     report = _export(options) if word == "export" else _import(options)
@@ -248,7 +248,7 @@ def _parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
 
 def _export_parser() -> argparse.ArgumentParser:
     parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
-    parser.add_argument("ids", nargs="*", metavar="ID", help="all that match when none is named")
+    parser.add_argument("ids", nargs="*", metavar="ID", help="default: all that match the filters")
     parser.add_argument("--format", required=True, choices=sorted([*_SINGLE, *_JOINT]))
     parser.add_argument(
         "--to", required=True, type=Path, metavar="PATH", help="file; mcap and rrd: or a folder"
@@ -257,12 +257,12 @@ def _export_parser() -> argparse.ArgumentParser:
     parser.add_argument("--task", help="only of this task")
     parser.add_argument("--domain", choices=("human", "robot"), help="only of this domain")
     parser.add_argument("--operator", help="only of this operator")
-    parser.add_argument("--force", action="store_true", help="replace what is there")
+    parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.add_argument(
         "--jpeg-quality",
         type=int,
         metavar="1…100",
-        help="mcap: rgb8 images as JPEG; without it they stay exact",
+        help="mcap: encode rgb8 images as JPEG (default: lossless)",
     )
     parser.add_argument("--fps", type=int, help="lerobot: frames a second (the model rate)")
     parser.add_argument(
@@ -278,11 +278,11 @@ def _import_parser() -> argparse.ArgumentParser:
     parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
     parser.add_argument("path", type=Path, help="file or folder to read")
     parser.add_argument("--format", required=True, choices=("lerobot", "mcap", "umi"))
-    parser.add_argument("--id-prefix", default="", help="lerobot: put before every id")
+    parser.add_argument("--id-prefix", default="", help="lerobot: prefix of every id")
     parser.add_argument(
         "--images",
         choices=("h264", "jpeg", "rgb8"),
         default="h264",
-        help="lerobot: how images are stored (%(default)s)",
+        help="lerobot: unit of stored images (%(default)s)",
     )
     return parser

@@ -1,8 +1,8 @@
-"""Which optional extra brings a package, for messages about one that is not installed."""
+"""Optional extra that provides each package, for messages about missing ones."""
 
 from dextouch.errors import DexTouchError, UnavailableError
 
-# By the name under which a package is imported; of several extras, the one it matters most to.
+# By import name; the most relevant one of several extras.
 EXTRA_OF = {
     "zarr": "store",
     "zstandard": "store",
@@ -39,16 +39,16 @@ EXTRA_OF = {
 
 
 def install_hint(package: str) -> str:
-    """The command that installs what brings a package."""
+    """The command that installs a package through its extra."""
     return f"pip install 'dextouch-wm[{EXTRA_OF[package]}]'"
 
 
 def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouchError | None:
-    """What to say of a package that is not installed; None where no extra brings it.
+    """Error for a missing package; None if no extra provides it.
 
     Args:
         error: of the import.
-        otherwise: what else may be done.
+        otherwise: an alternative to mention.
     """
     package = (error.name or "").partition(".")[0]
     if package not in EXTRA_OF:

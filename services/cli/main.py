@@ -1,4 +1,4 @@
-"""`dextouch COMMAND …` in, the command's exit status out; errors we raise become one clear line."""
+"""Entry point `dextouch COMMAND`: dispatches to commands and prints errors as one line."""
 
 import importlib
 import sys
@@ -11,9 +11,9 @@ from services.cli.extras import missing_package
 
 
 class Command(NamedTuple):
-    """One word of the command line: the module whose `main(argv)` does it, and what it does.
+    """A command: the module whose `main(argv)` runs it, and its summary.
 
-    `before` are words put before the arguments.
+    `before` are words inserted before the arguments.
     """
 
     module: str
@@ -24,9 +24,9 @@ class Command(NamedTuple):
 COMMANDS = {
     "demo": Command("services.cli.demo", "record, align, imagine and score on this machine"),
     "up": Command("services.cli.up", "run every service in one process, with a dashboard"),
-    "doctor": Command("services.cli.doctor", "say what this machine can do and what is missing"),
+    "doctor": Command("services.cli.doctor", "check what this machine can do and what is missing"),
     "twin": Command(
-        "services.twin.__main__", "record truth episodes in the physics twin, or serve it"
+        "services.twin.__main__", "record true episodes in the physics twin, or serve it"
     ),
     "station": Command("services.acquisition.__main__", "record gloves, trackers and cameras"),
     "store": Command(
@@ -48,12 +48,10 @@ COMMANDS = {
         "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
     ),
     "bench": Command("services.cli.bench", "time a stage against its error, beside its rivals"),
-    "stress": Command(
-        "services.cli.stress.command", "feed every stage what breaks numerical code; tell what held"
-    ),
+    "stress": Command("services.cli.stress.command", "check every stage against numerical hazards"),
 }
 
-# A second word that another module does.
+# Subcommands that are implemented by another module.
 INNER_COMMANDS = {
     ("station", "calibrate"): Command(
         "services.cli.calibrate", "measure tare and gain, lenses and mounts"
@@ -84,17 +82,17 @@ def usage() -> str:
 
 
 def find_command(name: str, rest: Sequence[str]) -> tuple[str, Command, list[str]]:
-    """The command that words mean.
+    """Resolve a command.
 
     Args:
         name: of `COMMANDS`.
-        rest: what stands behind it.
+        rest: the remaining arguments.
 
     Returns:
-        The words of the command, what does it, and what is left for it.
+        Full name of the command, the command, and its arguments.
 
     Raises:
-        UnknownNameError: a word behind a command that takes flags and a few words only.
+        UnknownNameError: an unknown subcommand.
     """
     inner = {word: command for (outer, word), command in INNER_COMMANDS.items() if outer == name}
     first = rest[0] if rest else ""
@@ -111,7 +109,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command.
 
     Returns:
-        Its exit status; 2 for a word we do not know, 3 for a refusal with a reason on stderr.
+        Its exit status; 2 for an unknown command, 3 for a refusal with its reason on stderr.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in {"-h", "--help", "help"}:
@@ -128,7 +126,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _run(name: str, rest: list[str]) -> int:
-    """One command's exit status; a refusal and a package that is not installed are one line."""
+    """Run one command; a refusal or a missing package is printed as one line."""
     try:
         name, command, rest = find_command(name, rest)
         module = importlib.import_module(command.module)

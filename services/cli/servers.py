@@ -1,4 +1,4 @@
-"""Several service applications in, all of them served from one event loop until told to stop."""
+"""Several service applications served from one event loop until stopped."""
 
 import asyncio
 import signal
@@ -17,14 +17,14 @@ BACKLOG = 128
 
 
 class Server(uvicorn.Server):
-    """One service; signals belong to whoever runs all of them."""
+    """Server of one service that leaves signal handling to its owner."""
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)
         self.answers = asyncio.Event()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Start, and say when that is done.
+        """Start and signal completion.
 
         Raises:
             UnavailableError: the service's own start failed; its log says why.
@@ -43,30 +43,31 @@ class Server(uvicorn.Server):
 
 @dataclass(frozen=True)
 class Place:
-    """A bound socket: the URL is known before the service exists, so others can be told it."""
+    """A bound socket, whose URL is known before the service exists."""
 
     name: str
     socket: socket.socket
 
     @property
     def url(self) -> str:
-        """Where the service answers."""
+        """URL of the service."""
         host, port = self.socket.getsockname()[:2]
         return f"http://{host}:{port}"
 
 
 def bind(name: str, *, host: str, port: int) -> Place:
-    """Take a port; 0 takes any free one.
+    """Bind a port; 0 selects a free one.
 
     Raises:
-        ConflictError: the port is taken, or this host is not ours.
+        ConflictError: the port is in use, or the host is not local.
     """
-    # The protocol is named so that asyncio switches Nagle off; else every answer takes 40 ms.
+    # The protocol is explicit so that asyncio sets TCP_NODELAY; otherwise every response takes 40
+    # ms.
     listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM, socket.IPPROTO_TCP)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        # At once: until somebody listens there, others could bind the same port.
+        # At once: until the socket listens, others could bind the same port.
         listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
@@ -84,10 +85,10 @@ async def serve_all(
     ready: asyncio.Event,
     grace_s: int = 10,
 ) -> None:
-    """Serve until `stop` is set; set `ready` once all of them answer.
+    """Serve until `stop` is set; sets `ready` once all services respond.
 
     Raises:
-        UnavailableError: a service ended by itself; the others were stopped in order.
+        UnavailableError: a service terminated unexpectedly; the others were shut down.
     """
     servers = {place.name: _server(app, grace_s) for place, app in placed}
     tasks = {
@@ -98,7 +99,7 @@ async def serve_all(
     announcing = asyncio.create_task(_announce(list(servers.values()), ready))
     await asyncio.wait([stopping, *tasks.values()], return_when=asyncio.FIRST_COMPLETED)
     ended = [name for name, task in tasks.items() if task.done()]
-    # In reverse: readers go before what they read from.
+    # In reverse, so that clients stop before the services they use.
     for name in reversed(list(servers)):
         servers[name].should_exit = True
         await asyncio.wait([tasks[name]])

@@ -1,4 +1,4 @@
-"""`dextouch up`: flags in; every service in this one process, its address on the terminal, out."""
+"""Command `dextouch up`: runs every service in one process and prints their addresses."""
 
 import asyncio
 import json
@@ -25,12 +25,11 @@ Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
 
 
 class UpSettings(BaseSettings):
-    """Where data goes and which ports are taken; 0 takes any free one.
+    """Data folder and ports of the services; port 0 selects a free one.
 
-    A port that was asked for must be free; a default that is taken gives way to any free one.
-
-    Everything that is recorded lies below `data`. Mock devices play episode `mock_episode_id` of
-    this store, or a made-up pattern when none is named.
+    An explicit port must be free; a default port in use is replaced by a free one. All data is
+    stored below `data`. Mock devices replay episode `mock_episode_id` of this store, or a synthetic
+    pattern by default.
     """
 
     model_config = SettingsConfigDict(
@@ -47,10 +46,8 @@ class UpSettings(BaseSettings):
     )
     station: str = Field(default="mock station", min_length=1, max_length=64)
     mock_episode_id: str | None = None
-    align_new: bool = Field(
-        default=True, description="turn saved takes into episodes by themselves"
-    )
-    without: tuple[str, ...] = Field(default=(), description="services to leave out")
+    align_new: bool = Field(default=True, description="align saved takes automatically")
+    without: tuple[str, ...] = Field(default=(), description="services not to start")
     dashboard_port: int = Field(default=8080, ge=0, le=65535)
     episode_store_port: int = Field(default=8081, ge=0, le=65535)
     alignment_port: int = Field(default=8082, ge=0, le=65535)
@@ -61,11 +58,11 @@ class UpSettings(BaseSettings):
     json_path: Path | None = Field(
         default=None,
         validation_alias=AliasChoices("json"),
-        description="write the addresses there once all services answer",
+        description="write the addresses to this file once all services respond",
     )
 
     def port(self, name: str) -> int:
-        """The wanted port of a service."""
+        """Configured port of a service."""
         ports: dict[str, int] = self.model_dump()
         return ports[f"{name}_port"]
 
@@ -78,14 +75,14 @@ def main(argv: Sequence[str]) -> int:
 
 
 async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
-    """Compose and serve; `stop` ends it from inside (tests), signals from outside."""
+    """Build and serve all services until `stop` is set (tests) or a signal arrives."""
     if stop is None:
         stop = asyncio.Event()
         stop_on_signals(stop)
     builders = _wanted(settings)
     with ExitStack() as held:
         bound = {}
-        # Ports that were asked for first, lest another service's default takes one of them.
+        # Explicit ports first, so that no default takes one of them.
         for name in sorted(
             builders, key=lambda name: f"{name}_port" not in settings.model_fields_set
         ):
@@ -148,7 +145,7 @@ async def _announce(
         settings.json_path.write_text(json.dumps(urls, indent=2) + "\n", encoding="utf-8")
 
 
-# Services are imported when they are built: `dextouch --help` stays light.
+# Services are imported lazily, to keep `dextouch --help` fast.
 
 
 def _episode_store(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
@@ -217,7 +214,7 @@ def _store_url(settings: UpSettings) -> str:
     return str(settings.data / "store")
 
 
-# In the order in which data flows; stopped in reverse.
+# In the order of the data flow; stopped in reverse.
 BUILDERS: Mapping[str, Builder] = {
     "episode_store": _episode_store,
     "alignment": _alignment,

@@ -1,1 +1,1 @@
-"""The operators' page: health, touch and recorder of a station, from the other services' APIs."""
+"""Operators' web page: health, touch and recorder of a station, fed by the services' APIs."""

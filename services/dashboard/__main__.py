@@ -1,4 +1,4 @@
-"""`python -m services.dashboard`: settings from flags and environment in, a running service out."""
+"""Entry point `python -m services.dashboard`, which serves the operators' page."""
 
 import sys
 from collections.abc import Sequence

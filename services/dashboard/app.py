@@ -1,4 +1,4 @@
-"""Settings in, the dashboard's application out."""
+"""Application factory of the dashboard."""
 
 import asyncio
 from collections.abc import AsyncIterator, Mapping
@@ -24,11 +24,11 @@ STATIC = Path(__file__).parent / "static"
 def create_app(
     settings: DashboardSettings, upstreams: Mapping[str, Upstream] | None = None
 ) -> FastAPI:
-    """The page and what feeds it.
+    """Create the dashboard's application.
 
     Args:
-        settings: which services are shown, and who may look.
-        upstreams: the services to read; made from the settings' URLs when not given.
+        settings: services to show, and access control.
+        upstreams: clients of the services; created from the settings' URLs by default.
     """
     if upstreams is None:
         upstreams = {

@@ -1,4 +1,4 @@
-"""The other services' APIs in, the page's topics out: cached, never waiting for a viewer."""
+"""Data feeds of the page, polled from the other services and cached for all viewers."""
 
 import asyncio
 from collections.abc import Mapping
@@ -29,7 +29,7 @@ NUM_TAKES = 6
 
 
 class Feeds:
-    """Everything the page shows, read from the services that are there."""
+    """Reads everything that the page shows from the configured services."""
 
     def __init__(self, upstreams: Mapping[str, Upstream], settings: DashboardSettings) -> None:
         self._upstreams = upstreams
@@ -44,7 +44,7 @@ class Feeds:
         self.topics = {topic.name: topic for topic in topics}
 
     def upstream(self, name: str) -> Upstream:
-        """The service of that name.
+        """Client of a service by name.
 
         Raises:
             NotFoundError: this dashboard was started without its URL.
@@ -57,7 +57,7 @@ class Feeds:
         return self._upstreams[name]
 
     async def station(self) -> StationView:
-        """Streams and recorder of the station, or why it does not answer."""
+        """Streams and recorder of the station, or why it is unreachable."""
         try:
             acquisition = self.upstream("acquisition")
             health, recorder = await asyncio.gather(
@@ -69,7 +69,7 @@ class Feeds:
             return unreachable_station(error.message)
 
     async def services(self) -> list[ServiceView]:
-        """Whether each service would take work."""
+        """Readiness of each service."""
         names = list(self._upstreams)
         answers = await asyncio.gather(*(self._upstreams[name].ready() for name in names))
         return [
@@ -78,7 +78,7 @@ class Feeds:
         ]
 
     async def takes(self) -> TakesView:
-        """The newest recordings and episodes, and takes of the station that are refused."""
+        """The newest recordings and episodes, and takes that the store refused."""
         stored, refused = await asyncio.gather(self._stored(), self._refused())
         return stored.model_copy(update={"refused": refused})
 
@@ -90,7 +90,7 @@ class Feeds:
             return ()  # the station topic tells why
 
     async def _stored(self) -> TakesView:
-        """The newest first, or why there are none."""
+        """Stored takes, newest first, or why there are none."""
         if "episode_store" not in self._upstreams:
             return TakesView(
                 note="This dashboard was started without DEXTOUCH_DASHBOARD_EPISODE_STORE_URL: "
@@ -101,7 +101,7 @@ class Feeds:
             recordings = await store_api.newest_recordings(store, NUM_TAKES)
             episodes = await store_api.newest_episodes(store, NUM_TAKES)
             known = self._clocks
-            # An episode never changes: each is asked about once.
+            # Episodes are immutable: each is queried once.
             self._clocks = {
                 item.episode_id: known[item.episode_id]
                 if item.episode_id in known
@@ -118,13 +118,13 @@ class Feeds:
         return TakesView(takes=takes, note="" if takes else "Nothing stored yet.")
 
     async def operate(self, action: str, body: Mapping[str, Any]) -> dict[str, object]:
-        """One recorder action; the recorder's new state."""
+        """Perform a recorder action and return the recorder's new state."""
         path = station_api.action_path(action)
         answer = await self.upstream("acquisition").json("POST", path, body=body)
         return station_api.recorder_view(answer).model_dump()
 
     async def retry(self, recording_id: str) -> None:
-        """Let the station send a take again that the store refused."""
+        """Make the station upload a refused take again."""
         path = station_api.retry_path(recording_id)
         await self.upstream("acquisition").json("POST", path)
 

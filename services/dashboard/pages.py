@@ -1,4 +1,4 @@
-"""The pages for people: the station, signing in and out, and what is refused, in words."""
+"""HTML pages: the station, signing in and out, and refusals."""
 
 from pathlib import Path
 from urllib.parse import parse_qs
@@ -20,18 +20,18 @@ CONTENT_SECURITY_POLICY = (
 PAGE_HEADERS = {
     "content-security-policy": CONTENT_SECURITY_POLICY,
     "x-content-type-options": "nosniff",
-    # Under "no-referrer" browsers post the sign-in with "Origin: null", which is refused.
+    # With "no-referrer", browsers send the sign-in with "Origin: null", which is refused.
     "referrer-policy": "same-origin",
     "cache-control": "no-store",
 }
-# Jinja2 escapes everything it fills in; no part of a page is built from strings elsewhere.
+# Jinja2 escapes all values; no HTML is built from strings elsewhere.
 TEMPLATES = Environment(
     loader=FileSystemLoader(Path(__file__).parent / "templates"), autoescape=True
 )
 
 
 def page_router() -> APIRouter:
-    """The station's page, signing in and signing out."""
+    """Router of the HTML pages."""
     router = APIRouter(include_in_schema=False)
 
     @router.get("/")
@@ -75,7 +75,7 @@ def page_router() -> APIRouter:
 
 
 def refusal_page(request: Request, error: DexTouchError) -> Response:
-    """What a person sees instead of problem+json."""
+    """HTML page of a refusal, in place of problem+json."""
     return _page(request, "refused.html", status_of(error), reason=error.message)
 
 

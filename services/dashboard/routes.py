@@ -1,4 +1,4 @@
-"""What the page asks for: its data, its live websocket and its recorder buttons."""
+"""HTTP and WebSocket routes of the page: data, live updates and recorder actions."""
 
 import asyncio
 import json
@@ -30,17 +30,17 @@ from services.dashboard.views import heatmap_layout
 
 MAX_VIEW_CHARACTERS = 1000
 WEBSOCKET_REFUSED = 1008
-# A session that ends closes its live link so soon.
+# Interval at which a WebSocket checks that its session is still valid.
 SESSION_CHECK_S = 1.0
-# As streams are named (dextouch.streams.descriptors).
+# Same pattern as stream names (dextouch.streams.descriptors).
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
 
 class RecorderRequest(BaseModel):
-    """What an operator sends with an action: a prompt with `arm`, an outcome with `save`.
+    """Body of a recorder action: a prompt for `arm`, an outcome for `save`.
 
-    `success` is true, false or null (not judged); `save` needs one of them said. `recording_id`
-    names the take that the action is meant for.
+    `success` is true, false or null (not judged), and required for `save`. `recording_id` is the
+    take that the action refers to.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -56,14 +56,14 @@ class RecorderRequest(BaseModel):
 
 
 def guard(connection: HTTPConnection) -> None:
-    """Refuse browsers that did not sign in."""
+    """Refuse browsers that are not signed in."""
     sessions: Sessions = connection.app.state.sessions
     if not sessions.allows(connection):
         raise not_signed_in()
 
 
 def api_router(settings: DashboardSettings) -> APIRouter:
-    """What the page asks for."""
+    """Router of the page's data and actions."""
     router = APIRouter(prefix="/v1", dependencies=[Depends(guard)], tags=["dashboard"])
     layout = heatmap_layout()
 
@@ -74,7 +74,7 @@ def api_router(settings: DashboardSettings) -> APIRouter:
 
     @router.get("/overview")
     async def overview(request: Request) -> JSONResponse:
-        """What the page shows, once, as JSON."""
+        """Everything that the page shows, as JSON."""
         feeds: Feeds = request.app.state.feeds
         station, services, takes = await asyncio.gather(
             feeds.station(), feeds.services(), feeds.takes()
@@ -94,7 +94,7 @@ def api_router(settings: DashboardSettings) -> APIRouter:
     async def operate(
         action: str, request: Request, wanted: Annotated[RecorderRequest, Body()]
     ) -> JSONResponse:
-        """Arm, record, stop, save or discard; answers with the recorder's new state."""
+        """Arm, record, stop, save or discard; returns the recorder's new state."""
         if action == "save" and "success" not in wanted.model_fields_set:
             raise InvalidInputError(
                 "save: got no outcome, expected success: true, false or null (not judged)"
@@ -104,7 +104,7 @@ def api_router(settings: DashboardSettings) -> APIRouter:
 
     @router.post("/uploads/{recording_id}/retry", status_code=204)
     async def retry(recording_id: str, request: Request) -> None:
-        """Send a take again that the store refused."""
+        """Upload a refused take again."""
         feeds: Feeds = request.app.state.feeds
         await feeds.retry(recording_id)
 
@@ -119,7 +119,7 @@ def api_router(settings: DashboardSettings) -> APIRouter:
 
 
 def live_router() -> APIRouter:
-    """The live link: the page says what is in view, news of that is sent until it leaves."""
+    """WebSocket router: the page subscribes to the topics in view and receives their updates."""
     router = APIRouter()
 
     @router.websocket("/v1/live")
@@ -146,7 +146,7 @@ def live_router() -> APIRouter:
 
 
 async def _send_news(websocket: WebSocket, viewer: Viewer) -> None:
-    """Send until the session ends."""
+    """Send updates until the session ends."""
     messages: list[Message] = []
     try:
         while True:
@@ -164,7 +164,7 @@ async def _send_news(websocket: WebSocket, viewer: Viewer) -> None:
 
 
 def _view(text: str) -> list[str]:
-    """The topics a page asks for; what does not fit asks for nothing."""
+    """Parse the topics that a page subscribes to; invalid messages give none."""
     if len(text) > MAX_VIEW_CHARACTERS:
         return []
     try:

@@ -1,4 +1,4 @@
-"""Sessions of browsers that signed in with a key."""
+"""Browser sessions, opened with a key."""
 
 import secrets
 import time
@@ -14,7 +14,7 @@ MAX_SESSIONS = 1000
 
 
 class Sessions:
-    """Who may see and operate: everyone on loopback without keys, else browsers that signed in."""
+    """Access of browsers: open on loopback without keys, otherwise by signing in."""
 
     def __init__(
         self,
@@ -31,7 +31,7 @@ class Sessions:
         self._ends_s: dict[str, float] = {}
 
     def sign_in(self, key: str) -> str:
-        """A new session's token for a key with the scope `operate`.
+        """Open a session with a key of scope `operate` and return its token.
 
         Raises:
             AccessDeniedError: an unknown key or one without the scope.
@@ -46,11 +46,11 @@ class Sessions:
         return token
 
     def sign_out(self, connection: HTTPConnection) -> None:
-        """End the session of this browser; its cookie opens nothing any more."""
+        """End the session of this browser and invalidate its cookie."""
         self._ends_s.pop(connection.cookies.get(COOKIE, ""), None)
 
     def allows(self, connection: HTTPConnection) -> bool:
-        """Whether this request or websocket comes from a session that is still open."""
+        """Whether a request or WebSocket belongs to an open session."""
         if not self.needs_key:
             return True
         return self._ends_s.get(connection.cookies.get(COOKIE, ""), 0.0) > self._clock_s()

@@ -1,4 +1,4 @@
-"""Environment and flags in (DEXTOUCH_DASHBOARD_…), where the dashboard finds the services out."""
+"""Settings of the dashboard, from flags and DEXTOUCH_DASHBOARD_… variables."""
 
 from pydantic import Field, SecretStr
 
@@ -6,10 +6,10 @@ from dextouch.serving.settings import ServiceSettings, service_config
 
 
 class DashboardSettings(ServiceSettings):
-    """Which services the page shows; one without a URL is left out.
+    """URLs of the services to show; a service without URL is omitted.
 
-    `upstream_key` is the bearer key that the other services ask for. Browsers reach the page under
-    loopback names and those of `allowed_hosts`.
+    `upstream_key` is the bearer key of the other services. Browsers reach the page under loopback
+    names and those of `allowed_hosts`.
     """
 
     model_config = service_config("dashboard")
@@ -29,7 +29,7 @@ class DashboardSettings(ServiceSettings):
     session_hours: float = Field(default=12.0, gt=0, le=24 * 30)
 
     def upstream_urls(self) -> dict[str, str]:
-        """The services that are there, by name, in the order in which data flows."""
+        """Configured services by name, in the order of the data flow."""
         urls = {
             "acquisition": self.acquisition_url,
             "episode_store": self.episode_store_url,

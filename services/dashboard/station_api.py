@@ -1,4 +1,4 @@
-"""The acquisition service's answers in, the station as the page shows it out."""
+"""Client side of the acquisition API: parses its responses and converts them to views."""
 
 from collections.abc import Sequence
 from typing import TypeVar
@@ -30,13 +30,13 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 class _Answer(BaseModel):
-    """Fields the page does not know are none of its business."""
+    """Base of response models; unknown fields are ignored."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
 
 class HealthFinding(_Answer):
-    """Something wrong with a stream, or with the station itself: its disk, its calibration."""
+    """A problem of a stream or of the station (disk, calibration)."""
 
     level: Level
     message: str
@@ -45,7 +45,7 @@ class HealthFinding(_Answer):
 
 
 class StreamHealth(_Answer):
-    """One stream as acquisition judges it; clock figures only where a clock is being fitted."""
+    """Health of a stream; clock figures only if a clock is fitted."""
 
     stream: str
     device: str
@@ -61,7 +61,7 @@ class StreamHealth(_Answer):
 
 
 class DeviceHealth(_Answer):
-    """One device."""
+    """Health of a device."""
 
     device: str
     reconnects: int = 0
@@ -70,7 +70,7 @@ class DeviceHealth(_Answer):
 
 
 class StationHealth(_Answer):
-    """All streams and devices, and what is wrong with the station itself."""
+    """Health of all streams and devices, and problems of the station."""
 
     findings: tuple[HealthFinding, ...] = ()
     streams: tuple[StreamHealth, ...]
@@ -78,21 +78,21 @@ class StationHealth(_Answer):
 
 
 class TakeProblem(_Answer):
-    """Something found in a take right after its end."""
+    """A problem found by the check after a take."""
 
     level: str
     message: str
 
 
 class TakeCheck(_Answer):
-    """Whether a take is complete."""
+    """Result of the check after a take."""
 
     complete: bool
     problems: tuple[TakeProblem, ...] = ()
 
 
 class RecorderStatus(_Answer):
-    """Where the recorder stands."""
+    """State of the recorder."""
 
     state: str
     actions: tuple[str, ...]
@@ -114,10 +114,10 @@ class CameraList(_Answer):
 
 
 def action_path(action: str) -> str:
-    """Where an action is asked for.
+    """Path of a recorder action.
 
     Raises:
-        UnknownNameError: no action of the recorder.
+        UnknownNameError: no such action.
     """
     if action not in ALL_ACTIONS:
         raise UnknownNameError("recorder action", action, list(ALL_ACTIONS))
@@ -125,15 +125,15 @@ def action_path(action: str) -> str:
 
 
 def camera_path(name: str) -> str:
-    """Where the newest image of a camera is."""
+    """Path of the newest image of a camera."""
     return f"{CAMERAS_PATH}/{name}"
 
 
 def station_view(health: object, recorder: object) -> StationView:
-    """The station from the answers at HEALTH_PATH and RECORDER_PATH.
+    """Build the station view from the responses of HEALTH_PATH and RECORDER_PATH.
 
     Raises:
-        UnavailableError: answers in a form this version does not know.
+        UnavailableError: responses of an unknown form.
     """
     station = _read(StationHealth, health)
     devices = {device.device: device for device in station.devices}
@@ -154,11 +154,12 @@ def station_view(health: object, recorder: object) -> StationView:
 
 
 def recorder_view(answer: object) -> RecorderView:
-    """The recorder from its own answer."""
+    """Build the recorder view from its response."""
     recorder = _read(RecorderStatus, answer)
     check = recorder.check
     found = sorted(check.problems, key=lambda problem: problem.level) if check else []
-    # What the check found is also among the problems: say it once. ERROR sorts before WARN.
+    # Findings of the check are repeated among the problems: list each once. ERROR sorts before
+    # WARN.
     checked = [problem.message for problem in found]
     own = [message for message in recorder.problems if message not in checked]
     problems = tuple(dict.fromkeys([*own, *checked]))
@@ -185,17 +186,17 @@ def recorder_view(answer: object) -> RecorderView:
 
 
 def retry_path(recording_id: str) -> str:
-    """Where a take is sent again."""
+    """Path for uploading a refused take again."""
     return f"/v1/uploads/{quote(recording_id, safe='')}/retry"
 
 
 def refused_views(answer: object) -> tuple[RefusedView, ...]:
-    """The takes that the store refused from the answer at REFUSED_PATH."""
+    """Build the views of refused takes from the response of REFUSED_PATH."""
     return _read(RefusedList, answer).root
 
 
 def camera_views(answer: object) -> list[CameraView]:
-    """The cameras from the answer at CAMERAS_PATH."""
+    """Build the camera views from the response of CAMERAS_PATH."""
     return list(_read(CameraList, answer).cameras)
 
 
@@ -227,7 +228,7 @@ def _stream_view(item: StreamHealth, device: DeviceHealth | None) -> StreamView:
 
 
 def _summary(streams: Sequence[StreamView]) -> str:
-    """How many streams are at each level, and which devices are in trouble."""
+    """Number of streams at each level, and the devices with problems."""
     parts = []
     for level in ("ERROR", "STALE", "WARN", "OK"):
         devices = [stream.device for stream in streams if stream.level == level]

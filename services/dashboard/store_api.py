@@ -1,4 +1,4 @@
-"""The episode store's answers in, the newest takes as the page shows them out."""
+"""Client side of the episode store API: the newest takes as views."""
 
 from collections.abc import Mapping
 from typing import TypeVar
@@ -19,19 +19,19 @@ ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
 async def newest_recordings(store: Upstream, count: int) -> list[RecordingSummary]:
-    """The last recordings by id, latest first."""
+    """The last recordings by id, in descending order."""
     page = await _last_page(store, RECORDINGS_PATH, count, RecordingList)
     return list(reversed(page.recordings))
 
 
 async def newest_episodes(store: Upstream, count: int) -> list[EpisodeSummary]:
-    """The last episodes by id, latest first."""
+    """The last episodes by id, in descending order."""
     page = await _last_page(store, EPISODES_PATH, count, EpisodeList)
     return list(reversed(page.episodes))
 
 
 async def clock_words(store: Upstream, episode_id: str) -> str:
-    """How well the clocks of an episode were fitted; empty where none were."""
+    """Summary of an episode's clock fits; empty if there are none."""
     answer = await store.json("GET", f"{EPISODES_PATH}/{episode_id}")
     clocks = _read(EpisodeDetail, answer).attributes.clocks
     residuals_ms = [clock.residual_rms_ms for clock in clocks if clock.residual_rms_ms is not None]
@@ -47,7 +47,7 @@ async def clock_words(store: Upstream, episode_id: str) -> str:
 
 
 def recording_view(item: RecordingSummary) -> TakeView:
-    """A recording as the page shows it."""
+    """View of a recording."""
     num_samples = sum(item.num_samples.values())
     return TakeView(
         kind="recording",
@@ -62,7 +62,7 @@ def recording_view(item: RecordingSummary) -> TakeView:
 
 
 def episode_view(item: EpisodeSummary, clocks: Mapping[str, str]) -> TakeView:
-    """An episode as the page shows it."""
+    """View of an episode."""
     return TakeView(
         kind="episode",
         name=item.episode_id,
@@ -77,7 +77,7 @@ def episode_view(item: EpisodeSummary, clocks: Mapping[str, str]) -> TakeView:
 
 
 async def _last_page(store: Upstream, path: str, count: int, model: type[ModelT]) -> ModelT:
-    """The store lists by id, oldest first: ask how many there are, then for the last of them."""
+    """Last page of a list, which the store sorts by id in ascending order."""
     first = await store.json("GET", f"{path}?limit={count}")
     total = first.get("num_matching", 0) if isinstance(first, dict) else 0
     if not isinstance(total, int) or total <= count:

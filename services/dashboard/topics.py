@@ -1,4 +1,4 @@
-"""What a viewer looks at in, its newest messages out: fetched only while someone looks."""
+"""Live topics of the page, polled only while they have viewers."""
 
 import asyncio
 import json
@@ -9,18 +9,18 @@ import structlog
 
 logger = structlog.get_logger(__name__)
 
-# What goes over a websocket: text (JSON) or bytes.
+# A WebSocket message: text (JSON) or bytes.
 Message = str | bytes
 Fetch = Callable[[], Awaitable[list[Message]]]
 
 
 def topic_message(topic: str, data: object) -> str:
-    """One JSON message of the live link."""
+    """Encode a message of a topic as JSON."""
     return json.dumps({"topic": topic, "data": data}, allow_nan=False, separators=(",", ":"))
 
 
 class Topic:
-    """One kind of news: its newest messages, fetched every period while it has viewers."""
+    """A topic: its newest messages, fetched every period while it has viewers."""
 
     def __init__(self, name: str, period_s: float, fetch: Fetch) -> None:
         self.name = name
@@ -32,19 +32,19 @@ class Topic:
         self._wanted = asyncio.Event()
 
     def add(self, viewer: "Viewer") -> None:
-        """Someone looks; what is known is sent at once."""
+        """Add a viewer, which gets the current messages at once."""
         self._viewers.add(viewer)
         self._wanted.set()
         viewer.changed.set()
 
     def remove(self, viewer: "Viewer") -> None:
-        """Nobody is left: fetching rests."""
+        """Remove a viewer; without viewers fetching pauses."""
         self._viewers.discard(viewer)
         if not self._viewers:
             self._wanted.clear()
 
     async def refresh(self) -> None:
-        """Fetch once and wake the viewers if there is news."""
+        """Fetch once, and notify viewers of changes."""
         messages = await self._fetch()
         if messages != self.messages:
             self.messages = messages
@@ -53,7 +53,7 @@ class Topic:
                 viewer.changed.set()
 
     async def run(self) -> None:
-        """Keep fetching while wanted, never faster than the period; ends by cancellation."""
+        """Poll while there are viewers, at most once per period; runs until cancelled."""
         loop = asyncio.get_running_loop()
         while True:
             await self._wanted.wait()
@@ -61,13 +61,13 @@ class Topic:
             try:
                 await self.refresh()
             except Exception:
-                # The supervisor of a feed: one bad answer must not end the page's news for ever.
+                # Supervisor of a feed: a bad response must not end the page's updates.
                 logger.exception("topic_failed", topic=self.name)
             await asyncio.sleep(max(0.0, self.period_s - (loop.time() - started_s)))
 
 
 class Viewer:
-    """One open page: a slow one skips to the newest news, it never holds up the others."""
+    """An open page; a slow one skips to the newest messages without delaying others."""
 
     def __init__(self, topics: Mapping[str, Topic]) -> None:
         self.changed = asyncio.Event()
@@ -75,7 +75,7 @@ class Viewer:
         self._seen: dict[str, int] = {}
 
     def look_at(self, names: Iterable[str]) -> None:
-        """Replace what is in view; names that are no topics are ignored."""
+        """Replace the topics in view; unknown names are ignored."""
         wanted = set(names) & set(self._topics)
         for name in set(self._seen) - wanted:
             self._topics[name].remove(self)
@@ -85,7 +85,7 @@ class Viewer:
             self._topics[name].add(self)
 
     async def news(self) -> list[Message]:
-        """Wait for something new and return it."""
+        """Wait for new messages and return them."""
         while True:
             await self.changed.wait()
             self.changed.clear()
@@ -100,7 +100,7 @@ class Viewer:
 
 
 async def run_topics(topics: Iterable[Topic], until_stopped: asyncio.Event) -> None:
-    """Run all topics until told to stop."""
+    """Run all topics until the event is set."""
     tasks = [asyncio.create_task(topic.run()) for topic in topics]
     try:
         await until_stopped.wait()

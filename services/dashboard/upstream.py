@@ -1,4 +1,4 @@
-"""Requests to another service in, its JSON or bytes out; what goes wrong is an UnavailableError."""
+"""HTTP client of another service, whose failures become UnavailableError."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -11,7 +11,7 @@ from dextouch.schemas.problems import Problem, error_from_problem
 
 
 class Upstream:
-    """One other service, asked through its HTTP API only."""
+    """Client of another service's HTTP API."""
 
     def __init__(self, name: str, client: httpx.AsyncClient) -> None:
         self.name = name
@@ -19,7 +19,7 @@ class Upstream:
 
     @staticmethod
     def connect(name: str, url: str, *, key: SecretStr | None, timeout_s: float) -> "Upstream":
-        """A client with a bounded pool; nothing is sent yet."""
+        """Create a client with a bounded connection pool, without sending a request."""
         headers = {"authorization": f"Bearer {key.get_secret_value()}"} if key else {}
         limits = httpx.Limits(max_connections=8, max_keepalive_connections=4)
         client = httpx.AsyncClient(
@@ -28,11 +28,11 @@ class Upstream:
         return Upstream(name, client)
 
     async def json(self, method: str, path: str, *, body: Mapping[str, Any] | None = None) -> Any:  # noqa: ANN401 - another service's JSON; views.py checks it
-        """The JSON answer.
+        """Send a request and return the JSON response.
 
         Raises:
-            UnavailableError: no answer, or one that is no JSON.
-            DexTouchError: what the service refused, as its own class.
+            UnavailableError: no response, or not JSON.
+            DexTouchError: a refusal of the service, as its own class.
         """
         response = await self._send(method, path, body)
         try:
@@ -43,12 +43,12 @@ class Upstream:
             ) from error
 
     async def content(self, path: str) -> tuple[bytes, Mapping[str, str]]:
-        """The body and headers of a GET."""
+        """Body and headers of a GET request."""
         response = await self._send("GET", path, None)
         return response.content, response.headers
 
     async def ready(self) -> tuple[bool, str]:
-        """Whether work may be sent, and what is missing otherwise."""
+        """Readiness of the service, and what is missing otherwise."""
         try:
             response = await self._client.get("/readyz")
             waiting = response.json().get("waiting_for", [])
@@ -59,7 +59,7 @@ class Upstream:
         return False, "waiting for " + ", ".join(str(item) for item in waiting)
 
     async def close(self) -> None:
-        """Give the connections back."""
+        """Close the connections."""
         await self._client.aclose()
 
     async def _send(self, method: str, path: str, body: Mapping[str, Any] | None) -> httpx.Response:

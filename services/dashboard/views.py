@@ -1,4 +1,4 @@
-"""What the other services answer in, what the page shows out: checked, in the page's own units."""
+"""View models of the page, validated and in its display units."""
 
 from typing import Literal
 
@@ -17,9 +17,9 @@ TAXEL_MESSAGE = 1
 
 
 class StreamView(BaseModel):
-    """One row of the device table; None where nothing was measured.
+    """One row of the device table; None where not measured.
 
-    `advice` is what to do about the gravest of what `message` tells, which lasts since `lasted_s`.
+    `advice` refers to the most severe problem in `message`, which has lasted for `lasted_s`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -40,7 +40,7 @@ class StreamView(BaseModel):
 
 
 class PromptView(BaseModel):
-    """What was armed: the page's own fields, filled by whoever armed."""
+    """The armed prompt, with the page's fields."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -52,9 +52,9 @@ class PromptView(BaseModel):
 
 
 class RecorderView(BaseModel):
-    """The recorder's state and which of its actions make sense now.
+    """State of the recorder and its available actions.
 
-    `note` is the verdict on the take in a few words, `problems` what it rests on, worst first.
+    `note` summarizes the check of the take, `problems` lists its findings, worst first.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
@@ -71,7 +71,7 @@ class RecorderView(BaseModel):
 
 
 class StationView(BaseModel):
-    """The station at a glance."""
+    """Overview of the station."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -85,7 +85,7 @@ class StationView(BaseModel):
 
 
 class ServiceView(BaseModel):
-    """One service: may work be sent to it?"""
+    """Readiness of a service."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -95,7 +95,7 @@ class ServiceView(BaseModel):
 
 
 class TakeView(BaseModel):
-    """One stored recording or episode; `consent` is None where the store does not say it."""
+    """A stored recording or episode; `consent` is None where unknown."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -111,7 +111,7 @@ class TakeView(BaseModel):
 
 
 class RefusedView(BaseModel):
-    """One take of the station that the store refused, and why."""
+    """A take that the store refused, and the reason."""
 
     model_config = ConfigDict(frozen=True, extra="ignore")
 
@@ -120,7 +120,7 @@ class RefusedView(BaseModel):
 
 
 class TakesView(BaseModel):
-    """The newest takes; `note` says why there are none. `refused` ones wait at the station."""
+    """The newest takes; `note` explains an empty list. `refused` ones are still at the station."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -130,7 +130,7 @@ class TakesView(BaseModel):
 
 
 class CameraView(BaseModel):
-    """One camera whose newest image can be had."""
+    """A camera with an image to show."""
 
     model_config = ConfigDict(frozen=True, extra="ignore", allow_inf_nan=False)
 
@@ -140,12 +140,12 @@ class CameraView(BaseModel):
 
 
 def worst(levels: list[Level]) -> Level:
-    """The level that asks most urgently for a look; STALE when there is nothing to judge."""
+    """The most severe level; STALE if there is none."""
     return max(levels, key=LEVELS.index) if levels else "STALE"
 
 
 def unreachable_station(reason: str) -> StationView:
-    """The station view while its acquisition service does not answer: no old numbers."""
+    """The station view while the acquisition service is unreachable, without stale values."""
     return StationView(
         reachable=False,
         level="ERROR",
@@ -158,7 +158,7 @@ def unreachable_station(reason: str) -> StationView:
 
 
 def heatmap_layout() -> dict[str, object]:
-    """Where each of the 320 taxels is drawn and in which colours, from `dextouch.tactile`."""
+    """Positions of the 320 taxels and the colour map, from `dextouch.tactile`."""
     cells = {side: _cells(side) for side in SIDES}
     rows, columns = hand_canvas(np.zeros(NUM_TAXELS, dtype=np.float32), side="right").shape
     pressures_kpa = np.linspace(0.0, FULL_SCALE_KPA, RAMP_STEPS)
@@ -173,7 +173,7 @@ def heatmap_layout() -> dict[str, object]:
 
 
 def taxel_message(side: Side, pressures_kpa: np.ndarray) -> bytes:
-    """uint8 kind, uint8 side, uint16 count, then float32 kPa, little endian."""
+    """Encode pressures: uint8 kind, uint8 side, uint16 count, then float32 kPa, little endian."""
     header = bytes([TAXEL_MESSAGE, SIDES.index(side)]) + len(pressures_kpa).to_bytes(2, "little")
     return header + np.ascontiguousarray(pressures_kpa, dtype="<f4").tobytes()
 

@@ -1,1 +1,1 @@
-"""The store as a service: takes recordings in batch by batch, gives episodes and windows out."""
+"""Episode store service: receives recordings in batches, serves episodes and windows."""

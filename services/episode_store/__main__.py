@@ -1,4 +1,4 @@
-"""`dextouch store …`: words and flags in, lists and verdicts of a local store or a service out."""
+"""Command line `dextouch store`: manage a store, or serve it over HTTP."""
 
 import argparse
 import json
@@ -20,10 +20,10 @@ EXIT_REFUSED = 3
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one word of the store's command line; without a word, serve.
+    """Run a command of the store's command line; serve by default.
 
     Returns:
-        0, 1 when something is damaged, left or not provably gone, 3 for a refusal.
+        0; 1 if something is damaged, remains or is not provably deleted; 3 for a refusal.
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     try:
@@ -32,10 +32,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         if arguments[0].startswith("--") and arguments[0] != "--help":
             return _serve(arguments)
         options = _parser().parse_args(arguments)
-        # What the catalog leaves out is told on stderr, beside the list.
+        # Items that the catalog leaves out are reported on stderr.
         configure_logging(service="episode_store", log_format="auto", level="warning")
         url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-        # With the result itself on stdout, what is said goes beside it.
+        # With the result on stdout, messages go to stderr.
         out = sys.stderr if options.json == "-" else sys.stdout
         context = Context(EpisodeStore(url), url, options, lambda line: print(line, file=out))
         result, status = _COMMANDS[options.command](context)
@@ -73,34 +73,52 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="dextouch store",
-        description="Look into a store, mend it, or serve it ('serve --help' lists the settings).",
+        description="Inspect, repair or serve a store ('serve --help' lists the settings).",
     )
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("--store", metavar="URL", help="local folder, file:///… or s3://…")
-    shared.add_argument("--json", metavar="PATH", help="write the result there too; - for stdout")
+    shared.add_argument(
+        "--json", metavar="PATH", help="also write the result as JSON to this file; - for stdout"
+    )
     kind = argparse.ArgumentParser(add_help=False, parents=[shared])
-    kind.add_argument("--kind", choices=("episode", "recording"), help="both when not given")
-    words = parser.add_subparsers(dest="command", required=True)
-    words.add_parser("serve", help="answer over HTTP", add_help=False)
-    listing = words.add_parser("list", parents=[kind], help="what is in the store")
+    kind.add_argument("--kind", choices=("episode", "recording"), help="default: both")
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("serve", help="serve the store over HTTP", add_help=False)
+    listing = commands.add_parser("list", parents=[kind], help="list episodes and recordings")
     listing.add_argument("--task")
     listing.add_argument("--domain", choices=("human", "robot"))
     listing.add_argument("--origin", choices=("recorded", "twin", "imagined"), help="episodes only")
-    listing.add_argument("--trash", action="store_true", help="what was deleted instead")
-    show = words.add_parser("show", parents=[kind], help="attributes and streams of one")
-    show.add_argument("id")
-    _add_ids(words.add_parser("verify", parents=[kind], help="read everything, name all damage"))
-    repair = words.add_parser(
-        "repair", parents=[kind], help="complete what was interrupted, mend or salvage damage"
+    listing.add_argument("--trash", action="store_true", help="list the trash instead")
+    show = commands.add_parser(
+        "show", parents=[kind], help="show attributes and streams of an item"
     )
-    _add_ids(repair)
-    repair.add_argument("--from", dest="source", metavar="URL", help="another copy of the store")
-    _add_ids(words.add_parser("migrate", parents=[kind], help="bring older versions over"))
-    _add_delete(words.add_parser("delete", parents=[kind], help="into the trash, or for good"))
-    restore = words.add_parser("restore", parents=[shared], help="out of the trash again")
-    restore.add_argument("--kind", choices=TRASH_KINDS, help="needed where an id has several")
+    show.add_argument("id")
+    _add_ids(
+        commands.add_parser("verify", parents=[kind], help="verify all checksums and list damage")
+    )
+    repairing = commands.add_parser(
+        "repair", parents=[kind], help="complete interrupted items, repair or salvage damaged ones"
+    )
+    _add_ids(repairing)
+    repairing.add_argument(
+        "--from", dest="source", metavar="URL", help="intact copy of the store to repair from"
+    )
+    _add_ids(
+        commands.add_parser(
+            "migrate", parents=[kind], help="upgrade items of older format versions"
+        )
+    )
+    _add_delete(
+        commands.add_parser(
+            "delete", parents=[kind], help="move items to the trash, or delete them permanently"
+        )
+    )
+    restore = commands.add_parser("restore", parents=[shared], help="restore items from the trash")
+    restore.add_argument("--kind", choices=TRASH_KINDS, help="required if an id has several kinds")
     restore.add_argument("ids", nargs="+")
-    purge = words.add_parser("purge", parents=[shared], help="empty the trash for good")
+    purge = commands.add_parser(
+        "purge", parents=[shared], help="permanently delete items in the trash"
+    )
     purge.add_argument(
         "--older-than", type=_age, default=0.0, metavar="AGE", help="such as 30d or 12h"
     )
@@ -114,19 +132,23 @@ def _age(text: str) -> float:
         raise argparse.ArgumentTypeError(str(error)) from error
 
 
-def _add_ids(word: argparse.ArgumentParser) -> None:
-    word.add_argument("ids", nargs="*", help="all when none is named")
+def _add_ids(command: argparse.ArgumentParser) -> None:
+    command.add_argument("ids", nargs="*", help="default: all")
 
 
-def _add_delete(word: argparse.ArgumentParser) -> None:
-    word.add_argument("ids", nargs="*")
-    word.add_argument("--for-good", action="store_true", help="not into the trash")
-    word.add_argument("--operator", metavar="P", help="all that stems from this pseudonym")
-    word.add_argument("--recording", metavar="ID", help="this recording")
-    word.add_argument("--derived", action="store_true", help="and all that was made from it")
-    word.add_argument("--yes", action="store_true", help="do not ask")
-    word.add_argument("--receipt", metavar="PATH", help="where the proof goes")
-    word.add_argument("--checkpoints", metavar="FOLDER", help="models to search as well")
+def _add_delete(command: argparse.ArgumentParser) -> None:
+    command.add_argument("ids", nargs="*")
+    command.add_argument(
+        "--for-good", action="store_true", help="delete permanently, without trash"
+    )
+    command.add_argument("--operator", metavar="P", help="all data of this operator pseudonym")
+    command.add_argument("--recording", metavar="ID", help="delete this recording")
+    command.add_argument("--derived", action="store_true", help="also everything derived from it")
+    command.add_argument("--yes", action="store_true", help="skip the confirmation")
+    command.add_argument("--receipt", metavar="PATH", help="file for the deletion receipt")
+    command.add_argument(
+        "--checkpoints", metavar="FOLDER", help="also search the models in this folder"
+    )
 
 
 if __name__ == "__main__":

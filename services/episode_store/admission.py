@@ -1,4 +1,4 @@
-"""How much is being written and how much room is left in, a refusal or nothing out."""
+"""Admission control: limits of concurrent batches and of free disk space."""
 
 import os
 import threading
@@ -14,13 +14,13 @@ FULL_RETRY_S = 30
 
 
 class Admission:
-    """Bounds the batches that are in the service at once, by number and by bytes.
+    """Limits the batches in flight, by number and bytes (backpressure).
 
-    A batch is admitted before its body is read, so what is refused costs no memory.
+    A batch is admitted before its body is read, so a refused one costs no memory.
 
     Args:
-        max_requests: batches at once.
-        max_bytes: of all their bodies together; one batch alone always fits.
+        max_requests: maximum number of batches in flight.
+        max_bytes: of all their bodies; a single batch is always admitted.
     """
 
     def __init__(self, *, max_requests: int, max_bytes: int) -> None:
@@ -30,7 +30,7 @@ class Admission:
 
     @contextmanager
     def admitted(self, num_bytes: int) -> Iterator[None]:
-        """Be counted while a body of this size is read and written.
+        """Context manager that counts a body of this size while it is read and written.
 
         Raises:
             LimitExceededError: with `retry_after_s`, so the answer is 429.
@@ -58,7 +58,7 @@ class Admission:
 
 
 def free_bytes_of(folder: Path) -> int:
-    """Bytes that may still be written below a folder, which need not exist yet."""
+    """Free disk space at a folder, which need not exist yet."""
     with disk_errors(f"measure free space of {folder}"):
         while not folder.exists():
             folder = folder.parent
@@ -67,12 +67,12 @@ def free_bytes_of(folder: Path) -> int:
 
 
 class DiskReserve:
-    """Keeps space free that uploads do not take, so that nothing breaks off half written.
+    """Reserves disk space that uploads must not use, so that started writes can finish.
 
     Args:
-        folder: on the disk in question.
-        min_free_bytes: that stay free.
-        free_bytes: another way to measure; None asks the file system.
+        folder: on the disk.
+        min_free_bytes: size of the reserve.
+        free_bytes: measures free space; None queries the file system.
     """
 
     def __init__(
@@ -86,11 +86,11 @@ class DiskReserve:
         self._measure = free_bytes
 
     def free_bytes(self) -> int:
-        """What is free now, the reserve included."""
+        """Free bytes, including the reserve."""
         return (self._measure or free_bytes_of)(self._folder)
 
     def check_upload(self, num_bytes: int) -> None:
-        """Refuse bytes that would go into the reserve.
+        """Refuse an upload that would use the reserve.
 
         Raises:
             StorageFullError: with `retry_after_s`; nothing was written.
@@ -98,7 +98,7 @@ class DiskReserve:
         self._check(num_bytes, self._min_free, "upload")
 
     def check_commit(self, num_bytes: int) -> None:
-        """Refuse a copy that does not fit at all; it may use the reserve, for its source goes then.
+        """Refuse a commit that exceeds the free space; it may use the reserve.
 
         Raises:
             StorageFullError: with `retry_after_s`; nothing was written.

@@ -1,4 +1,4 @@
-"""Settings in, the store's application out."""
+"""Application factory of the episode store."""
 
 import threading
 from collections.abc import AsyncIterator
@@ -30,10 +30,10 @@ logger = structlog.get_logger(__name__)
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
-    """The routes over one store folder; what crashed writers left is mended at the start.
+    """Create the application of one store; recovers data of crashed writers at startup.
 
     Args:
-        settings: where the store is and what it allows.
+        settings: location of the store and limits.
     """
     store = EpisodeStore(settings.store_url)
     commit = CommitProcess(settings.store_url) if settings.commit_in_process else None
@@ -54,7 +54,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         _mend(store)
-        # The first list of a large store takes seconds; it is read while nobody waits for it.
+        # The first listing of a large store takes seconds, so it is warmed up in the background.
         threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
         try:
             yield
@@ -81,12 +81,12 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
 
 
 def _mend(store: EpisodeStore) -> None:
-    """Complete what killed writers left, remove what is worth nothing."""
+    """Commit the stages of terminated writers and remove unrecoverable ones."""
     try:
         for group in store.recover():
             logger.warning("recover_recording", kind=group.kind, id=group.item_id)
     except StorageError as error:
-        # The service still serves all the rest; `dextouch store repair` says more.
+        # The service still serves everything else; `dextouch store repair` reports details.
         logger.error("fail_recovery", error=error.message)  # noqa: TRY400
     removed = store.sweep()
     if removed:

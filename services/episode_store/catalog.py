@@ -1,4 +1,4 @@
-"""Filters in, the matching episodes, recordings and hours out; what is committed is read once."""
+"""Catalog of a store: filtered lists of episodes and recordings from cached summaries."""
 
 import threading
 from bisect import bisect_right
@@ -28,7 +28,7 @@ S = TypeVar("S", EpisodeSummary, RecordingSummary)
 
 @dataclass(frozen=True, slots=True)
 class Entry(Generic[S]):
-    """One row, and what it is filtered by beside its fields."""
+    """A row, with further properties to filter by."""
 
     summary: S
     quality: Mapping[str, float]
@@ -36,7 +36,7 @@ class Entry(Generic[S]):
 
 
 class _Shelf(Generic[S]):
-    """All entries of one kind in the order of ids, brought up to date by `entries`."""
+    """Entries of one kind sorted by id, refreshed by `entries`."""
 
     def __init__(
         self, store: EpisodeStore, kind: Kind, summarize: Callable[[str], Entry[S]]
@@ -49,7 +49,7 @@ class _Shelf(Generic[S]):
         self._guard = threading.Lock()
 
     def entries(self) -> dict[str, Entry[S]]:
-        """By id; the dictionary is never changed afterwards."""
+        """Current entries by id; the returned dictionary is never modified."""
         with self._guard:
             found = self._changes.look()
             if found is not None:
@@ -77,9 +77,9 @@ class _Shelf(Generic[S]):
 
 
 class Catalog:
-    """Summaries of all that is in a store, kept in memory since nothing committed ever changes.
+    """Summaries of all groups of a store, cached since committed groups are immutable.
 
-    A damaged episode is left out and logged once; `verify` says what is wrong with it.
+    A damaged episode is omitted and logged once; `verify` reports the damage.
     """
 
     def __init__(self, store: EpisodeStore) -> None:
@@ -88,14 +88,14 @@ class Catalog:
         self._recordings = _Shelf(store, "recording", self._recording)
 
     def warm_up(self) -> None:
-        """Read what a first list would read."""
+        """Read the summaries in advance."""
         self._episodes.entries()
         self._recordings.entries()
 
     def episodes(
         self, wanted: EpisodeFilter, *, limit: int, offset: int = 0, after: str | None = None
     ) -> EpisodeList:
-        """One page of matching episodes in the order of their ids, those behind `after`."""
+        """One page of matching episodes, sorted by id, after the id `after`."""
         found = _matching(self._episodes.entries(), wanted)
         page, next_after = _page(found, limit, offset, after)
         return EpisodeList.model_construct(
@@ -110,7 +110,7 @@ class Catalog:
         offset: int = 0,
         after: str | None = None,
     ) -> RecordingList:
-        """One page of matching finished recordings in the order of their ids, behind `after`."""
+        """One page of matching finished recordings, sorted by id, after the id `after`."""
         found = _matching(self._recordings.entries(), wanted or RecordingFilter())
         page, next_after = _page(found, limit, offset, after)
         return RecordingList.model_construct(
@@ -118,7 +118,7 @@ class Catalog:
         )
 
     def hours(self, wanted: EpisodeFilter) -> CatalogHours:
-        """How much there is of the matching episodes by task, domain and origin."""
+        """Total duration of matching episodes by task, domain and origin."""
         groups: defaultdict[tuple[str, str, str], list[EpisodeSummary]] = defaultdict(list)
         for episode in _matching(self._episodes.entries(), wanted).values():
             groups[episode.task, episode.domain, episode.origin].append(episode)
@@ -130,7 +130,7 @@ class Catalog:
         )
 
     def bytes_by_station(self) -> dict[str, int]:
-        """What the finished recordings of each station take on disk."""
+        """Disk usage of finished recordings by station."""
         totals: defaultdict[str, int] = defaultdict(int)
         for entry in self._recordings.entries().values():
             totals[entry.summary.station] += entry.summary.num_bytes
@@ -204,7 +204,7 @@ def _hours_row(group: list[EpisodeSummary]) -> HoursRow:
 
 
 def _nominal_duration_s(reader: EpisodeReader | RecordingReader) -> float:
-    # No array is opened for a row of the catalog: counts are in the commit record.
+    # Counts come from the commit record, so no array is opened.
     return max(
         (
             reader.num_samples(name) / descriptor.nominal_rate_hz

@@ -1,4 +1,4 @@
-"""A store in, the revision of every committed id out, or word that nothing changed."""
+"""Change detection of a store: revisions of all ids, polled cheaply by folder stamps."""
 
 import os
 import re
@@ -9,22 +9,21 @@ from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import COMMIT_FILE, Kind
 from dextouch.schemas.episodes import ID_PATTERN
 
-# Stamps of a file system can be this coarse: a change as young may have a twin with its stamp.
+# Stamps of a file system can be this coarse: another change may get the same stamp.
 SETTLED_NS = 2_000_000_000
-# Listing a bucket takes a request for every thousand files in it.
+# Listing a bucket takes one request per 1000 objects.
 BUCKET_PERIOD_NS = 5_000_000_000
 
 Revision = tuple[int, int]
 
 
 class FolderChanges:
-    """Looks at one kind of a store with one `stat` while nothing comes or goes.
+    """Detects changes of one kind of group with a single `stat` while there are none.
 
-    Committing and deleting rename folders in and out, which sets the stamp of the folder above.
-    What was changed in place behind the store's back shows at the next coming or going only.
-
-    A store that is no folder is listed, at most once in BUCKET_PERIOD_NS, and by ids alone: one
-    that is deleted and written again between two looks goes unnoticed there.
+    Commits and deletions rename folders, which updates the parent folder's stamp. In-place changes
+    by other programs are noticed only at the next commit or deletion. A bucket is listed at most
+    once per BUCKET_PERIOD_NS, by ids only: an id that is deleted and written again in between goes
+    unnoticed.
     """
 
     def __init__(self, store: EpisodeStore, kind: Kind) -> None:
@@ -35,7 +34,7 @@ class FolderChanges:
         self._is_settled = False
 
     def look(self) -> dict[str, Revision] | None:
-        """Revisions by id, in order; None when nothing changed since the last look."""
+        """Revisions by sorted id; None if nothing changed since the last call."""
         with disk_errors(f"list {self._folder.name}"):
             try:
                 stamp_ns = self._folder.stat().st_mtime_ns
@@ -50,7 +49,7 @@ class FolderChanges:
         return found
 
     def _list(self) -> dict[str, Revision] | None:
-        # An empty folder's list costs nothing; a bucket's is not asked for again at once.
+        # Listing an empty folder is free; a bucket is not listed again at once.
         now_ns = time.monotonic_ns()
         if self._listed_ns is not None and now_ns - self._listed_ns < BUCKET_PERIOD_NS:
             return None
@@ -60,14 +59,14 @@ class FolderChanges:
 
     def _scan(self) -> dict[str, Revision]:
         found = {}
-        # Plain names, one stat an id: thousands of Path objects would be in the way of a list.
+        # Plain names and one stat per id: thousands of Path objects would slow down a listing.
         for name in sorted(os.listdir(self._folder)):  # noqa: PTH208
             try:
                 state = os.stat(f"{self._folder}/{name}/{COMMIT_FILE}")  # noqa: PTH116
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except PermissionError:
-                # Reading it says why; what has no id is no episode.
+                # Reading it reports the error; a name that is not an id is not an episode.
                 if re.fullmatch(ID_PATTERN, name):
                     found[name] = (0, 0)
                 continue

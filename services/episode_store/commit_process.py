@@ -1,7 +1,7 @@
-"""Commits recordings in a process of its own.
+"""Child process that commits finished spools to the store.
 
-Copying a take costs as much as receiving it, and in the process that acknowledges batches it
-would hold up every station.
+Copying a take costs as much as receiving it, and would delay all stations in the process that
+acknowledges batches.
 """
 
 import sys
@@ -15,16 +15,16 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.serving.child_process import ChildProcess, serve_parent
 from services.episode_store.committing import commit_spool
 
-# Acknowledging goes before committing when the processor is short.
+# Acknowledging batches has priority over committing.
 NICENESS = 5
 RETRY_AFTER_S = 1
 
 
 class CommitProcess:
-    """A `Commit` that another process carries out, one spool at a time; started when first used.
+    """A `Commit` in a child process, one spool at a time; started on first use.
 
     Args:
-        store_url: of the store, as the child opens it.
+        store_url: of the store that the child opens.
     """
 
     def __init__(self, store_url: str) -> None:
@@ -36,7 +36,7 @@ class CommitProcess:
         """Commit a spool; raises as `commit_spool`.
 
         Raises:
-            UnavailableError: the process died on the way; the spool is as it was.
+            UnavailableError: the process died; the spool is unchanged.
         """
         with self._guard:
             if self._child is None or not self._child.is_running:
@@ -56,7 +56,7 @@ class CommitProcess:
         return counts
 
     def close(self) -> None:
-        """Let the process finish the spool it is at, and wait until it has ended."""
+        """Wait for the running commit and end the process."""
         with self._guard:
             if self._child is not None:
                 self._child.close()
@@ -64,7 +64,7 @@ class CommitProcess:
 
 
 def serve(store_url: str) -> None:
-    """Commit the spools that the parent orders, until it ends."""
+    """Commit spools on request of the parent, until it ends."""
     orders, answer = serve_parent(niceness=NICENESS)
     store = EpisodeStore(store_url)
     for order in orders:

@@ -1,4 +1,4 @@
-"""A complete spool in, a finished recording of the store out, with bounded memory."""
+"""Commit of a complete spool as a recording of the store, with bounded memory."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -10,26 +10,26 @@ from dextouch.streams.checks import ENCODED_UNITS
 
 COPY_SAMPLES = 256
 COPY_BYTES = 4 << 20
-# Images are some fifty thousand bytes each.
+# Images take about 50 kB each.
 COPY_IMAGES = 32
 
-# Moves the spool in a folder into the store, under the attributes that are known at the end.
+# Commits the spool in a folder with its final attributes.
 Commit = Callable[[Path, RecordingAttributes], dict[str, int]]
 
 
 def commit_spool(
     store: EpisodeStore, spool: Path, attributes: RecordingAttributes
 ) -> dict[str, int]:
-    """Copy all samples of a closed spool into a new recording; samples by stream come back.
+    """Copy a closed spool to a new recording; returns the number of samples by stream.
 
     Raises:
         ConflictError: the recording exists.
         CorruptDataError: the spool is damaged; nothing is written.
-        StorageFullError: no space; nothing remains, the spool stays.
+        StorageFullError: no space; nothing is written, the spool is kept.
     """
     reader = SpoolReader(spool)
-    # What a kill leaves of the copy is worth nothing: the spool has it all, and a recording that
-    # was recovered from half a copy would stand in the way of the whole one.
+    # Not recoverable: the spool has all data, and a recording recovered from a partial copy would
+    # block the id of the complete one.
     options = WriteOptions(recoverable=False)
     with store.writer(kind="recording", attributes=attributes, options=options) as writer:
         for name, descriptor in reader.streams.items():

@@ -1,4 +1,4 @@
-"""What is asked for in a catalog: query parameters in, a test of one entry out."""
+"""Query filters of the catalog: task, station, quality bounds, times and paging."""
 
 import math
 from collections.abc import Callable, Mapping
@@ -13,26 +13,26 @@ from dextouch.schemas.episodes import Domain, Origin
 
 @runtime_checkable
 class Filterable(Protocol):
-    """What a catalog knows of an episode or a recording, beside the fields it is filtered by."""
+    """Interface of catalog entries for filters."""
 
     @property
     def summary(self) -> Any:  # noqa: ANN401 - of either kind
-        """Its row."""
+        """Row of the catalog."""
         ...
 
     @property
     def quality(self) -> Mapping[str, float]:
-        """Its figures by name."""
+        """Quality figures by name."""
         ...
 
     @property
     def created_at(self) -> datetime | None:
-        """When it was made."""
+        """Creation time."""
         ...
 
 
 def quality_bound(text: str) -> tuple[str, float]:
-    """Name and least figure of `NAME:NUMBER`.
+    """Parse `NAME:NUMBER` to a figure's name and lower bound.
 
     Raises:
         ValueError: anything else, and NaN.
@@ -53,10 +53,10 @@ def _checked(text: str) -> str:
 
 
 class CatalogFilter(BaseModel):
-    """What an episode or recording must be; what is not given takes any.
+    """Filter of episodes or recordings; omitted fields match anything.
 
-    `min_quality` are bounds `NAME:NUMBER`, all of which hold: what does not have a figure does not
-    match. Times are created_after ≤ t < created_before; what has none does not match.
+    `min_quality` are bounds `NAME:NUMBER` that must all hold; an item without the figure does not
+    match. Times are created_after ≤ t < created_before; an item without a time does not match.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,7 +72,7 @@ class CatalogFilter(BaseModel):
     created_before: AwareDatetime | None = None
 
     def matcher(self) -> Callable[[Filterable], bool]:
-        """A quick test of many entries."""
+        """Compile the filter to a fast predicate."""
         fields = [name for name in self._fields() if getattr(self, name) is not None]
         get = attrgetter(*fields) if fields else None
         expected = get(self) if get else None
@@ -100,11 +100,11 @@ class CatalogFilter(BaseModel):
 
 
 class RecordingFilter(CatalogFilter):
-    """What a recording must be."""
+    """Filter of recordings."""
 
 
 class EpisodeFilter(CatalogFilter):
-    """What an episode must be."""
+    """Filter of episodes."""
 
     origin: Origin | None = None
 
@@ -113,18 +113,18 @@ class EpisodeFilter(CatalogFilter):
 
 
 class Page(BaseModel):
-    """Which part of a list is wanted: after an id, or from a place in it."""
+    """Page of a list: after an id, or from an offset."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     limit: int | None = Field(default=None, ge=1)
     offset: int = Field(default=0, ge=0)
-    after: str | None = Field(default=None, description="only ids behind this one")
+    after: str | None = Field(default=None, description="only ids after this one")
 
 
 class EpisodeQuery(EpisodeFilter, Page):
-    """One page of the episodes that match."""
+    """Filter and page of episodes."""
 
 
 class RecordingQuery(RecordingFilter, Page):
-    """One page of the recordings that match."""
+    """Filter and page of recordings."""

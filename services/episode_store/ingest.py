@@ -1,4 +1,4 @@
-"""Numbered batches of recordings → their spools, exactly once each; at the end → the store."""
+"""Ingest of uploads: numbered batches are spooled exactly once, finished recordings committed."""
 
 import shutil
 import threading
@@ -29,18 +29,18 @@ from services.episode_store.upload import Upload
 logger = structlog.get_logger(__name__)
 
 UPLOADS_FOLDER = ".uploads"
-# A finish of a long take holds its recording this long at most before others are told to wait.
+# Maximum wait for the lock of a recording, which finishing a long take holds.
 PATIENCE_S = 20.0
 
 
 class Ingest:
-    """All uploads of a store. Thread-safe; one recording is worked on by one thread at a time.
+    """All uploads of a store. Thread-safe, with one lock per recording.
 
     Args:
-        store: where finished recordings go; unfinished ones lie in a folder below it.
-        sync: whether an acknowledged batch survives a power loss.
-        max_open_uploads: how many keep their files open; others are opened when asked for.
-        commit: moves a complete upload into the store; here and now when None.
+        store: destination of finished recordings; unfinished ones are in a folder below it.
+        sync: whether batches are synced to disk before they are acknowledged.
+        max_open_uploads: number of uploads with open files; others are reopened on demand.
+        commit: commits a complete upload; None commits synchronously.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Ingest:
         self._guard = threading.Lock()
 
     def create(self, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload, or say where it stands if it had begun.
+        """Begin an upload, or return the status of an existing one.
 
         Raises:
             InvalidInputError: a recording without a stream.
@@ -82,10 +82,10 @@ class Ingest:
             return upload.status()
 
     def status(self, recording_id: str) -> RecordingStatus:
-        """Where an upload stands.
+        """Status of an upload.
 
         Raises:
-            NotFoundError: never begun.
+            NotFoundError: no such upload.
         """
         with self._working_on(recording_id):
             if self._store.exists(recording_id, kind="recording"):
@@ -93,28 +93,28 @@ class Ingest:
             return self._upload(recording_id).status()
 
     def put_batch(self, recording_id: str, stream: str, number: int, data: bytes) -> BatchReceipt:
-        """Take a batch in; when this returns, it is kept.
+        """Store a batch; it is durable when this returns.
 
         Raises:
             NotFoundError: no such recording.
             UnknownNameError: no such stream.
             ConflictError: a gap, other samples under a known number, or a finished recording.
-            PacketError, InvalidInputError: bytes that are no batch of this stream.
+            PacketError, InvalidInputError: not a valid batch of this stream.
             UnavailableError: the recording is being finished; try again later.
-            StorageFullError: no space; all that was acknowledged stays.
+            StorageFullError: no space; acknowledged batches are kept.
         """
         with self._working_on(recording_id):
             return self._upload(recording_id).put(stream, number, data)
 
     def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
-        """Move a complete upload into the store; repeating it changes nothing.
+        """Commit a complete upload; idempotent.
 
         Raises:
             NotFoundError: no such recording.
             ConflictError: batches are missing, or more are here than announced.
             InvalidInputError: not all streams are announced, or none has a sample.
             UnavailableError: it is being finished already; try again later.
-            StorageFullError: no space; the upload stays as it is.
+            StorageFullError: no space; the upload is unchanged.
         """
         with self._working_on(recording_id):
             if not self._store.exists(recording_id, kind="recording"):
@@ -125,10 +125,10 @@ class Ingest:
         return RecordingStatus(recording_id=recording_id, state="finished")
 
     def expire(self, recording_id: str, *, idle_s: float) -> bool:
-        """Drop an unfinished upload if nothing has come for so long; whether it went.
+        """Drop an unfinished upload that has been idle for `idle_s`; whether it was dropped.
 
         Raises:
-            UnavailableError: it is being worked on.
+            UnavailableError: it is in use.
         """
         with self._working_on(recording_id):
             path = self._path(recording_id)
@@ -143,7 +143,7 @@ class Ingest:
         return True
 
     def close(self) -> None:
-        """Give all files back; uploads go on after the next start."""
+        """Close all files; uploads continue after a restart."""
         with self._guard:
             while self._open:
                 self._open.popitem()[1].abandon()
@@ -163,7 +163,7 @@ class Ingest:
         try:
             counts = self._commit(self._path(recording_id), attributes)
         except ConflictError:
-            # A process that outlived the service before this one may have ended its commit.
+            # The commit process of a previous service may have completed it.
             if not self._store.exists(recording_id, kind="recording"):
                 raise
             return
@@ -202,7 +202,7 @@ class Ingest:
 
 
 def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
-    # What is known only at the end may have been told after the upload began.
+    # Attributes known only at the end may differ from those at the beginning.
     late = {"success": ours.success, "ledger": ours.ledger}
     if got.model_copy(update=late) != ours:
         raise ConflictError(

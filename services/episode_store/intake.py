@@ -1,4 +1,4 @@
-"""What stations send in; admitted and kept, or refused before anything is read, out."""
+"""Intake of uploads: applies admission, disk reserve and quotas before the ingest."""
 
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
@@ -22,20 +22,20 @@ from services.episode_store.ingest import Ingest
 from services.episode_store.metrics import StoreMetrics
 from services.episode_store.quotas import StationQuotas
 
-# What an upload's attributes and empty files may take.
+# Allowance for an upload's attributes and empty files.
 CREATE_BYTES = 1 << 16
 
 
 class Intake:
-    """The way of every upload into the store: bounds first, then the ingest, and the counting.
+    """Passes every upload through the limits to the ingest, and updates metrics.
 
     Args:
-        ingest: keeps what is let in.
-        admission: bounds what is here at once.
-        reserve: bounds what the disk takes.
+        ingest: stores admitted batches.
+        admission: limits batches in flight.
+        reserve: limits disk usage.
         quotas: limits what a station may store.
-        metrics: told of everything.
-        num_threads: that write batches; reading and finishing have others.
+        metrics: to update.
+        num_threads: number of threads that write batches; reads and commits use others.
     """
 
     def __init__(
@@ -54,7 +54,7 @@ class Intake:
         self._threads = anyio.CapacityLimiter(num_threads)
 
     def create(self, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload, or say where it stands; raises as `Ingest.create` and when full."""
+        """Begin an upload or return its status; raises as `Ingest.create` and when full."""
         with self._counting_refusals():
             self._reserve.check_upload(CREATE_BYTES)
             self._quotas.check_station(attributes.station, CREATE_BYTES)
@@ -64,7 +64,7 @@ class Intake:
         return status
 
     def status(self, recording_id: str) -> RecordingStatus:
-        """Where an upload stands."""
+        """Status of an upload."""
         return self._ingest.status(recording_id)
 
     async def put_batch(
@@ -76,17 +76,17 @@ class Intake:
         announced: str | None,
         read: Callable[[], Awaitable[bytes]],
     ) -> BatchReceipt:
-        """Take a batch in.
+        """Store a batch.
 
         Args:
-            recording_id: of an upload that was begun.
+            recording_id: of an unfinished upload.
             stream: one of its streams.
             number: of the batch.
-            announced: length of the body, as the request says it.
-            read: gives the body; not called for a batch that is refused.
+            announced: Content-Length of the request.
+            read: reads the body; not called for a refused batch.
 
         Raises:
-            LimitExceededError: too much at once; the body was not read.
+            LimitExceededError: too many batches in flight; the body was not read.
             StorageFullError: the disk or the station's quota is full; the body was not read.
             DexTouchError: as `Ingest.put_batch`.
         """
@@ -104,7 +104,7 @@ class Intake:
         return receipt
 
     def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
-        """Move a complete upload into the store; raises as `Ingest.finish` and when full."""
+        """Commit a complete upload; raises as `Ingest.finish` and when full."""
         started = time.perf_counter()
         with self._counting_refusals():
             self._reserve.check_commit(self._quotas.bytes_of(recording_id))
@@ -114,11 +114,11 @@ class Intake:
         return status
 
     def idle(self, *, idle_s: float) -> UploadList:
-        """Unfinished uploads for which nothing has come for so long."""
+        """Unfinished uploads that have been idle for `idle_s`."""
         return self._quotas.idle(idle_s=idle_s)
 
     def expire(self, wanted: ExpireUploads) -> UploadList:
-        """Drop unfinished uploads for which nothing has come for so long; those that went."""
+        """Drop unfinished uploads that have been idle for `idle_s` and return them."""
         gone = []
         for upload in self._quotas.idle(idle_s=wanted.idle_s).uploads:
             if self._ingest.expire(upload.recording_id, idle_s=wanted.idle_s):
@@ -128,7 +128,7 @@ class Intake:
 
     @asynccontextmanager
     async def _admitted(self, recording_id: str, announced: str | None) -> AsyncIterator[None]:
-        # A body of unknown length may be as long as a batch can be.
+        # A body of unknown length may be as large as the largest batch.
         num_bytes = int(announced) if announced and announced.isdecimal() else MAX_BATCH_BYTES
         with self._counting_refusals():
             admission = self._admission.admitted(num_bytes)

@@ -1,4 +1,4 @@
-"""A key in, the one lock of that key out, kept only while somebody wants it."""
+"""One lock per key, kept only while it is in use."""
 
 import threading
 from collections.abc import Iterator
@@ -10,24 +10,24 @@ RETRY_AFTER_S = 1
 
 
 class KeyedLocks:
-    """One lock a recording, so that no recording ever waits for another one.
+    """One lock per recording, so that recordings do not block each other.
 
     Args:
-        patience_s: how long somebody waits for a recording that is being worked on.
+        patience_s: timeout for acquiring a lock.
     """
 
     def __init__(self, *, patience_s: float) -> None:
         self._patience_s = patience_s
         self._guard = threading.Lock()
-        # Locks with the number of threads that hold or want them: unknown ids cost no memory.
+        # Locks with their number of users, so that unknown ids cost no memory.
         self._locks: dict[str, tuple[threading.Lock, int]] = {}
 
     @contextmanager
     def holding(self, key: str) -> Iterator[None]:
-        """Be the only one who works on a key.
+        """Context manager that holds the lock of a key.
 
         Raises:
-            UnavailableError: somebody else was at work all the time.
+            UnavailableError: the lock was not released in time.
         """
         with self._guard:
             lock, num_users = self._locks.get(key, (threading.Lock(), 0))
@@ -51,6 +51,6 @@ class KeyedLocks:
                     self._locks[key] = (lock, num_users - 1)
 
     def is_wanted(self, key: str) -> bool:
-        """Whether somebody holds a key or waits for it."""
+        """Whether a key is locked or waited for."""
         with self._guard:
             return key in self._locks

@@ -1,4 +1,4 @@
-"""What the store counts for Prometheus: batches, bytes, acknowledgement times, refusals, room."""
+"""Prometheus metrics of the store: batches, bytes, latencies, refusals, free space."""
 
 from collections.abc import Callable
 
@@ -8,14 +8,14 @@ SECONDS = (0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 3
 
 
 class StoreMetrics:
-    """Counters of one store service; `register` shows them."""
+    """Metrics of one store service, exposed by `register`."""
 
     def __init__(
         self, *, open_uploads: Callable[[], float], free_bytes: Callable[[], float]
     ) -> None:
         self.batches = Counter(
             "dextouch_store_batches",
-            "Acknowledged batches; replayed ones were here already.",
+            "Acknowledged batches; replayed ones were stored before.",
             ("replayed",),
             registry=None,
         )
@@ -24,24 +24,24 @@ class StoreMetrics:
         )
         self.ack_seconds = Histogram(
             "dextouch_store_ack_seconds",
-            "From admitting a batch to its acknowledgement.",
+            "Time from admission of a batch to its acknowledgement.",
             buckets=SECONDS,
             registry=None,
         )
         self.finish_seconds = Histogram(
             "dextouch_store_finish_seconds",
-            "From the wish to finish an upload to the recording.",
+            "Time from the request to finish an upload to the committed recording.",
             buckets=SECONDS,
             registry=None,
         )
         self.refused = Counter(
             "dextouch_store_refused",
-            "Uploads told to come again later, by what is short.",
+            "Refused upload requests by the exhausted resource.",
             ("reason",),
             registry=None,
         )
         self.open_uploads = Gauge(
-            "dextouch_store_open_uploads", "Uploads that are not finished.", registry=None
+            "dextouch_store_open_uploads", "Unfinished uploads.", registry=None
         )
         self.open_uploads.set_function(open_uploads)
         self.free_bytes = Gauge(
@@ -50,7 +50,7 @@ class StoreMetrics:
         self.free_bytes.set_function(free_bytes)
 
     def register(self, registry: CollectorRegistry) -> None:
-        """Show all of them in a registry."""
+        """Add all metrics to a registry."""
         for metric in (
             self.batches,
             self.bytes,

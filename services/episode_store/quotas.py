@@ -1,4 +1,4 @@
-"""Unfinished uploads in, their bytes by station out, and a refusal when a station has too much."""
+"""Storage quotas of stations, which count unfinished uploads and finished recordings."""
 
 import threading
 import time
@@ -16,7 +16,7 @@ from services.episode_store.admission import FULL_RETRY_S
 
 logger = structlog.get_logger(__name__)
 
-# How old the sum of finished recordings may be; our own finishes are counted at once.
+# Maximum age of the sum of finished recordings; our own commits are counted at once.
 REFRESH_S = 1.0
 
 
@@ -27,13 +27,13 @@ class _Account:
 
 
 class StationQuotas:
-    """What unfinished uploads take, by station. Thread-safe.
+    """Disk usage by station, checked against a quota. Thread-safe.
 
     Args:
         folder: of the uploads.
         recordings: bytes of finished recordings by station.
-        quota_bytes: of one station, uploads and recordings together; None: no bound.
-        clock: seconds, for the age of the sums.
+        quota_bytes: per station, uploads and recordings together; None: unlimited.
+        clock: in seconds, for the age of the cached sums.
     """
 
     def __init__(
@@ -55,33 +55,33 @@ class StationQuotas:
 
     @property
     def num_open(self) -> int:
-        """Uploads that are not finished."""
+        """Number of unfinished uploads."""
         return len(self._accounts)
 
     def begin(self, attributes: RecordingAttributes) -> None:
-        """An upload begins."""
+        """Register a new upload."""
         with self._guard:
             self._accounts.setdefault(attributes.recording_id, _Account(attributes.station, 0))
 
     def add(self, recording_id: str, num_bytes: int) -> None:
-        """Bytes of an upload were kept."""
+        """Add bytes of an upload."""
         with self._guard:
             if recording_id in self._accounts:
                 self._accounts[recording_id].num_bytes += num_bytes
 
     def end(self, recording_id: str) -> None:
-        """An upload is finished or dropped."""
+        """Unregister an upload that was finished or dropped."""
         with self._guard:
             self._accounts.pop(recording_id, None)
             self._finished = None
 
     def bytes_of(self, recording_id: str) -> int:
-        """What an upload takes; 0 for one that is unknown."""
+        """Size of an upload; 0 if unknown."""
         account = self._accounts.get(recording_id)
         return 0 if account is None else account.num_bytes
 
     def check_upload(self, recording_id: str, num_bytes: int) -> None:
-        """Refuse more bytes of an upload than its station may have.
+        """Refuse bytes of an upload beyond its station's quota.
 
         Raises:
             StorageFullError: with `retry_after_s`; nothing was written.
@@ -91,7 +91,7 @@ class StationQuotas:
             self.check_station(account.station, num_bytes)
 
     def check_station(self, station: str, num_bytes: int) -> None:
-        """Refuse more bytes than a station may have; raises as `check_upload`."""
+        """Refuse bytes beyond a station's quota; raises as `check_upload`."""
         if self._quota is None:
             return
         used = self._used(station)
@@ -106,7 +106,7 @@ class StationQuotas:
             )
 
     def idle(self, *, idle_s: float) -> UploadList:
-        """Uploads for which nothing has come for so long, by id."""
+        """Uploads that have been idle for `idle_s`, by id."""
         found = []
         for path, attributes in self._spools():
             seconds = idle_seconds(path)
@@ -137,7 +137,7 @@ class StationQuotas:
         found = []
         with disk_errors("list uploads"):
             paths = sorted(self._folder.iterdir()) if self._folder.is_dir() else []
-        # A name with a dot is an upload that is only being born.
+        # A name with a dot is an upload that is still being created.
         for path in (path for path in paths if "." not in path.name):
             try:
                 found.append((path, read_attributes(path)))
@@ -149,7 +149,7 @@ class StationQuotas:
 
 
 def idle_seconds(path: Path) -> float:
-    """Seconds since anything in an upload's folder was written."""
+    """Seconds since the last write to an upload's folder."""
     with disk_errors(f"look at upload {path.name}"):
         try:
             newest = max(file.stat().st_mtime for file in [path, *path.iterdir()])

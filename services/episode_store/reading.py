@@ -1,4 +1,4 @@
-"""Ids and times in, msgpack of windows and samples out, within the bounds of one answer."""
+"""Read access for the routes: windows and samples as msgpack, limited in size, with ETags."""
 
 import hashlib
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from dextouch.schemas.recordings import RecordingAttributes
 from dextouch.schemas.rollouts import ActionKind
 from dextouch.streams.packing import pack
 
-# Raised whenever the same query gives other bytes.
+# To be incremented whenever the same query gives other bytes.
 ANSWER_VERSION = 1
 
 
 class WindowQuery(BaseModel):
-    """Which window is asked for; `cameras` are names with commas between, none when empty.
+    """Query of a window; `cameras` is a comma-separated list, which may be empty.
 
-    Images come at half size in both axes, or gray with one channel, if so asked.
+    Images are optionally at half size in both axes, or gray with one channel.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -35,16 +35,16 @@ class WindowQuery(BaseModel):
     gray: bool = False
 
     def camera_names(self) -> tuple[str, ...]:
-        """The names."""
+        """Names of the cameras."""
         return tuple(name for name in self.cameras.split(",") if name)
 
     def image_form(self) -> ImageForm:
-        """What is wanted of each image."""
+        """Requested form of images."""
         return ImageForm(half_size=self.half_size, gray=self.gray)
 
 
 class SpanQuery(BaseModel):
-    """Which samples are asked for: start_ns ≤ t < stop_ns, all without bounds."""
+    """Query of samples: start_ns ≤ t < stop_ns, by default all."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -54,19 +54,19 @@ class SpanQuery(BaseModel):
 
 @dataclass(frozen=True)
 class Answer:
-    """Bytes and the tag that names them; no bytes for an asker who has them already."""
+    """Response body and its ETag; no body if the client has it already."""
 
     etag: str
     data: bytes | None
 
 
 class StoreReader:
-    """What the routes read, each answer bounded, and not made at all for those who have it.
+    """Reads for the routes, with size limits and conditional requests.
 
     Args:
-        store: that is read.
-        max_window_steps: longest window.
-        max_answer_bytes: largest answer, before it is read.
+        store: to read from.
+        max_window_steps: maximum length of a window.
+        max_answer_bytes: maximum size of a response, checked before reading.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class StoreReader:
         Args:
             episode_id: of a committed episode.
             query: the window.
-            known: `If-None-Match` of the asker.
+            known: `If-None-Match` of the request.
 
         Raises:
             LimitExceededError: more steps or bytes of images than allowed.
@@ -110,7 +110,7 @@ class StoreReader:
         if is_known(etag, known):
             return Answer(etag, None)
         cameras, form = query.camera_names(), query.image_form()
-        # An unknown camera is the reader's to refuse.
+        # An unknown camera is refused by the reader.
         known_cameras = [reader.streams[name] for name in cameras if name in reader.streams]
         step_bytes = sum(
             prod(form.shape(stream.shape)) for stream in known_cameras if len(stream.shape) == 3
@@ -186,13 +186,13 @@ def _packed(reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuer
 
 
 def etag_of(reader: EpisodeReader | RecordingReader, what: str, query: BaseModel) -> str:
-    """A tag that is equal exactly where content and query are: what is committed never changes."""
+    """ETag of content and query; valid forever since committed groups are immutable."""
     text = f"{ANSWER_VERSION} {reader.content_sha256} {what} {query.model_dump_json()}"
     return f'"{hashlib.sha256(text.encode()).hexdigest()[:40]}"'
 
 
 def is_known(etag: str, known: str | None) -> bool:
-    """Whether a tag is among those of an `If-None-Match` header."""
+    """Whether an ETag is listed in an `If-None-Match` header."""
     if known is None:
         return False
     tags = {tag.strip().removeprefix("W/") for tag in known.split(",")}

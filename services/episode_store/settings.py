@@ -1,4 +1,4 @@
-"""Environment and flags in (DEXTOUCH_EPISODE_STORE_…), what the store keeps and allows out."""
+"""Settings of the episode store, from flags and DEXTOUCH_EPISODE_STORE_… variables."""
 
 from pydantic import Field
 
@@ -7,15 +7,15 @@ from dextouch.serving.settings import ServiceSettings, service_config
 
 
 class EpisodeStoreSettings(ServiceSettings):
-    """Where episodes lie, and the bounds of one request, of all at once, and of a station.
+    """Location of the store, and limits per request, in flight and per station.
 
-    `store_url` is a local folder or file:///…; uploads that are not finished lie below it too.
+    `store_url` is a local folder or file:///…; unfinished uploads are kept below it.
     `max_body_bytes` must hold one batch of the wire format. `max_open_uploads` unfinished uploads
-    keep their files open, two each: choose at least the number of stations that upload at once,
-    for opening one again costs a reading of its whole log. Batches beyond `max_batches_in_flight`
-    or `max_bytes_in_flight` are refused with 429; those that leave less than `min_free_bytes` on
-    the disk, or bring a station above its quota (unfinished and finished), with 507.
-    `commit_in_process` writes finished recordings in a process of its own.
+    keep their files open, two each: choose at least the number of concurrently uploading stations,
+    since reopening one reads its whole log. Batches beyond `max_batches_in_flight` or
+    `max_bytes_in_flight` are refused with 429; those that leave less than `min_free_bytes` on the
+    disk, or exceed a station's quota (unfinished and finished), with 507. `commit_in_process`
+    commits finished recordings in a child process.
     """
 
     model_config = service_config("episode_store")

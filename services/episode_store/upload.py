@@ -1,4 +1,4 @@
-"""Numbered batches of one unfinished recording → its spool, where append n is batch n."""
+"""One unfinished upload: numbered batches appended to its spool."""
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from dextouch.streams.wire import decode_batch
 
 
 class Upload:
-    """One unfinished recording; for one thread at a time.
+    """One unfinished recording; not thread-safe.
 
     Args:
         spool: of the recording, open for writing.
@@ -22,7 +22,7 @@ class Upload:
 
     @property
     def attributes(self) -> RecordingAttributes:
-        """As they were announced."""
+        """Attributes given when the upload began."""
         return self._spool.attributes
 
     def status(self) -> RecordingStatus:
@@ -34,7 +34,7 @@ class Upload:
         )
 
     def put(self, stream: str, number: int, data: bytes) -> BatchReceipt:
-        """Take batch `number` of a stream in; raises as `Ingest.put_batch`."""
+        """Store batch `number` of a stream; raises as `Ingest.put_batch`."""
         if stream not in self._streams:
             raise UnknownNameError("stream", stream, list(self._streams))
         expected, recording_id = self._spool.num_batches(stream), self.attributes.recording_id
@@ -65,11 +65,11 @@ class Upload:
         )
 
     def close(self) -> None:
-        """Mark the spool as complete and give all files back."""
+        """Mark the spool as complete and close all files."""
         self._spool.close()
 
     def abandon(self) -> None:
-        """Give all files back; the upload can be gone on with."""
+        """Close all files; the upload can be continued."""
         self._spool.abandon()
 
 

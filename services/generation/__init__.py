@@ -1,1 +1,1 @@
-"""Imagined episodes: recorded actions played in an imagined world, back into the store."""
+"""Imagined episodes: recorded actions replayed in an imagined world and stored."""

@@ -1,4 +1,4 @@
-"""A robot episode and a served imagined world in; the same actions as that world sees them, out."""
+"""Replay of robot episodes in a served imagined world, to create imagined episodes."""
 
 import hashlib
 from collections.abc import Collection
@@ -29,24 +29,24 @@ def imagine_episode(
     *,
     image_steps: Collection[int] | None = None,
 ) -> str:
-    """Play an episode's commanded actions in an imagined world and keep what it showed.
+    """Replay an episode's commanded actions in an imagined world and store the result.
 
-    The imagined episode starts from the source's first observation. Its `success` is the
-    *source's*: what these actions really led to, which is what a judge of imagined endings has to
-    learn. Its lineage names the source and the world's digest. Where the world gives object poses,
-    they are the stream `object_poses`, from step 1 on.
+    The imagined episode starts from the source's first observation. Its `success` is that of the
+    *source*: the true outcome of the actions, which is the label for a success probe on imagined
+    endings. Its lineage names the source and the world's digest. Object poses, if the world
+    provides them, are the stream `object_poses`, from step 1 on.
 
     Args:
         source: a robot episode with head camera, touch and commanded actions.
-        client: of the service that has the world.
-        world: its name there.
-        store: where the imagined episode goes.
-        image_steps: steps whose images somebody will look at; None for all of them. Images are
-            then kept of the chunks of four steps that hold one of these. It is meant for worlds
-            whose state does not depend on where chunks end, since chunks are shorter then.
+        client: of the service with the world.
+        world: its name at the service.
+        store: destination of the imagined episode.
+        image_steps: steps whose images are needed; None for all. Images are kept for the chunks of
+            four steps that contain one of these. Use it only with worlds whose state does not
+            depend on chunk boundaries, since chunks are then shorter.
 
     Returns:
-        Its id; the same source and world give the same id, and one that is there is kept.
+        Its id; equal source and world give an equal id, and an existing episode is kept.
 
     Raises:
         InvalidInputError: a source without commanded actions.
@@ -91,7 +91,7 @@ def _played(
     world: str,
     image_steps: Collection[int] | None,
 ) -> list[Observation]:
-    """What the world shows of an episode's commands, its first observation included."""
+    """Observations of the world for an episode's commands, including the first one."""
     attributes = source.attributes
     window = source.window(0, source.num_steps, cameras=(CAMERA,))
     first = Observation(
@@ -121,7 +121,7 @@ def _played(
 
 
 def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[int, int, bool]]:
-    """First step, step after the last, and whether images are asked for, of every chunk."""
+    """First step, end step and image request of every chunk."""
     if image_steps is None:
         firsts = range(1, num_steps, CHUNK_STEPS)
         return [(first, min(first + CHUNK_STEPS, num_steps), True) for first in firsts]
@@ -137,7 +137,7 @@ def _chunks(num_steps: int, image_steps: Collection[int] | None) -> list[tuple[i
 
 
 def imagined_id(episode_id: str, world_digest: str) -> str:
-    """The id of an imagined episode: its source and, in short, the world that imagined it."""
+    """Id of an imagined episode, from its source and an abbreviated world digest."""
     return f"imagined-{world_digest[:8]}-{episode_id}"
 
 
@@ -167,7 +167,7 @@ def _write(
         streams.append((f"tactile_{side}", "tactile", "kPa", tactile[:, index]))
     poses = [one.object_poses for one in seen[1:] if one.object_poses is not None]
     if poses and len(poses) == len(seen) - 1:
-        # The first observation is a real one: nobody knows where its objects are.
+        # The first observation is real, without known object poses.
         values = np.concatenate(poses).astype(np.float64)
         streams.append(("object_poses", "pose", "pose_m_wxyz", values))
     with store.writer(kind="episode", attributes=attributes) as writer:

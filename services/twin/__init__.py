@@ -1,1 +1,1 @@
-"""The physics twin: two simulated hands and a task in, truth episodes and a world out."""
+"""Physics twin in MuJoCo: two hands, a table and tasks, as a world and a source of episodes."""

@@ -1,4 +1,4 @@
-"""`dextouch twin record|serve`: seeds to truth episodes in a store, or the twin over HTTP."""
+"""Command line `dextouch twin`: record true episodes to a store, or serve the twin over HTTP."""
 
 import argparse
 import json
@@ -32,7 +32,7 @@ _MISS_DRAW = 5
 
 @dataclass(frozen=True)
 class TakeOrder:
-    """One episode to make, in whatever process."""
+    """Order for one episode, for a worker process."""
 
     task: str
     domain: Domain
@@ -43,7 +43,7 @@ class TakeOrder:
 
 @dataclass(frozen=True)
 class TakeReport:
-    """What became of one order."""
+    """Result of one order."""
 
     episode_id: str
     seed: int
@@ -53,7 +53,7 @@ class TakeReport:
 
 @lru_cache(maxsize=2)
 def _stage(task: str, domain: Domain) -> Stage:
-    """Each process compiles each scene once."""
+    """Stage of a task, compiled once per process."""
     return Stage(task, domain, TwinSettings())
 
 
@@ -76,24 +76,38 @@ def _seed_range(text: str) -> range:
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="dextouch twin", description=__doc__)
     commands = parser.add_subparsers(dest="command", required=True)
-    make = commands.add_parser("record", help="write truth episodes of a scripted demonstrator")
+    make = commands.add_parser(
+        "record", help="record episodes of a scripted demonstrator with true values"
+    )
     make.add_argument("--task", required=True, choices=TASK_NAMES)
-    make.add_argument("--seeds", required=True, type=_seed_range, help="A:B, B not included")
+    make.add_argument("--seeds", required=True, type=_seed_range, help="range A:B, B excluded")
     make.add_argument("--domain", default="robot", choices=DOMAINS)
-    make.add_argument("--noise", default=0.0, type=float, help="demonstrator's error, metres")
-    make.add_argument("--miss-fraction", default=0.0, type=float, help="takes without the objects")
-    make.add_argument("--freeze-from", type=int, help="step 0 … 80 from which on nothing moves")
-    make.add_argument("--motion", choices=MOTION_KINDS, help="leave the script for this motion")
+    make.add_argument(
+        "--noise",
+        default=0.0,
+        type=float,
+        help="standard deviation of the demonstrator's error (m)",
+    )
+    make.add_argument(
+        "--miss-fraction", default=0.0, type=float, help="share of takes that miss the objects"
+    )
+    make.add_argument("--freeze-from", type=int, help="freeze the commands from this step (0 … 80)")
+    make.add_argument("--motion", choices=MOTION_KINDS, help="replace the script by this motion")
     make.add_argument("--motion-from", type=int, default=0, help="at this step (%(default)s)")
-    make.add_argument("--actions-of", type=int, help="play what is done for this seed instead")
+    make.add_argument("--actions-of", type=int, help="play the actions of this seed instead")
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS)
-    make.add_argument("--image-every", type=int, help="images of every n-th step, not at 30 Hz")
+    make.add_argument(
+        "--image-every", type=int, help="record images of every n-th step instead of at 30 Hz"
+    )
     make.add_argument("--streams", default="all", choices=STREAM_CHOICES, help="(%(default)s)")
     make.add_argument(
-        "--store", default=default_store(), help="where episodes go (%(default)s)", metavar="URL"
+        "--store",
+        default=default_store(),
+        help="store for the episodes (%(default)s)",
+        metavar="URL",
     )
     make.add_argument("--jobs", default=1, type=int, help="processes")
-    make.add_argument("--json", type=Path, help="write a summary here")
+    make.add_argument("--json", type=Path, help="write a JSON summary to this file")
     commands.add_parser("serve", help="serve the twin as a world; flags: serve --help")
     return parser
 
@@ -125,7 +139,7 @@ def _work(orders: Sequence[TakeOrder], num_jobs: int) -> Iterator[TakeReport]:
     if num_jobs == 1:
         yield from map(_take, orders)
         return
-    # Fresh processes: forking would copy whatever threads and locks the caller has.
+    # Spawned processes: forking would copy the caller's threads and locks.
     with multiprocessing.get_context("spawn").Pool(num_jobs) as pool:
         yield from pool.imap(_take, orders)
 

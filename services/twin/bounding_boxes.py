@@ -1,4 +1,4 @@
-"""Bounding boxes of a task's objects in their own frames, computed from the compiled geoms."""
+"""Bounding boxes of a task's objects in their own frames, from the compiled geoms."""
 
 from collections.abc import Callable
 from typing import Final
@@ -10,8 +10,8 @@ from jaxtyping import Float64
 from dextouch.geometry.transforms import apply, invert, transform, transform_from_pose
 from services.twin.scene import Scene
 
-# How far a solid reaches from its centre along each axis of another frame; `A` holds the axes of
-# that frame in the solid's own, row by row, `size` is MuJoCo's.
+# Half extent of a solid along each axis of another frame; the rows of `A` are the axes of that
+# frame in the solid's own, `size` is MuJoCo's.
 _REACH: Final[dict[int, Callable[[np.ndarray, np.ndarray], np.ndarray]]] = {
     int(mujoco.mjtGeom.mjGEOM_SPHERE): lambda A, size: np.full(3, size[0]),
     int(mujoco.mjtGeom.mjGEOM_CAPSULE): lambda A, size: size[0] + size[1] * np.abs(A[:, 2]),
@@ -27,7 +27,7 @@ _MESH: Final = int(mujoco.mjtGeom.mjGEOM_MESH)
 def object_boxes_m(scene: Scene) -> Float64[np.ndarray, "objects 6"]:
     """Centre x y z and half sizes x y z of each object's box in its own frame (m).
 
-    Nameless parts of an object count with their joints at rest; of a mesh, its hull.
+    Unnamed parts of an object are included with their joints at rest; meshes by their hull.
     """
     data = mujoco.MjData(scene.model)
     mujoco.mj_kinematics(scene.model, data)
@@ -51,7 +51,7 @@ def _span(
     geom: int,
     T_object_world: Float64[np.ndarray, "4 4"],
 ) -> tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]]:
-    """Lowest and highest coordinates of a geom in its object's frame."""
+    """Minimum and maximum coordinates of a geom in its object's frame."""
     R_world_geom = data.geom_xmat[geom].reshape(3, 3)
     T = T_object_world @ transform(R_world_geom, data.geom_xpos[geom])
     kind = int(model.geom_type[geom])

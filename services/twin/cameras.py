@@ -1,7 +1,7 @@
-"""Pictures of the twin by ray casting: a consistent state in, 64×64 images out, no GPU, no GL.
+"""Camera rendering by ray casting, deterministic and without GPU or OpenGL.
 
-Flat segment colours under one fixed light (Lambert) with a chequered table, so that motion shows
-and the same state always gives the same bytes.
+Flat object colours with Lambert shading by one fixed light, and a chequered table that makes motion
+visible. Equal states give equal bytes.
 """
 
 import math
@@ -53,7 +53,7 @@ def _wrist_mount(palm_sign: float) -> Float64[np.ndarray, "4 4"]:
 
 
 class CameraRig:
-    """The three cameras of one scene; rays are computed once and turned with the camera."""
+    """The three cameras of a scene; rays are computed once and rotated with the camera."""
 
     def __init__(self, scene: Scene, *, height_px: int, width_px: int) -> None:
         self._model = scene.model
@@ -87,7 +87,7 @@ class CameraRig:
         return transform_from_pose(simulation.wrist_poses()[side_index]) @ self.mounts[side_index]
 
     def image(self, simulation: Simulation, camera: str) -> UInt8[np.ndarray, "h w 3"]:
-        """What one camera sees of a simulation whose derived quantities are current."""
+        """Render one camera; derived quantities of the simulation must be current."""
         T_world_camera = self.pose(simulation, camera)
         rays_world = np.ascontiguousarray(self._rays[camera] @ T_world_camera[:3, :3].T)
         eye_m = np.ascontiguousarray(T_world_camera[:3, 3])

@@ -1,4 +1,4 @@
-"""Scripted demonstrators: waypoints of both hands in, smooth commands on the model grid out."""
+"""Scripted demonstrators: smooth commands on the model grid from waypoints of both hands."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,18 +17,18 @@ from services.twin.simulation import MODEL_RATE_HZ
 
 # 1 + 5 × 16 grid steps: a take of 5 1/3 s.
 NUM_GRID_STEPS: Final = 81
-# A person who looks at what the hands do moves the head by centimetres and degrees.
+# Head motion of a person watching their hands: centimetres and degrees.
 _SWAY_M: Final = np.array([0.030, 0.025, 0.020])
 _SWAY_RAD: Final = np.array([0.050, 0.050, 0.028])
-# Each part of a take lasts this share of its nominal time.
+# Range of the duration of each part of a take, relative to the nominal one.
 _TEMPO: Final = (0.85, 1.15)
-# A person reading a waypoint a centimetre wrong also turns a little wrong.
+# An offset of a centimetre comes with a small rotation error.
 YAW_NOISE_RAD_PER_M: Final = 5.0
 
 
 @dataclass(frozen=True)
 class HandPose:
-    """Where one hand is and how it is bent."""
+    """Pose and joint angles of one hand."""
 
     T_world_wrist: Float64[np.ndarray, "4 4"]
     joints_rad: Float64[np.ndarray, "20"]
@@ -36,7 +36,7 @@ class HandPose:
 
 @dataclass(frozen=True)
 class Waypoint:
-    """Both hands at one time of the take."""
+    """Both hands at a time of the take."""
 
     time_s: float
     left: HandPose
@@ -45,14 +45,14 @@ class Waypoint:
 
 @dataclass(frozen=True)
 class WaypointNoise:
-    """How wrong a demonstrator reads one place: an offset on the table and a turn about z."""
+    """A demonstrator's error at one location: an offset on the table and a rotation about z."""
 
     offset_m: Float64[np.ndarray, "3"]
     yaw_rad: float
 
     @staticmethod
     def draw(generator: np.random.Generator, noise_m: float) -> "WaypointNoise":
-        """One error; always draws as many numbers, so that ladders of noise share their seeds."""
+        """Draw an error; the number of draws is fixed, so that noise levels share their seeds."""
         errors = generator.normal(size=3) * noise_m
         return WaypointNoise(
             np.array([errors[0], errors[1], 0.0]), float(errors[2] * YAW_NOISE_RAD_PER_M)
@@ -60,14 +60,14 @@ class WaypointNoise:
 
 
 def moved(hand: HandPose, offset_m: Sequence[float] | np.ndarray) -> HandPose:
-    """The same hand shifted in the world."""
+    """Translate a hand in the world."""
     T = hand.T_world_wrist.copy()
     T[:3, 3] += np.asarray(offset_m)
     return HandPose(T, hand.joints_rad)
 
 
 def bent(hand: HandPose, joints_rad: np.ndarray) -> HandPose:
-    """The same wrist with another posture."""
+    """Replace the joint angles of a hand."""
     return HandPose(hand.T_world_wrist, joints_rad)
 
 
@@ -84,7 +84,7 @@ def head_sway(generator: np.random.Generator) -> Float64[np.ndarray, "81 4 4"]:
 
 
 def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) -> list[Waypoint]:
-    """The same places, each reached a little earlier or later; start and end keep their time."""
+    """Vary the timing of waypoints; start and end keep their time."""
     times = np.array([waypoint.time_s for waypoint in waypoints])
     parts = np.diff(times) * generator.uniform(*_TEMPO, size=len(times) - 1)
     parts *= (times[-1] - times[0]) / parts.sum()
@@ -96,7 +96,7 @@ def at_own_tempo(waypoints: Sequence[Waypoint], generator: np.random.Generator) 
 
 
 def follow(waypoints: Sequence[Waypoint], head: Float64[np.ndarray, "81 4 4"]) -> HandTrajectory:
-    """Commands of a whole take: smoothstep between waypoints, still before and after them.
+    """Commands of a whole take: smoothstep between waypoints, constant before and after them.
 
     Raises:
         InvalidInputError: times that do not increase.

@@ -1,4 +1,4 @@
-"""Truth episodes of the twin: every stream of one take, scripted or played, and its success."""
+"""Recording of true episodes: all streams of one take, scripted or played, and its success."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -34,15 +34,15 @@ __all__ = [
 ]
 
 TAKE_STEPS: Final = (NUM_GRID_STEPS - 1) * STEPS_PER_GRID
-# Of the random numbers of motions, beside those of `Stage.plan`.
+# Random stream of motions, independent of those of `Stage.plan`.
 _MOTION: Final = 101
 
 
 @dataclass(frozen=True)
 class TruthEpisode:
-    """One take as it really was.
+    """True values of one take.
 
-    `pad_forces_n` is the contact truth at the tactile rate: normal force on thumb … little tip
+    `pad_forces_n` is the true contact force at the tactile rate: normal force on thumb … little tip
     and palm, left then right; pressures times taxel areas sum to it.
     """
 
@@ -60,7 +60,7 @@ def demonstrate(
     miss: bool = False,
     images: tuple[str, ...] = CAMERAS,
 ) -> TruthEpisode:
-    """One scripted take from a freshly compiled scene; use `record` for many.
+    """Record one scripted take, compiling the scene; use `record` for many.
 
     Raises:
         UnknownNameError: unknown task, domain or camera.
@@ -72,17 +72,18 @@ def demonstrate(
 def record(
     stage: Stage, seed: int, options: TakeOptions, *, played: PlayedActions | None = None
 ) -> TruthEpisode:
-    """One take on a stage; the same stage, seed, options and actions give the same bytes.
+    """Record one take; equal stage, seed, options and actions give equal bytes.
 
     Args:
         stage: a task with the hands of a domain.
-        seed: of the scene, and of all that is drawn.
-        options: how the take is made; they say what is commanded unless `played` does.
-        played: actions that came from elsewhere.
+        seed: of the scene and of all random numbers.
+        options: of the take; they determine the commands unless `played` is given.
+        played: actions from another source.
     """
     plan = stage.plan(seed, noise_m=options.noise_m, miss=options.miss)
     anchor = stage.start(plan)
-    # The take obeys exactly the numbers that its `action_commanded` holds: through 67-D and back.
+    # Commands are converted to 67-D and back, so that the take follows exactly its
+    # `action_commanded`.
     if played is None:
         actions_commanded = _commanded(stage, seed, options, plan, anchor)
     else:
@@ -114,10 +115,10 @@ def record(
 def _commanded(
     stage: Stage, seed: int, options: TakeOptions, plan: Plan, anchor: AnchorPoses
 ) -> Float64[np.ndarray, "81 67"]:
-    """What the hands are told in 67-D, relative to what is measured at the start."""
+    """Commanded 67-D actions, relative to the measured poses at the start."""
     if options.actions_of_seed is not None:
         other = stage.plan(options.actions_of_seed, noise_m=options.noise_m).commands
-        # As measured at that take's start: the hands are where the first command wants them.
+        # As measured at the start of that take, where the hands are at the first command.
         Ts = transform_from_pose(pose_from_transform(np.stack(other.anchor(0).as_tuple())))
         return actions_from_poses(other, AnchorPoses(*Ts))
     commands = plan.commands
@@ -164,10 +165,10 @@ def _attributes(
 
 
 def write_episode(store: EpisodeStore, episode: TruthEpisode) -> str:
-    """Put a truth episode into a store; returns its id.
+    """Write an episode to a store and return its id.
 
     Raises:
-        ConflictError: the store has an episode of this id already.
+        ConflictError: the id exists.
     """
     with store.writer(kind="episode", attributes=episode.attributes) as writer:
         for name, stream in episode.streams.items():

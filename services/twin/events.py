@@ -1,4 +1,4 @@
-"""When a task's milestones were first reached, noted at the grid steps of a take."""
+"""Times at which a task's milestones are first reached in a take."""
 
 from services.twin.simulation import MODEL_RATE_HZ, Simulation
 from services.twin.tasks import Task
@@ -12,7 +12,7 @@ class EventTimes:
         self.times_s: dict[str, float] = {}
 
     def sample(self, step: int, simulation: Simulation) -> None:
-        """Note what holds at a grid step, counted from the start of the take."""
+        """Record the milestones reached at a grid step, counted from the start of the take."""
         reached = self._task.reached(simulation)
         for name, holds in zip(self._task.milestones, reached, strict=True):
             if holds:

@@ -1,6 +1,6 @@
-"""Hand postures by kinematic search: a hand and a cylinder in, joint angles that hold it out.
+"""Kinematic search for hand postures that hold a cylinder.
 
-The search is deterministic (its own fixed generator) and runs once a process and hand.
+The search is deterministic (with a fixed generator of its own) and cached per process and hand.
 """
 
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD
 
 _NUM_FIRST, _NUM_NEXT, _NUM_ROUNDS = 6000, 300, 45
 _SHRINK: Final = 0.90
-# Weights against one metre of distance between fingertip and cylinder.
+# Cost weights relative to the distance between fingertip and cylinder.
 _FACING_M_PER_RAD: Final = 0.004
 _PLACE_M_PER_RAD: Final = 0.02
 _ALONG: Final = 0.3
@@ -26,7 +26,7 @@ _INSIDE: Final = 3.0
 _SMALL_RAD: Final = 1e-5
 _NUM_OPENING_STEPS: Final = 10
 _DAMPING_M2: Final = 1e-4
-# How thumb … little finger share a squeeze: the thumb against all others.
+# Force shares of thumb … little finger in a squeeze: the thumb opposes all others.
 _SHARES: Final = (1.0, 0.45, 0.30, 0.20, 0.05)
 
 
@@ -34,9 +34,9 @@ _SHARES: Final = (1.0, 0.45, 0.30, 0.20, 0.05)
 class CylinderGrasp:
     """A cylinder in front of the palm and parallel to it, to be held by all five fingertips.
 
-    Its axis runs across the hand, turned by `skew_rad` so that on the thumb's side it lies more
+    Its axis runs across the hand, rotated by `skew_rad` so that on the thumb's side it lies more
     towards the fingertips (people hold a bottle that way, since the thumb sits far back).
-    `distance_m` is the axis' distance from the wrist origin on the palm side, `z_m` its place
+    `distance_m` is the axis' distance from the wrist origin on the palm side, `z_m` its position
     along the fingers; fingertips touch `below_rad` beyond the middle, seen from the palm; the
     thumb's touches at `thumb_m` along the axis. The table is `table_m` beyond the axis.
     """
@@ -50,7 +50,7 @@ class CylinderGrasp:
     table_m: float
 
     def axis_rotation(self) -> Float64[np.ndarray, "3 3"]:
-        """R_wrist_axis: turns a frame whose x runs along the cylinder into the wrist frame."""
+        """R_wrist_axis from a frame whose x axis is the cylinder's axis."""
         return rotation_from_vector(np.array([0.0, self.skew_rad, 0.0]))
 
     def axis_point_m(self, hand: TwinHand) -> Float64[np.ndarray, "3"]:
@@ -61,7 +61,7 @@ class CylinderGrasp:
 def _costs(
     hand: TwinHand, grasp: CylinderGrasp, joints_rad: Float64[np.ndarray, "samples 20"]
 ) -> Float64[np.ndarray, "samples 5"]:
-    """How badly each finger of each sample holds the cylinder, in metres."""
+    """Cost of each finger of each sample, in metres."""
     T_axis_wrist = transform(grasp.axis_rotation().T, np.zeros(3))
     frames = T_axis_wrist @ hand.kinematics.joint_frames(joints_rad)
     chain_m = apply(T_axis_wrist, hand.kinematics.chain_points_m(joints_rad))
@@ -72,7 +72,7 @@ def _costs(
     local[:, 0, 2] = -straight
     local[:, 1, 2] = -0.5 * straight
     distal = apply(frames[:, :, 3], np.broadcast_to(local, (len(frames), 5, 2, 3)))
-    # In the plane across the cylinder: u towards the fingers' side, v away from the palm.
+    # In the cylinder's cross section: u towards the fingers' side, v away from the palm.
     side = np.array([-1.0, 1.0, 1.0, 1.0, 1.0])
     axis = grasp.axis_rotation().T @ grasp.axis_point_m(hand)
     u = -(distal[..., 2] - axis[2]) * side[:, None]
@@ -96,7 +96,7 @@ def _penetration(
     axis: Float64[np.ndarray, "3"],
     chain_m: Float64[np.ndarray, "samples 5 4 3"],
 ) -> Float64[np.ndarray, "samples 5"]:
-    """How far knuckles and phalanges reach into the cylinder or below it, in metres."""
+    """Penetration of knuckles and phalanges into the cylinder or the table, in metres."""
     points = np.concatenate([chain_m[:, :, 1:3], 0.5 * (chain_m[:, :, :2] + chain_m[:, :, 1:3])], 2)
     distance = np.hypot(points[..., 1] - axis[1], points[..., 2] - axis[2])
     clearance = grasp.radius_m + np.array([row[1] for row in hand.shape.radii_m])[:, None] + 0.001
@@ -113,7 +113,7 @@ def _refine(
     start_rad: Float64[np.ndarray, "samples 20"],
     spread_rad: float,
 ) -> Float64[np.ndarray, "20"]:
-    """Best posture found near the best fingers of the start samples; each finger by itself."""
+    """Local search around the best start sample of each finger, independently per finger."""
     generator = np.random.default_rng(20)
     lower, upper = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     samples, best_cost, best = start_rad, np.full(5, np.inf), np.zeros((5, 4))
@@ -131,7 +131,7 @@ def _refine(
 
 @lru_cache(maxsize=8)
 def _searched(grasp: CylinderGrasp, domain: Domain) -> Float64[np.ndarray, "20"]:
-    """Joint angles that hold the cylinder; the same for left and right hands."""
+    """Joint angles that hold the cylinder, equal for left and right hands."""
     hand = twin_hand("right", domain)
     lower, upper = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     start = np.random.default_rng(10).uniform(lower, upper, size=(_NUM_FIRST, 20))
@@ -154,7 +154,7 @@ def _fingertip_jacobian(
 
 
 def opened(grasp: CylinderGrasp, domain: Domain, *, gap_m: float) -> Float64[np.ndarray, "20"]:
-    """Joint angles after all fingertips went straight off the held cylinder by `gap_m`."""
+    """Joint angles with all fingertips retracted from the held cylinder by `gap_m`."""
     hand = twin_hand("right", domain)
     joints = holding(grasp, domain)
     tips, _ = _fingertip_jacobian(hand, joints)
@@ -171,10 +171,10 @@ def opened(grasp: CylinderGrasp, domain: Domain, *, gap_m: float) -> Float64[np.
 
 
 def pressing(grasp: CylinderGrasp, domain: Domain, *, force_n: float) -> Float64[np.ndarray, "20"]:
-    """A posture whose servos press the cylinder from both sides with about `force_n`.
+    """Servo targets that squeeze the cylinder with about `force_n`.
 
-    The servos' targets lead the joints by Jᵀ f / stiffness: the thumb presses with all of the
-    force, the fingers share it. Targets may lie past a joint's limit; the joint stops there.
+    The targets are offset from the joint angles by Jᵀ f / stiffness: the thumb presses with the
+    full force, the fingers share it. Targets may exceed a joint's limit, where the joint stops.
     """
     hand = twin_hand("right", domain)
     joints = holding(grasp, domain)
@@ -187,7 +187,7 @@ def pressing(grasp: CylinderGrasp, domain: Domain, *, force_n: float) -> Float64
 def _towards_axis(
     hand: TwinHand, grasp: CylinderGrasp, tips_m: Float64[np.ndarray, "5 3"]
 ) -> Float64[np.ndarray, "5 3"]:
-    """Unit vectors from fingertips to the axis, along the palm: nothing is pushed out of it."""
+    """Unit vectors from fingertips to the axis, parallel to the palm to keep the cylinder in."""
     across = grasp.axis_rotation()[:, 2]
     side = np.sign((grasp.axis_point_m(hand) - tips_m) @ across)
     return side[:, None] * across

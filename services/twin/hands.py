@@ -1,4 +1,4 @@
-"""The two hands of a domain, robot or human: their kinematics, their shape, their MJCF bodies.
+"""Robot and human hands of the twin: kinematics, collision shape and tactile skin.
 
 Both are five fingers × four hinges in the wrist frame of `dextouch.hands.wuji_hand_2` (fingers
 along -z, thumb side +x, right palm towards +y, left palm towards -y).
@@ -21,11 +21,11 @@ from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
 Domain = Literal["robot", "human"]
 DOMAINS: Final[tuple[Domain, Domain]] = ("robot", "human")
 
-# How far the sensing skin stands off the rigid shape; measured best for the shape of the pressure.
+# Offset of the sensing skin from the rigid shape, chosen for the most accurate pressure pattern.
 SKIN_OFFSET_M: Final = 0.0015
 PALM_THICKNESS_M: Final = 0.024
-# Fingertip taxels: angle around the finger (radial to ulnar) and places along the meridian, as
-# angles on the cap (distal) or distances up the straight part (proximal).
+# Fingertip taxels: angle around the finger (radial to ulnar) and positions along the meridian, as
+# angles on the cap (distal) or distances along the straight part (proximal).
 TIP_COLUMN_ANGLES_RAD: Final = np.deg2rad([60.0, 20.0, -20.0, -60.0])
 TIP_CAP_ANGLES_RAD: Final = np.deg2rad([52.0, 20.0])
 TIP_SHAFT_M: Final = (0.002, 0.007)
@@ -34,8 +34,8 @@ TIP_SHAFT_M: Final = (0.002, 0.007)
 class HandShape(NamedTuple):
     """Collision shape: radii [5][3] of proximal, middle and distal capsules, centre of the palm.
 
-    `palm_z_m` and `palm_x_m` are the palm's centre in the wrist frame; `palm_face_m` is how far
-    its sensing face lies on the palm side of the wrist origin.
+    `palm_z_m` and `palm_x_m` are the palm's centre in the wrist frame; `palm_face_m` is the
+    distance of its sensing face from the wrist origin.
     """
 
     radii_m: tuple[tuple[float, float, float], ...]
@@ -56,7 +56,7 @@ _HUMAN_SHAPE: Final = HandShape(
 
 
 class HumanHand(RobotHand):
-    """A human hand with the robot's tree and joint order but human bones and limits."""
+    """A human hand with the robot's kinematic tree and joint order, but human bones and limits."""
 
     def __init__(self, side: str) -> None:
         super().__init__(side)

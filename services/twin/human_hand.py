@@ -1,8 +1,8 @@
-"""The human parameter set: bone lengths and joint limits in, finger tables like the robot's out.
+"""Kinematic tables of the human hand: mean bone lengths and joint limits.
 
 Adult mean bone lengths (Buryanov and Kotiuk 2010; phalanges with the pulp added to the last one).
-Places of the wrist bones and the limits are ours, from common anatomy. The thumb's base frame is
-turned like the robot's, so that flexion and abduction mean the same on both.
+Positions of the wrist bones and the limits are our estimates from common anatomy. The thumb's base
+frame is oriented like the robot's, so that flexion and abduction have the same meaning.
 """
 
 from typing import Final
@@ -18,7 +18,7 @@ METACARPAL_BASES_M: Final[dict[str, np.ndarray]] = {
     "ring": np.array([-0.007, -0.003, -0.027]),
     "little": np.array([-0.015, 0.000, -0.024]),
 }
-# Length of the metacarpal, and how far it leans to the thumb side.
+# Length of the metacarpal, and its lean to the thumb side.
 _METACARPALS: Final = {
     "index": (0.06812, 0.14),
     "middle": (0.06460, 0.00),
@@ -49,7 +49,7 @@ def _finger(name: str) -> FingerTable:
     base = METACARPAL_BASES_M[name]
     knuckle = base + length * np.array([np.sin(lean), 0.0, -np.cos(lean)])
     proximal, middle, distal = _PHALANGES_M[name]
-    # The finger fans out half as much as its metacarpal: a turn about y, seen from the wrist.
+    # The finger spreads half as much as its metacarpal, by a rotation about y.
     fan = (float(np.cos(lean / 4)), 0.0, float(-np.sin(lean / 4)), 0.0)
     firmware = "pinky" if name == "little" else f"{name}_finger"
     flex, abd, pip, dip = _FINGER_LIMITS_RAD
@@ -86,7 +86,7 @@ def _thumb() -> FingerTable:
 
 
 def _mirrored(row: JointRow) -> JointRow:
-    """The left hand's row: y of places changes sign, and so do turns about x and z."""
+    """Mirror a row to the left hand: y positions and rotations about x and z change sign."""
     x, y, z = row.position_m
     qw, qx, qy, qz = row.q_wxyz
     axis_x, axis_y, axis_z = row.axis

@@ -1,4 +1,4 @@
-"""MJCF text: a pair of hands and a task's objects in, the XML of the whole scene out."""
+"""MJCF generation of the scene: table, two hands with tactile skin, and a task's objects."""
 
 from collections.abc import Iterable
 
@@ -9,11 +9,11 @@ from dextouch.tactile.layout import FINGERS
 from services.twin.hands import PALM_THICKNESS_M, TwinHand
 
 PHYSICS_RATE_HZ = 600
-# Wrist impedance: what the arm (or the operator's arm) does against the hand's commanded pose.
+# Wrist impedance of the arm (or the operator's arm) towards the commanded pose.
 WRIST_STIFFNESS_N_M, WRIST_DAMPING_N_S_M = 700.0, 40.0
 WRIST_STIFFNESS_NM_RAD, WRIST_DAMPING_NM_S_RAD = 15.0, 0.4
 FINGER_STIFFNESS_NM_RAD, FINGER_DAMPING_NM_S_RAD, FINGER_TORQUE_NM = 1.2, 0.03, 2.0
-# Human skin and the robot's pads give about 1 mm at 10 N.
+# Human skin and the robot's pads yield about 1 mm at 10 N.
 _HAND_CONTACT = 'friction="1.2 0.01 0.0005" solref="0.02 1" solimp="0.4 0.8 0.004" priority="1"'
 _OBJECT_CONTACT = 'friction="1 0.005 0.0001"'
 _HAND_COLOURS = {"left": (0.45, 0.62, 0.88), "right": (0.90, 0.66, 0.50)}
@@ -21,12 +21,12 @@ _SKIN_GROUP = 4
 
 
 def numbers(values: Iterable[float]) -> str:
-    """Numbers as an MJCF attribute, exact to the last bit."""
+    """Format numbers as an MJCF attribute, without loss."""
     return " ".join(repr(float(value)) for value in values)
 
 
 def _tint(side: str, finger_index: int) -> str:
-    """A hand's own colour, lighter from thumb to little finger."""
+    """Colour of a hand, lighter from thumb to little finger."""
     base = np.array(_HAND_COLOURS[side])
     return numbers([*(base * (0.80 + 0.06 * finger_index)).clip(0, 1), 1.0])
 
@@ -99,7 +99,7 @@ def _hand(hand: TwinHand) -> str:
 
 
 def _grid_mesh(name: str, grid_m: np.ndarray, *, flip: bool) -> str:
-    """An open surface through a grid of points [rows, columns, 3], in their order."""
+    """Mesh of an open surface through a grid of points [rows, columns, 3]."""
     rows, columns, _ = grid_m.shape
     index = np.arange(rows * columns).reshape(rows, columns)
     a, b = index[:-1, :-1].ravel(), index[:-1, 1:].ravel()
@@ -148,7 +148,7 @@ def _sensors(hand: TwinHand) -> str:
 
 
 def scene_xml(hands: tuple[TwinHand, ...], objects: str) -> str:
-    """The scene: table, a shelf behind the viewer for removed objects, hands and objects.
+    """MJCF of the scene: table, a shelf behind the viewer for removed objects, hands and objects.
 
     Args:
         hands: left and right, or any of them.

@@ -1,8 +1,7 @@
-"""Motions beside a task's script: hands that retreat, push, let slip, or wander about.
+"""Off-script motions of the hands: retreat, push, slip and wander, for data beyond demonstrations.
 
-A network that has only watched scripts believes that every motion of that kind succeeds. These
-motions begin at any step of a script and are drawn from a generator, so that the outcome has to be
-learned from where things are.
+A network trained on scripts only predicts success for any similar motion. These motions start at
+any step of a script and are random, so that the outcome must be learned from the state.
 """
 
 from dataclasses import dataclass
@@ -26,22 +25,22 @@ Hands = tuple[HandPose, HandPose]
 
 _END_S: Final = (NUM_GRID_STEPS - 1) / MODEL_RATE_HZ
 _FIST: Final = np.tile(np.array([1.25, 0.0, 1.45, 1.0]), 5)
-# Half the thickness of a finger or of the palm's edge, so that hands stay above the table.
+# Half the thickness of a finger or of the palm's edge, to keep hands above the table.
 _HAND_RADIUS_M: Final = 0.010
 _APART_M: Final = 0.07
-# A posture that differs less than this from the first one holds by its wrists, not its fingers.
+# Below this difference from the first posture, the object is held by the wrists, not the fingers.
 _SAME_POSTURE_RAD: Final = 0.1
 _SLIP_S: Final = 0.2
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What the hands do from a step of the script (0 … 79) on.
+    """Motion of the hands from a step of the script (0 … 79) on.
 
-    `retreat`: back to where they began, or up and away, with what they hold or without.
-    `push`: a sweep through an object's place with the posture of the moment or a fist.
-    `slip`: the script goes on with a grasp opened in part.
-    `wander`: both hands go smoothly from one random place near the objects to the next.
+    `retreat`: back to the start or up and away, with or without the held object.
+    `push`: a sweep through an object's position with the current posture or a fist.
+    `slip`: the script continues with a partially opened grasp.
+    `wander`: both hands move smoothly between random positions near the objects.
     """
 
     kind: MotionKind
@@ -57,7 +56,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class MotionScene:
-    """Whose hands move, and where the objects are at the start (x y z m, qw qx qy qz)."""
+    """The hands, and the initial object poses (x y z m, qw qx qy qz)."""
 
     domain: Domain
     object_poses: Float64[np.ndarray, "objects 7"]
@@ -71,7 +70,7 @@ class MotionScene:
 def with_motion(
     commands: HandTrajectory, motion: Motion, scene: MotionScene, generator: np.random.Generator
 ) -> HandTrajectory:
-    """The commands of a script, changed from the motion's step on; the head sways as before."""
+    """Replace a script's commands from the motion's step on; the head motion is kept."""
     if motion.kind == "slip":
         return _slipping(commands, motion.from_step, generator)
     draw = {"retreat": _retreat, "push": _push, "wander": _wander}[motion.kind]
@@ -101,7 +100,7 @@ def _hands_at(commands: HandTrajectory, step: int) -> Hands:
 
 
 def _path(first: Hands, from_step: int, stops: list[tuple[float, Hands]]) -> list[Waypoint]:
-    """Waypoints after a step; each stop comes with the seconds since the one before."""
+    """Waypoints after a step; each stop has the time since the previous one in seconds."""
     waypoints = [Waypoint(from_step / MODEL_RATE_HZ, *first)]
     for duration_s, hands in stops:
         waypoints.append(Waypoint(waypoints[-1].time_s + duration_s, *hands))
@@ -125,7 +124,7 @@ def _retreat(
 
 
 def _set_down(hand: TwinHand, pose: HandPose, middle_m: np.ndarray, lowest_m: float) -> HandPose:
-    """The hand turned and bent as in `pose`, its middle over a place, its lowest point so high."""
+    """Move a hand above a position with its lowest point at a given height."""
     fingers_m = hand.kinematics.chain_points_m(pose.joints_rad[None]).reshape(-1, 3)
     R = pose.T_world_wrist[:3, :3]
     points_m = np.concatenate([fingers_m, hand.palm_skin_m().reshape(-1, 3)]) @ R.T
@@ -198,7 +197,7 @@ def _wander(
 def _slipping(
     commands: HandTrajectory, from_step: int, generator: np.random.Generator
 ) -> HandTrajectory:
-    """Fingers go part of the way back to the first posture; hands without a grip go apart."""
+    """Open fingers part of the way to the first posture; hands without a grip move apart."""
     opened, gap_m = generator.uniform([0.1, 0.005], [1.0, 0.045])
     since_s = np.arange(NUM_GRID_STEPS) / MODEL_RATE_HZ - from_step / MODEL_RATE_HZ
     share = np.clip(since_s / _SLIP_S, 0.0, 1.0)[:, None]

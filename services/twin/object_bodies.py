@@ -1,9 +1,9 @@
-"""How a task's objects hang in the world: free bodies, fixed ones, and drawers or doors of these.
+"""Addresses of object poses in MuJoCo's arrays: free, fixed, and jointed objects.
 
-A free body is a child of the world with a free joint. Everything else hangs on a mocap body, a
-child of the world that nothing moves: the object is that body itself (a stand, a cabinet), or a
-descendant of it with hinge or slide joints on the way (a door, a drawer). Mocap poses are part of
-the physics state, so that states and snapshots hold where fixed things stand.
+A free object is a child of the world with a free joint. Any other is attached to a mocap body, a
+static child of the world: it is that body itself (a stand, a cabinet), or a descendant with hinge
+or slide joints in between (a door, a drawer). Mocap poses are part of the physics state, so states
+and snapshots contain the poses of fixed objects.
 """
 
 from typing import Final
@@ -17,20 +17,20 @@ from dextouch.geometry.transforms import invert, pose_from_transform, transform_
 
 _FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
 _SINGLE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))
-# How far the poses of one cabinet's parts may contradict each other (m, and in R's entries).
+# Tolerance for contradictions between poses of a fixed object's parts (m, and entries of R).
 _SAME_PLACE: Final = 1e-6
 
 
 class ObjectBodies:
-    """Where the poses and speeds of a task's objects are in MuJoCo's arrays.
+    """Access to poses and speeds of a task's objects in MuJoCo's arrays.
 
     Args:
         model: the compiled scene.
-        names: bodies of the objects, in the order of poses.
+        names: body names of the objects, in the order of poses.
 
     Raises:
-        InvalidInputError: a name without a body, or a body that neither has a free joint as a
-            child of the world nor hangs on a mocap body by hinges and slides.
+        InvalidInputError: a name without a body, or a body that is neither free nor attached to a
+            mocap body by hinges and slides.
     """
 
     def __init__(self, model: mujoco.MjModel, names: tuple[str, ...]) -> None:
@@ -93,7 +93,7 @@ class ObjectBodies:
         return np.array(Ts).reshape(-1, 4, 4)
 
     def _nearest_object(self) -> Int64[np.ndarray, " bodies"]:
-        """Object that each body is a part of: itself or its nearest named ancestor; -1 none."""
+        """Object index of each body: itself or its nearest named ancestor; -1 if none."""
         owner = np.full(self._model.nbody, -1, dtype=np.int64)
         owner[self.ids] = np.arange(len(self.ids))
         for body in range(1, self._model.nbody):  # parents come before their children
@@ -102,10 +102,10 @@ class ObjectBodies:
         return owner
 
     def place(self, data: mujoco.MjData, poses: Float64[np.ndarray, "objects 7"]) -> None:
-        """Put every object at its pose; joints of fixed things are at rest and stay untouched.
+        """Set the pose of every object; joints of fixed objects keep their rest position.
 
         Raises:
-            InvalidInputError: parts of one fixed thing are asked to be where they cannot both be.
+            InvalidInputError: contradictory poses of the parts of a fixed object.
         """
         data.qpos[self._free_qpos] = poses[self.is_free]
         placed: dict[int, np.ndarray] = {}
@@ -123,7 +123,7 @@ class ObjectBodies:
                 )
 
     def poses(self, data: mujoco.MjData) -> Float64[np.ndarray, "objects 7"]:
-        """T_world_object: x y z (m), qw qx qy qz; current even between MuJoCo's own updates."""
+        """T_world_object: x y z (m), qw qx qy qz; current also between MuJoCo's own updates."""
         poses = np.empty((len(self.ids), 7))
         poses[self.is_free] = data.qpos[self._free_qpos]
         if not self.is_free.all():
@@ -134,7 +134,7 @@ class ObjectBodies:
         return poses
 
     def speeds(self, data: mujoco.MjData) -> Float64[np.ndarray, " objects"]:
-        """Largest speed component (m/s or rad/s): of a free body, else of the joints below it."""
+        """Maximum speed component (m/s or rad/s) of a free body, or of the joints below it."""
         return np.array([np.abs(data.qvel[dofs]).max(initial=0.0) for dofs in self._speed_dofs])
 
 

@@ -1,4 +1,4 @@
-"""Truth streams of a running simulation: samples at each stream's own rate in, arrays out."""
+"""Recorder of a simulation's true streams, each sampled at its own rate."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,14 +24,14 @@ TACTILE_RATE_HZ: Final = 60
 POSE_RATE_HZ: Final = 100
 KEYPOINT_RATE_HZ: Final = 120
 IMAGE_RATE_HZ: Final = 30
-# How many of the last grid steps are shown whatever the images' rate: success is judged on them.
+# Number of final grid steps that always have images, since success is judged on them.
 NUM_LAST_SHOWN_STEPS: Final = 3
 _NS_PER_S: Final = 1_000_000_000
 
 
 @dataclass(frozen=True)
 class TruthStream:
-    """One stream of a truth episode."""
+    """A recorded stream."""
 
     descriptor: StreamDescriptor
     t_ref_ns: Int64[np.ndarray, " n"]
@@ -63,7 +63,7 @@ def _flat(source: Callable[[], np.ndarray]) -> np.ndarray:
 
 
 class Recorder:
-    """Collects the truth of one take. `sample` is called at every physics step, from step 0."""
+    """Records the true values of one take; call `sample` at every physics step from step 0."""
 
     def __init__(self, stage: Stage, options: TakeOptions) -> None:
         self._stage = stage
@@ -73,7 +73,7 @@ class Recorder:
         self._every = options.image_every
         self.pad_forces_n: list[np.ndarray] = []
         self._add_touch()
-        # For training at the grid steps: nobody has to interpolate.
+        # For training, sampled at the grid steps to avoid interpolation.
         self._add_objects(POSE_RATE_HZ if options.streams == "all" else MODEL_RATE_HZ)
         if options.streams == "all":
             self._add_hands()
@@ -138,7 +138,7 @@ class Recorder:
                 )
 
     def _add_keypoints(self, side: Side, index: int) -> None:
-        """Joint angles are kept while recording and become keypoints at the end."""
+        """Record joint angles, which are converted to keypoints at the end."""
         simulation = self._stage.simulation
         self._add(
             _descriptor(
@@ -156,7 +156,7 @@ class Recorder:
         )
 
     def sample(self, step_index: int) -> None:
-        """Take the samples that are due at this physics step."""
+        """Record the samples due at this physics step."""
         for name in self._due.get(step_index, ()):
             self._samples[name].append(np.array(self._sources[name][1]()))
         if step_index % (PHYSICS_RATE_HZ // TACTILE_RATE_HZ) == 0:
@@ -183,7 +183,7 @@ class Recorder:
 
 
 def timed_stream(descriptor: StreamDescriptor, values: np.ndarray) -> TruthStream:
-    """Values of a stream that started at 0 and kept its nominal rate."""
+    """A stream that starts at time 0 with its exact nominal rate."""
     t_ref_ns = _regular_ns(len(values), round(descriptor.nominal_rate_hz))
     return TruthStream(descriptor, t_ref_ns, values)
 
@@ -193,7 +193,7 @@ def _regular_ns(num_samples: int, rate_hz: int) -> Int64[np.ndarray, " n"]:
 
 
 def shown_steps(image_every: int) -> list[int]:
-    """Grid steps with an image: the multiples of `image_every`, and the last three."""
+    """Grid steps with images: multiples of `image_every` and the last three."""
     last = range(NUM_GRID_STEPS - NUM_LAST_SHOWN_STEPS, NUM_GRID_STEPS)
     return sorted({*range(0, NUM_GRID_STEPS, image_every), *last})
 
@@ -205,7 +205,7 @@ def action_stream(name: str, actions: np.ndarray) -> TruthStream:
 
 
 class GridLog:
-    """Measured poses and joints at grid steps, turned into a trajectory."""
+    """Collects measured poses and joints at grid steps as a trajectory."""
 
     def __init__(self, stage: Stage) -> None:
         self._simulation = stage.simulation
@@ -214,13 +214,13 @@ class GridLog:
         self._joints: list[np.ndarray] = []
 
     def sample(self) -> None:
-        """Note what is measured now."""
+        """Record the current measurements."""
         self._wrists.append(self._simulation.wrist_poses())
         self._heads.append(self._simulation.head_pose())
         self._joints.append(self._simulation.joints_rad())
 
     def trajectory(self) -> HandTrajectory:
-        """All noted steps."""
+        """Trajectory of all recorded steps."""
         Ts = transform_from_pose(np.stack(self._wrists))
         joints = np.stack(self._joints)
         return HandTrajectory(

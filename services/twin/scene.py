@@ -1,4 +1,4 @@
-"""A compiled scene: a task's objects and a domain's hands in, the model and its addresses out."""
+"""Compiled MuJoCo model of a scene, and the addresses of hands and objects in its arrays."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,7 +26,7 @@ mujoco.set_mju_user_warning(_log_warning)
 
 @dataclass(frozen=True)
 class Scene:
-    """A model and where in its arrays things are; left comes before right everywhere."""
+    """A model with its array addresses; always left before right."""
 
     model: mujoco.MjModel
     xml: str
@@ -39,13 +39,13 @@ class Scene:
 
     @cached_property
     def wrist_qpos(self) -> Int64[np.ndarray, "2 7"]:
-        """Places of each wrist's pose (x y z, qw qx qy qz) in qpos."""
+        """Indices of each wrist's pose (x y z, qw qx qy qz) in qpos."""
         joints = self._ids(mujoco.mjtObj.mjOBJ_JOINT, [f"{side}_free" for side in SIDES])
         return np.array([self.model.jnt_qposadr[j] + np.arange(7) for j in joints], dtype=np.int64)
 
     @cached_property
     def joint_qpos(self) -> Int64[np.ndarray, "2 20"]:
-        """Places of each hand's joint angles in qpos."""
+        """Indices of each hand's joint angles in qpos."""
         return np.array(
             [
                 self.model.jnt_qposadr[
@@ -58,7 +58,7 @@ class Scene:
 
     @cached_property
     def joint_ctrl(self) -> Int64[np.ndarray, "2 20"]:
-        """Places of each hand's commanded joint angles in ctrl."""
+        """Indices of each hand's commanded joint angles in ctrl."""
         return np.array(
             [
                 self._ids(mujoco.mjtObj.mjOBJ_ACTUATOR, list(hand.kinematics.joint_names))
@@ -75,12 +75,12 @@ class Scene:
 
     @cached_property
     def bodies(self) -> ObjectBodies:
-        """How the task's objects hang in the world."""
+        """Access to the task's objects."""
         return ObjectBodies(self.model, self.object_names)
 
     @cached_property
     def geom_hand(self) -> Int64[np.ndarray, " geoms"]:
-        """Which hand each geom belongs to: 0 left, 1 right, -1 none."""
+        """Hand of each geom: 0 left, 1 right, -1 none."""
         wrists = self._ids(mujoco.mjtObj.mjOBJ_BODY, [f"{side}_wrist" for side in SIDES])
         roots = self.model.body_rootid[self.model.geom_bodyid]
         is_of_hand = roots[:, None] == np.array(wrists)
@@ -88,12 +88,12 @@ class Scene:
 
     @cached_property
     def geom_object(self) -> Int64[np.ndarray, " geoms"]:
-        """Which of the task's objects each geom belongs to, -1 for none."""
+        """Object of each geom, -1 for none."""
         return self.bodies.of_body[self.model.geom_bodyid]
 
     @cached_property
     def table_geom(self) -> int:
-        """The table top."""
+        """Geom of the table top."""
         return int(self.model.geom("table").id)
 
 

@@ -1,4 +1,4 @@
-"""Flags and environment (DEXTOUCH_TWIN_…) in; the twin and its baseline over HTTP out."""
+"""HTTP service of the twin and its baseline world."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from services.twin.world import TwinWorld
 
 
 class TwinServiceSettings(WorldServiceSettings):
-    """A rollout service with the twin as its world."""
+    """Settings of the twin's rollout service."""
 
     model_config = service_config("twin")
 
@@ -19,7 +19,7 @@ class TwinServiceSettings(WorldServiceSettings):
 
 
 def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:
-    """The twin and, beside it, the baseline that every imagined world must beat."""
+    """The twin, and the baseline that every imagined world must beat."""
     twin = TwinWorld(scene)
     baseline = CopyFirstWorld.beside(twin.description)
     return {"twin": twin, baseline.description.name: baseline}
@@ -29,7 +29,7 @@ def serve(arguments: list[str]) -> None:
     """Serve until SIGINT or SIGTERM.
 
     Raises:
-        InvalidInputError: settings that do not fit.
+        InvalidInputError: invalid settings.
     """
     settings = load_settings(TwinServiceSettings, arguments)
     serve_worlds(twin_worlds(settings.scene), settings, name="twin")

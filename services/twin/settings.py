@@ -1,12 +1,12 @@
-"""What can be chosen about the twin; physics and geometry belong to the code's version."""
+"""User settings of the twin; physics and geometry are fixed by the code's version."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
 class TwinSettings(BaseModel):
-    """Cameras that a world shows, their size, and how long objects settle before a take begins.
+    """Cameras of the world, their image size, and the settling time of objects before a take.
 
-    A camera that nobody looks at costs half as much as the physics: leave it out.
+    Rendering a camera takes half as long as the physics, so omit unused ones.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,7 +1,7 @@
-"""The running twin: commands on the model grid in, physics steps, contacts and poses out.
+"""Running simulation of a scene: commands on the model grid, physics, contacts and poses.
 
-Everything that plays in the twin, a scripted demonstrator or a policy through a rollout, goes
-through `Simulation.advance`, so both obey the same physics and the same interpolation.
+Scripted demonstrators and policies both use `Simulation.advance`, so they share physics and
+interpolation of commands.
 """
 
 from collections.abc import Iterator
@@ -29,14 +29,14 @@ _NO_SENSORS = int(mujoco.mjtDisableBit.mjDSBL_SENSOR)
 
 @dataclass(frozen=True)
 class Command:
-    """Where hands and head should be: poses of left wrist, right wrist, head camera; joints."""
+    """Commanded poses of left wrist, right wrist and head camera, and joint angles."""
 
     Ts_world_x: Float64[np.ndarray, "3 4 4"]
     joints_rad: Float64[np.ndarray, "2 20"]
 
 
 class Simulation:
-    """One scene in motion. `step_index` counts physics steps since the start of the take."""
+    """Simulation of a scene. `step_index` counts physics steps since the start of the take."""
 
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
@@ -51,9 +51,9 @@ class Simulation:
     def place(
         self, command: Command, object_poses: Float64[np.ndarray, "objects 7"], *, settle_s: float
     ) -> None:
-        """Put hands at the command and objects at their poses, let things settle, start at 0.
+        """Set hands and objects, let objects settle, and restart at step 0.
 
-        The hands hang still where the command is, so measured equals commanded at the start.
+        The hands rest exactly at the command, so measured equals commanded at the start.
         """
         mujoco.mj_resetData(self.scene.model, self.data)
         self._apply(pose_from_transform(command.Ts_world_x), command.joints_rad)
@@ -77,10 +77,10 @@ class Simulation:
         self.data.ctrl[self.scene.joint_ctrl] = joints_rad
 
     def advance(self, target: Command) -> Iterator[int]:
-        """Play one grid interval, moving the command linearly from where it is to `target`.
+        """Simulate one grid interval, moving the command linearly to `target`.
 
-        Yields the number of every physics step that was reached; poses are current at each of
-        them, everything else (skin, cameras, contacts) at those divisible by STEPS_PER_TACTILE.
+        Yields the index of every physics step; poses are current at each step, everything else
+        (skin, cameras, contacts) at steps divisible by STEPS_PER_TACTILE.
 
         Raises:
             InvalidInputError: the physics diverged.
@@ -106,7 +106,7 @@ class Simulation:
         parts = STEPS_PER_GRID // STEPS_PER_COMMAND
         weight = np.arange(1, parts + 1) / parts
         before = transform_from_pose(self.commanded_poses())
-        # All three bodies in one call: start and end of each, one after the other.
+        # All three bodies in one call: start and end poses concatenated.
         ends = np.stack([before, target.Ts_world_x], axis=1).reshape(-1, 4, 4)
         left = np.repeat(np.arange(0, len(ends), 2), parts)
         Ts = interpolate_poses(ends, left, np.tile(weight, len(before)))
@@ -115,7 +115,7 @@ class Simulation:
         return pose_from_transform(Ts.reshape(-1, parts, 4, 4).swapaxes(0, 1)), joints
 
     def _sense(self) -> None:
-        """Make every derived quantity belong to the present state, and read the skin."""
+        """Update all derived quantities and read the tactile sensors."""
         option = self.scene.model.opt
         option.disableflags &= ~_NO_SENSORS
         mujoco.mj_forward(self.scene.model, self.data)
@@ -183,17 +183,17 @@ class Simulation:
 
     @property
     def state_size(self) -> int:
-        """How many numbers a state has."""
+        """Length of a state vector."""
         return mujoco.mj_stateSize(self.scene.model, STATE_KIND)
 
     def state(self) -> Float64[np.ndarray, " numbers"]:
-        """Everything the future depends on, commands included."""
+        """Full state for continuing the simulation, including commands."""
         state = np.empty(self.state_size)
         mujoco.mj_getState(self.scene.model, self.data, state, STATE_KIND)
         return state
 
     def set_state(self, state: np.ndarray, *, step_index: int) -> None:
-        """Continue from a state of `state`, `step_index` physics steps after the start."""
+        """Restore a state of `state`, `step_index` physics steps after the start."""
         if state.shape != (self.state_size,):
             raise InvalidInputError(
                 f"twin state: got shape {state.shape}, expected ({self.state_size},)"

@@ -1,4 +1,4 @@
-"""A task set up with a domain's hands: seed in, everything in its place and the script out."""
+"""Stage: a task set up with the hands of a domain; plans and starts takes from a seed."""
 
 from dataclasses import dataclass
 from typing import Final
@@ -18,23 +18,23 @@ from services.twin.simulation import Command, Simulation
 from services.twin.tasks import get_task
 
 MAX_NOISE_M: Final = 0.2
-# Where the objects of a miss episode go: aside, or behind the viewer where nobody sees them.
+# Positions of the objects in a miss episode: aside, or out of view behind the viewer.
 _ASIDE_M: Final = 0.13
 _SHELF_Y_M: Final = -3.0
-# Independent random numbers for each purpose, so that noise never changes the placement.
+# Independent random streams for each purpose, so that noise does not affect the placement.
 _PLACEMENT, _NOISE, _SWAY, _MISS, _HABIT, _TEMPO = range(6)
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What one take will do: where things really are, and the commands of every grid step."""
+    """Plan of a take: true object poses, and the commands of every grid step."""
 
     object_poses: Float64[np.ndarray, "objects 7"]
     commands: HandTrajectory
 
 
 def command_row(commands: HandTrajectory, row: int) -> Command:
-    """One grid step of a trajectory as a command."""
+    """Command of one grid step of a trajectory."""
     return Command(
         np.stack(commands.anchor(row).as_tuple()),
         np.stack([commands.joints_left_rad[row], commands.joints_right_rad[row]]),
@@ -42,7 +42,7 @@ def command_row(commands: HandTrajectory, row: int) -> Command:
 
 
 class Stage:
-    """One task with one domain's hands: the compiled scene, its simulation and its cameras."""
+    """A task with the hands of a domain: compiled scene, simulation and cameras."""
 
     def __init__(self, task: str, domain: Domain, settings: TwinSettings) -> None:
         self.task = get_task(task)
@@ -57,12 +57,12 @@ class Stage:
         )
 
     def plan(self, seed: int, *, noise_m: float = 0.0, miss: bool = False) -> Plan:
-        """The take of one seed.
+        """Plan the take of a seed.
 
         Args:
-            seed: 0 or more; decides placement, habits and, if there is any, the noise.
-            noise_m: standard deviation of the demonstrator's error at each place, 0 … 0.2 m.
-            miss: the objects are elsewhere but the demonstrator moves as if they were not.
+            seed: 0 or more; determines placement, variations of the motion, and noise.
+            noise_m: standard deviation of the demonstrator's error at each location, 0 … 0.2 m.
+            miss: whether the objects are moved away, unknown to the demonstrator.
         """
         if seed < 0 or not 0.0 <= noise_m <= MAX_NOISE_M:
             raise InvalidInputError(
@@ -84,7 +84,7 @@ class Stage:
         return Plan(placed, commands)
 
     def start(self, plan: Plan) -> AnchorPoses:
-        """Set everything up for a take; the anchor is what is measured at step 0."""
+        """Set up a take and return the anchor, measured at step 0."""
         self.simulation.place(
             command_row(plan.commands, 0), plan.object_poses, settle_s=self._settings.settle_s
         )

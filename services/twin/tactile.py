@@ -1,9 +1,9 @@
-"""What the skin feels: contacts of a MuJoCo state in, pressures [2, 320] and pad forces out.
+"""Tactile sensing of the simulated skin: taxel pressures [2, 320] and pad forces from contacts.
 
-The native tactile sensor tells how deep each taxel lies in what it touches: the *shape*. The
-contact solver tells how hard each pad is pressed: the *amount*. Each pad's depths become the
-pressures of an elastic layer that sum to its force; where a pad is pressed but no taxel lies in
-anything, the force goes to the taxel nearest to each contact.
+MuJoCo's tactile sensor gives the penetration depth of each taxel, hence the *pattern*; the contact
+solver gives the force on each pad, hence the *magnitude*. Depths are converted to pressures of an
+elastic layer that integrate to the pad's force; if a pad is pressed without any taxel penetrating,
+the force goes to the taxel nearest to each contact.
 """
 
 from dataclasses import dataclass
@@ -15,12 +15,12 @@ from jaxtyping import Float32, Float64
 from dextouch.tactile.layout import FINGERS, NUM_TAXELS, SIDES, taxel_areas_m2
 from services.twin.scene import Scene
 
-# A contact farther than this from every taxel is on the back of the hand and not felt.
+# A contact farther than this from every taxel is on the back of the hand and not sensed.
 FELT_WITHIN_M = 0.008
-# The elastic layer, fitted to an analytic one of 20 kPa/mm (tests/accuracy/test_twin_tactile.py).
+# Elastic layer, fitted to an analytic one of 20 kPa/mm (tests/accuracy/test_twin_tactile.py).
 SKIN_STIFFNESS_PA_M = 1.4e7
-# Native depths carry the skin's offset and the softness of the rigid contact. At most this much
-# of them is taken back: a flat face needs some to bridge the sensor's errors at its edges.
+# Sensor depths include the skin's offset and the compliance of the contact. At most this much is
+# subtracted: a flat face needs some depth to cover the sensor's errors at its edges.
 MAX_RELIEF_M = 0.002
 _MIN_FORCE_N = 1e-6
 _MIN_DEPTH_M = 1e-9
@@ -38,7 +38,7 @@ class _Pad:
 
 
 class TactileReader:
-    """Reads the skin of both hands of one scene."""
+    """Tactile sensors of both hands of a scene."""
 
     def __init__(self, scene: Scene) -> None:
         self._model = scene.model
@@ -72,7 +72,7 @@ class TactileReader:
     def taxel_positions_m(
         self, data: mujoco.MjData, *, side_index: int
     ) -> Float64[np.ndarray, "320 3"]:
-        """Where the taxels of one hand are in the world, in anatomical order."""
+        """World positions of the taxels of one hand, in anatomical order."""
         pads = [pad for pad in self._pads if pad.side_index == side_index]
         return np.concatenate([self._skin_world_m(data, pad) for pad in pads])
 
@@ -82,7 +82,7 @@ class TactileReader:
         return pad.vertices_m @ R_world_skin.T + data.geom_xpos[pad.skin_geom]
 
     def _pad_contacts(self, data: mujoco.MjData) -> dict[int, list[int]]:
-        """Contacts on each pressed pad."""
+        """Contact indices by pressed pad."""
         pads = self._pad_of_geom[data.contact.geom[: data.ncon]].max(axis=1)
         contacts: dict[int, list[int]] = {}
         for contact_index in np.flatnonzero(pads >= 0):
@@ -110,7 +110,7 @@ class TactileReader:
     def _spread(
         self, data: mujoco.MjData, pad: _Pad, contacts: list[int]
     ) -> Float64[np.ndarray, " taxels"]:
-        """Force on each taxel of one pad; their sum is the felt contacts' normal force."""
+        """Distribute the normal force of a pad's contacts to its taxels."""
         offsets = self._skin_world_m(data, pad)[None] - data.contact.pos[contacts][:, None]
         distances = np.linalg.norm(offsets, axis=2)
         nearest = distances.argmin(axis=1)
@@ -136,7 +136,7 @@ def elastic_layer(
     force_n: float,
     stiffness_n_m: float,
 ) -> Float64[np.ndarray, " taxels"]:
-    """Force on each taxel of springs at depths that are known up to a common relief c.
+    """Forces of an elastic layer at depths that are known up to a common offset c.
 
     Solves Σ k max(0, depth - c) = F over the touched taxels, c at most MAX_RELIEF_M, and scales
     the result so that it sums to F.

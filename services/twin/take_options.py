@@ -1,4 +1,4 @@
-"""How a take of the twin is made and what of it is recorded, apart from task, domain and seed."""
+"""Options of a take: demonstrator error, commanded motion, and recorded streams."""
 
 import re
 from dataclasses import dataclass
@@ -20,16 +20,17 @@ STREAM_CHOICES: Final[tuple[StreamChoice, ...]] = get_args(StreamChoice)
 
 @dataclass(frozen=True)
 class TakeOptions:
-    """How a demonstration is made, and what is recorded of it.
+    """Options of a demonstration and its recording.
 
-    `noise_m` is the demonstrator's error (0 … 0.2 m), `miss` moves or removes the objects while
-    the motion stays, `images` are the cameras to record. At most one of three changes what is
-    commanded: from `frozen_from_step` (0 … 80) on nothing moves (0 holds still from the start),
-    `motion` leaves the script, and `actions_of_seed` plays what the demonstrator of another seed
-    of the task does, relative to this take's start.
+    `noise_m` is the demonstrator's error (0 … 0.2 m), `miss` moves or removes the objects while the
+    motion stays, `images` are the cameras to record. At most one of three modifies the commands:
+    `frozen_from_step` (0 … 80) freezes them from that step on (0: from the start), `motion`
+    replaces the script, and `actions_of_seed` plays the demonstration of another seed, relative to
+    this take's start.
 
-    Cameras run at 30 Hz, or show the grid steps that are multiples of `image_every` and the last
-    three. The streams for `training` are touch, images, actions, and object poses at grid steps.
+    Cameras record at 30 Hz, or at grid steps that are multiples of `image_every` and the last
+    three. With `training`, only touch, images, actions, and object poses at grid steps are
+    recorded.
     """
 
     noise_m: float = 0.0
@@ -64,7 +65,7 @@ class TakeOptions:
                 raise UnknownNameError("camera", camera, list(CAMERAS))
 
     def words(self) -> list[str]:
-        """Flags of `dextouch twin record` that say the same."""
+        """Equivalent flags of `dextouch twin record`."""
         words = ["--noise", repr(self.noise_m), "--miss-fraction", repr(float(self.miss))]
         if self.images != CAMERAS:
             words += ["--cameras", *self.images]
@@ -81,7 +82,7 @@ class TakeOptions:
         return words
 
     def figures(self) -> dict[str, float]:
-        """What an episode's `quality` says about how it was made."""
+        """Entries of an episode's `quality` about its options."""
         figures = {"noise_m": self.noise_m, "miss": float(self.miss)}
         if self.frozen_from_step is not None:
             figures["frozen_from_step"] = float(self.frozen_from_step)
@@ -94,10 +95,10 @@ class TakeOptions:
 
 @dataclass(frozen=True)
 class PlayedActions:
-    """Commands of a take that come from elsewhere, such as a policy.
+    """Commands of a take from another source, such as a policy.
 
-    `actions` are relative to the take's start, row 0 being its pose; `name` becomes a part of the
-    episode's id, and `command` says how the episode is made again.
+    `actions` are relative to the take's start, row 0 being its pose; `name` becomes part of the
+    episode's id, and `command` is the command that reproduces the episode.
     """
 
     name: str
@@ -120,13 +121,13 @@ class PlayedActions:
 def episode_id(
     task: str, domain: Domain, seed: int, options: TakeOptions, *, played: str | None = None
 ) -> str:
-    """A name that tells what is in the episode and differs for every way to make one.
+    """Descriptive id of an episode, unique for each combination of options.
 
     Args:
         task: name of the task.
         domain: whose hands.
         seed: of the scene.
-        options: how the take is made.
+        options: of the take.
         played: name of the `PlayedActions`, if there are any.
     """
     parts = ["twin", task, domain, f"{seed:06d}"]

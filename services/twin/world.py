@@ -1,4 +1,4 @@
-"""The twin as a world: rollouts of commanded actions in, what cameras and skin report out."""
+"""The twin as a `World`: rollouts of commanded actions in the simulation."""
 
 import hashlib
 import json
@@ -42,7 +42,7 @@ MAX_SNAPSHOT_BYTES: Final = 1 << 20
 
 @dataclass(frozen=True)
 class TwinState:
-    """Where one rollout is: its task, its grid step, and all of the physics."""
+    """State of a rollout: task, grid step and physics state."""
 
     task: str
     seed: int
@@ -52,17 +52,17 @@ class TwinState:
 
 
 class TwinWorld:
-    """The real world of this platform until there is a robot.
+    """Reference world of the platform, in place of a real robot.
 
-    A rollout starts from task and seed, at the first observation of the demonstration of that
-    seed; replaying a demonstration's `action_commanded` reproduces it to the last bit. Measured
-    actions are taken as commands. Physics has no noise: the seed of a step changes nothing.
+    A rollout starts from task and seed, at the first observation of the demonstration of that seed;
+    replaying a demonstration's `action_commanded` reproduces it exactly. Measured actions are
+    treated as commands. The physics has no noise, so the seed of a step has no effect.
 
     Args:
-        settings: cameras to show and how.
+        settings: of the cameras.
 
     Raises:
-        UnknownNameError: a camera that the twin does not have.
+        UnknownNameError: an unknown camera.
     """
 
     def __init__(self, settings: TwinSettings) -> None:
@@ -74,7 +74,7 @@ class TwinWorld:
         self._description = self._describe()
 
     def stage(self, task: str) -> Stage:
-        """The task set up with robot hands; one for all rollouts, where the last call left it."""
+        """Stage of a task with robot hands, shared by all rollouts (in the last call's state)."""
         if task not in self._stages:
             self._stages[get_task(task).name] = Stage(task, "robot", self._settings)
         return self._stages[task]
@@ -102,7 +102,7 @@ class TwinWorld:
         return self._description
 
     def reset(self, start: RolloutStart) -> StartedRollout[TwinState]:
-        """See World; the task's hands and objects are placed by the seed."""
+        """See World; hands and objects are placed by the seed."""
         if start.observation is not None:
             raise InvalidInputError(
                 "world twin: got a start with an observation; it begins from task and seed only"
@@ -125,7 +125,7 @@ class TwinWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[TwinState]:
-        """See World; wrists, fingers and head are sent along the actions."""
+        """See World; wrists, fingers and head follow the actions."""
         del seed
         checked = check_actions(actions, where="world twin: actions")
         commands = poses_from_actions(checked, state.anchor)
@@ -192,7 +192,7 @@ class TwinWorld:
 
 
 class _StepLog:
-    """What is seen, felt and measured at consecutive grid steps of one stage."""
+    """Collects the observation of consecutive grid steps of a stage."""
 
     def __init__(self, stage: Stage, cameras: tuple[str, ...]) -> None:
         self._stage = stage
@@ -202,11 +202,11 @@ class _StepLog:
         self._since_step: list[np.ndarray] = []
 
     def touch(self) -> None:
-        """Note the skin's sample of now."""
+        """Record the current tactile sample."""
         self._since_step.append(self._stage.simulation.tactile_kpa)
 
     def step(self) -> None:
-        """Close a grid step: its tactile reading is the mean since the last one."""
+        """Complete a grid step, whose tactile reading is the mean since the last one."""
         if not self._since_step:
             self.touch()
         mean = np.stack(self._since_step).mean(axis=0, dtype=np.float64)
@@ -215,14 +215,14 @@ class _StepLog:
         self._grid.sample()
 
     def draw(self) -> None:
-        """Take the images of the step that was closed last."""
+        """Render the images of the last completed step."""
         for camera, images in self._images.items():
             images.append(self._stage.rig.image(self._stage.simulation, camera))
 
     def observation(
         self, first_step: int, anchor: AnchorPoses, *, steps: Literal["all", "last"] = "all"
     ) -> Observation:
-        """All closed steps or the last one; success is judged at the last one."""
+        """Observation of all completed steps or the last one; success is judged at the last one."""
         first = 0 if steps == "all" else len(self._tactile) - 1
         reached = actions_from_poses(self._grid.trajectory(), anchor)
         return Observation(

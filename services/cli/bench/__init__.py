@@ -1,4 +1,4 @@
-"""`dextouch bench STAGE`: a stage of the platform timed against its error, beside its rivals."""
+"""Benchmarks `dextouch bench STAGE`: time and error of a stage beside rival implementations."""
 
 from services.cli.bench.command import main
 

@@ -1,4 +1,4 @@
-"""Designs as points of time and error in; one SVG picture that stands by itself out."""
+"""SVG charts of time against error."""
 
 import math
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from html import escape
 
 _WIDTH, _HEIGHT = 460, 340
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 18, 34, 48
-# About the mean width of a letter at the font size of the chart.
+# Approximate mean width of a letter at the chart's font size.
 _CHARACTER_PX = 6.6
 _OURS, _RIVAL, _LINE, _TEXT = "#c2410c", "#475569", "#cbd5e1", "#1e293b"
 
@@ -26,7 +26,7 @@ class Point:
 
 @dataclass(frozen=True)
 class Panel:
-    """One picture: time from left to right (logarithmic), error upwards; low and left is good."""
+    """One panel: time on the x axis (logarithmic), error on the y axis; lower left is best."""
 
     title: str
     time_label: str
@@ -35,7 +35,7 @@ class Panel:
 
 
 def draw(panels: Sequence[Panel], *, title: str) -> str:
-    """The SVG text of panels side by side; panels without a point are left out."""
+    """SVG of panels side by side; panels without points are omitted."""
     panels = [panel for panel in panels if panel.points]
     width = _WIDTH * max(1, len(panels))
     body = [
@@ -65,7 +65,7 @@ def linear_ticks(low: float, high: float) -> list[float]:
 
 
 class _Axes:
-    """Where a time and an error lie in a panel."""
+    """Mapping of time and error to pixels."""
 
     def __init__(self, points: Sequence[Point]) -> None:
         self.low = min(point.time_low for point in points) / 1.5
@@ -107,7 +107,7 @@ def _panel(panel: Panel) -> list[str]:
 
 
 def _points(points: Sequence[Point], axes: _Axes) -> list[str]:
-    """Dots with whiskers, each with its label where it covers neither a dot nor a label."""
+    """Dots with whiskers, with labels placed to avoid dots and other labels."""
     parts = []
     dots = [(axes.x_px(point.time), axes.y_px(point.error)) for point in points]
     taken = [(x - 6, y - 6, x + 6, y + 6) for x, y in dots]
@@ -127,7 +127,7 @@ def _points(points: Sequence[Point], axes: _Axes) -> list[str]:
 def _label_place(
     width: float, x: float, y: float, taken: list[tuple[float, float, float, float]]
 ) -> tuple[float, float]:
-    """Left end and baseline of a label near its dot; its box is added to those taken."""
+    """Left end and baseline of a label near its dot; adds its box to `taken`."""
     right = _WIDTH - _RIGHT
     for row in (0, 1, -1, 2, -2, 3, -3, 4):
         baseline = y - 9 + 13 * row + (6 if row > 0 else 0)

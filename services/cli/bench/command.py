@@ -1,4 +1,4 @@
-"""The words after `dextouch bench` in; tables, a chart, JSON and an exit status out."""
+"""Command line `dextouch bench`: runs a stage, prints tables, writes chart and JSON."""
 
 import argparse
 import shutil
@@ -25,10 +25,10 @@ DESCRIPTION = (
 
 
 def main(argv: Sequence[str]) -> int:
-    """Measure one stage.
+    """Run the benchmark of one stage.
 
     Returns:
-        0; with --check 1 where a requirement is missed or was not measured.
+        0; with --check 1 if a requirement is missed or was not measured.
     """
     arguments = list(argv)
     if not arguments or arguments[0] in {"-h", "--help"}:
@@ -66,10 +66,12 @@ def usage() -> str:
 
 
 def stage_parser(name: str) -> argparse.ArgumentParser:
-    """The options that every stage has."""
+    """Parser with the options common to all stages."""
     entry = STAGES[name]
     parser = argparse.ArgumentParser(prog=f"dextouch bench {name}", description=entry.teaches)
-    parser.add_argument("--json", type=Path, metavar="PATH", help="write every figure here")
+    parser.add_argument(
+        "--json", type=Path, metavar="PATH", help="write all figures to this JSON file"
+    )
     parser.add_argument(
         "--out",
         type=Path,
@@ -77,16 +79,16 @@ def stage_parser(name: str) -> argparse.ArgumentParser:
         help="keep tables, chart, JSON and all that was written here (default: nothing is kept)",
     )
     parser.add_argument(
-        "--check", action="store_true", help="exit with 1 where a requirement is not met"
+        "--check", action="store_true", help="exit with status 1 if a requirement is not met"
     )
     parser.add_argument(
-        "--quick", action="store_true", help="a short run that only shows that all works"
+        "--quick", action="store_true", help="short run that only checks that everything works"
     )
     return parser
 
 
 def publish(report: StageReport, options: argparse.Namespace) -> None:
-    """Print the report; write the JSON and the chart where they were asked for."""
+    """Print the report; write JSON and chart on request."""
     show(report, Console())
     if options.json is not None:
         write_json(report, options.json)
@@ -101,7 +103,7 @@ def publish(report: StageReport, options: argparse.Namespace) -> None:
 
 @contextmanager
 def _folder(out: Path | None) -> Iterator[Path]:
-    """Where a stage writes: an empty folder below --out, or one that vanishes."""
+    """Working folder of a stage: an empty folder below --out, or a temporary one."""
     if out is None:
         with tempfile.TemporaryDirectory(prefix="dextouch-bench-") as scratch:
             yield Path(scratch)

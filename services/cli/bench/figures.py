@@ -1,4 +1,4 @@
-"""Repeated measurements in; their median and spread, and whether a bound is met, out."""
+"""Repeated measurements with median and spread, and requirements on them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ Sense = Literal["at least", "at most"]
 
 @dataclass(frozen=True)
 class Figure:
-    """One quantity measured several times: all values, in the order of the rounds."""
+    """A quantity measured several times, in the order of the rounds."""
 
     values: tuple[float, ...]
 
@@ -30,21 +30,21 @@ class Figure:
 
     @property
     def median(self) -> float:
-        """The middle of the rounds."""
+        """Median over the rounds."""
         return float(np.median(self.values))
 
     @property
     def low(self) -> float:
-        """The smallest round."""
+        """Minimum over the rounds."""
         return min(self.values)
 
     @property
     def high(self) -> float:
-        """The largest round."""
+        """Maximum over the rounds."""
         return max(self.values)
 
     def over(self, other: "Figure") -> "Figure":
-        """Ratio to another figure, round by round: what both saw of the machine cancels.
+        """Ratio to another figure round by round, which cancels the load of the machine.
 
         Raises:
             InvalidInputError: another number of rounds.
@@ -61,7 +61,7 @@ class Figure:
         return Figure.of([value * factor for value in self.values])
 
     def inverse(self, of: float = 1.0) -> "Figure":
-        """How often something fits into `of`: a rate from a time."""
+        """`of` divided by the figure, for example a rate from a time."""
         return Figure.of([of / value for value in self.values])
 
     def text(self) -> str:
@@ -73,7 +73,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Requirement:
-    """What was promised, and what was measured; None: not measured in this run."""
+    """A requirement with its measured value; None if not measured in this run."""
 
     what: str
     figure: float | None
@@ -83,7 +83,7 @@ class Requirement:
 
     @property
     def is_met(self) -> bool | None:
-        """Whether the bound holds; None where nothing was measured."""
+        """Whether the bound is met; None if not measured."""
         if self.figure is None:
             return None
         return self.figure >= self.bound if self.sense == "at least" else self.figure <= self.bound

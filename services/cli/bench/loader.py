@@ -1,4 +1,4 @@
-"""The stage `loader`: twin episodes in; whether training waits for the disk out."""
+"""Benchmark stage `loader`: whether reading training windows keeps up with training."""
 
 import argparse
 from collections.abc import Callable, Mapping
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
-# What `dextouch train world-model --streaming` does unless told otherwise.
+# Default of `dextouch train world-model --streaming`.
 USUAL_WORKERS = 0
 _QUICK = {"episodes": 4, "rounds": 1, "batches": 2, "fit_windows": 8}
 _USUAL = {"episodes": 200, "rounds": 5, "batches": 40, "fit_windows": 256}
@@ -29,7 +29,7 @@ LEARNING = "training, windows in memory"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument("--store", help="read this store instead of making twin episodes")
     parser.add_argument(
         "--episodes", type=int, help=f"twin episodes to make ({_USUAL['episodes']}; quick 4)"
@@ -47,7 +47,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Time the loader and the training step in turns.
 
     Raises:
-        InvalidInputError: no episode, round or batch, or worker numbers that are none.
+        InvalidInputError: no episode, round or batch, or invalid numbers of workers.
     """
     from services.world_model.training.pace import TrainingPace
 
@@ -77,7 +77,7 @@ def loading(num_workers: int) -> str:
 
 
 def rate_table(rates: Mapping[str, Figure], num_episodes: int) -> ResultTable:
-    """Windows a second, and how many times what training consumes."""
+    """Windows per second, and the ratio to the consumption of training."""
     learning = rates[LEARNING]
     rows = [(name, figure.text(), figure.over(learning).text()) for name, figure in rates.items()]
     return ResultTable(
@@ -88,7 +88,7 @@ def rate_table(rates: Mapping[str, Figure], num_episodes: int) -> ResultTable:
 
 
 def requirement(rates: Mapping[str, Figure]) -> Requirement:
-    """The promise of the loader; not measured where its usual worker was not."""
+    """Requirement on the loader; unmeasured if its usual worker was not run."""
     loader = rates.get(loading(USUAL_WORKERS))
     figure = None if loader is None else loader.over(rates[LEARNING]).median
     what = f"{loading(USUAL_WORKERS)}, times what training consumes"
@@ -122,7 +122,7 @@ def _make_episodes(folder: Path, num_episodes: int) -> str:
 
 
 def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say, else the usual or the quick numbers."""
+    """Values of the options, otherwise the usual or the quick defaults."""
     plan: dict[str, Any] = dict(_QUICK if options.quick else _USUAL)
     for name in ("episodes", "rounds", "batches"):
         given = getattr(options, name)

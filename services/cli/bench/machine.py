@@ -1,4 +1,4 @@
-"""Nothing in; what a reader of a figure must know of the machine and the code out."""
+"""Description of the machine and the code version, for the head of a report."""
 
 import os
 import platform
@@ -36,7 +36,7 @@ def describe_machine(packages: Sequence[str]) -> dict[str, str]:
 
 
 def commit() -> str:
-    """The commit of the code that runs, with a mark where files differ from it."""
+    """Commit of the running code, with a mark if files are modified."""
     git, root = shutil.which("git"), Path(__file__).resolve().parents[3]
     if git is None or not (root / ".git").exists():
         return "unknown"
@@ -52,10 +52,10 @@ def commit() -> str:
 
 
 def refuse_shape_checks() -> None:
-    """Refuse to time code whose array shapes are checked at every call.
+    """Refuse to time code with run-time checks of array shapes.
 
     Raises:
-        ConflictError: the import hook of the tests is at work in this process.
+        ConflictError: the import hook of the tests is active in this process.
     """
     if any(type(finder).__module__.startswith("jaxtyping") for finder in sys.meta_path):
         raise ConflictError(
@@ -77,7 +77,7 @@ def _memory() -> str:
 
 
 def _first_value(path: Path, key: str) -> str:
-    """The first `key : value` of a file of the kernel's; empty where there is none."""
+    """The first `key : value` of a kernel file; empty if there is none."""
     if not path.is_file():
         return ""
     for line in path.read_text(encoding="utf-8").splitlines():

@@ -1,4 +1,4 @@
-"""What a stage found: tables, points, requirements in; tables, Markdown and JSON out."""
+"""Report of a benchmark stage: tables, charts and requirements, as text, Markdown and JSON."""
 
 import json
 from collections.abc import Sequence
@@ -24,9 +24,9 @@ class ResultTable:
 
 @dataclass(frozen=True)
 class StageReport:
-    """Everything one run of a stage says.
+    """Results of one run of a stage.
 
-    `data` is what JSON keeps of the measurements: every round of every figure.
+    `data` holds the raw measurements for JSON: every round of every figure.
     """
 
     stage: str
@@ -40,7 +40,7 @@ class StageReport:
 
     @property
     def is_met(self) -> bool:
-        """Whether every requirement was measured and holds."""
+        """Whether every requirement was measured and is met."""
         return all(requirement.is_met for requirement in self.requirements)
 
     def to_json(self) -> str:
@@ -72,7 +72,7 @@ def show(report: StageReport, console: Console) -> None:
 
 
 def to_markdown(report: StageReport) -> str:
-    """The report as Markdown, to be pasted into the documents: what ran where, and the tables."""
+    """The report as Markdown for the documentation: machine, versions and tables."""
     about = ", ".join(f"{name} {value}" for name, value in report.machine.items())
     parts = [f"Machine: {about}.\n"]
     for table in (*report.tables, _acceptance(report)):
@@ -96,7 +96,7 @@ def _acceptance(report: StageReport) -> ResultTable:
 
 
 def write_json(report: StageReport, path: Path) -> None:
-    """Write the report where `--json` says; its folder is made."""
+    """Write the report to the path of `--json`, creating its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(report.to_json() + "\n", encoding="utf-8")
 

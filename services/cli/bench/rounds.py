@@ -1,4 +1,4 @@
-"""Things to time in; their measurements, taken in turns, out."""
+"""Interleaved measurements, so that all subjects see the same load of the machine."""
 
 from collections.abc import Callable, Mapping
 from typing import TypeVar
@@ -14,12 +14,12 @@ def interleaved(
     *,
     on_step: Callable[[str], None] = lambda _: None,
 ) -> dict[str, list[T]]:
-    """Measure all subjects once a round, each round beginning with another of them.
+    """Measure all subjects once per round, rotating the first one.
 
-    What the machine does besides (a busy neighbour, a warm cache) then falls on all alike.
+    Other load of the machine and cache effects then affect all subjects alike.
 
     Args:
-        subjects: name → what measures it once, given the round's index.
+        subjects: name → function that measures it once, given the round's index.
         num_rounds: at least 1.
         on_step: called with a subject's name before it is measured.
 

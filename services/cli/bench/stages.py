@@ -1,4 +1,4 @@
-"""The name of a stage in; what adds its options and measures it out."""
+"""Registry of the benchmark stages by name, loaded lazily."""
 
 import argparse
 import importlib
@@ -16,26 +16,23 @@ Bar = Callable[[str, int], AbstractContextManager[Callable[[str], None]]]
 
 @runtime_checkable
 class Stage(Protocol):
-    """One stage of the platform that can be timed against its error.
-
-    A module with these two functions is a stage.
-    """
+    """Interface of a benchmark stage, implemented by modules with these two functions."""
 
     def add_options(self, parser: argparse.ArgumentParser) -> None:
         """Add the stage's own options; every stage has --quick, --json, --out and --check."""
 
     def measure(self, options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-        """Measure everything once.
+        """Run the benchmark.
 
         Args:
-            options: what the command line said.
-            folder: for what the measurement writes; the caller removes it.
-            bar: shows how far long work is.
+            options: parsed command line.
+            folder: for temporary files; the caller removes it.
+            bar: opens a progress bar.
         """
 
 
 class StageEntry(NamedTuple):
-    """Where a stage lives, what it times, and what its --help teaches."""
+    """Module, summary and help text of a stage."""
 
     module: str
     does: str
@@ -137,7 +134,7 @@ STAGES = {
 
 
 def load_stage(name: str) -> Stage:
-    """The module that measures a stage.
+    """Import the module of a stage.
 
     Raises:
         UnknownNameError: no such stage.

@@ -1,4 +1,4 @@
-"""`dextouch station calibrate`: photos, poses and takes in; the matrices of recordings out."""
+"""Command `dextouch station calibrate`: cameras, hand-eye mounts and gloves."""
 
 from services.cli.calibrate.command import main
 

@@ -1,4 +1,4 @@
-"""Views of a board, or poses of a tracker, in; what is still missing and what to do next out."""
+"""Coverage of calibration views, and advice on what to capture next."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -33,14 +33,14 @@ TILTS = {
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the views of a board show of a camera.
+    """Coverage of a camera by views of a board.
 
     Attributes:
-        views_by_region: how many views have corners in each ninth of the image.
-        views_by_edge: how many come near the left, upper, right and lower edge.
-        tilts_rad: [n, 2] the board's normal turned away from the viewing ray: right, down.
-        sizes: [n] length of the board's diagonal as a part of the image's, 0 … about 1.
-        todo: what to do next, the most important first; empty when there is enough.
+        views_by_region: number of views with corners in each ninth of the image.
+        views_by_edge: number of views near the left, upper, right and lower edge.
+        tilts_rad: [n, 2] angle of the board's normal to the viewing ray: right, down.
+        sizes: [n] board diagonal relative to the image diagonal, 0 … about 1.
+        todo: advice, most important first; empty if the coverage is sufficient.
     """
 
     views_by_region: Int64[np.ndarray, "3 3"]
@@ -52,12 +52,12 @@ class Coverage:
 
 @dataclass(frozen=True)
 class TurnCoverage:
-    """How far a tracker was turned about each axis of its own frame, over all pairs of views.
+    """Rotations of a tracker about the axes of its own frame, over all pairs of views.
 
     Attributes:
         turns_rad: [pairs, 3] rotation vectors of the pairs' relative motions.
         spread_rad: [3] RMS about x, y, z.
-        todo: what to do next; empty when there is enough.
+        todo: advice; empty if the coverage is sufficient.
     """
 
     turns_rad: Float64[np.ndarray, "pairs 3"]
@@ -68,12 +68,12 @@ class TurnCoverage:
 def camera_coverage(
     views: Sequence[BoardView], size_px: tuple[int, int], lens: Lens | None = None
 ) -> Coverage:
-    """Where in the image, how tilted and how large the board was seen.
+    """Coverage of the image by positions, tilts and sizes of the board.
 
     Args:
-        views: those in which the board was found.
+        views: with a detected board.
         size_px: width and height of the photos.
-        lens: of the camera; guessed when not known yet.
+        lens: of the camera; a default guess if not yet known.
     """
     width_px, height_px = size_px
     lens = lens or Lens.guessed(width_px, height_px)
@@ -138,7 +138,7 @@ def _pose_todo(tilts_rad: np.ndarray, sizes: np.ndarray) -> list[str]:
 
 
 def turn_coverage(Ts_world_tracker: np.ndarray) -> TurnCoverage:
-    """About which axes a tracker was turned between its poses [n ≥ 2, 4, 4]."""
+    """Rotation coverage of tracker poses [n ≥ 2, 4, 4]."""
     pairs = np.array(list(combinations(range(len(Ts_world_tracker)), 2)))
     relative = invert(Ts_world_tracker[pairs[:, 1]]) @ Ts_world_tracker[pairs[:, 0]]
     turns_rad = vector_from_rotation(relative[:, :3, :3])

@@ -1,4 +1,4 @@
-"""Photos of a flat board in, where its corners are and how it stood to the camera out."""
+"""Detection of calibration boards in photos, and their poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -27,11 +27,11 @@ BOARD_HELP = (
 
 @dataclass(frozen=True)
 class BoardView:
-    """Corners of the board in one photo.
+    """Corners of the board detected in one photo.
 
-    `points_board` are places on the board (m), `pixels` OpenCV's: the middle of the first is 0, 0.
-    `pattern` says how the board is printed, `edge_width_px` how blurred its edges are. An
-    `is_blurred` photo must not count: camera or board moved, and its corners are off.
+    `points_board` are positions on the board (m), `pixels` follow OpenCV: the centre of the first
+    pixel is 0, 0. `pattern` is the board's print, `edge_width_px` the blur of its edges.
+    `is_blurred` photos must be excluded: camera or board moved, and the corners are inaccurate.
     """
 
     name: str
@@ -51,17 +51,17 @@ class Lens:
 
     @staticmethod
     def guessed(width_px: int, height_px: int) -> "Lens":
-        """A lens of about 56 degrees: good enough to tell tilts before there is a calibration."""
+        """A lens of about 56 degrees field of view, for tilts before there is a calibration."""
         middle = [0.5 * (width_px - 1), 0.5 * (height_px - 1)]
         K = np.array([[0.94 * width_px, 0, middle[0]], [0, 0.94 * width_px, middle[1]], [0, 0, 1]])
         return Lens(K, np.zeros(5))
 
 
 def parse_board(text: str) -> Board:
-    """A board from its short description (`BOARD_HELP`).
+    """Parse a board description (`BOARD_HELP`).
 
     Raises:
-        InvalidInputError: it does not fit the form.
+        InvalidInputError: invalid syntax.
         UnknownNameError: no such kind of board or dictionary.
     """
     kind, *parts = text.split(":")
@@ -83,10 +83,10 @@ def parse_board(text: str) -> Board:
 
 
 def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
-    """The board in a grey photo (uint8 [h, w]); None where it is not seen.
+    """Detect the board in a grey photo (uint8 [h, w]); None if not found.
 
     Raises:
-        InvalidInputError: the board is no board.
+        InvalidInputError: an invalid board.
     """
     found = find_boards([photo], board)
     if not found.photos:
@@ -100,7 +100,7 @@ def find_board(name: str, photo: np.ndarray, board: Board) -> BoardView | None:
 
 
 def usual_pattern(views: Sequence[BoardView]) -> str:
-    """The print that most corners speak for; views of another are mistakes."""
+    """Pattern supported by most corners; views with another one are false detections."""
     corners: dict[str, int] = {}
     for view in views:
         corners[view.pattern] = corners.get(view.pattern, 0) + len(view.pixels)
@@ -108,7 +108,7 @@ def usual_pattern(views: Sequence[BoardView]) -> str:
 
 
 def is_ambiguous(board: Board) -> bool:
-    """Whether the board looks the same after half a turn: useless for poses of the board."""
+    """Whether the board is symmetric under a half turn, so that its pose is ambiguous."""
     return isinstance(board, Chessboard) and (board.columns - board.rows) % 2 == 0
 
 
@@ -138,7 +138,7 @@ def board_pose(view: BoardView, lens: Lens) -> Float64[np.ndarray, "4 4"]:
 def reprojection(
     view: BoardView, lens: Lens, T_camera_board: np.ndarray
 ) -> Float64[np.ndarray, "n 2"]:
-    """Seen minus predicted pixels of a view's corners."""
+    """Measured minus predicted pixels of a view's corners."""
     import cv2
 
     turn, _ = cv2.Rodrigues(T_camera_board[:3, :3])
@@ -156,7 +156,7 @@ def _metres(text: str) -> float:
 
 
 def _dark_first(photo: np.ndarray, pixels: np.ndarray, board: Chessboard) -> np.ndarray:
-    """Corners in the order that begins beside a dark square, where that tells both ends apart."""
+    """Order the corners to start beside a dark square, where that resolves the symmetry."""
     if is_ambiguous(board):
         return pixels
     grid = pixels.reshape(board.rows, board.columns, 2)

@@ -1,4 +1,4 @@
-"""`dextouch station calibrate camera`: photos of a board in, K with sigma and pictures out."""
+"""Command `dextouch station calibrate camera`: intrinsics from photos of a board."""
 
 import argparse
 from collections.abc import Sequence
@@ -27,13 +27,13 @@ from services.cli.calibrate.pictures import coverage_picture, residual_picture
 from services.cli.calibrate.record import write_entry, write_picture
 
 CAMERAS = ("head", "wrist_left", "wrist_right")
-# OpenCV counts pixels from the middle of the first one, DexTouch from its corner.
+# OpenCV's pixel origin is the centre of the first pixel, DexTouch's its corner.
 PIXEL_SHIFT_PX = 0.5
 
 
 @dataclass(frozen=True)
 class Found:
-    """The photos of a folder in which the board was found; blurred ones are left out by name."""
+    """Photos of a folder with a detected board; blurred ones are excluded and listed."""
 
     views: tuple[BoardView, ...]
     without_board: tuple[str, ...]
@@ -43,16 +43,16 @@ class Found:
 
     @property
     def num_photos(self) -> int:
-        """All that were looked at."""
+        """Number of all photos."""
         return len(self.views) + len(self.without_board) + len(self.blurred)
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Photos of a folder to K; coverage and advice are written even when they do not suffice.
+    """Calibrate from the photos of a folder; coverage and advice are written in any case.
 
     Raises:
-        InvalidInputError: too few photos with the board, or they do not show the lens.
-        NotFoundError, CorruptDataError: no photos, or broken ones.
+        InvalidInputError: too few photos with the board, or insufficient coverage.
+        NotFoundError, CorruptDataError: missing or damaged photos.
     """
     board = parse_board(options.board)
     found = find_boards(photo_paths(options.photos), board)
@@ -98,7 +98,7 @@ def find_boards(paths: Sequence[Path], board: Board) -> Found:
 
 
 def corners_of(found: Found) -> FoundBoards:
-    """The corners in the form of the solver."""
+    """Convert the corners to the solver's input."""
     return FoundBoards(
         tuple(view.points_board for view in found.views),
         tuple(view.pixels for view in found.views),
@@ -110,7 +110,7 @@ def corners_of(found: Found) -> FoundBoards:
 
 
 def report_coverage(found: Found, folder: Path, camera: str) -> dict[str, object]:
-    """Print and draw what the photos cover; the same as data."""
+    """Print and draw the coverage of the photos, and return it as data."""
     coverage = camera_coverage(found.views, found.size_px)
     path = write_coverage(found, coverage, folder, camera)
     print(f"board found in {len(found.views)} of {found.num_photos} photos ({found.board_kind})")
@@ -130,7 +130,7 @@ def report_coverage(found: Found, folder: Path, camera: str) -> dict[str, object
 
 
 def tell_left_out(found: Found) -> None:
-    """Name the photos that do not count, and why."""
+    """List the excluded photos with the reasons."""
     for name in found.without_board:
         print(f"  no board in {name}: left out")
     for name in found.blurred:
@@ -138,7 +138,7 @@ def tell_left_out(found: Found) -> None:
 
 
 def write_coverage(found: Found, coverage: Coverage, folder: Path, camera: str) -> Path:
-    """Draw the coverage picture; its path."""
+    """Draw the coverage picture and return its path."""
     picture = coverage_picture(found.views, coverage, found.size_px)
     return write_picture(folder, f"coverage_{camera}.svg", picture)
 
@@ -188,10 +188,10 @@ def _keep(
 
 
 def lens_of(matrices: dict[str, np.ndarray], size_px: tuple[int, int]) -> Lens:
-    """OpenCV's lens from the kept matrices K [3, 3], distortion [1, 5] and image size [1, 2].
+    """OpenCV's lens from the stored matrices K [3, 3], distortion [1, 5] and image size [1, 2].
 
     Raises:
-        InvalidInputError: the photos have another size than those of the calibration.
+        InvalidInputError: the photos differ in size from those of the calibration.
     """
     calibrated = tuple(int(v) for v in matrices["image_size"][0])
     if calibrated != size_px:

@@ -1,4 +1,4 @@
-"""Command line of `dextouch station calibrate`: its commands, their options and their help."""
+"""Command line `dextouch station calibrate`."""
 
 import argparse
 import json
@@ -12,7 +12,7 @@ from services.cli.calibrate.boards import BOARD_HELP, parse_board
 Report = dict[str, object]
 EXIT_LEVEL = 1
 STANDARD_OUTPUT = Path("-")
-JSON_HELP = "write the result there as well; - prints it last"
+JSON_HELP = "also write the result as JSON to this file; - prints it last"
 
 _ABOUT = """\
 Measure what a station must know of its devices. Everything goes into one folder:
@@ -108,10 +108,10 @@ examples:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Calibrate one thing, or show what is there.
+    """Run one calibration, or show the existing ones.
 
     Returns:
-        0; of `show` 1 where something is missing or wrong (level ERROR).
+        0; for `show` 1 if something is missing or wrong (level ERROR).
     """
     options = _parser().parse_args(list(argv))
     report = _WORDS[options.word](options)
@@ -208,7 +208,7 @@ def _parser() -> argparse.ArgumentParser:
         _word(words, "robot-base", "pairs of poses → the robot's base in the world", _ROBOT_BASE)
     )
     _add_latency(_word(words, "latency", "common motion or taps → path delay", _LATENCY))
-    shown = _word(words, "show", "what a calibration holds, how old and how good it is", "")
+    shown = _word(words, "show", "contents, age and accuracy of a calibration", "")
     shown.add_argument("folder", type=Path, help="calibration folder or file, or a spooled take")
     return parser
 
@@ -235,7 +235,7 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 
 def _add_cameras(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", required=True, choices=("head", "wrist_left", "wrist_right"))
-    parser.add_argument("--check", action="store_true", help="only say what is missing")
+    parser.add_argument("--check", action="store_true", help="only report what is missing")
 
 
 def _add_camera(parser: argparse.ArgumentParser) -> None:
@@ -243,7 +243,7 @@ def _add_camera(parser: argparse.ArgumentParser) -> None:
     _add_cameras(parser)
     parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER", help="of photos")
     parser.add_argument("--board", required=True, metavar="BOARD", help=BOARD_HELP)
-    parser.add_argument("--watch", action="store_true", help="look on while photos come in")
+    parser.add_argument("--watch", action="store_true", help="watch the folder for new photos")
     parser.add_argument("--url", metavar="URL", help="take photos from this running station")
     parser.add_argument("--key", metavar="KEY", help="API key of the station")
 

@@ -1,4 +1,4 @@
-"""Numbers in; SVG pictures that stand by themselves out."""
+"""SVG primitives for calibration pictures."""
 
 from collections.abc import Sequence
 from html import escape
@@ -11,7 +11,7 @@ INK, LINE, GOOD, BAD, FAINT = "#1e293b", "#cbd5e1", "#0f766e", "#c2410c", "#94a3
 
 
 def page(width: Px, height: Px, title: str, parts: Sequence[str]) -> str:
-    """A whole SVG document."""
+    """A complete SVG document."""
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" '
         f'width="{width:.0f}" height="{height:.0f}" role="img" aria-label="{escape(title)}" '
@@ -22,12 +22,12 @@ def page(width: Px, height: Px, title: str, parts: Sequence[str]) -> str:
 
 
 def group(x: Px, y: Px, parts: Sequence[str]) -> str:
-    """Parts moved to a place."""
+    """Translated group of parts."""
     return f'<g transform="translate({x:.1f} {y:.1f})">{"".join(parts)}</g>'
 
 
 def text(x: Px, y: Px, words: str, *, bold: bool = False, colour: str = INK) -> str:
-    """One line of words that begins at x."""
+    """One line of text starting at x."""
     weight = ' font-weight="bold"' if bold else ""
     return f'<text x="{x:.1f}" y="{y:.1f}" fill="{colour}"{weight}>{escape(words)}</text>'
 
@@ -42,7 +42,7 @@ def rectangle(box: tuple[Px, Px, Px, Px], *, fill: str, stroke: str = LINE) -> s
 
 
 def dots(points: np.ndarray, *, colour: str = GOOD, radius: Px = 1.5) -> str:
-    """Points [n, 2] as one path: thousands of corners stay a small file."""
+    """Points [n, 2] as one path, which is compact for thousands of corners."""
     marks = "".join(f"M{x:.1f} {y:.1f}h0" for x, y in points)
     return (
         f'<path d="{marks}" stroke="{colour}" stroke-width="{2 * radius:.1f}" '
@@ -59,7 +59,7 @@ def arrows(starts: np.ndarray, vectors: np.ndarray, *, colour: str = BAD) -> str
 
 
 def bars(values: np.ndarray, labels: Sequence[str], *, unit: str, width: Px) -> list[str]:
-    """One horizontal bar a value, with its label and number; 18 px a row."""
+    """Horizontal bars with label and value; 18 px per row."""
     longest = max(float(np.max(values)), 1e-12) if len(values) else 1.0
     parts = []
     for index, (value, label) in enumerate(zip(values, labels, strict=True)):
@@ -74,7 +74,7 @@ def bars(values: np.ndarray, labels: Sequence[str], *, unit: str, width: Px) -> 
 
 
 def polar(points_rad: np.ndarray, *, radius: Px, full_rad: Px, title: str) -> list[str]:
-    """Directions [n, 2] around a middle, with rings every third of `full_rad`."""
+    """Directions [n, 2] in a polar plot with rings every third of `full_rad`."""
     middle = radius + 4
     parts = [text(0, -6, title)]
     for ring in (1, 2, 3):
@@ -95,7 +95,7 @@ def polar(points_rad: np.ndarray, *, radius: Px, full_rad: Px, title: str) -> li
 def cells(
     values: np.ndarray, colours: Sequence[Sequence[str]], *, size: Px, title: str
 ) -> list[str]:
-    """A grid of small boxes with a hover text each; NaN cells are left out."""
+    """A grid of small boxes with hover texts; NaN cells are omitted."""
     parts = [text(0, -6, title)]
     for (row, column), value in np.ndenumerate(values):
         if np.isnan(value):

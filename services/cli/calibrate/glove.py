@@ -1,4 +1,4 @@
-"""`dextouch station calibrate glove`: a rest take and presses in; tare, gain and faults out."""
+"""Command `dextouch station calibrate glove`: tare, gain and fault map of the taxels."""
 
 import argparse
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ from services.cli.calibrate.record import MATRICES_FILE, write_entry, write_pict
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Tare, and with presses gain and fault map, of one glove.
+    """Calibrate the tare of one glove, and with presses its gain and fault map.
 
     Raises:
-        InvalidInputError: takes or pressures that do not fit; the message says what to do.
+        InvalidInputError: unsuitable takes or pressures; the message says what to do.
         NotFoundError: no such take, or it has no readings of this glove.
     """
     side = options.side
@@ -44,7 +44,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _takes(options: argparse.Namespace) -> tuple[str, Sequence[PressRow]]:
-    """The rest take and the presses: those that are named, or recorded now by a station."""
+    """The rest take and the presses, either given or recorded now by a station."""
     if options.url is not None:
         if options.rest is not None or options.presses is not None:
             raise InvalidInputError(
@@ -90,7 +90,7 @@ def _facts(found: GloveCalibration, rest: str, rows: Sequence[PressRow]) -> dict
 
 
 def _keep(found: GloveCalibration, folder: Path, facts: dict[str, object]) -> None:
-    """Tare and gain are entries of their own: a daily tare leaves the gain as it was."""
+    """Write tare and gain as separate entries, so that a daily tare keeps the gain."""
     side, now = found.tare.side, datetime.now(UTC)
     matrices = found.matrices()
     zero = {name: m for name, m in matrices.items() if "_tare_" in name or "_noise_" in name}

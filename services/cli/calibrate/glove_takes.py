@@ -1,4 +1,4 @@
-"""Takes of a glove and the pressures in them: the list of presses as CSV, and its readings."""
+"""Glove takes and the list of presses with known pressures."""
 
 import argparse
 import csv
@@ -18,7 +18,7 @@ COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads", "mass_kg", "area_cm2", "
 
 @dataclass(frozen=True)
 class PressRow:
-    """One line of the list of presses; `stop_s` None means to the end of the take."""
+    """One row of the list of presses; `stop_s` None means the end of the take."""
 
     take: str
     pressure_kpa: float
@@ -29,11 +29,11 @@ class PressRow:
 
 
 def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
-    """Lines of a CSV: `take` and either `pressure_kpa` or `mass_kg` with `area_cm2`.
+    """Read a CSV with the columns `take` and either `pressure_kpa` or `mass_kg` with `area_cm2`.
 
     Raises:
         NotFoundError: no such file.
-        InvalidInputError: columns or numbers that do not fit.
+        InvalidInputError: invalid columns or numbers.
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such list of presses")
@@ -83,15 +83,15 @@ def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
 
 
 def press_row(row: dict[str, str], relative_sigma: float, folder: Path) -> PressRow:
-    """One line of the list by column.
+    """Parse one row of the list.
 
     Args:
         row: as `COLUMNS`.
-        relative_sigma: of a pressure whose sigma is not given, as a part of it.
-        folder: from which takes are named.
+        relative_sigma: default relative sigma of a pressure.
+        folder: base of relative take paths.
 
     Raises:
-        ValueError: numbers that are missing or none.
+        ValueError: missing or invalid numbers.
     """
     take = row["take"]
     if take and (folder / take).is_dir():
@@ -135,7 +135,7 @@ def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
 
 
 def write_presses(path: Path, rows: Sequence[PressRow]) -> None:
-    """The list that `read_presses` reads, so that a calibration can be repeated."""
+    """Write the list for `read_presses`, so that a calibration can be repeated."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file)

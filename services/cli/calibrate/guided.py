@@ -1,4 +1,4 @@
-"""A running station and an operator at its glove in; a rest take and presses, recorded now, out."""
+"""Guided glove calibration: leads an operator through takes recorded by a running station."""
 
 import argparse
 import json
@@ -26,7 +26,7 @@ from services.cli.calibrate.glove_takes import (
 from services.cli.calibrate.photos import progress
 
 REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
-# How long an upload may take before the take is given up.
+# Timeout of an upload.
 UPLOAD_S = 120.0
 TASK = "calibrate-glove"
 PRESS_HELP = "30, or 30 palm, or 30 thumb+index (kPa), or 2kg/90cm2 palm (a weight)"
@@ -43,21 +43,21 @@ Wait = Callable[[float], None]
 
 @runtime_checkable
 class Link(Protocol):
-    """What is needed of `HttpLink`."""
+    """The part of `HttpLink` used here."""
 
     def request(self, method: str, path: str, *, body: bytes | None = None) -> Reply:
-        """Ask the station."""
+        """Send a request to the station."""
         ...
 
 
 class StationTakes:
-    """Records takes through a running station's recorder and finds them again.
+    """Records takes with a running station and locates them.
 
     Args:
         link: to the station.
-        spool: the station's folder of takes, where this machine has it.
-        has_store: whether takes may come from the store that the station uploads to.
-        wait: passes time.
+        spool: the station's spool, if accessible from this machine.
+        has_store: whether takes may be read from the store that the station uploads to.
+        wait: sleeps.
     """
 
     def __init__(
@@ -68,21 +68,21 @@ class StationTakes:
     def record(
         self, name: str, words: str, seconds: float, check: Callable[[str], Found]
     ) -> tuple[str, Found]:
-        """One take that is good; interrupted ones, and those that are not, are thrown away.
+        """Record a valid take; interrupted and invalid ones are discarded.
 
         Args:
             name: id of the take.
-            words: what is recorded, for the operator and as the take's instruction.
-            seconds: how long.
-            check: raises what is wrong with a take. Where only the store has takes, it is asked
-                when the take is saved already.
+            words: description for the operator, also the take's instruction.
+            seconds: duration.
+            check: raises an error for an invalid take. If takes are only in the store, it runs
+                after the take is saved.
 
         Returns:
-            The take's folder in the spool, or its id in the store; and what the check found.
+            The take's folder in the spool, or its id in the store; and the result of the check.
 
         Raises:
             ConflictError: the recorder is busy with another take; save or discard that.
-            UnavailableError: the station does not answer.
+            UnavailableError: the station does not respond.
             NotFoundError: neither spool nor store has the take.
         """
         self._act("arm", {"task": TASK, "instruction": words})
@@ -98,7 +98,7 @@ class StationTakes:
         finally:
             if not is_good:
                 self._act("discard", {"recording_id": name})
-        # Other devices may be absent; whether the glove was there, its readings tell.
+        # Other devices may be absent; the presence of the glove shows in its readings.
         self._act("save", {"recording_id": name, "accept_incomplete": True})
         if found is not None:
             return str(folder.resolve()), found
@@ -109,7 +109,7 @@ class StationTakes:
         self._link.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
 
     def _await_upload(self, name: str) -> str:
-        """The take's id in the store."""
+        """Wait for the upload and return the take's id in the store."""
         if not self._has_store:
             raise NotFoundError(
                 f"take {name!r}: not in {self._spool.resolve()}; name the station's spool with "
@@ -128,7 +128,7 @@ class StationTakes:
 
 
 def station_takes(options: argparse.Namespace) -> StationTakes:
-    """Of the station that the options name."""
+    """Create the helper for the station of the options."""
     link = HttpLink(options.url, api_key=options.key)
     return StationTakes(link, spool=options.spool, has_store=options.store is not None)
 
@@ -136,13 +136,13 @@ def station_takes(options: argparse.Namespace) -> StationTakes:
 def walk(
     options: argparse.Namespace, takes: StationTakes, *, ask: Ask = input
 ) -> tuple[str, Sequence[PressRow]]:
-    """Lead an operator through rest and presses; the rest take and the presses that are good.
+    """Lead an operator through rest and presses; returns the rest take and valid presses.
 
-    A take that is not good is explained and asked for again. The list of presses is kept in the
-    folder, so that the same takes can be calibrated again.
+    An invalid take is explained and repeated. The list of presses is stored in the folder, so that
+    the calibration can be repeated from the same takes.
 
     Raises:
-        InvalidInputError: nobody answers.
+        InvalidInputError: no operator input.
     """
     guide = _Guide(options, takes, ask)
     rest, tare = guide.rest()
@@ -157,7 +157,7 @@ def walk(
 
 
 class _Guide:
-    """What is asked of the operator, and of the station, one after the other."""
+    """Dialogue with the operator and the station."""
 
     def __init__(self, options: argparse.Namespace, takes: StationTakes, ask: Ask) -> None:
         self._options, self._takes, self._ask = options, takes, ask
@@ -165,7 +165,7 @@ class _Guide:
         self._num_takes = 0
 
     def rest(self) -> tuple[str, TaxelTare]:
-        """A rest take whose tare is good."""
+        """Record a rest take with a valid tare."""
         side = self._options.side
         while True:
             self._answer(
@@ -182,7 +182,7 @@ class _Guide:
                 print(f"Once more: {error.message}")
 
     def presses(self, tare: TaxelTare) -> list[PressRow]:
-        """Presses until the operator has no more."""
+        """Record presses until the operator is done."""
         print(f"Now two to four known pressures, the highest as high as work needs: {PRESS_HELP}.")
         rows: list[PressRow] = []
         known: list[TaxelPress] = []
@@ -224,7 +224,7 @@ class _Guide:
         )
 
     def _press(self, tare: TaxelTare, wanted: PressRow, take: str) -> TaxelPress:
-        """The press of a take, if a gain follows from it alone."""
+        """The press of a take, if it determines a gain on its own."""
         press = press_of(replace(wanted, take=take), self._options)
         fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
         return press
@@ -246,7 +246,7 @@ class _Guide:
 
 
 def parse_press(words: str, relative_sigma: float) -> PressRow:
-    """A known pressure as an operator types it (`PRESS_HELP`); its take is still to come.
+    """Parse a pressure typed by the operator (`PRESS_HELP`), before its take.
 
     Raises:
         InvalidInputError: no pressure above 0.

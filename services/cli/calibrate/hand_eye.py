@@ -1,4 +1,4 @@
-"""`dextouch station calibrate hand-eye`: photos and poses in, T_tracker_camera with sigma out."""
+"""Command `dextouch station calibrate hand-eye`: mount of a camera on its tracker."""
 
 import argparse
 import csv
@@ -25,7 +25,7 @@ from services.cli.calibrate.record import (
     write_picture,
 )
 
-# Which tracker carries which camera: the names that recordings use.
+# Tracker of each camera, by the stream names of recordings.
 TRACKERS = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
 POSE_COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 POSES_HELP = (
@@ -37,10 +37,10 @@ POSES_HELP = (
 
 @dataclass(frozen=True)
 class PosedViews:
-    """Poses of the tracker and of the board at the same moments, and what each is called.
+    """Paired poses of tracker and board, with names of the views.
 
-    `corners` are what the board's poses were found from, where there are photos; `blurred` names
-    photos that are none of the views for that reason.
+    `corners` are the detected corners, if there are photos; `blurred` lists photos excluded for
+    blur.
     """
 
     names: tuple[str, ...]
@@ -51,17 +51,17 @@ class PosedViews:
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """The mount of one camera on its tracker.
+    """Calibrate the mount of one camera on its tracker.
 
     Raises:
-        DegenerateMotionError: the tracker was turned too little; the message names the axis.
-        InvalidInputError: poses and photos that do not belong together or contradict each other.
+        DegenerateMotionError: the tracker was rotated too little; the message names the axis.
+        InvalidInputError: poses and photos that do not match or contradict each other.
         NotFoundError: no photos, poses or intrinsics.
     """
     views = read_views(options)
     turns = turn_coverage(views.Ts_world_tracker)
     picture = f"hand_eye_{options.camera}.svg"
-    # Drawn before solving: whoever is refused wants to see why.
+    # Drawn before solving, so that it is available after a refusal.
     path = write_picture(options.to, picture, turns_picture(turns, views.names, None))
     print(f"{len(views.names)} views; turns of the tracker: {path}")
     for words in turns.todo:
@@ -111,7 +111,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
 
 
 def read_views(options: argparse.Namespace) -> PosedViews:
-    """Poses from the file, boards from the photos or from the same file."""
+    """Read poses from the file, and boards from the photos or from the same file."""
     entries = read_json(options.poses) if options.poses.suffix.lower() == ".json" else None
     if entries is not None and all(isinstance(entry, list) for entry in entries):
         views = _pairs(entries, options.poses)
@@ -133,17 +133,17 @@ def read_views(options: argparse.Namespace) -> PosedViews:
 
 
 def board_scatter_mm(views: PosedViews, T_tracker_camera: np.ndarray) -> Float64[np.ndarray, " n"]:
-    """How far each view puts the board from where all views put it on average, in mm."""
+    """Distance of the board in each view from its mean over all views, in mm."""
     places = (views.Ts_world_tracker @ T_tracker_camera @ views.Ts_camera_board)[:, :3, 3]
     return np.linalg.norm(places - places.mean(axis=0), axis=1) * 1e3
 
 
 def read_json(path: Path) -> list[object]:
-    """A list from a JSON file.
+    """Read a list from a JSON file.
 
     Raises:
         NotFoundError: no such file.
-        InvalidInputError: no JSON list with something in it.
+        InvalidInputError: not a JSON list, or empty.
     """
     if not path.is_file():
         raise NotFoundError(f"{path}: no such file of poses; expected {POSES_HELP}")

@@ -1,4 +1,4 @@
-"""Photos that come one by one, from a folder or a running station; a growing set of views out."""
+"""Live collection of calibration views, from a watched folder or a running station."""
 
 import argparse
 import time
@@ -17,12 +17,12 @@ from services.cli.calibrate.photos import SUFFIXES, decode_photo
 
 LIVE_PERIOD_S = 0.2
 WATCH_PERIOD_S = 1.0
-# A board that moved more between two live images is blurred along its motion (0.5 px at 6 px).
+# A board that moved by more between two live images is motion-blurred (0.5 px at 6 px).
 MAX_MOTION_PX = 1.5
-# Views nearer to a kept one than this part of the image's diagonal add nothing.
+# Views nearer to a kept one than this share of the image diagonal are redundant.
 MIN_NEWS = 0.04
 MAX_VIEWS = 60
-# So many live images without a new view (4 s and more) are told.
+# Number of live images without a new view (4 s and more) after which a hint is printed.
 TELL_AFTER_IMAGES = 20
 
 Arrivals = Iterator[tuple[str, bytes]]
@@ -30,11 +30,11 @@ Wait = Callable[[float], None]
 
 
 class Session:
-    """Views of one camera as they come, with the picture of what they cover.
+    """Growing set of views of one camera, with its coverage picture.
 
     Args:
-        board: to look for.
-        folder: of the calibration; the picture is kept there.
+        board: to detect.
+        folder: of the calibration, also for the picture.
         camera: name of the camera.
     """
 
@@ -45,21 +45,21 @@ class Session:
 
     @property
     def is_enough(self) -> bool:
-        """Whether nothing is left to do, or no more views are of use."""
+        """Whether coverage is sufficient, or the maximum number of views is reached."""
         return not self.todo or len(self.views) >= MAX_VIEWS
 
     def find(self, name: str, photo: np.ndarray) -> BoardView | None:
-        """The board in a photo; None where it is not seen."""
+        """Detect the board in a photo; None if not found."""
         return find_board(name, photo, self._board)
 
     def is_new(self, view: BoardView, photo: np.ndarray) -> bool:
-        """Whether no kept view shows the board nearly there already."""
+        """Whether the view differs enough from all kept ones."""
         height_px, width_px = photo.shape
         needed_px = MIN_NEWS * float(np.hypot(width_px, height_px))
         return all(motion_px(view, kept) > needed_px for kept in self.views)
 
     def keep(self, view: BoardView, photo: np.ndarray) -> None:
-        """Add a view, draw the picture and say what is next."""
+        """Add a view, redraw the picture and print advice."""
         self.views.append(view)
         size_px = (photo.shape[1], photo.shape[0])
         coverage = camera_coverage(self.views, size_px)
@@ -71,7 +71,7 @@ class Session:
 
 
 def motion_px(a: BoardView, b: BoardView) -> float:
-    """Mean distance of the corners that both views show; infinity when they share none."""
+    """Mean displacement of common corners; infinity if there are none."""
     places = {tuple(place): index for index, place in enumerate(b.points_board.tolist())}
     pairs = [
         (index, places[tuple(place)])
@@ -85,7 +85,7 @@ def motion_px(a: BoardView, b: BoardView) -> float:
 
 
 def follow_folder(session: Session, arrivals: Arrivals) -> None:
-    """Look at photos as somebody else puts them into a folder, until there are enough."""
+    """Process photos as they appear in a folder, until coverage is sufficient."""
     for name, data in arrivals:
         photo = decode_photo(data, where=name)
         view = session.find(name, photo)
@@ -100,12 +100,12 @@ def follow_folder(session: Session, arrivals: Arrivals) -> None:
 
 
 def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
-    """Keep live images of a board that stands still somewhere new; their number.
+    """Keep live images of a static board in new positions, and return their number.
 
     Args:
         session: views so far.
         arrivals: images of the camera, JPEG.
-        photos: folder for those that are kept.
+        photos: folder for the kept images.
     """
     photos.mkdir(parents=True, exist_ok=True)
     before: BoardView | None = None
@@ -139,7 +139,7 @@ def _why_nothing_is_kept(view: BoardView | None, *, still: bool) -> str:
 
 
 def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
-    """Photos of a folder, and each new one after it, for ever.
+    """Yield the photos of a folder, then new ones, indefinitely.
 
     Raises:
         NotFoundError: no such folder.
@@ -156,18 +156,18 @@ def folder_arrivals(folder: Path, *, wait: Wait = time.sleep) -> Arrivals:
 
 
 def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) -> Arrivals:
-    """Newest images of a station's camera, five a second, for ever; repeated ones are skipped.
+    """Yield new images of a station's camera at 5 Hz, indefinitely, skipping repeated ones.
 
     Args:
-        newest: asks the station for the newest image, JPEG.
-        wait: passes the time between two questions.
+        newest: requests the newest JPEG image.
+        wait: sleeps between requests.
     """
     last = b""
     for number in count():
         try:
             data = newest()
         except StaleDataError:
-            # The camera pauses; an old image would be taken for a board that stands still.
+            # The camera pauses; an old image would look like a static board.
             data = b""
         if data and data != last:
             last = data
@@ -176,10 +176,10 @@ def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) ->
 
 
 def run(options: argparse.Namespace, board: Board) -> None:
-    """Collect with `--url`, or look on with `--watch`, until there is enough or Ctrl-C.
+    """Collect with `--url` or `--watch` until coverage is sufficient, or Ctrl-C.
 
     Raises:
-        UnavailableError: the station does not answer.
+        UnavailableError: the station does not respond.
     """
     session = Session(board, options.to, options.camera)
     print("Ctrl-C ends the collecting and calibrates with what is there")

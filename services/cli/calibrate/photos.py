@@ -1,4 +1,4 @@
-"""A folder of photos in; their names and grey pixels out."""
+"""Loading of photos as grey images."""
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
@@ -16,7 +16,7 @@ SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
 
 def photo_paths(folder: Path) -> list[Path]:
-    """Photos of a folder by name.
+    """List the photos of a folder, sorted by name.
 
     Raises:
         NotFoundError: no folder, or no photo in it.
@@ -30,10 +30,10 @@ def photo_paths(folder: Path) -> list[Path]:
 
 
 def read_photos(paths: Iterable[Path]) -> list[UInt8[np.ndarray, "h w"]]:
-    """Grey pixels of photos of one size.
+    """Read photos of equal size as grey images.
 
     Raises:
-        CorruptDataError: a file that is no photo.
+        CorruptDataError: a file that cannot be decoded.
         InvalidInputError: photos of different sizes.
     """
     photos, size = [], None
@@ -50,10 +50,10 @@ def read_photos(paths: Iterable[Path]) -> list[UInt8[np.ndarray, "h w"]]:
 
 
 def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
-    """Grey pixels of an encoded photo.
+    """Decode a photo to a grey image.
 
     Raises:
-        CorruptDataError: bytes that are no image.
+        CorruptDataError: not an image.
     """
     import cv2
 
@@ -65,7 +65,7 @@ def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
 
 
 def progress(items: list[Item], what: str) -> Iterator[Item]:
-    """The items, with a bar on stderr where somebody looks at it."""
+    """Iterate with a progress bar on stderr, if it is a terminal."""
     console = Console(stderr=True)
     yield from track(
         items, total=len(items), description=what, console=console, disable=not console.is_terminal

@@ -1,4 +1,4 @@
-"""Results of a calibration in; the pictures that an operator looks at out."""
+"""SVG pictures of calibration results: coverage, residuals, rotations, taxel maps."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -41,7 +41,7 @@ _STATE_COLOURS = dict(
 def coverage_picture(
     views: Sequence[BoardView], coverage: Coverage, size_px: tuple[int, int]
 ) -> str:
-    """Where corners were seen, how the board was tilted, and what to do next."""
+    """Picture of corner positions, board tilts and advice."""
     scale = _WIDTH / size_px[0]
     height = size_px[1] * scale
     image = []
@@ -71,7 +71,7 @@ def coverage_picture(
 def residual_picture(
     views: Sequence[BoardView], residuals_px: Sequence[np.ndarray], size_px: tuple[int, int]
 ) -> str:
-    """What the model leaves of every corner, a hundred times enlarged, and RMS by photo."""
+    """Picture of corner residuals, enlarged 100 times, and RMS by photo."""
     scale = _WIDTH / size_px[0]
     height = size_px[1] * scale
     image = [rectangle((0, 0, _WIDTH, height), fill="none", stroke=LINE)]
@@ -88,7 +88,7 @@ def residual_picture(
 
 
 def turns_picture(coverage: TurnCoverage, names: Sequence[str], off_mm: np.ndarray | None) -> str:
-    """About which axes the tracker was turned, and how far each view is off."""
+    """Picture of tracker rotations, and the error of each view."""
     parts = []
     for index, (a, b) in enumerate(((0, 1), (0, 2), (1, 2))):
         plot = polar(
@@ -110,7 +110,7 @@ def turns_picture(coverage: TurnCoverage, names: Sequence[str], off_mm: np.ndarr
 
 
 def glove_picture(found: GloveCalibration) -> str:
-    """Tare, noise, gain and state of every taxel in the shape of the hand."""
+    """Maps of tare, noise, gain and state of all taxels in hand layout."""
     side = found.tare.side
     select = partial(select_taxels, side=side)
     level = found.tare.level
@@ -122,7 +122,7 @@ def glove_picture(found: GloveCalibration) -> str:
         maps.append(("gain, counts a kPa", filled_gain(found.gain)))
     parts = []
     for index, (title, values) in enumerate(maps):
-        # A saturated taxel must not take the colours from all others.
+        # A saturated taxel must not compress the colour range of the others.
         low, high = (float(v) for v in np.percentile(values, (2, 98)))
         canvas = hand_canvas(values, side=side)
         words = f"{title}: mostly {low:.3g} … {high:.3g}"

@@ -1,8 +1,8 @@
-"""A calibration folder: named matrices as recordings carry them, and what is known about each.
+"""Calibration folder: named matrices for recordings, with accuracy, age and provenance.
 
-`calibration.json` is what a station reads (DEXTOUCH_ACQUISITION_CALIBRATION). Sigma and time of a
-matrix are matrices too (`…_sigma…`, `…_calibrated_at_unix_s`), so that they travel with every
-recording.
+Stations read `calibration.json` (DEXTOUCH_ACQUISITION_CALIBRATION). Sigma and time of a matrix are
+stored as matrices too (`…_sigma…`, `…_calibrated_at_unix_s`), so that every recording contains
+them.
 """
 
 import json
@@ -27,7 +27,7 @@ MAX_AGE_S = 7 * 86_400.0
 
 _MATRICES: TypeAdapter[dict[str, Matrix]] = TypeAdapter(dict[str, Matrix])
 
-# What may be known to no better than this (relative or absolute) before `show` warns.
+# Limits of sigma (relative or absolute) above which `show` warns.
 MAX_FOCAL_SIGMA = 0.003
 # Column of a hand profile that holds the sigma of the knuckles, in metres.
 PROFILE_SIGMA = 7
@@ -36,15 +36,15 @@ MOUNT_LIMITS = (0.06, 0.8)
 BASE_LIMITS = (0.2, 2.0)
 MAX_GAIN_SIGMA = 0.05
 MAX_TAXEL_FAULTS = (0.01, 0.05)
-# Matrices of a glove that are no measurement of their own, or that an episode brings with it.
+# Matrices of a glove that are metadata, or that are added by an episode.
 _ABOUT_GLOVES = ("noise_counts", "taxel_state", "cells", "refused_taxels")
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One calibrated thing: how old, how good.
+    """Assessment of one calibration: age and accuracy.
 
-    `level` is OK, WARN or ERROR; `reasons` say why it is not OK and what to do.
+    `level` is OK, WARN or ERROR; `reasons` explain a level other than OK and what to do.
     """
 
     name: str
@@ -64,24 +64,24 @@ def write_entry(
     facts: Mapping[str, object],
     now: datetime,
 ) -> None:
-    """Put matrices into a folder's calibration; those of other entries stay.
+    """Write an entry of a calibration folder; other entries are kept.
 
     Args:
-        folder: made when absent.
-        entry: name of the main thing, such as `K_head`; its time is kept as
+        folder: created if absent.
+        entry: name of the main matrix, such as `K_head`; its time is stored as
             `<entry>_calibrated_at_unix_s`.
         matrices: two-dimensional, finite.
-        facts: sigma, inputs and the like, for people; JSON.
-        now: when it was measured, with a time zone.
+        facts: sigma, inputs and similar details for humans; JSON.
+        now: time of the measurement, with a time zone.
 
     Raises:
         NonFiniteError: NaN or infinity in a matrix.
-        CorruptDataError: what is there already cannot be read.
+        CorruptDataError: an existing file cannot be read.
     """
     for name, matrix in matrices.items():
         if not np.isfinite(matrix).all():
             raise NonFiniteError(f"calibration {name!r}: NaN or infinity; nothing was written")
-    # Whole seconds: exact in a matrix of float64.
+    # Whole seconds, which are exact in float64.
     stamp = np.array([[float(int(now.timestamp()))]])
     old = read_matrices(folder) if (folder / MATRICES_FILE).exists() else {}
     details = read_details(folder)
@@ -101,11 +101,11 @@ def write_entry(
 
 
 def read_matrices(folder: Path) -> dict[str, Matrix]:
-    """The matrices of a folder, or of a JSON file of matrices.
+    """Read the matrices of a folder or a JSON file.
 
     Raises:
-        NotFoundError: none there.
-        CorruptDataError: no JSON of matrices.
+        NotFoundError: no calibration.
+        CorruptDataError: not a JSON file of matrices.
     """
     path = folder / MATRICES_FILE if folder.is_dir() else folder
     if not path.is_file():
@@ -121,10 +121,10 @@ def read_matrices(folder: Path) -> dict[str, Matrix]:
 
 
 def read_details(folder: Path) -> dict[str, object]:
-    """What is known about each entry; nothing for a folder without that file.
+    """Read the details of each entry; empty for a folder without that file.
 
     Raises:
-        CorruptDataError: no JSON object.
+        CorruptDataError: not a JSON object.
     """
     path = folder / DETAILS_FILE
     if not path.is_file():
@@ -139,7 +139,7 @@ def read_details(folder: Path) -> dict[str, object]:
 
 
 def write_picture(folder: Path, name: str, svg: str) -> Path:
-    """Keep a picture beside the matrices; its path."""
+    """Write a picture beside the matrices and return its path."""
     path = folder / PICTURES / name
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(svg, encoding="utf-8")
@@ -147,7 +147,7 @@ def write_picture(folder: Path, name: str, svg: str) -> Path:
 
 
 def named_matrix(matrices: Mapping[str, Matrix], name: str, shape: tuple[int, int]) -> np.ndarray:
-    """One matrix as float64.
+    """Get a matrix as float64.
 
     Raises:
         NotFoundError: missing.
@@ -164,7 +164,7 @@ def named_matrix(matrices: Mapping[str, Matrix], name: str, shape: tuple[int, in
 
 
 def judge(matrices: Mapping[str, Matrix], *, now: datetime) -> list[Finding]:
-    """Every calibrated thing among the matrices, with age and sigma."""
+    """Assess age and sigma of every calibration among the matrices."""
     return [
         _judge_one(name, matrices, now)
         for name in sorted(matrices)
@@ -173,7 +173,7 @@ def judge(matrices: Mapping[str, Matrix], *, now: datetime) -> list[Finding]:
 
 
 def _is_companion(name: str, matrices: Mapping[str, Matrix]) -> bool:
-    """Whether a matrix only tells about another one."""
+    """Whether a matrix is metadata of another one."""
     if name.endswith("calibrated_at_unix_s") or "_sigma_" in name:
         return True
     side = name.removeprefix("tactile_").split("_")[0]
@@ -216,7 +216,7 @@ def _judge_one(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Find
 
 
 def _where_from(name: str) -> str:
-    """What to do about a matrix of unknown age: not every one is measured by this command."""
+    """Advice for a matrix of unknown age, which may not come from this command."""
     if name.endswith("_latency_ns"):
         return (
             "measured by the station where the device answers time requests, a camera's is its "
@@ -228,7 +228,7 @@ def _where_from(name: str) -> str:
 
 
 def _sigma(name: str, matrices: Mapping[str, Matrix]) -> tuple[str, list[str]]:
-    """The sigma in words, and what is wrong with it."""
+    """Description of the sigma, and problems with it."""
     found = {
         suffix: np.array(matrices[f"{entry_of(name)}_sigma_{suffix}"])
         for suffix in ("px", "rad", "m", "counts", "counts_per_kpa", "ns")

@@ -1,4 +1,4 @@
-"""`dextouch station calibrate show`: a calibration or a take in; age and sigma of all out."""
+"""Command `dextouch station calibrate show`: contents, age and sigma of a calibration."""
 
 import argparse
 from dataclasses import asdict
@@ -13,13 +13,13 @@ from dextouch.schemas.episodes import Matrix
 from services.cli.calibrate.record import Finding, judge, read_matrices
 
 EXIT_MISSING = 1
-# Alignment refuses takes without these, or without those of the gloves that were recorded.
+# Alignment refuses takes without these, or without those of the recorded gloves.
 NEEDED = ("K_head",)
 _STYLES = {"OK": "green", "WARN": "yellow", "ERROR": "bold red"}
 
 
 def show(options: argparse.Namespace, *, now: datetime | None = None) -> dict[str, object]:
-    """Print every calibrated thing with its age and sigma; the same as data."""
+    """Print every calibration with age and sigma, and return them as data."""
     matrices = load(options.folder)
     findings = judge(matrices, now=now or datetime.now(UTC))
     missing = missing_names(matrices)
@@ -37,14 +37,14 @@ def show(options: argparse.Namespace, *, now: datetime | None = None) -> dict[st
 
 
 def load(path: Path) -> dict[str, Matrix]:
-    """Matrices of a calibration folder or file, or those that a spooled take carries."""
+    """Matrices of a calibration folder or file, or of a spooled take."""
     if (path / "recording.json").is_file():
         return dict(read_attributes(path).calibration)
     return read_matrices(path)
 
 
 def missing_names(matrices: dict[str, Matrix]) -> list[str]:
-    """What is needed and not there; a glove needs both its tare and its gain."""
+    """Missing required matrices; a glove needs both tare and gain."""
     missing = [name for name in NEEDED if name not in matrices]
     for side in ("left", "right"):
         pair = (f"tactile_{side}_tare_counts", f"tactile_{side}_gain_counts_per_kpa")

@@ -1,4 +1,4 @@
-"""`dextouch demo`: the whole way from device bytes to a policy score, measured against truth."""
+"""Command `dextouch demo`: the full path from device bytes to policy scores, against truth."""
 
 from services.cli.demo.command import main
 

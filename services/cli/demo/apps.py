@@ -1,4 +1,4 @@
-"""The applications of the services that the demo uses."""
+"""Service applications of the demo."""
 
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,11 @@ from services.twin.world import TwinWorld
 
 
 def build_apps(store: str, jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
-    """Store, alignment, the twin as the real world, and the imagined worlds.
+    """Create store, alignment, the twin as the real world, and the imagined worlds.
 
     Args:
-        store: where recordings and episodes lie.
-        jobs_folder: of the alignments.
+        store: for recordings and episodes.
+        jobs_folder: of alignment jobs.
         world_model: served beside the copy-first baseline.
     """
     imagined: dict[str, World[Any]] = {

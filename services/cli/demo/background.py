@@ -1,4 +1,4 @@
-"""Service applications in; the same services answering on loopback while a block runs out."""
+"""Service applications served from a background thread on loopback."""
 
 import asyncio
 import threading
@@ -15,10 +15,10 @@ START_TIMEOUT_S = 60.0
 
 @contextmanager
 def served(apps: Mapping[str, FastAPI]) -> Iterator[dict[str, str]]:
-    """Serve applications from a thread of their own; gives the URL of each by name.
+    """Context manager that serves applications in a thread; yields their URLs by name.
 
     Raises:
-        UnavailableError: they did not start, or one ended by itself.
+        UnavailableError: they did not start, or one terminated unexpectedly.
     """
     placed = [(bind(name, host="127.0.0.1", port=0), app) for name, app in apps.items()]
     runner = _Runner(placed)

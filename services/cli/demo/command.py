@@ -1,4 +1,4 @@
-"""`dextouch demo`: all stages in order, a table, report.json and report.html."""
+"""Command line `dextouch demo`: runs all stages and writes report.json and report.html."""
 
 import json
 import tempfile
@@ -34,15 +34,15 @@ from services.cli.demo.timing import Stages
 from services.cli.demo.truth import Truth, make_truth
 from services.evaluation.reporting import write_report
 
-# Errors that both takes have; the report's figure is the worse one.
+# Errors of both takes; the report shows the worse one.
 COMMON_ERRORS = ("taxel_mae_kpa", "fingertip_error_mm", "wrist_error_mm", "wrist_error_deg")
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the whole way once.
+    """Run the demo.
 
     Returns:
-        0 when every stage ran; what was measured is in the report, good or not.
+        0 if every stage ran, whatever the figures in the report.
     """
     plan = parse(argv)
     configure_logging(service="demo", log_format="auto", level="warning")
@@ -65,7 +65,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 class Demo:
-    """One run: its plan, its scratch folder and the stages it went through."""
+    """One run: plan, scratch folder and stages."""
 
     def __init__(self, plan: DemoPlan, folder: Path) -> None:
         self.plan = plan
@@ -73,11 +73,11 @@ class Demo:
         self._truth_folder = folder / "truth"
         self._store = default_store()
         self._spool = folder / "spool"
-        # Apart from the store, whose own alignment service may be running.
+        # Separate from the store, which may have a running alignment service.
         self._jobs = folder / "alignments"
 
     def run(self) -> dict[str, Any]:
-        """All stages; the report as `report.json` holds it."""
+        """Run all stages and return the contents of `report.json`."""
         truth = self._make_truth()
         models = self._models()
         apps = build_apps(self._store, self._jobs, models.world_model)
@@ -162,13 +162,13 @@ class Demo:
 
 
 def describe(world: WorldDescription) -> str:
-    """A world model in a few words: its name, what it keeps, and its digest."""
+    """Short description of a world model: name, form and digest."""
     form = "state model" if world.object_names else "paper's form"
     return f"{world.name}, {form}, {world.digest[:12]}"
 
 
 def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
-    """Of every error the worse of the takes; streams carry their take's name where both have it."""
+    """The worse of the takes for every error; streams in both are prefixed by their take."""
     errors: dict[str, Any] = {}
     for name in ("clock_rms_ms", "latency_ms", "latency_error_ms", "num_dropped"):
         errors[name] = {

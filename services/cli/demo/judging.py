@@ -1,4 +1,4 @@
-"""Policies of different quality, and their scores in the real and the imagined world."""
+"""Scoring of policies of different quality in the real and the imagined world."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -21,11 +21,11 @@ BASELINE = "copy-first"
 
 
 def ladder(plan: DemoPlan) -> dict[str, Policy]:
-    """Policies that do not look, good and bad ones.
+    """Open-loop policies of graded quality.
 
-    They are the scripted demonstrator with its errors, and three that should not succeed: holding
-    still, retreating, and the actions of another scene. Nothing is simulated for them: the twin
-    only plans what the demonstrator would command.
+    The scripted demonstrator with errors, and three that should fail: holding still, retreating,
+    and the actions of another scene. The twin only plans the demonstrator's commands, without
+    simulation.
     """
     stages = {task: Stage(task, "robot", TwinSettings()) for task in TASKS}
     names = (*(script_name(level) for level in plan.levels_mm), HOLD, RETREAT, ELSEWHERE)
@@ -44,16 +44,16 @@ def ladder(plan: DemoPlan) -> dict[str, Policy]:
 def judge(
     urls: Mapping[str, str], policies: Mapping[str, Policy], models: Models, plan: DemoPlan
 ) -> dict[str, Any]:
-    """Roll all policies out from matched starts in the twin, the model and the copy baseline.
+    """Roll out all policies from matched starts in the twin, the model and the copy baseline.
 
     Args:
         urls: of the services `twin` and `imagined`.
         policies: by name.
-        models: the probe judges imagined success; what they were trained on is never judged on.
+        models: with the success probe; training scenes are excluded.
         plan: seeds.
 
     Returns:
-        `policies`, `agreement` and the rest, as `report.json` holds them.
+        `policies`, `agreement` and other entries of `report.json`.
 
     Raises:
         DexTouchError: a rollout failed.

@@ -1,4 +1,4 @@
-"""Committed or freshly trained networks, as the demo uses them."""
+"""Pretrained or freshly trained networks for the demo."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ ENDINGS = (
     "--miss-fraction", "0.1", "--still-fraction", "0.1",
 )  # fmt: skip
 UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180")
-# A state model in small: one member, few steps.
+# A small state model: one ensemble member, few steps.
 SMALL_STATE_MODEL = (
     "--num_members=1", "--jobs=1", "--reader.num_steps=2500", "--core.num_steps=1500",
     "--drawing.cpu_budget_s=300",
@@ -36,24 +36,24 @@ SMALL_STATE_MODEL = (
 
 @dataclass(frozen=True)
 class TrainedOn:
-    """What a world model was trained on: content of episodes, or ranges of seeds by task."""
+    """Training data of a world model: content hashes of episodes, or seed ranges by task."""
 
     fingerprints: tuple[str, ...] = ()
     seeds: tuple[tuple[str, int, int], ...] = ()
 
     @classmethod
     def of(cls, checkpoint: Path) -> "TrainedOn":
-        """What a checkpoint of either form says."""
+        """Read it from a checkpoint of either form."""
         if not is_state_checkpoint(checkpoint):
             return cls(fingerprints=read_checkpoint(checkpoint).metadata.train_fingerprints)
         ranges = read_state_checkpoint(checkpoint).metadata.training_seeds
         return cls(seeds=tuple((task, low, high) for task, (low, high) in ranges.items()))
 
     def refuse(self, seeds: Iterable[int]) -> None:
-        """Let no scene be judged on whose seed is among those of training.
+        """Refuse to evaluate on seeds used in training.
 
         Raises:
-            ConflictError: the world model was trained on seeds about these.
+            ConflictError: the world model was trained on some of these seeds.
         """
         wanted = list(seeds)
         for task, low, high in self.seeds:
@@ -76,7 +76,7 @@ class Models:
 
 
 def committed_models() -> Models:
-    """The networks that come with the package.
+    """Load the networks shipped with the package.
 
     Raises:
         NotFoundError, CorruptDataError: a file is missing or damaged.
@@ -85,12 +85,12 @@ def committed_models() -> Models:
 
 
 def train_models(folder: Path) -> Models:
-    """Record training episodes and train all three: a small state model, a policy and a judge.
+    """Record training episodes and train a small state model, a policy and a success probe.
 
-    The judge learns from true endings and from those that the state model imagines.
+    The probe learns from true endings and from those imagined by the state model.
 
     Args:
-        folder: where episodes and checkpoints go; episodes that are there are used again.
+        folder: for episodes and checkpoints; existing episodes are reused.
     """
     episodes, exact, endings, unseen, imagined = (
         str(folder / name) for name in ("episodes", "exact", "endings", "unseen", "imagined")
@@ -112,7 +112,7 @@ def train_models(folder: Path) -> Models:
 
 
 def use_one_thread() -> None:
-    """One torch thread: beside busy services a second one makes small networks slower."""
+    """Limit torch to one thread, since more slow down small networks beside busy services."""
     torch.set_num_threads(1)
 
 

@@ -1,4 +1,4 @@
-"""Takes and predictions of a run in, the arrays that its report shows out."""
+"""Pictures of takes and predictions for the demo's report."""
 
 import numpy as np
 
@@ -16,7 +16,7 @@ CAMERA = "camera_head"
 
 
 def collect(takes: dict[str, Take], predictions: tuple[PredictionPicture, ...]) -> ReportPictures:
-    """Everything of the report that is not a figure."""
+    """Collect all pictures of the report."""
     robot = takes["robot"].episode
     return ReportPictures(
         episodes=tuple(

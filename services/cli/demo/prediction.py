@@ -1,7 +1,7 @@
-"""How well a world foresees images and touch of held-out episodes, beside simple rivals.
+"""Prediction errors of a world on held-out episodes, beside simple baselines.
 
 Only the `World` interface is used, so every form of the world model is measured alike: over whole
-rollouts, from the first observed step to the last, with what was imagined before as the only past.
+open-loop rollouts, from the first observed step to the last.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _LAST_STEP = ReturnSelector(cameras=(CAMERA,), steps="last")
 
 @dataclass(frozen=True)
 class PredictionResult:
-    """Figures as `report.json` holds them, and one rollout a task to look at."""
+    """Figures for `report.json`, and one rollout per task as a picture."""
 
     figures: dict[str, Any]
     pictures: tuple[PredictionPicture, ...]
@@ -48,7 +48,7 @@ class Future:
 
 @dataclass(frozen=True)
 class Scene:
-    """An episode as it begins, what was commanded then, and what came of it."""
+    """Start of an episode, its commanded actions, and the true future."""
 
     episode_id: str
     start: RolloutStart
@@ -64,9 +64,9 @@ def measure_prediction(
 
     Args:
         world: starts from observations.
-        store: where the episodes are.
-        episode_ids: none of which was trained on.
-        trained_on: what the world was trained on.
+        store: of the episodes.
+        episode_ids: held out from training.
+        trained_on: training data of the world.
 
     Returns:
         The figures of `measure_scenes`, and the first scene of every task as a picture.
@@ -86,10 +86,10 @@ def measure_scenes(world: World[Any], scenes: Sequence[Scene]) -> PredictionResu
 
     Returns:
         `psnr` (dB, mean over the images at the ends of chunks), `tactile_mse` (kPa²) and
-        `contact_f1`, each also for the rivals that an ending names, and `num_rollouts`.
+        `contact_f1`, each also for the baselines named by a suffix, and `num_rollouts`.
 
-        - _copy repeats the first step; tactile_mse_zero feels nothing.
-        - psnr_warp is the first image, moved by the known motion of the camera over the table.
+        - _copy repeats the first step; tactile_mse_zero predicts no touch.
+        - psnr_warp is the first image, warped by the known camera motion over the table.
         - _other_take is the world given the actions of another held-out scene of the same task.
         - _hold is the world given actions in which nothing moves; in _hands_still the head does.
 
@@ -116,7 +116,7 @@ def measure_scenes(world: World[Any], scenes: Sequence[Scene]) -> PredictionResu
 
 
 def read_scene(reader: EpisodeReader) -> Scene:
-    """A stored robot episode as a start and its true future."""
+    """Convert a stored robot episode to a scene."""
     about = reader.attributes
     reader.require_images(CAMERA)
     window = reader.window(0, reader.num_steps, cameras=(CAMERA,))
@@ -145,12 +145,12 @@ def read_scene(reader: EpisodeReader) -> Scene:
 
 
 def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps 67"]) -> Future:
-    """What a world makes of actions that begin as a scene does."""
+    """Predict the future of a scene for given actions."""
     state = world.reset(scene.start).state
     images, touch = [], []
     for first in range(0, len(actions), CHUNK_STEPS):
         chunk, seed = actions[first : first + CHUNK_STEPS], scene.start.seed + first
-        # A world is a function: asking twice gives touch of all steps and only the last image.
+        # A world is functional: two calls give touch of all steps and only the last image.
         felt = world.step(state, chunk, seed=seed, selector=_NO_IMAGE)
         seen = world.step(state, chunk, seed=seed, selector=_LAST_STEP)
         images.append(seen.observation.images[CAMERA][-1])
@@ -160,7 +160,7 @@ def imagine(world: World[Any], scene: Scene, actions: Float64[np.ndarray, "steps
 
 
 def _other(scene: Scene, scenes: Sequence[Scene]) -> Scene | None:
-    """The next scene of the task that is another one."""
+    """The next, different scene of the same task."""
     mine = [one for one in scenes if one.start.task == scene.start.task]
     at = next(index for index, one in enumerate(mine) if one is scene)
     turned = mine[at + 1 :] + mine[:at]

@@ -1,7 +1,7 @@
-"""Truth episodes in; what is left of them after devices, spool, upload and alignment, out.
+"""Recording and alignment of true episodes through mock devices, with end-to-end errors.
 
-The whole way is the real one: mock devices speak packets, real drivers decode them, the recorder
-spools, the uploader sends over HTTP, the alignment service makes the episode.
+The path is the real one: mock devices send packets, real drivers decode them, the recorder spools,
+the uploader sends over HTTP, the alignment service creates the episode.
 """
 
 import shutil
@@ -36,7 +36,7 @@ STATION = "demo"
 
 @dataclass(frozen=True)
 class Take:
-    """One recorded, aligned take with the errors of the whole way."""
+    """A recorded and aligned take with its end-to-end errors."""
 
     truth: EpisodeReader
     episode: EpisodeReader
@@ -48,11 +48,10 @@ class Take:
 def record_take(
     truth: EpisodeReader, spool_root: Path, *, seed: int
 ) -> tuple[MockTake, list[dict[str, Any]]]:
-    """Play the truth through every mock device once, disturbed as an ordinary station is.
+    """Replay the truth through all mock devices, with the faults of an ordinary station.
 
     Returns:
-        The take in the spool, and for every device what the ledger says beside what the health
-        counters found.
+        The take in the spool, and for every device the mock's ledger beside the health counters.
     """
     attributes = truth.attributes
     with MockStation(
@@ -90,7 +89,7 @@ def _device_row(take: MockTake, counters: dict[str, Any]) -> dict[str, Any]:
 
 
 def forget_take(store: EpisodeStore, recording_id: str) -> None:
-    """Remove a take of an earlier run, whole or half sent, and the episodes made from it.
+    """Delete a take of an earlier run, complete or partial, and its derived episodes.
 
     Raises:
         ConflictError: another station's take has this id; nothing is removed.
@@ -122,7 +121,7 @@ def upload(spool_root: Path, store_url: str) -> None:
     """Send every take of the spool to the store service.
 
     Raises:
-        UnavailableError: a take could not be sent; it stays in the spool.
+        UnavailableError: a take could not be sent and remains in the spool.
     """
     with EpisodeStoreClient(store_url) as client:
         uploader = Uploader(spool_root, client, period_s=UPLOAD_PERIOD_S)
@@ -133,7 +132,7 @@ def upload(spool_root: Path, store_url: str) -> None:
 
 
 def align(alignment_url: str, recording_id: str) -> AlignmentJob:
-    """Let the alignment service make an episode of a recording, and wait for it.
+    """Align a recording with the alignment service, and wait for the job.
 
     Raises:
         DexTouchError: what the service refused, with its reason.
@@ -158,7 +157,7 @@ def measure(
     *,
     devices: list[dict[str, Any]],
 ) -> Take:
-    """Compare the aligned episode with the truth it was recorded from."""
+    """Errors of the aligned episode against its truth."""
     episode = store.open(episode_id)
     started_ns = store.recording(take.recording_id).attributes.started_t_host_ns
     if started_ns is None:

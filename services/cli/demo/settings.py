@@ -1,4 +1,4 @@
-"""Flags of the demo in, one frozen plan of what it does out."""
+"""Command line options of the demo, and the plan derived from them."""
 
 import argparse
 from collections.abc import Sequence
@@ -14,11 +14,11 @@ FIRST_HELD_OUT_SEED = 31_000
 
 @dataclass(frozen=True)
 class DemoPlan:
-    """What one run does.
+    """Plan of one run.
 
-    `levels_mm` are the errors of the scripted demonstrator that make policies of different
-    quality; `num_seeds` held-out scenes a task are judged on. The world model is measured on
-    `num_predicted` scenes a task, played with each of the errors `predicted_noise_m`.
+    `levels_mm` are the errors of the scripted demonstrator, which give policies of different
+    quality; `num_seeds` is the number of held-out scenes per task. The world model is measured on
+    `num_predicted` scenes per task, with each of the errors `predicted_noise_m`.
     """
 
     output: Path
@@ -32,12 +32,12 @@ class DemoPlan:
 
     @property
     def seeds(self) -> range:
-        """Held-out scenes that policies are judged on."""
+        """Seeds of the held-out scenes for policies."""
         return range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + self.num_seeds)
 
 
 def parse(argv: Sequence[str]) -> DemoPlan:
-    """The plan of a command line; `--help` ends the process with the usage."""
+    """Parse the command line; `--help` prints the usage and exits."""
     parser = argparse.ArgumentParser(
         prog="dextouch demo",
         description="Record a human and a robot take through mock devices, align them, compare "
@@ -49,7 +49,7 @@ def parse(argv: Sequence[str]) -> DemoPlan:
     parser.add_argument(
         "--output", type=Path, default=Path("demo"), help="folder of the results (%(default)s)"
     )
-    parser.add_argument("--json", type=Path, help="write the report here too")
+    parser.add_argument("--json", type=Path, help="also write the report to this file")
     parser.add_argument(
         "--train",
         action="store_true",
@@ -60,7 +60,7 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         "--seeds",
         type=int,
         default=6,
-        help="scenes a task that policies are judged on (%(default)s)",
+        help="held-out scenes per task for scoring policies (%(default)s)",
     )
     arguments = parser.parse_args(list(argv))
     if arguments.seeds < 1:

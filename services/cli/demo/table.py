@@ -1,4 +1,4 @@
-"""The tables that end a run on the terminal."""
+"""Result tables of the demo on the terminal."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,7 +6,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-# Endings of the figures' names, and what made those predictions.
+# Suffixes of figure names, and the predictors they denote.
 PREDICTORS = (
     ("", "the model"),
     ("_hands_still", "the model, only the head moves"),
@@ -97,7 +97,7 @@ def _policies(rows: list[dict[str, Any]]) -> Table:
 
 
 def rate(row: Mapping[str, Any], world: str) -> str:
-    """A success rate with its 95 % interval, where the report has one."""
+    """A success rate with its 95 % interval, if the report has one."""
     interval = row.get(f"{world}_interval")
     told = f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else ""
     return f"{row[world]:.2f}{told}"

@@ -1,4 +1,4 @@
-"""Named stages of a run: how long each took, told to whoever is watching."""
+"""Wall time of the named stages of a run, with progress output."""
 
 import sys
 import time
@@ -7,14 +7,14 @@ from contextlib import contextmanager
 
 
 class Stages:
-    """Keeps the wall time of every stage, in the order in which they ran."""
+    """Records the wall time of every stage, in order."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str, what: str) -> Iterator[None]:
-        """Time one stage; `what` is what a person is told while it runs."""
+        """Context manager that times a stage and prints `what` at its start."""
         print(f"{len(self.seconds) + 1}. {what} …", file=sys.stderr, flush=True)
         begin_s = time.perf_counter()
         try:
@@ -24,7 +24,7 @@ class Stages:
         print(f"   {self.seconds[name]:.1f} s", file=sys.stderr, flush=True)
 
     def rows(self) -> list[dict[str, object]]:
-        """As `report.json` holds them."""
+        """Rows for `report.json`."""
         return [
             {"name": name, "seconds": round(seconds, 3)} for name, seconds in self.seconds.items()
         ]

@@ -1,4 +1,4 @@
-"""Truth episodes of a run: what it records through mock devices, and what it predicts."""
+"""True episodes of the demo, recorded in the twin: two takes, and demonstrations to predict."""
 
 import multiprocessing
 import os
@@ -15,14 +15,14 @@ from services.twin.hands import Domain
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 
-# The human stands a bottle, the robot stacks bowls: one hand and both, in one run.
+# The human stands a bottle, the robot stacks bowls, to cover one-handed and bimanual tasks.
 RECORDED = {"human": "stand_bottle", "robot": "stack_bowls"}
 MAX_PROCESSES = 4
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Ids of the truth episodes: the two takes, and demonstrations to predict."""
+    """Ids of the true episodes: the two takes, and demonstrations to predict."""
 
     takes: dict[str, str] = field(default_factory=dict)
     demonstrations: tuple[str, ...] = ()
@@ -30,7 +30,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class _Order:
-    """Episodes of one stage, made by one process."""
+    """Episodes of one twin stage, recorded by one process."""
 
     task: str
     domain: Domain
@@ -39,18 +39,18 @@ class _Order:
 
 
 def make_truth(plan: DemoPlan, store_folder: Path, progress: Callable[[int, int], None]) -> Truth:
-    """Record the truth of a run in the twin, on all cores.
+    """Record the true episodes in the twin, on all cores.
 
     Args:
         plan: seeds, and errors of the demonstrations.
-        store_folder: where the episodes go.
-        progress: told how many episodes are done, of how many.
+        store_folder: destination of the episodes.
+        progress: called with the numbers of finished and of all episodes.
     """
     takes = [
         _Order(task, "human" if domain == "human" else "robot", (plan.take_seed,), TakeOptions())
         for domain, task in RECORDED.items()
     ]
-    # Two scenes at least, so that another one's actions can be given.
+    # At least two scenes, so that the actions of another one are available.
     scenes = range(FIRST_HELD_OUT_SEED, FIRST_HELD_OUT_SEED + plan.num_predicted)
     demonstrations = [
         _Order(task, "robot", tuple(scenes), TakeOptions(noise_m, images=CAMERAS[:1]))

@@ -1,1 +1,1 @@
-"""`dextouch stress`: every stage under every numerical hazard, as checks that also are tests."""
+"""Command `dextouch stress`: checks of every stage under numerical hazards, also run as tests."""

@@ -1,4 +1,4 @@
-"""Cells of the stress matrix: one stage under one numerical hazard, checked against the real code.
+"""Cells of the stress matrix: checks of one stage under one numerical hazard.
 
 A stage is a module with a `STAGE`; each hazard of `HAZARDS` is there either a function that checks
 or a reason why the hazard cannot occur. The command and the tests run the same functions.
@@ -30,7 +30,7 @@ Verdict = Literal["held", "failed", "does not apply", "not run"]
 
 
 class Check:
-    """What one cell finds: every statement is noted, and those that do not hold fail the cell."""
+    """Collects the statements of one cell; any false one fails it."""
 
     def __init__(self) -> None:
         self._told: list[str] = []
@@ -41,14 +41,14 @@ class Check:
 
     @property
     def held(self) -> bool:
-        """Whether something was checked and all of it holds."""
+        """Whether at least one statement was checked and all are true."""
         has_checked = self._told or self._refusals or self._bounds
         within = all(self.figures[what] <= bound for what, (bound, _) in self._bounds.items())
         return bool(has_checked) and within and not self._broken
 
     @property
     def came_out(self) -> str:
-        """What came out, in words; what does not hold stands first."""
+        """Summary of the results, failures first."""
         figures: dict[bool, list[str]] = {True: [], False: []}
         for what, (bound, unit) in self._bounds.items():
             text = f"{what} {self.figures[what]:.3g} {unit}".rstrip() + f" (≤ {bound:g})"
@@ -66,7 +66,7 @@ class Check:
     def at_most(
         self, what: str, value: float | int | np.number[Any], bound: float | int, unit: str = ""
     ) -> None:
-        """A figure that must be finite and not above its bound; of several the largest is told."""
+        """A figure that must be finite and within its bound; the maximum of several is reported."""
         figure = float(value)
         if what not in self.figures or not figure <= self.figures[what]:
             self.figures[what] = figure
@@ -77,7 +77,7 @@ class Check:
         self.true(f"{what} finite", np.isfinite(np.asarray(values, dtype=np.float64)).all())
 
     def equal(self, what: str, got: np.ndarray, expected: np.ndarray) -> None:
-        """Arrays that must be the same to the last bit; NaN equals NaN."""
+        """Arrays that must be bit-identical; NaN equals NaN."""
         a, b = np.asarray(got), np.asarray(expected)
         same = a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
         self.true(f"{what} equal to the bit", same)
@@ -85,7 +85,7 @@ class Check:
     def refused(
         self, what: str, call: Callable[[], object], kind: type[DexTouchError] = InvalidInputError
     ) -> None:
-        """A call that must end in an error of ours of this kind."""
+        """A call that must raise a DexTouch error of this kind."""
         try:
             call()
         except DexTouchError as error:
@@ -101,7 +101,7 @@ class Check:
 
 @dataclass(frozen=True)
 class Cell:
-    """One check: what is fed, whether it takes long, and the function that does it."""
+    """A check: description of its input, whether it is slow, and its function."""
 
     stage: str
     hazard: str
@@ -112,7 +112,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Exemption:
-    """A cell that does not apply, and why."""
+    """A cell that does not apply, with the reason."""
 
     stage: str
     hazard: str
@@ -130,7 +130,7 @@ class StageCells:
     def cell(
         self, hazard: str, fed: str, *, slow: bool = False
     ) -> Callable[[Callable[[Check], None]], Callable[[Check], None]]:
-        """Decorator: this function checks the stage under this hazard."""
+        """Decorator that registers a function as the check of a hazard."""
         self._free(hazard)
 
         def add(run: Callable[[Check], None]) -> Callable[[Check], None]:
@@ -140,7 +140,7 @@ class StageCells:
         return add
 
     def does_not_apply(self, **reasons: str) -> None:
-        """Hazards that cannot occur in the stage, each with its reason."""
+        """Declare hazards that cannot occur in the stage, with reasons."""
         for hazard, reason in reasons.items():
             self._free(hazard)
             self.exemptions[hazard] = Exemption(self.name, hazard, reason)
@@ -166,7 +166,7 @@ class StageCells:
 
 @dataclass(frozen=True)
 class Finding:
-    """What came of one cell."""
+    """Result of one cell."""
 
     stage: str
     hazard: str
@@ -178,7 +178,7 @@ class Finding:
 
 
 def run_cell(cell: Cell | Exemption) -> Finding:
-    """Run one cell; whatever the code under test raises unasked fails it."""
+    """Run one cell; any unexpected exception fails it."""
     if isinstance(cell, Exemption):
         return Finding(cell.stage, cell.hazard, "", cell.reason, "does not apply", {}, 0.0)
     check = Check()
@@ -195,6 +195,6 @@ def run_cell(cell: Cell | Exemption) -> Finding:
 
 
 def not_run(cell: Cell) -> Finding:
-    """A slow cell that a quick run leaves out."""
+    """Result of a slow cell that a quick run skips."""
     text = "slow; run without --quick"
     return Finding(cell.stage, cell.hazard, cell.fed, text, "not run", {}, 0.0)

@@ -1,4 +1,4 @@
-"""Stress of clocks: counters that wrap while nobody looks, steps, huge stamps, long takes."""
+"""Stress of clocks: counter wraps in gaps, steps, huge stamps, long takes."""
 
 import numpy as np
 

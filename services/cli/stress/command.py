@@ -1,4 +1,4 @@
-"""The command `dextouch stress`: runs cells of the matrix and prints what each one found."""
+"""Command line `dextouch stress`: runs cells of the matrix and prints the results."""
 
 import argparse
 from collections.abc import Sequence
@@ -15,17 +15,17 @@ from services.cli.stress.stages import STAGES, load_stage
 EXIT_FAILED = 1
 WIDTH = 200
 DESCRIPTION = (
-    "Feed every stage what breaks numerical code (near-singular rotations, clock steps, NaN, "
-    "saturated touch, 1000 steps, …) and tell what came out: a named refusal, a bounded answer or "
-    "a figure against its bound. Ends with status 1 where a cell fails."
+    "Check every stage with inputs that break numerical code (near-singular rotations, clock "
+    "steps, NaN, saturated touch, 1000 steps, …) and report the outcome: a named refusal, a "
+    "bounded answer or a figure against its bound. Exits with status 1 if a cell fails."
 )
 
 
 def main(argv: Sequence[str]) -> int:
-    """Run the matrix, or the stages that are named.
+    """Run the matrix, or the given stages.
 
     Returns:
-        0, or 1 where a cell fails.
+        0, or 1 if a cell fails.
     """
     options = _parser().parse_args(list(argv))
     for name in options.stage:
@@ -50,7 +50,7 @@ def main(argv: Sequence[str]) -> int:
 
 
 def _console() -> Console:
-    """As wide as the terminal; where there is none, wide enough for a table."""
+    """Console of the terminal's width, or wide enough for the table without a terminal."""
     console = Console()
     return console if console.is_terminal else Console(width=WIDTH)
 
@@ -65,10 +65,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--hazard", action="append", metavar="NAME", help=f"only these: {', '.join(HAZARDS)}"
     )
-    parser.add_argument("--quick", action="store_true", help="leave out what takes long")
-    parser.add_argument("--list", action="store_true", help="say what would be run, run nothing")
-    parser.add_argument("--json", type=Path, metavar="PATH", help="write every finding here")
-    parser.add_argument("--markdown", type=Path, metavar="PATH", help="write the matrix here")
+    parser.add_argument("--quick", action="store_true", help="skip slow cells")
+    parser.add_argument("--list", action="store_true", help="list the cells without running them")
+    parser.add_argument(
+        "--json", type=Path, metavar="PATH", help="write all results to this JSON file"
+    )
+    parser.add_argument(
+        "--markdown", type=Path, metavar="PATH", help="write the matrix as Markdown to this file"
+    )
     return parser
 
 

@@ -1,4 +1,4 @@
-"""Stress of the success probe and the policies: what they say of touch and poses never seen."""
+"""Stress of the success probe and the policies with unusual touch and poses."""
 
 from dataclasses import replace
 from functools import cache, partial

@@ -1,4 +1,4 @@
-"""Stress of metrics and statistics: figures that must be right, or NaN where there is none."""
+"""Stress of metrics and statistics: figures must be correct, or NaN if undefined."""
 
 from functools import partial
 

@@ -1,4 +1,4 @@
-"""What the cells of the stress matrix found, as a table, Markdown and JSON."""
+"""Results of the stress matrix as a table, Markdown and JSON."""
 
 import json
 from collections import Counter
@@ -25,7 +25,7 @@ _SIGNS: Final[dict[Verdict, str]] = {
 
 
 def summary(findings: Sequence[Finding]) -> str:
-    """The matrix in numbers, on one line."""
+    """One-line summary of the matrix."""
     counts = Counter(one.verdict for one in findings)
     parts = [f"{counts[verdict]} {verdict}" for verdict in COLOURS if counts[verdict]]
     num_run = counts["held"] + counts["failed"]
@@ -34,7 +34,7 @@ def summary(findings: Sequence[Finding]) -> str:
 
 
 def to_markdown(findings: Sequence[Finding]) -> str:
-    """The matrix, one row a stage, and below it what came out of every cell."""
+    """The matrix with one row per stage, followed by the result of every cell."""
     stages = list(dict.fromkeys(one.stage for one in findings))
     verdicts = {(one.stage, one.hazard): _SIGNS[one.verdict] for one in findings}
     lines = [f"| stage | {' | '.join(HAZARDS)} |", "|---" * (1 + len(HAZARDS)) + "|"]
@@ -50,7 +50,7 @@ def to_markdown(findings: Sequence[Finding]) -> str:
 
 
 def to_json(findings: Sequence[Finding]) -> str:
-    """The findings as JSON; a figure that is not finite is null."""
+    """The results as JSON; non-finite figures are null."""
     counts = Counter(one.verdict for one in findings)
     rows = [asdict(one) for one in findings]
     for row in rows:
@@ -62,7 +62,7 @@ def to_json(findings: Sequence[Finding]) -> str:
 
 
 def to_table(findings: Sequence[Finding]) -> Table:
-    """One row a cell."""
+    """Table with one row per cell."""
     table = Table("stage", "hazard", "fed", "came out", "verdict", "s", header_style="bold")
     last = ""
     for one in findings:

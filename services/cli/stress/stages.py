@@ -1,4 +1,4 @@
-"""The stages of the stress matrix, by name; their modules are loaded when asked for."""
+"""Stages of the stress matrix by name, loaded lazily."""
 
 import importlib
 from typing import Final

@@ -1,7 +1,6 @@
 """Stress of the world model in state form, opened through `open_world`.
 
-The package has no trained state model, so that a small one of random weights stands in: what is
-checked is what must hold whatever was learned.
+A small model with random weights stands in for a trained one: the checks must hold for any weights.
 """
 
 import tempfile

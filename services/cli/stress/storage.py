@@ -1,4 +1,4 @@
-"""Stress of store and wire: numbers must come back to the last bit, or be refused by name."""
+"""Stress of store and wire format: values must be bit-identical, or refused by name."""
 
 import tempfile
 from functools import partial

@@ -1,4 +1,4 @@
-"""Stress of tactile calibration: gloves with known zero and gain, silent, saturated or broken."""
+"""Stress of tactile calibration: gloves with known tare and gain, silent, saturated or broken."""
 
 import numpy as np
 

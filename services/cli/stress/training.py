@@ -1,4 +1,4 @@
-"""Stress of training: losses and steps on broken, untouched and saturated windows."""
+"""Stress of training: losses and steps on corrupt, untouched and saturated windows."""
 
 from dataclasses import replace
 from functools import cache, partial

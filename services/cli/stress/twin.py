@@ -1,4 +1,4 @@
-"""Stress of the twin: commands that no hand can follow, hard presses, 1008 steps."""
+"""Stress of the twin: infeasible commands, hard presses, 1008 steps."""
 
 from functools import cache
 

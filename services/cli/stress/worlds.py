@@ -1,4 +1,4 @@
-"""Stress of worlds: what every form of the world model must hold, and what it starts from."""
+"""Stress checks common to all forms of the world model, and their start."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,1 +1,1 @@
-"""The words of `dextouch store`, by what they do: look, remove, mend."""
+"""Commands of `dextouch store`: inspect, delete, repair."""

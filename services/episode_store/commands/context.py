@@ -1,4 +1,4 @@
-"""What every word of the command line is given: the store, its flags, and ways to speak."""
+"""Context of a store command: the store, its arguments, and output."""
 
 import argparse
 import sys
@@ -27,7 +27,7 @@ def _ask(question: str) -> str:
 
 @dataclass(frozen=True)
 class Context:
-    """A store, what was asked of it, where lines go and where answers come from."""
+    """Store, parsed arguments, and functions for output and confirmation."""
 
     store: EpisodeStore
     url: str
@@ -36,11 +36,11 @@ class Context:
     ask: Callable[[str], str] = field(default=_ask)
 
     def kind_of(self, item_id: str) -> Kind:
-        """The kind of an id: the one named with --kind, else the one under which it exists.
+        """Kind of an id: given by --kind, otherwise the one under which it exists.
 
         Raises:
-            NotFoundError: there is none.
-            InvalidInputError: there are both.
+            NotFoundError: no such id.
+            InvalidInputError: both kinds exist.
         """
         check_id(item_id)
         if self.options.kind:
@@ -63,9 +63,9 @@ class Context:
         return root is not None and (root / f"{kind}s" / item_id).is_dir()
 
     def items(self) -> list[tuple[Kind, str]]:
-        """What is meant: the ids that were named, else all of the kinds that were named.
+        """Selected items: the given ids, otherwise all of the given kinds.
 
-        A folder in a group's place counts even without a commit record.
+        A folder counts even without a commit record.
         """
         if self.options.ids:
             return [(self.kind_of(item_id), item_id) for item_id in self.options.ids]
@@ -99,7 +99,7 @@ class Context:
 
 
 def seconds_of(text: str) -> float:
-    """Seconds of `30d`, `12h`, `90m` or `10s`.
+    """Parse a duration such as `30d`, `12h`, `90m` or `10s` to seconds.
 
     Raises:
         ValueError: anything else.
@@ -111,7 +111,7 @@ def seconds_of(text: str) -> float:
 
 
 def readable_size(num_bytes: int) -> str:
-    """A size with three digits and a unit."""
+    """Format a size with three digits and a unit."""
     size, unit = float(num_bytes), 0
     while size >= 999.5 and unit < len(_SIZES) - 1:
         size, unit = size / 1000, unit + 1
@@ -119,7 +119,7 @@ def readable_size(num_bytes: int) -> str:
 
 
 def table(rows: list[tuple[str, ...]]) -> list[str]:
-    """Rows of words as lines with columns below each other."""
+    """Format rows of text as lines with aligned columns."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))] if rows else []
     return [
         "  ".join(cell.ljust(w) for cell, w in zip(row, widths, strict=True)).rstrip()

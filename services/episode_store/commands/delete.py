@@ -1,4 +1,4 @@
-"""`delete`, `restore` and `purge`: ids or an operator in, a trash or a deletion receipt out."""
+"""Commands `delete`, `restore` and `purge`."""
 
 import json
 from dataclasses import asdict
@@ -12,7 +12,7 @@ from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outco
 
 
 def delete(context: Context) -> Outcome:
-    """Put ids into the trash, remove them for good, or remove all of an operator or recording."""
+    """Move ids to the trash, delete them permanently, or all data of an operator or recording."""
     options = context.options
     if options.operator is not None or options.recording is not None:
         return _delete_all_of(context)
@@ -37,7 +37,7 @@ def _delete_all_of(context: Context) -> Outcome:
             "delete: --operator and --recording remove all that stems from them; got "
             f"{'ids as well' if options.ids else 'no --for-good'}, expected --for-good alone"
         )
-    # All that stems from an operator always goes; of a recording, if that is asked for.
+    # Derived data of an operator is always deleted; that of a recording on request.
     derived = options.derived or options.operator is not None
     request = DeletionRequest(
         operator=options.operator, recording=options.recording, derived=derived
@@ -63,7 +63,7 @@ def _delete_all_of(context: Context) -> Outcome:
 
 
 def restore(context: Context) -> Outcome:
-    """Put what was deleted last under each id back."""
+    """Restore the last deleted item of each id."""
     options = context.options
     for item_id in options.ids:
         kinds = {entry.kind for entry in context.store.trash_list() if entry.item_id == item_id}
@@ -79,7 +79,7 @@ def restore(context: Context) -> Outcome:
 
 
 def purge(context: Context) -> Outcome:
-    """Remove for good what is old enough."""
+    """Permanently delete old items of the trash."""
     gone = context.store.purge(older_than_s=context.options.older_than)
     for entry in gone:
         context.say(f"{entry.item_id}  {entry.kind}  {readable_size(entry.num_bytes)} freed")

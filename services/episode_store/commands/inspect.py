@@ -1,4 +1,4 @@
-"""`list`, `show` and `verify`: a store in, lines and verdicts out."""
+"""Commands `list`, `show` and `verify`."""
 
 import importlib.util
 import sys
@@ -48,7 +48,7 @@ _OUTCOMES = {True: "success", False: "failure", None: "not judged"}
 
 
 def list_items(context: Context) -> Outcome:
-    """What is in the store and matches, or what is in its trash."""
+    """List matching items of the store, or its trash."""
     options = context.options
     if options.trash:
         return _list_trash(context)
@@ -58,7 +58,7 @@ def list_items(context: Context) -> Outcome:
     if options.kind == "recording" and options.origin is not None:
         raise InvalidInputError("list --kind recording: takes no --origin, recordings have none")
     catalog = Catalog(context.store)
-    # Recordings have no origin that could match.
+    # Recordings have no origin to match.
     kind: Kind | None = "episode" if options.origin is not None else options.kind
     result: dict[str, Any] = {"num_matching": 0, "next_after": None}
     totals = []
@@ -75,7 +75,7 @@ def list_items(context: Context) -> Outcome:
 
 
 def _list_episodes(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
-    """The matching episodes, and how many there are in all."""
+    """List matching episodes; returns them and the total number."""
     options = context.options
     wanted = EpisodeFilter(task=options.task, domain=options.domain, origin=options.origin)
     found = catalog.episodes(wanted, limit=sys.maxsize)
@@ -88,7 +88,7 @@ def _list_episodes(context: Context, catalog: Catalog) -> tuple[dict[str, Any], 
 
 
 def _list_recordings(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
-    """The matching recordings, and how many there are in all."""
+    """List matching recordings; returns them and the total number."""
     options = context.options
     wanted = RecordingFilter(task=options.task, domain=options.domain)
     found = catalog.recordings(wanted, limit=sys.maxsize)
@@ -105,7 +105,7 @@ def _outcome(row: EpisodeSummary | RecordingSummary | Attributes) -> str:
 
 
 def _list_broken_off(context: Context, root: Path) -> list[str]:
-    """Takes whose writer is gone and whose stage waits for `recover`; their names come back."""
+    """List interrupted takes, whose stages `recover` can complete; returns their names."""
     names = []
     for place, folder in unfinished(root):
         if place == "stage" and (folder / STAGE_FILE).is_file() and not is_held(folder):
@@ -120,7 +120,7 @@ def _stage_name(folder: Path) -> tuple[str, str]:
         attributes = read_stage(folder)
     except StorageError:
         attributes = None
-    # A damaged one goes by the name of its folder.
+    # A damaged one is listed by its folder name.
     return (
         ("stage", folder.name)
         if attributes is None
@@ -192,7 +192,7 @@ def show(context: Context) -> Outcome:
 
 
 def _num_gaps(reader: EpisodeReader | RecordingReader, name: str) -> int:
-    """Steps between samples of more than one and a half nominal periods."""
+    """Number of gaps: steps between samples above one and a half nominal periods."""
     steps = np.diff(reader.stamps_ns(name))
     return int((steps > 1.5 * reader.streams[name].period_ns()).sum())
 
@@ -202,7 +202,7 @@ def _shard_bytes(files: GroupFiles, array: str, shape: tuple[int, ...]) -> int:
 
 
 def verify(context: Context) -> Outcome:
-    """Read everything and name all that does not hold."""
+    """Verify items completely and list all damage."""
     items, root = context.items(), context.local_root()
     reports: list[ItemReport] = []
     with _progress_bar(context, items) as progress:
@@ -225,7 +225,7 @@ def verify(context: Context) -> Outcome:
 
 def _files(context: Context, kind: Kind, item_id: str) -> GroupFiles:
     root = context.local_root()
-    # Not by the store, which does not know what lost its commit record.
+    # Not through the store, which ignores groups without a commit record.
     return (
         context.store.files(item_id, kind=kind)
         if root is None
@@ -256,7 +256,7 @@ def _say_report(context: Context, report: ItemReport) -> None:
 
 @contextmanager
 def _progress_bar(context: Context, items: list[tuple[Kind, str]]) -> Iterator[Progress]:
-    """A bar of bytes at a terminal; nothing where there is none, or no rich."""
+    """Progress bar at a terminal, if rich is installed."""
     if not sys.stderr.isatty() or importlib.util.find_spec("rich") is None:
         yield lambda _: None
         return

@@ -1,4 +1,4 @@
-"""`repair` and `migrate`: a damaged or old store in, a whole or current one out."""
+"""Commands `repair` and `migrate`."""
 
 from dataclasses import asdict
 
@@ -11,7 +11,7 @@ from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outco
 
 
 def repair(context: Context) -> Outcome:
-    """Complete what was interrupted, mend what a copy holds, salvage the rest."""
+    """Complete interrupted items, repair damaged ones from a copy, and salvage the rest."""
     root, options = context.need_local_root(), context.options
     copies = EpisodeStore(options.source) if options.source else None
     reports = [] if options.ids else repair_unfinished(root)
@@ -43,7 +43,7 @@ def _say_report(context: Context, report: RepairReport) -> None:
 
 
 def migrate(context: Context) -> Outcome:
-    """Bring groups of older format versions over; what fails stays as it is and is named."""
+    """Upgrade groups of older format versions; failed ones are unchanged and listed."""
     migrated, failed = [], {}
     for kind, item_id in context.items():
         try:

@@ -1,4 +1,4 @@
-"""HTTP routes of the store: one router a resource."""
+"""HTTP routes of the store, one router per resource."""
 
 from services.episode_store.routes.catalog import catalog_router
 from services.episode_store.routes.episodes import episodes_router

@@ -1,4 +1,4 @@
-"""The catalog over HTTP: how much there is of what."""
+"""Routes of /v1/catalog: statistics of the stored episodes."""
 
 from typing import Annotated
 
@@ -11,7 +11,7 @@ from services.episode_store.routes.scopes import MAY_READ
 
 
 def catalog_router(*, catalog: Catalog) -> APIRouter:
-    """Routes under /v1/catalog."""
+    """Create the router."""
     router = APIRouter(prefix="/v1/catalog", tags=["catalog"], dependencies=[MAY_READ])
 
     @router.get("/hours")

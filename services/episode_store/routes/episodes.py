@@ -1,4 +1,4 @@
-"""Episodes over HTTP: the catalog, attributes, windows and samples of streams."""
+"""Routes of /v1/episodes: list, attributes, windows and samples."""
 
 from typing import Annotated
 
@@ -14,18 +14,18 @@ from services.episode_store.routes.scopes import MAY_READ
 
 
 def episodes_router(*, catalog: Catalog, reader: StoreReader, max_page: int) -> APIRouter:
-    """Routes under /v1/episodes."""
+    """Create the router."""
     router = APIRouter(prefix="/v1/episodes", tags=["episodes"], dependencies=[MAY_READ])
 
     @router.get("")
     def listing(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
-        """Episodes that match every given filter."""
+        """List episodes that match all filters."""
         limit = page_limit(wanted, max_page)
         return catalog.episodes(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
 
     @router.get("/{episode_id}")
     def detail(episode_id: str) -> EpisodeDetail:
-        """What an episode says about itself."""
+        """Attributes of an episode."""
         return reader.episode(episode_id)
 
     @router.get("/{episode_id}/windows")
@@ -35,7 +35,7 @@ def episodes_router(*, catalog: Catalog, reader: StoreReader, max_page: int) -> 
         accept: Annotated[str | None, Header()] = None,
         if_none_match: Annotated[str | None, Header()] = None,
     ) -> Response:
-        """Steps of the model grid as msgpack (`dextouch.episodes.window_codec`)."""
+        """Window of the model grid as msgpack (`dextouch.episodes.window_codec`)."""
         media_type = chosen_type(accept, (WINDOW_MSGPACK, MSGPACK))
         return as_response(reader.window(episode_id, query, known=if_none_match), media_type)
 

@@ -1,4 +1,4 @@
-"""An `Accept` header in, the media type of the answer out."""
+"""Content negotiation and conditional responses."""
 
 from fastapi import HTTPException, Response
 
@@ -6,26 +6,26 @@ from services.episode_store.reading import Answer
 
 MSGPACK = "application/msgpack"
 WINDOW_MSGPACK = "application/vnd.dextouch.window+msgpack"
-# What is committed never changes, but it may be deleted: ask again, cheaply.
+# Committed content is immutable but may be deleted: clients must revalidate.
 CACHE_CONTROL = "private, no-cache"
 
 
 def chosen_type(accept: str | None, offered: tuple[str, ...]) -> str:
-    """The offered media type that an asker likes best; of equals the first offered.
+    """Select the offered media type with the highest weight; the first one in a tie.
 
     Raises:
-        HTTPException: 406, it accepts none of them.
+        HTTPException: 406, none is acceptable.
     """
     weights = [(_weight(kind, accept or "*/*"), -place) for place, kind in enumerate(offered)]
     weight, place = max(weights)
     if weight <= 0:
-        # Starlette's own class: 406 has no other meaning in our errors.
+        # Starlette's exception, since no DexTouch error maps to 406.
         raise HTTPException(406, f"got Accept {accept!r}, expected one of {', '.join(offered)}")
     return offered[-place]
 
 
 def as_response(answer: Answer, media_type: str) -> Response:
-    """The answer with its tag; 304 without a body for who has it already."""
+    """Response with ETag; 304 without a body if the client has it already."""
     headers = {"etag": answer.etag, "cache-control": CACHE_CONTROL, "vary": "accept"}
     if answer.data is None:
         return Response(status_code=304, headers=headers)
@@ -33,7 +33,7 @@ def as_response(answer: Answer, media_type: str) -> Response:
 
 
 def _weight(kind: str, accept: str) -> float:
-    """The q of the most exact range that covers a media type."""
+    """Quality value of the most specific range that matches a media type."""
     ranges = {"*/*": 0, kind.partition("/")[0] + "/*": 1, kind: 2}
     best, weight = -1, 0.0
     for part in accept.split(","):

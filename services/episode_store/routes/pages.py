@@ -1,14 +1,14 @@
-"""The page that is asked for and the longest one in, how many rows to give out."""
+"""Page size limit of list routes."""
 
 from dextouch.errors import LimitExceededError
 from services.episode_store.filters import Page
 
 
 def page_limit(page: Page, max_page: int) -> int:
-    """Rows of this page: as many as allowed when none are named.
+    """Number of rows of a page; the maximum by default.
 
     Raises:
-        LimitExceededError: more than allowed.
+        LimitExceededError: above the maximum.
     """
     if page.limit is not None and page.limit > max_page:
         raise LimitExceededError(

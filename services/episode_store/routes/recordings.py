@@ -1,4 +1,4 @@
-"""Recordings over HTTP: stations send batches in, finished takes are listed and read."""
+"""Routes of /v1/recordings: uploads by stations, list, attributes and samples."""
 
 from typing import Annotated
 
@@ -20,20 +20,20 @@ from services.episode_store.routes.media import MSGPACK, as_response
 from services.episode_store.routes.pages import page_limit
 from services.episode_store.routes.scopes import MAY_READ, MAY_WRITE
 
-# Calibrations and descriptors of a station's streams, or the ledger of a take.
+# Room for the calibration and descriptors of a station, or the ledger of a take.
 MAX_ATTRIBUTES_BYTES = 2**20
 
 
 def recordings_router(
     *, intake: Intake, catalog: Catalog, reader: StoreReader, max_page: int
 ) -> APIRouter:
-    """Routes under /v1/recordings."""
+    """Create the router."""
     router = APIRouter(prefix="/v1/recordings", tags=["recordings"])
 
     @router.post("", status_code=201, dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def create(attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload; repeating it says where it stands."""
+        """Begin an upload, or return the status of an existing one."""
         return intake.create(attributes)
 
     @router.post(
@@ -45,7 +45,7 @@ def recordings_router(
     async def put_batch(
         recording_id: str, stream: str, number: Annotated[int, Path(ge=0)], request: Request
     ) -> BatchReceipt:
-        """Take batch n of a stream in (wire format v1), exactly once however often it comes."""
+        """Store batch n of a stream (wire format v1), exactly once even if it is repeated."""
         announced = request.headers.get("content-length")
         return await intake.put_batch(
             recording_id, stream, number, announced=announced, read=request.body
@@ -54,23 +54,23 @@ def recordings_router(
     @router.post("/{recording_id}/finish", dependencies=[MAY_WRITE])
     @takes({JSON: MAX_ATTRIBUTES_BYTES})
     def finish(recording_id: str, body: FinishRecording) -> RecordingStatus:
-        """Move a complete upload into the store."""
+        """Commit a complete upload."""
         return intake.finish(recording_id, body)
 
     @router.get("", dependencies=[MAY_READ])
     def listing(wanted: Annotated[RecordingQuery, Query()]) -> RecordingList:
-        """Finished recordings that match every given filter."""
+        """List finished recordings that match all filters."""
         limit = page_limit(wanted, max_page)
         return catalog.recordings(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
 
     @router.get("/{recording_id}", dependencies=[MAY_READ])
     def status(recording_id: str) -> RecordingStatus:
-        """Where an upload stands."""
+        """Status of an upload."""
         return intake.status(recording_id)
 
     @router.get("/{recording_id}/attributes", dependencies=[MAY_READ])
     def attributes(recording_id: str) -> RecordingAttributes:
-        """What a finished recording says about itself."""
+        """Attributes of a finished recording."""
         return reader.recording_attributes(recording_id)
 
     @router.get("/{recording_id}/streams/{stream}", dependencies=[MAY_READ])

@@ -1,4 +1,4 @@
-"""The scopes that keys need: reading, and writing."""
+"""Access scopes of the store: read and write."""
 
 from fastapi import Depends
 

@@ -1,4 +1,4 @@
-"""Unfinished uploads over HTTP: which ones nobody goes on with, and an end to them on request."""
+"""Routes of /v1/uploads: list and drop abandoned uploads."""
 
 from typing import Annotated
 
@@ -10,17 +10,17 @@ from services.episode_store.routes.scopes import MAY_READ, MAY_WRITE
 
 
 def uploads_router(*, intake: Intake) -> APIRouter:
-    """Routes under /v1/uploads."""
+    """Create the router."""
     router = APIRouter(prefix="/v1/uploads", tags=["uploads"])
 
     @router.get("", dependencies=[MAY_READ])
     def listing(idle_s: Annotated[float, Query(ge=0)] = 0.0) -> UploadList:
-        """Uploads that are not finished and for which nothing has come for so long."""
+        """List unfinished uploads that have been idle for `idle_s`."""
         return intake.idle(idle_s=idle_s)
 
     @router.post("/expire", dependencies=[MAY_WRITE])
     def expire(wanted: ExpireUploads) -> UploadList:
-        """Drop such uploads with all that was sent of them; the answer lists them."""
+        """Drop such uploads with their data; the response lists them."""
         return intake.expire(wanted)
 
     return router

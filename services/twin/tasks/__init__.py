@@ -1,4 +1,4 @@
-"""The twin's tasks: each brings its objects, where they start, a demonstrator and a judge."""
+"""Tasks of the twin, each with objects, placement, demonstrator and success check."""
 
 from services.twin.tasks.registry import TASK_NAMES, get_task
 from services.twin.tasks.task import Task

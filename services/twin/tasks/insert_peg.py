@@ -1,4 +1,4 @@
-"""Insert Peg: a standing peg is taken from the side and put into the hole of a block."""
+"""Insert Peg: grasp a standing peg from the side and insert it into the hole of a block."""
 
 from typing import Final
 
@@ -16,9 +16,9 @@ from services.twin.tasks.postures import THUMB_UP, relaxed
 from services.twin.tasks.task import REST_SPEED
 
 _RADIUS_M, _HALF_LENGTH_M, _FOOT_HALF_M = 0.022, 0.090, 0.020
-# The hand takes the peg this far above its middle, so that it stays clear of the block.
+# Grasp height above the peg's centre, to keep the hand clear of the block.
 _GRIP_M: Final = 0.035
-# Room on each side of the peg in the square hole, and how far the chamfer widens it at the top.
+# Clearance on each side of the peg in the square hole, and widening by the chamfer at the top.
 _CLEARANCE_M, _CHAMFER_M, _CHAMFER_RAD = 0.002, 0.008, 0.9
 _HOLE_HALF_M: Final = _RADIUS_M + _CLEARANCE_M
 _BLOCK_HALF_M, _WALL_HEIGHT_M, _PLATE_HALF_M = 0.056, 0.036, 0.003
@@ -32,7 +32,7 @@ _COLOURS: Final = {
     "wall": "0.16 0.20 0.30 1",
     "chamfer": "0.10 0.70 0.72 1",
 }
-# The thumb presses near the middle of the fingers: farther out it would turn the peg in the hand.
+# The thumb presses opposite the middle of the fingers: further out it would rotate the peg.
 _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.020, 0.06),
     "human": CylinderGrasp(_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.020, 0.06),
@@ -40,24 +40,24 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
 _SQUEEZE_N: Final = 6.0
 _OPEN_M: Final = 0.020
 _LIFT_M: Final = 0.075
-# How far below the table the peg is sent, so that the compliant wrist pushes it in.
+# Commanded depth below the table, so that the compliant wrist pushes the peg in.
 _PUSH_M: Final = 0.010
-# Where the peg's foot is in the frame of the grasp when held, found by closing the hand once.
+# Position of the peg's foot in the grasp frame when held, determined by closing the hand once.
 _HELD_FEET_M: Final[dict[Domain, tuple[float, float, float]]] = {
     "robot": (-0.128, -0.0061, -0.0014),
     "human": (-0.127, -0.0025, 0.0014),
 }
-# Verdict: the foot this near to the table and to the hole's axis, the peg upright within 10°.
+# Success: distances of the foot to the table and to the hole's axis; upright within 10°.
 _DEPTH_M, _ASIDE_M, _UPRIGHT = 0.010, _CLEARANCE_M + 0.003, 0.985
 _LIFTED_M, _OVER_HOLE_M = 0.03, 0.02
 
 
 def _wall(index: int) -> str:
-    """A wall of the block and the chamfer plate on top of it, of the side that `index` turns to."""
+    """A wall of the block and the chamfer plate on top of it, for one of four sides."""
     turn, up = 0.5 * np.pi * index, np.array([0.0, 0.0, 1.0])
     outwards = np.array([np.cos(turn), np.sin(turn), 0.0])
     along = np.array([-np.sin(turn), np.cos(turn), 0.0])
-    # Walls go round like the blades of a windmill: each ends at the next one's side.
+    # Walls are arranged like a pinwheel: each ends at the side of the next.
     half_m = 0.5 * (_BLOCK_HALF_M - _HOLE_HALF_M)
     middle_m = 0.5 * (_BLOCK_HALF_M + _HOLE_HALF_M)
     centre = middle_m * outwards + half_m * along + 0.5 * _WALL_HEIGHT_M * up
@@ -78,7 +78,7 @@ def _wall(index: int) -> str:
 
 
 def _foot_in_socket_m(poses: Float64[np.ndarray, "2 7"]) -> Float64[np.ndarray, "3"]:
-    """The middle of the peg's lower end in the socket's frame."""
+    """Centre of the peg's lower end in the socket's frame."""
     T_world_peg, T_world_socket = transform_from_pose(poses)
     foot_world = T_world_peg[:3, 3] - _HALF_LENGTH_M * T_world_peg[:3, 2]
     return T_world_socket[:3, :3].T @ (foot_world - T_world_socket[:3, 3])
@@ -131,7 +131,7 @@ class InsertPeg:
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """Beside it, around it, close, lift, over the hole, push in, open, away."""
+        """Approach, enclose, close, lift, move over the hole, insert, open, withdraw."""
         grasp = _GRASPS[domain]
         open_hand = opened(grasp, domain, gap_m=_OPEN_M)
         press = pressing(grasp, domain, force_n=_SQUEEZE_N)
@@ -141,7 +141,7 @@ class InsertPeg:
         start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
 
         def hand(point_m: np.ndarray, held: np.ndarray, yaw_rad: float) -> HandPose:
-            """The palm to the left; what it holds at `held` in its own frame is at the point."""
+            """Hand with its palm to the left, with `held` (in its own frame) at a point."""
             R = rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ THUMB_UP @ R_axis.T
             return HandPose(transform(R, point_m - R @ held), open_hand)
 
@@ -168,7 +168,7 @@ class InsertPeg:
         return [Waypoint(time_s, rest, pose) for time_s, pose in path]
 
     def succeeded(self, simulation: Simulation) -> bool:
-        """The foot within 1 cm of the hole's ground, upright within 10°, at rest, untouched."""
+        """Foot within 1 cm of the hole's bottom, upright within 10°, at rest, untouched."""
         return bool(
             _is_inserted(simulation.object_poses())
             and simulation.object_speeds().max() < REST_SPEED
@@ -176,7 +176,7 @@ class InsertPeg:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched by a hand; held 3 cm up; its foot over the hole; in it; let go."""
+        """Touched by a hand; lifted by 3 cm; foot over the hole; inserted; released."""
         poses = simulation.object_poses()
         foot = _foot_in_socket_m(poses)
         touched = simulation.hand_touches(0)

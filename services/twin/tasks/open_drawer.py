@@ -1,4 +1,4 @@
-"""Open Drawer: fingers hooked behind the handle of a fixed cabinet's drawer pull it open."""
+"""Open Drawer: hook the fingers behind the handle of a fixed cabinet's drawer and pull."""
 
 from functools import lru_cache
 from typing import Final
@@ -28,19 +28,19 @@ _BAR_Y_M: Final = _FRONT_Y_M - _GAP_M - _BAR_RADIUS_M
 _TRAVEL_M, _FRICTION_N, _DAMPING_N_S_M, _DRAWER_KG = 0.11, 1.0, 6.0, 0.25
 _PULL_M: Final = 0.080
 _OPEN_M, _MOVED_M = 0.06, 0.01
-# The hook: index, middle and ring finger straight down; the little one curled out of the way.
+# Hook: index, middle and ring finger straight down; the little finger curled out of the way.
 _HOOK_FINGERS: Final = (1, 2, 3)
 _HOOK_BEND_RAD, _HOOK_TIP_BEND_RAD = 1.70, 0.35
 _CURLED_RAD: Final = (0.30, 0.0, 1.90, 1.00)
 _DEPTH_M: Final = 0.018
 _UNLOAD_M: Final = 0.012
-# Where the hand waits before and after, so that the head camera sees the drawer.
+# Waiting position of the hand beside the drawer, which stays visible to the head camera.
 _BESIDE_M: Final = np.array([0.13, -0.03, 0.0])
 
 
 @lru_cache(maxsize=2)
 def _hook(domain: Domain) -> Float64[np.ndarray, "20"]:
-    """Joint angles at which the three fingertips hang side by side, as far out as the ring's."""
+    """Joint angles with the three fingertips side by side, at the reach of the ring finger."""
     hand = twin_hand("right", domain)
     bases = np.linspace(-0.25, 1.05, 131)
     samples = np.tile(flat(domain).reshape(5, 4), (len(bases), 1, 1))
@@ -61,13 +61,13 @@ def _hook(domain: Domain) -> Float64[np.ndarray, "20"]:
 
 
 def _tips_m(domain: Domain) -> Float64[np.ndarray, "3"]:
-    """Middle of the three hooking fingertips in the wrist frame."""
+    """Centre of the three hooking fingertips in the wrist frame."""
     chain = twin_hand("right", domain).kinematics.chain_points_m(_hook(domain)[None])[0]
     return np.asarray(chain[list(_HOOK_FINGERS), 3].mean(axis=0))
 
 
 def _opening_m(poses: Float64[np.ndarray, "2 7"]) -> float:
-    """How far the drawer is out of the cabinet."""
+    """Opening of the drawer."""
     closed = apply(transform_from_pose(poses[0]), np.array([[0.0, 0.0, _DRAWER_Z_M]]))[0]
     return float(np.linalg.norm(poses[1, :3] - closed))
 
@@ -81,7 +81,7 @@ class OpenDrawer:
     milestones = ("touched", "moved", "opened", "released")
 
     def objects_mjcf(self) -> str:
-        """A cabinet that stands fixed and its drawer; only hands can touch them."""
+        """A fixed cabinet with its drawer; both collide with hands only."""
         alone = 'class="object" contype="0" conaffinity="1"'
         bar_z = _BAR_Z_M
         posts = "".join(
@@ -111,7 +111,7 @@ class OpenDrawer:
         )
 
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "2 7"]:
-        """To the right of the middle, ±3 cm and ±0.2 rad, the drawer closed."""
+        """Cabinet right of the centre, ±3 cm and ±0.2 rad, drawer closed."""
         x, y = generator.uniform(-0.03, 0.03, size=2)
         R = rotation_from_vector(np.array([0.0, 0.0, generator.uniform(-0.2, 0.2)]))
         q_wxyz = quaternion_from_rotation(R)
@@ -127,7 +127,7 @@ class OpenDrawer:
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """Over the handle, down behind it, pull, stop pulling, up, away."""
+        """Move over the handle, down behind it, pull, stop, up, withdraw."""
         joints, tips = _hook(domain), _tips_m(domain)
         start_m, away_m = generator.uniform(-0.02, 0.02, size=(2, 3))
         T_world_cabinet = transform_from_pose(object_poses[0])
@@ -169,7 +169,7 @@ class OpenDrawer:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Drawer touched by a hand; out by 1 cm; out by 6 cm; let go and at rest."""
+        """Drawer touched by a hand; open by 1 cm; open by 6 cm; released and at rest."""
         opening_m = _opening_m(simulation.object_poses())
         return (
             simulation.hand_touches(1),

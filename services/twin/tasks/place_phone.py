@@ -1,4 +1,4 @@
-"""Place Phone: a phone lying on a pad, a one-handed pinch of its long edges, a leaning stand."""
+"""Place Phone: pinch a phone by its long edges, lift it off its pad and lean it into a stand."""
 
 from typing import Final
 
@@ -15,7 +15,7 @@ from services.twin.simulation import Simulation
 from services.twin.tasks.postures import PALM_DOWN, relaxed
 from services.twin.tasks.task import REST_SPEED
 
-# Phone frame: x across, y towards its top, z out of the screen; origin in its middle.
+# Phone frame: x across, y towards its top, z out of the screen; origin at its centre.
 _PHONE_HALF_M: Final = (0.036, 0.075, 0.0045)
 # The pad is smaller than the phone, so that fingertips get around the phone's long edges.
 _PAD_HALF_M: Final = (0.024, 0.055, 0.008)
@@ -36,16 +36,16 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_PHONE_HALF_M[0], 0.052, -0.085, 0.40, 0.0, 0.025, _PHONE_Z_M),
     "human": CylinderGrasp(_PHONE_HALF_M[0], 0.052, -0.085, 0.40, 0.0, 0.025, _PHONE_Z_M),
 }
-# How far from its seat a phone may be that counts as seated, and one that is over the stand.
+# Maximum distance from the seat for a seated phone, and for one over the stand.
 _SEATED_WITHIN_M: Final = np.array([0.014, 0.006, 0.008])
 _SEATED_RAD: Final = 0.2
 _LIFTED_M, _NEAR_M = 0.03, 0.08
 _SQUEEZE_N: Final = 8.0
 _OPEN_M: Final = 0.018
-# Where the phone's middle is in the hand, along its own y.
+# Position of the phone's centre in the hand, along its own y.
 _ALONG_M: Final = -0.010
-# How the phone lies in the closed hand, since thumb and fingers turn it when they press: offset
-# and rotation vector from where it would be, in its own frame, found by closing the hand.
+# Shift of the phone in the closed hand, caused by the pressure of thumb and fingers: offset and
+# rotation vector in its own frame, determined by closing the hand.
 _HELD: Final[dict[Domain, tuple[tuple[float, float, float], tuple[float, float, float]]]] = {
     "robot": ((0.0011, -0.0053, -0.0008), (-0.068, 0.117, -0.216)),
     "human": ((0.0001, -0.0049, -0.0019), (-0.072, 0.077, -0.156)),
@@ -60,7 +60,7 @@ def _wall(
     low_m: tuple[float, float, float],
     high_m: tuple[float, float, float],
 ) -> str:
-    """A box of the stand between two corners given in a frame of its own."""
+    """A box of the stand between two corners given in a local frame."""
     low, high = np.array(low_m), np.array(high_m)
     centre = apply(T_stand_foot, 0.5 * (low + high)[None])[0]
     return (
@@ -96,13 +96,13 @@ def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
 
 
 def _in_cradle(simulation: Simulation) -> Float64[np.ndarray, "4 4"]:
-    """T_cradle_phone: where the phone is in the stand."""
+    """T_cradle_phone, the pose of the phone in the stand."""
     T_world_phone, T_world_stand, _ = transform_from_pose(simulation.object_poses())
     return invert(T_world_stand @ _T_STAND_CRADLE) @ T_world_phone
 
 
 def _is_near(T_cradle_phone: Float64[np.ndarray, "4 4"]) -> bool:
-    """Whether the phone's middle is within reach of its seat."""
+    """Whether the phone's centre is near its seat."""
     return bool(np.linalg.norm(T_cradle_phone[:3, 3] - _SEATED_M) < _NEAR_M)
 
 
@@ -121,7 +121,7 @@ class PlacePhone:
     milestones = ("touched", "lifted", "over_stand", "placed", "released")
 
     def objects_mjcf(self) -> str:
-        """A free phone; a stand and a pad that stand fixed."""
+        """A free phone, and a fixed stand and pad."""
         half = np.array(_PHONE_HALF_M)
         screen = half * [0.92, 0.94, 0.1]
         return (
@@ -156,7 +156,7 @@ class PlacePhone:
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """Over it, down, close, lift, lean, lower into the stand, open, away."""
+        """Move over it, down, close, lift, lean, lower into the stand, open, withdraw."""
         grasp = _GRASPS[domain]
         open_hand = opened(grasp, domain, gap_m=_OPEN_M)
         press = pressing(grasp, domain, force_n=_SQUEEZE_N)
@@ -210,7 +210,7 @@ class PlacePhone:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched by a hand; held 3 cm higher than it lay; held over the stand; seated; let go."""
+        """Touched by a hand; lifted by 3 cm; over the stand; seated; released."""
         T_cradle_phone = _in_cradle(simulation)
         height_m = simulation.object_poses()[0, 2]
         touched = simulation.hand_touches(0)

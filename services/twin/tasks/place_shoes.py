@@ -1,4 +1,4 @@
-"""Place Shoes: both hands take one boot each by its shaft and set the pair down on a rack."""
+"""Place Shoes: grasp one boot with each hand and set the pair down on a rack."""
 
 from typing import Final
 
@@ -16,14 +16,14 @@ from services.twin.simulation import Simulation
 from services.twin.tasks.postures import THUMB_UP
 from services.twin.tasks.task import REST_SPEED
 
-# A boot's frame: origin under the middle of its sole, y towards the toe, z up.
+# A boot's frame: origin below the centre of its sole, y towards the toe, z up.
 _SOLE_HALF_M: Final = (0.030, 0.065, 0.008)
 _SHAFT_RADIUS_M: Final = 0.025
 _SHAFT_Y_M, _SHAFT_TOP_M = -0.032, 0.150
 _TOE_HALF_M: Final = (0.024, 0.045, 0.010)
 _TOE_Y_M: Final = 0.012
 _RACK_HALF_M: Final = (0.145, 0.085, 0.010)
-# Where the soles' middles belong, right and left of the rack's middle.
+# Target positions of the soles' centres, right and left of the rack's centre.
 _SLOT_X_M: Final = 0.075
 _RACK_AT_M: Final = (0.0, 0.150)
 _SHOES_AT_M: Final = (0.140, -0.085)
@@ -36,7 +36,7 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_SHAFT_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.0, 0.2),
     "human": CylinderGrasp(_SHAFT_RADIUS_M, 0.039, -0.105, 0.45, 0.40, 0.0, 0.2),
 }
-# Height at which the hand's grasp crosses the shaft.
+# Grasp height on the shaft.
 _GRASP_HEIGHT_M: Final = 0.098
 _SQUEEZE_N: Final = 8.0
 _OPEN_M: Final = 0.022
@@ -54,7 +54,7 @@ def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
 
 
 def _yaw_rad(T: Float64[np.ndarray, "4 4"]) -> float:
-    """Heading of a body that stands upright: the turn of its y axis about the world's z."""
+    """Heading of an upright body: rotation of its y axis about the world's z."""
     return float(np.arctan2(-T[0, 1], T[1, 1]))
 
 
@@ -89,7 +89,7 @@ def _in_place(simulation: Simulation) -> tuple[bool, bool]:
 
 
 class PlaceShoes:
-    """Take the left boot with the left hand and the right one with the right, to the rack."""
+    """Carry the left boot with the left hand and the right one with the right to the rack."""
 
     name = "place_shoes"
     instruction = "Pick up both shoes and place them side by side on the rack."
@@ -97,7 +97,7 @@ class PlaceShoes:
     milestones = ("touched", "one_lifted", "both_lifted", "one_placed", "both_placed", "released")
 
     def objects_mjcf(self) -> str:
-        """Two boots of sole, toe, shaft and opening, and a low rack that stands fixed."""
+        """Two boots of sole, toe, shaft and opening, and a low, fixed rack."""
         rack = (
             '<body name="rack" mocap="true"><geom name="rack_board" class="object" type="box" '
             f'size="{numbers(_RACK_HALF_M)}" pos="0 0 {_RACK_HALF_M[2]!r}" '
@@ -144,7 +144,7 @@ class PlaceShoes:
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """Both hands: beside the shafts, around them, close, lift, over, down, open, away."""
+        """Both hands: approach the shafts, enclose, close, lift, carry, lower, open, withdraw."""
         start_m = generator.uniform(-0.02, 0.02, size=(2, 3))
         over_m = generator.uniform(-0.015, 0.015, size=3)
         T_rack = transform_from_pose(object_poses[2])
@@ -170,7 +170,7 @@ class PlaceShoes:
         noise: tuple[WaypointNoise, WaypointNoise],
         habits_m: tuple[Float64[np.ndarray, "3"], Float64[np.ndarray, "3"]],
     ) -> list[tuple[float, HandPose]]:
-        """Timed poses of one hand that takes a boot from the first pose to the second."""
+        """Timed poses of one hand that carries a boot from the first pose to the second."""
         grasp, outwards = _GRASPS[domain], -1.0 if side == "left" else 1.0
         open_hand = opened(grasp, domain, gap_m=_OPEN_M)
         press = pressing(grasp, domain, force_n=_SQUEEZE_N)
@@ -203,7 +203,7 @@ class PlaceShoes:
         ]
 
     def succeeded(self, simulation: Simulation) -> bool:
-        """Both boots upright in their places on the rack, at rest, untouched."""
+        """Both boots upright at their positions on the rack, at rest, untouched."""
         return bool(
             all(_in_place(simulation))
             and simulation.object_speeds().max() < REST_SPEED
@@ -211,10 +211,9 @@ class PlaceShoes:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """A boot touched; one or both taken up, or up and put down already; in place; let go.
+        """A boot touched; one, then both lifted or placed; one, then both placed; released.
 
-        A boot that stands in its place counts as taken up, so that boots may also be carried one
-        after the other.
+        A boot in its place counts as lifted, so that boots may be carried one after the other.
         """
         placed = _in_place(simulation)
         taken = [

@@ -1,4 +1,4 @@
-"""Hand orientations and postures that several tasks use, in the world and wrist frames."""
+"""Hand orientations and postures shared by several tasks."""
 
 from typing import Final
 
@@ -18,7 +18,7 @@ THUMB_UP: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]]
 
 
 def flat(domain: Domain) -> Float64[np.ndarray, "20"]:
-    """A straight hand with the thumb held up and away from the palm."""
+    """A straight hand with the thumb raised away from the palm."""
     joints = np.zeros((5, 4))
     joints[1:, 0] = -0.12
     joints[0] = [-1.0, 0.2, 0.0, 0.0]

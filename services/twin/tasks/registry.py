@@ -1,4 +1,4 @@
-"""Task names in, tasks out."""
+"""Registry of the twin's tasks by name."""
 
 from typing import Final
 
@@ -19,7 +19,7 @@ TASK_NAMES: Final = tuple(_TASKS)
 
 
 def get_task(name: str) -> Task:
-    """One task.
+    """Get a task by name.
 
     Raises:
         UnknownNameError: no such task.

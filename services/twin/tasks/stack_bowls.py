@@ -1,4 +1,4 @@
-"""Stack Bowls: two bowls' places in, a squeeze between both palms, a carry and a nesting out."""
+"""Stack Bowls: squeeze a bowl between both palms, carry it over another and nest it."""
 
 from typing import Final
 
@@ -20,7 +20,7 @@ _WALL_HALF_M: Final = (0.017, 0.024, 0.003)
 _WALL_RADIUS_M, _WALL_HEIGHT_M = 0.046, 0.026
 _RIM_RADIUS_M, _RIM_HEIGHT_M = 0.0606, 0.047
 _NEST_M: Final = 0.014
-# Palm centre above the rim, so that the lower bowl's rim is passed when nesting.
+# Height of the palm centre above the rim, to clear the lower bowl's rim when nesting.
 _PALM_ABOVE_RIM_M: Final = 0.026
 _SQUEEZE_M: Final = -0.014
 _OPEN_M: Final = 0.045
@@ -74,7 +74,7 @@ class StackBowls:
         return "".join(parts) + "</body>"
 
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "2 7"]:
-        """One on the left, one on the right, any yaw."""
+        """One on the left, one on the right, arbitrary yaw."""
         poses = np.zeros((2, 7))
         low, high = np.array([[-0.14, -0.05], [0.08, -0.05]]), np.array([[-0.10, 0.05]] * 2)
         high[1, 0] = 0.14
@@ -91,7 +91,7 @@ class StackBowls:
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """Around the bowl, down, squeeze, lift, carry, nest, open, up."""
+        """Enclose the bowl, lower, squeeze, lift, carry, nest, open, withdraw."""
         joints = flat(domain)
         start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
         rim_z = _RIM_HEIGHT_M + _PALM_ABOVE_RIM_M
@@ -137,7 +137,7 @@ class StackBowls:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched by a hand; held 3 cm up; held over the other bowl; in it; let go."""
+        """Touched by a hand; lifted by 3 cm; over the other bowl; nested; released."""
         poses = simulation.object_poses()
         touched = simulation.hand_touches(0)
         raised = bool(poses[0, 2] > _LIFTED_M)

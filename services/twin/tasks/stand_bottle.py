@@ -1,4 +1,4 @@
-"""Stand Bottle: a lying bottle's place in, a one-handed grasp, turn and set-down out."""
+"""Stand Bottle: grasp a lying bottle with one hand, turn it upright and set it down."""
 
 from typing import Final
 
@@ -20,7 +20,7 @@ _HALF_LENGTH_M: Final = 0.115
 # A foot and a collar of this radius at its ends: it lies level, and fingers fit under it.
 _FOOT_RADIUS_M, _FOOT_HALF_M = 0.034, 0.008
 _CAP_RADIUS_M, _CAP_HALF_M = 0.014, 0.014
-# Where the bottle's middle is in the hand, along its own axis.
+# Position of the bottle's centre in the hand, along its own axis.
 _ALONG_M: Final = 0.010
 _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
     "robot": CylinderGrasp(_RADIUS_M, 0.035, -0.095, 0.45, 0.40, 0.050, _FOOT_RADIUS_M),
@@ -28,10 +28,10 @@ _GRASPS: Final[dict[Domain, CylinderGrasp]] = {
 }
 _SQUEEZE_N: Final = 10.0
 _OPEN_M: Final = 0.020
-# How far below the table the bottle is sent, so that the compliant wrist sets it down firmly.
+# Commanded depth below the table, so that the compliant wrist sets the bottle down firmly.
 _PUSH_M: Final = 0.001
-# How the bottle lies in the closed hand: thumb and fingers turn it when they press. Its axis
-# (towards the cap) and its middle in the frame of the grasp, found by closing the hand once.
+# Pose of the bottle in the closed hand, where thumb and fingers rotate it: axis (towards the cap)
+# and centre in the grasp frame, determined by closing the hand once.
 _HELD_AXES: Final[dict[Domain, tuple[float, float, float]]] = {
     "robot": (0.889, -0.130, -0.440),
     "human": (0.967, -0.028, -0.250),
@@ -42,7 +42,7 @@ _HELD_MIDDLES_M: Final[dict[Domain, tuple[float, float, float]]] = {
 }
 _RELEASE_S: Final = 0.4
 _LIFTED_M: Final = 0.03
-# Bottle's own z (its cap) points to world -x when it lies at yaw 0.
+# The bottle's z axis (cap) points to world -x at yaw 0.
 _LYING: Final = rotation_from_vector(np.array([0.0, -0.5 * np.pi, 0.0]))
 _ROLL_UP: Final = rotation_from_vector(np.array([0.0, 0.5 * np.pi, 0.0]))
 
@@ -52,7 +52,7 @@ def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
 
 
 def _turn_to_x(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
-    """The smallest rotation that takes an axis to x."""
+    """The smallest rotation from an axis to x."""
     unit = axis / np.linalg.norm(axis)
     turn = np.cross(unit, [1.0, 0.0, 0.0])
     sine = float(np.linalg.norm(turn))
@@ -93,7 +93,7 @@ class StandBottle:
         )
 
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "1 7"]:
-        """Lying to the right of the middle, ±3 cm and ±0.25 rad."""
+        """Lying right of the centre, ±3 cm and ±0.25 rad."""
         x, y = generator.uniform(-0.03, 0.03, size=2)
         R = _yawed(float(generator.uniform(-0.25, 0.25))) @ _LYING
         return np.array([[0.08 + x, 0.02 + y, _FOOT_RADIUS_M, *quaternion_from_rotation(R)]])
@@ -106,7 +106,7 @@ class StandBottle:
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """Over it, down, close, lift, roll, set down, open, away."""
+        """Move over it, down, close, lift, roll, set down, open, withdraw."""
         grasp = _GRASPS[domain]
         open_hand = opened(grasp, domain, gap_m=_OPEN_M)
         press = pressing(grasp, domain, force_n=_SQUEEZE_N)
@@ -157,7 +157,7 @@ class StandBottle:
         )
 
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
-        """Touched by a hand; held 3 cm higher than it lay; upright; standing; let go."""
+        """Touched by a hand; lifted by 3 cm; upright; standing; released."""
         pose = simulation.object_poses()[0]
         touched = simulation.hand_touches(0)
         raised = bool(pose[2] > _FOOT_RADIUS_M + _LIFTED_M)

@@ -1,4 +1,4 @@
-"""What every task offers: objects and their places in, waypoints and a verdict out."""
+"""Protocol of tasks: objects and placement, demonstrator script, milestones, success check."""
 
 from typing import Final, Protocol, runtime_checkable
 
@@ -9,13 +9,13 @@ from services.twin.demonstrators import Waypoint, WaypointNoise
 from services.twin.hands import Domain
 from services.twin.simulation import Simulation
 
-# An object that moves slower than this (m/s and rad/s) is at rest.
+# An object slower than this (m/s and rad/s) is at rest.
 REST_SPEED: Final = 0.05
 
 
 @runtime_checkable
 class Task(Protocol):
-    """One thing to do on the table."""
+    """A manipulation task on the table."""
 
     @property
     def name(self) -> str:
@@ -24,7 +24,7 @@ class Task(Protocol):
 
     @property
     def instruction(self) -> str:
-        """What an operator or a policy is told."""
+        """Instruction for an operator or a policy."""
         ...
 
     @property
@@ -34,14 +34,14 @@ class Task(Protocol):
 
     @property
     def milestones(self) -> tuple[str, ...]:
-        """What happens on the way to success, in order, snake case; the last one is success."""
+        """Milestones in order, snake case; the last one is success."""
         ...
 
     def objects_mjcf(self) -> str:
-        """The bodies with geoms of class `object`.
+        """MJCF of the bodies, with geoms of class `object`.
 
-        Each has a free joint, or is a `mocap="true"` body (a thing that stands fixed), or hangs
-        on one by hinges or slides; see `services.twin.object_bodies`.
+        Each has a free joint, or is a fixed `mocap="true"` body, or is attached to one by hinges or
+        slides; see `services.twin.object_bodies`.
         """
         ...
 
@@ -57,14 +57,14 @@ class Task(Protocol):
         generator: np.random.Generator,
         noise: tuple[WaypointNoise, WaypointNoise],
     ) -> list[Waypoint]:
-        """How the demonstrator does it.
+        """Waypoints of the demonstrator.
 
         Args:
-            object_poses: where the demonstrator believes the objects are.
+            object_poses: assumed by the demonstrator.
             domain: whose hands.
-            generator: of the habits that vary between takes but do not depend on `noise`.
-            noise: errors at the first (grasp) and second (place) location. The first waypoint is
-                free of them.
+            generator: of variations between takes that are independent of `noise`.
+            noise: errors at the first (grasp) and second (place) location. The first waypoint has
+                none.
         """
         ...
 
@@ -75,6 +75,6 @@ class Task(Protocol):
     def reached(self, simulation: Simulation) -> tuple[bool, ...]:
         """Whether the condition of each milestone holds now; the last one is `succeeded`.
 
-        Simulation must be at a step where contacts are current, such as every grid step.
+        Contacts of the simulation must be current, as at every grid step.
         """
         ...

@@ -1,1 +1,1 @@
-"""Building blocks of the HTTP services: application factory, settings, logging, access, state."""
+"""Building blocks of services: application factory, settings, logging, access, state, processes."""

@@ -1,8 +1,8 @@
-"""A Python module in a process of its own that takes orders and answers them in lines of JSON.
+"""Child process that runs a Python module and exchanges JSON lines with its parent.
 
-For work that must not hold up a service or take it along when it is killed. The parent holds a
-`ChildProcess`; the module calls `serve_parent`, and ends when its standard input does, so it never
-outlives the parent by more than the order it is at.
+For work that must not block a service, or kill it when the work is killed. The parent holds a
+`ChildProcess`; the module calls `serve_parent` and exits when its standard input closes, so it
+outlives the parent by the current request at most.
 """
 
 import json
@@ -22,18 +22,18 @@ Answer = Callable[[Mapping[str, object]], None]
 
 
 class ChildProcess:
-    """A running child; `kill` may be called from any thread, the rest from one at a time.
+    """A running child; `kill` is thread-safe, the other methods are not.
 
     Args:
         module: to run, such as `services.alignment.worker_process`.
         arguments: of its command line.
-        environment: variables to add to this process's own.
+        environment: variables in addition to this process's own.
     """
 
     def __init__(
         self, module: str, *arguments: str, environment: Mapping[str, str] | None = None
     ) -> None:
-        # The child finds the same packages, wherever this process found them.
+        # The child uses the same import path as this process.
         python_path = os.pathsep.join(path for path in sys.path if path)
         self._process = subprocess.Popen(  # noqa: S603 - our own interpreter and module
             [sys.executable, "-m", module, *arguments],

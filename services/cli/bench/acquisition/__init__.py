@@ -1,1 +1,1 @@
-"""The stage `acquisition`: glove decoders and serial ports, timed against their errors."""
+"""Benchmark of acquisition: glove decoders and serial ports."""

@@ -1,4 +1,4 @@
-"""What was measured in; what decoders and ports promise, and whether it holds, out."""
+"""Requirements on decoders and serial ports, with measured values and verdicts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,7 +17,7 @@ def requirements(
     split_differences: Mapping[str, int],
     core_share: Figure | None,
 ) -> list[Requirement]:
-    """The table of promises; what was not measured in this run says so."""
+    """Build the table of requirements; some may be unmeasured in this run."""
     ours = {found.family: found for found in judgements if found.way == OURS}
     table = []
     for name in CHECKED:

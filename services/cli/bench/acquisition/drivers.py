@@ -1,4 +1,4 @@
-"""Every driver's packets, cut as its transport reads them, come in; time a packet goes out."""
+"""Processor time per packet of every driver, fed with the reads of its transport."""
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -51,10 +51,10 @@ NO_FAULTS = DeviceFaults()
 
 @dataclass(frozen=True)
 class DeviceTalk:
-    """What one device says.
+    """Recorded byte stream of one device.
 
-    `greeting` and each of `packets` are lists of reads, as its transport gives them; `decoder`
-    makes what takes them.
+    `greeting` and each of `packets` are lists of reads of its transport; `decoder` creates the
+    decoder.
     """
 
     name: str
@@ -103,7 +103,7 @@ def measure_drivers(
 
 
 def decode_all(talk: DeviceTalk, decoder: Decoder) -> int:
-    """Give a decoder all packets; how many samples they made, of all streams."""
+    """Feed all packets to a decoder and return the number of samples of all streams."""
     num_samples = 0
     for index, packet in enumerate(talk.packets, start=1):
         for read in packet:
@@ -186,7 +186,7 @@ def _robot(rng: np.random.Generator) -> DeviceTalk:
 def _cameras() -> list[DeviceTalk]:
     height_px, width_px = IMAGE_SIZE_PX
     rows, columns = np.mgrid[:height_px, :width_px]
-    # Stripes that move: sharp enough to be no blurred image, and small once encoded.
+    # Moving stripes: sharp enough not to count as blurred, and small once encoded.
     shifts = np.arange(NUM_IMAGES)[:, None, None, None]
     stripes = (8 * ((rows + columns) // 16))[None, :, :, None] + shifts
     images = np.broadcast_to(stripes % 256, (NUM_IMAGES, *IMAGE_SIZE_PX, 3)).astype(np.uint8)
@@ -202,7 +202,7 @@ def _cameras() -> list[DeviceTalk]:
 
 
 def _stream(descriptor: StreamDescriptor, values: np.ndarray) -> ReplayStream:
-    """A stream of many samples; one sample's values are repeated."""
+    """A stream of many samples with the values of one."""
     if values.ndim == len(descriptor.shape):
         values = np.broadcast_to(values, (NUM_PACKETS, *values.shape))
     t_ns = PERIOD_NS * np.arange(len(values), dtype=np.int64)
@@ -210,7 +210,7 @@ def _stream(descriptor: StreamDescriptor, values: np.ndarray) -> ReplayStream:
 
 
 def _packets(source: PacketSource) -> list[list[bytes]]:
-    """What a source says, each unit cut where one read ends."""
+    """Packets of a source, split into reads."""
     return [
         [
             unit[at : at + READ_BYTES]

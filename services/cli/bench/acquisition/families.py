@@ -1,4 +1,4 @@
-"""A packet family's name in; how it makes packets and who decodes them, rivals too, out."""
+"""Packet families of gloves: packet generators, our decoders and rival decoders."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,25 +29,25 @@ from services.acquisition.drivers.packets import encode_packet as encode_ours
 
 NUM_VALUES = 401
 FULL_SCALE = 4095.0
-# What an untouched glove sends most of.
+# The most frequent byte of an untouched glove.
 TOUCHED_SHARE = 0.3
 NO_CELL_SHARE = 0.3
 
 
 @runtime_checkable
 class Feed(Protocol):
-    """Takes bytes, gives the samples (rivals: payloads) of the packets that they complete."""
+    """Decoder that maps bytes to the samples (rivals: payloads) of completed packets."""
 
     def __call__(self, data: bytes, /) -> Sequence[bytes] | Sequence[Sample]:
-        """The next portion."""
+        """Decode the next bytes."""
 
 
 @dataclass(frozen=True)
 class Family:
-    """One packet family on a serial line.
+    """A packet family on a serial line.
 
-    `make` gives a packet by its index and a generator; `payload` is where its readings lie;
-    `ways` are our decoder and its rivals, each made anew by a call.
+    `make` creates a packet from its index and a generator; `payload` is the span of its readings;
+    `ways` are factories of our decoder and its rivals.
     """
 
     name: str
@@ -122,12 +122,12 @@ class TailAlone:
 
 
 def payload_of(item: bytes | Sample) -> bytes:
-    """The readings of what a way of decoding gave."""
+    """Readings of a decoded item."""
     return item if isinstance(item, bytes) else item.values.tobytes()
 
 
 def make_families() -> tuple[Family, ...]:
-    """Our own packet, one with CRC-16, one without any check."""
+    """Create the families: our own packet, one with CRC-16, one without checksum."""
     ours_payload = slice(HEADER.size, HEADER.size + PAYLOAD_BYTES)
     ours_size = OVERHEAD + PAYLOAD_BYTES
     wuji_payload = slice(HEAD.size, CRC_OFFSET - STAMPS.size)

@@ -1,4 +1,4 @@
-"""Packets of a family on a bad line in; what each way of decoding made of them out."""
+"""Decoding of packets from a noisy serial line, by our decoder and its rivals."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ READ_BYTES = 4096
 
 @dataclass(frozen=True)
 class Line:
-    """A line's faults."""
+    """Error rates of a line."""
 
     bit_error_rate: float
     byte_loss_rate: float
@@ -22,7 +22,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Judgement:
-    """What came of the packets: `wrong` were never sent so, `collateral` were lost untouched."""
+    """Result of a decoder: `wrong` packets were never sent, `collateral` lost though undamaged."""
 
     family: str
     way: str
@@ -34,7 +34,7 @@ class Judgement:
 
     @property
     def wrong_share(self) -> float:
-        """Of the delivered packets."""
+        """Share of wrong packets among the delivered ones."""
         return self.wrong / max(1, self.delivered)
 
 
@@ -47,10 +47,10 @@ def judge(
     seed: int,
     on_block: Callable[[str], None] = lambda _: None,
 ) -> list[Judgement]:
-    """Send packets once over the line and let each way decode what arrives.
+    """Send packets once over the line and decode them with each decoder.
 
-    The first and the last packets stand outside the account: a family without a mark at the
-    start needs one packet to find its place, and the last one may still wait for what follows.
+    The first and the last packets are excluded: a family without a start mark needs one packet to
+    synchronize, and the last one may still be pending.
     """
     rng = np.random.default_rng(seed)
     feeds = {way: family.ways[way]() for way in ways}
@@ -91,7 +91,7 @@ def judge(
 def disturb(
     packets: Sequence[bytes], line: Line, rng: np.random.Generator
 ) -> tuple[bytes, Bool[np.ndarray, " n"]]:
-    """The bytes behind the line, and which packets it touched."""
+    """Apply the line's errors; returns the received bytes and a mask of damaged packets."""
     data = np.frombuffer(b"".join(packets), np.uint8).copy()
     ends = np.cumsum([len(packet) for packet in packets])
     num_bits = 8 * len(data)
@@ -104,10 +104,10 @@ def disturb(
 
 
 def count_split_differences(family: Family, line: Line, num_splits: int, *, seed: int) -> int:
-    """How many random ways of cutting a damaged stream change what our decoder gives."""
+    """Number of random splits of a damaged stream that change our decoder's output."""
     rng = np.random.default_rng(seed)
     packets = [family.make(index, rng) for index in range(60)]
-    # Far more damage than a line does, so that every kind of it is cut in every place.
+    # Far more damage than on a real line, so that splits hit every kind of damage.
     worse = Line(30 * line.bit_error_rate, 30 * line.byte_loss_rate)
     data, _ = disturb(packets, worse, rng)
     whole = [payload_of(item) for item in family.ways["ours"]()(data)]

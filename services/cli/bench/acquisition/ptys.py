@@ -1,6 +1,7 @@
-"""Eight gloves on pseudo terminals: started as a process, it prints what reading them costs.
+"""Processor load of eight gloves on pseudo terminals, measured in a separate process.
 
-The gloves are a process of their own, so that only reading, stamping and decoding are counted.
+The simulated gloves run in another process, so that only reading, stamping and decoding are
+counted.
 """
 
 import json

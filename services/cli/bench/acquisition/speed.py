@@ -1,4 +1,4 @@
-"""Ways of decoding in; their time a packet by the size of reads, in turns, out."""
+"""Processor time per packet of each decoder by read size, measured in turns."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence

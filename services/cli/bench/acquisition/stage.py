@@ -1,4 +1,4 @@
-"""The stage `acquisition`: its options in, a report out."""
+"""Entry point of the benchmark stage `acquisition`."""
 
 import argparse
 from dataclasses import asdict
@@ -27,7 +27,7 @@ _BLOCKS = 500
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument(
         "--packets", type=int, help=f"a family over the bad line ({_USUAL['packets']}; quick 2000)"
     )
@@ -40,10 +40,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Decode over a bad line, time every way of decoding and every driver, read eight gloves.
+    """Decode from a noisy line, time every decoder and driver, read eight gloves.
 
     Raises:
-        InvalidInputError: a number that measures nothing.
+        InvalidInputError: an invalid number.
     """
     del folder
     plan = _plan(options)
@@ -109,7 +109,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 
 
 def _plan(options: argparse.Namespace) -> dict[str, Any]:
-    """What the options say, else the usual or the quick numbers."""
+    """Values of the options, otherwise the usual or the quick defaults."""
     plan: dict[str, Any] = {}
     for name, default in (_QUICK if options.quick else _USUAL).items():
         given = getattr(options, name)

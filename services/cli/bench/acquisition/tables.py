@@ -1,4 +1,4 @@
-"""Results of the acquisition stage in; its tables and its chart out."""
+"""Tables and chart of the acquisition benchmark."""
 
 from collections.abc import Mapping, Sequence
 
@@ -72,7 +72,7 @@ def tables(
 
 
 def panels(judgements: Sequence[Judgement], speeds: Speeds) -> list[Panel]:
-    """Time against wrong packets, a picture for each family."""
+    """Time against wrong packets, one panel per family."""
     found = []
     for family in dict.fromkeys(judgement.family for judgement in judgements):
         points = [

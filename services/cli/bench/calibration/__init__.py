@@ -1,1 +1,1 @@
-"""`dextouch bench calibration`: mounts and cameras of known places, found by ours and by others."""
+"""Benchmark of calibration: hand-eye mounts and cameras with known ground truth."""

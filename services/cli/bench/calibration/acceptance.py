@@ -1,4 +1,4 @@
-"""What was measured in; what calibration promises, and whether it holds, out."""
+"""Requirements on calibration, with measured values and verdicts."""
 
 from collections.abc import Sequence
 
@@ -11,14 +11,14 @@ from services.cli.bench.calibration.rivals import OURS, OURS_POSES, PARK
 from services.cli.bench.figures import Requirement, Sense
 
 PROMISED_VIEWS = 25
-# Differences below half of what either could know are no differences.
+# Differences below half of the uncertainty are insignificant.
 TOLERANCE_SIGMAS = 0.5
 
 
 def requirements(
     results: Results, cameras: Sequence[CameraResult], refusals: Sequence[SceneResult]
 ) -> list[Requirement]:
-    """The table of promises; what was not measured in this run says so."""
+    """Build the table of requirements; some may be unmeasured in this run."""
     return [
         *_mount(results[OURS]),
         *_mount(results[OURS_POSES]),
@@ -54,7 +54,7 @@ def _against_park(results: Results) -> list[Requirement]:
 
 
 def notes(results: Results) -> list[str]:
-    """What the requirements alone would hide."""
+    """Notes on results that the requirements do not show."""
     told = []
     for name in (OURS, OURS_POSES):
         rotation, translation = not_worse_share(results[name], results[PARK], tolerance_sigmas=0.0)

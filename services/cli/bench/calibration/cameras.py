@@ -1,4 +1,4 @@
-"""Numbers of views in; how far a calibrated camera is from the true one, and its sigma, out."""
+"""Errors and reported sigmas of cameras calibrated from different numbers of views."""
 
 import time
 from dataclasses import dataclass
@@ -21,23 +21,23 @@ from services.cli.bench.stages import Bar
 NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 # So that boards come to the edges of the image.
 SIDEWAYS_M = 0.25
-# The spread of fewer cameras says nothing of their sigma.
+# Below this number of cameras the spread is too uncertain to compare.
 MIN_SEEDS = 10
 
 
 @dataclass(frozen=True)
 class CameraResult:
-    """Cameras calibrated from so many views, in the order of the seeds.
+    """Cameras calibrated from `num_views` views, in the order of the seeds.
 
     Attributes:
         num_views: of each.
         focal_error: |df| / f.
         centre_px: distance of the principal point.
-        rms_px: what calibration leaves over; no measure of how good it is.
-        coverage: share of the image in which corners were seen.
+        rms_px: calibration residual, which is not a measure of accuracy.
+        coverage: share of the image covered by corners.
         ms: processor time of this thread.
         sigma_over_spread: parameter → reported sigma (RMS over the seeds) over the spread of the
-            errors; 1 is honest. Empty for few seeds.
+            errors; ideally 1. Empty for few seeds.
     """
 
     num_views: int
@@ -50,7 +50,7 @@ class CameraResult:
 
 
 def simulated_boards(seed: int, num_views: int) -> FoundBoards:
-    """Corners with the usual noise, all over the image."""
+    """Corners all over the image with the usual noise."""
     views = make_scene(seed, Motion(num_views=num_views, sideways_m=SIDEWAYS_M)).views
     return FoundBoards(
         tuple(points.astype(np.float32) for points in views.points_board),
@@ -76,7 +76,7 @@ def measure_cameras(counts: tuple[int, ...], num_seeds: int, bar: Bar) -> list[C
 
 
 def _calibrate(boards: FoundBoards) -> Float64[np.ndarray, "21"]:
-    """Errors (9), sigmas (9), what is left, coverage, time."""
+    """Errors (9), sigmas (9), residual, coverage, time."""
     begun_s = time.thread_time()
     found = calibrate_found(boards)
     ms = (time.thread_time() - begun_s) * 1e3

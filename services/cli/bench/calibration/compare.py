@@ -1,4 +1,4 @@
-"""Methods and seeds in; time and errors of each method on the same scenes, in turns, out."""
+"""Comparison of hand-eye methods on the same scenes: time and errors, in turns."""
 
 import gc
 import time
@@ -21,7 +21,7 @@ from services.cli.bench.stages import Bar
 
 @dataclass(frozen=True)
 class Solved:
-    """One method on one scene; `nees` by degree of freedom and `sigma` where it has them."""
+    """One method on one scene; `nees` per degree of freedom and `sigma` where available."""
 
     ms: float
     error_deg: float
@@ -33,7 +33,7 @@ class Solved:
 
 @dataclass(frozen=True)
 class MethodResult:
-    """One method on all scenes, in the order of the seeds."""
+    """Results of one method on all scenes, in the order of the seeds."""
 
     name: str
     num_seeds: int
@@ -46,7 +46,7 @@ class MethodResult:
 
 
 def compare(scenes: Sequence[Scene], bar: Bar) -> dict[str, MethodResult]:
-    """Every method on every scene; the first scene is solved once before, to warm up."""
+    """Run every method on every scene, after a warm-up on the first one."""
     for method in METHODS:
         method.solve(scenes[0])
     gc.collect()
@@ -108,7 +108,7 @@ def _result(name: str, solved: Sequence[Solved]) -> MethodResult:
 def not_worse_share(
     ours: MethodResult, rival: MethodResult, *, tolerance_sigmas: float
 ) -> tuple[float, float]:
-    """Share of seeds with an error of at most the rival's, or so many of our sigmas above it.
+    """Share of seeds with an error of at most the rival's plus a tolerance in our sigmas.
 
     Returns:
         Share by rotation, by translation.

@@ -1,4 +1,4 @@
-"""Scenes that show no mount, and healthy ones, in; whether each method refuses them out."""
+"""Detection of degenerate hand-eye scenes by each method, and acceptance of healthy ones."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -24,11 +24,11 @@ class SceneResult:
     Attributes:
         name: what is wrong with it.
         is_healthy: whether it should be solved.
-        num_seeds: how often it was made.
-        num_refused: how often ours refused it.
-        num_named: how often the refusal named axes to add.
-        cause: the first refusal's words.
-        rivals: rival → what it does: median error, or that it refuses or gives NaN.
+        num_seeds: number of scenes.
+        num_refused: number of refusals by ours.
+        num_named: number of refusals that name axes to add.
+        cause: message of the first refusal.
+        rivals: rival → median error, or that it refuses or returns NaN.
     """
 
     name: str
@@ -41,7 +41,7 @@ class SceneResult:
 
 
 def scene_makers() -> dict[str, tuple[Maker, bool]]:
-    """Kind of scene → what makes it of a seed, and whether it is healthy."""
+    """Kind of scene → factory by seed, and whether it is healthy."""
     makers: dict[str, tuple[Maker, bool]] = {"healthy": (make_scene, True)}
     for axis, axes in TURN_AXES.items():
         makers[f"turns about the camera's {axis} only"] = (
@@ -56,7 +56,7 @@ def scene_makers() -> dict[str, tuple[Maker, bool]]:
 
 
 def try_scenes(num_seeds: int, num_healthy: int, bar: Bar) -> list[SceneResult]:
-    """Every kind of scene with seeds that no other part of the stage uses."""
+    """Try every kind of scene, with seeds not used elsewhere in the stage."""
     makers = scene_makers()
     ours = next(method for method in METHODS if method.name == OURS)
     results = []
@@ -96,7 +96,7 @@ def _refusal(method: Method, scene: Scene) -> InvalidInputError | None:
 
 
 def _what_it_does(method: Method, scenes: list[Scene]) -> str:
-    """Median error where it answers at all; how often it does not."""
+    """Median error of a method, and how often it gives no result."""
     solved = []
     for scene in scenes:
         try:

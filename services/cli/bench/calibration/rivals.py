@@ -1,4 +1,4 @@
-"""A scene in; the mount that each method finds, ours and OpenCV's, out."""
+"""Hand-eye methods under comparison: ours and OpenCV's."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -23,28 +23,28 @@ PARK = "park"
 
 @dataclass(frozen=True)
 class Answer:
-    """A mount, with our covariance of its twist where the method has one."""
+    """A mount, with the covariance of its twist where available."""
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
     covariance: Float64[np.ndarray, "6 6"] | None = None
 
 
 class Method(ABC):
-    """One way to find the mount."""
+    """A method that estimates the mount."""
 
     name: str
 
     @abstractmethod
     def solve(self, scene: "Scene") -> Answer:
-        """The mount.
+        """Estimate the mount.
 
         Raises:
-            InvalidInputError: the method refuses the scene, or gives no finite mount.
+            InvalidInputError: the method refuses the scene, or returns no finite mount.
         """
 
 
 class Ours(Method):
-    """The weighted bundle, with the corners or with the board's poses alone."""
+    """Our weighted bundle adjustment, with the corners or with the board's poses alone."""
 
     def __init__(self, name: str, *, with_corners: bool) -> None:
         self.name = name
@@ -60,7 +60,7 @@ class Ours(Method):
 
 
 class OurPark(Method):
-    """The closed form that our bundle starts from."""
+    """The closed-form solution that initializes our bundle adjustment."""
 
     name = "our closed form"
 
@@ -127,7 +127,7 @@ METHODS: tuple[Method, ...] = (
 
 
 def _quiet_opencv() -> ModuleType:
-    """OpenCV without the lines that it prints where it gives up; the table says so."""
+    """OpenCV with its error output suppressed, since failures are in the table."""
     import cv2
 
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -1,4 +1,4 @@
-"""A seed and a kind of motion in; noisy views of a board with the true mount out."""
+"""Simulated hand-eye scenes: noisy views of a board with a known mount."""
 
 from dataclasses import dataclass, replace
 
@@ -21,16 +21,16 @@ MAX_TRIES = 100_000
 
 @dataclass(frozen=True)
 class Motion:
-    """How a camera is moved before a board, and how noisy what it sees is.
+    """Motion of a camera in front of a board, and noise levels.
 
     Attributes:
-        num_views: views whose board lies wholly on the image.
-        tilt_deg: turns about each axis are even within ± this.
-        axes: share of `tilt_deg` by axis of the camera; zeros leave turns out.
-        distance_m: from, to.
-        sideways_m: the board's middle lies within ± this off the optical axis.
-        pixel_px: noise of corners, an axis.
-        tracker_rotation_deg: noise of the tracker, an axis.
+        num_views: number of views with the whole board in the image.
+        tilt_deg: rotations about each axis are uniform within ± this.
+        axes: share of `tilt_deg` by axis of the camera; zero disables an axis.
+        distance_m: minimum and maximum.
+        sideways_m: the board's centre lies within ± this of the optical axis.
+        pixel_px: noise of corners per axis.
+        tracker_rotation_deg: noise of the tracker per axis.
         tracker_translation_m: likewise.
     """
 
@@ -46,7 +46,7 @@ class Motion:
 
 @dataclass(frozen=True)
 class Scene:
-    """What was measured, and the truth.
+    """Simulated measurements with ground truth.
 
     Attributes:
         Ts_world_tracker: [n, 4, 4] with the tracker's noise.
@@ -63,7 +63,7 @@ class Scene:
     T_world_board: Float64[np.ndarray, "4 4"]
 
     def repeated(self, views: list[int]) -> "Scene":
-        """A scene of these views, which may repeat."""
+        """A scene of selected views, which may repeat."""
         index = np.array(views)
         return replace(
             self,
@@ -80,10 +80,10 @@ def board_points() -> Float64[np.ndarray, "k 3"]:
 
 
 def make_scene(seed: int, motion: Motion | None = None) -> Scene:
-    """Views of a board before a moving camera.
+    """Simulate views of a board by a moving camera.
 
     Raises:
-        LimitExceededError: the board hardly ever lies on the image.
+        LimitExceededError: the board is rarely inside the image.
     """
     motion = motion or Motion()
     rng = np.random.default_rng(seed)
@@ -107,7 +107,7 @@ def make_scene(seed: int, motion: Motion | None = None) -> Scene:
 
 
 def _seen_boards(rng: np.random.Generator, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
-    """True poses of boards that lie on the image, and the true pixels of their corners."""
+    """True poses of boards inside the image, and the true pixels of their corners."""
     points = board_points()
     low = np.array([MARGIN_PX, MARGIN_PX])
     high = np.array(IMAGE_SIZE_PX) - MARGIN_PX
@@ -129,7 +129,7 @@ def _seen_boards(rng: np.random.Generator, motion: Motion) -> tuple[np.ndarray, 
 
 
 def _poses_of(points: np.ndarray, pixels: np.ndarray) -> Float64[np.ndarray, "n 4 4"]:
-    """Poses of a board by OpenCV's iterative solver, as stations find them."""
+    """Poses of a board by OpenCV's iterative solver, as in a station."""
     import cv2
 
     poses = []

@@ -1,4 +1,4 @@
-"""The stage `calibration`: its options in, a report out."""
+"""Entry point of the benchmark stage `calibration`."""
 
 import argparse
 from dataclasses import asdict
@@ -23,7 +23,7 @@ USUAL_COUNTS, QUICK_COUNTS = (8, 15, 25, 40), (8, 25)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument(
         "--seeds", type=int, help=f"hand-eye scenes ({USUAL['seeds']}; quick {QUICK['seeds']})"
     )
@@ -31,7 +31,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Solve scenes of known mounts and cameras with every method, then scenes to be refused.
+    """Solve scenes of known mounts and cameras with every method, then degenerate scenes.
 
     Raises:
         InvalidInputError: no seed.

@@ -1,4 +1,4 @@
-"""What the calibration stage measured in; its tables and its chart out."""
+"""Tables and charts of the calibration benchmark."""
 
 from collections.abc import Sequence
 

@@ -1,1 +1,1 @@
-"""The stage `clocks`: device clocks against simulated truth, beside their rivals."""
+"""Benchmark of device clocks against simulated truth, beside rival methods."""

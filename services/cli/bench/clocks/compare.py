@@ -1,4 +1,4 @@
-"""Scenes and ways of dating in; errors and processor time of each, round by round, out."""
+"""Errors and processor time of each clock method in each scene, round by round."""
 
 import time
 from collections.abc import Callable, Mapping
@@ -22,7 +22,7 @@ COUNTED, NUMBERED, PROVISIONAL = "counted", "numbered", "counted, at once"
 
 @dataclass(frozen=True)
 class Result:
-    """One way of dating in one scene: a score and a cost of every round (each has its own seed)."""
+    """One method in one scene: score and cost of every round (each with its own seed)."""
 
     scene: str
     way: str
@@ -41,7 +41,7 @@ class Result:
 
     @property
     def recovery_s(self) -> Figure | None:
-        """How long a step was felt; None in scenes without."""
+        """Recovery time after a step; None in scenes without one."""
         times = [found.recovery_s for found in self.scores if found.recovery_s is not None]
         return Figure.of(times) if times else None
 
@@ -58,14 +58,14 @@ class Result:
 def compare(
     scenes: Mapping[str, Scene], *, seconds: float, num_rounds: int, seed: int, bar: Bar
 ) -> list[Result]:
-    """Ours and all rivals in every scene, in turns."""
+    """Run ours and all rivals in every scene, in turns."""
     ways: list[tuple[str, Way, bool]] = [(name, way, True) for name, way in ONLINE.items()]
     ways += [(name, way, False) for name, way in OFFLINE.items()]
     return _compare(scenes, ways, (seconds, num_rounds, seed), bar)
 
 
 def compare_stampless(*, seconds: float, num_rounds: int, seed: int, bar: Bar) -> list[Result]:
-    """Streams that have a sequence number only, or nothing at all, at several rates of loss."""
+    """Compare on streams with sequence numbers only or no counter, at several loss rates."""
     ways: list[tuple[str, Way, bool]] = [
         (COUNTED, _counted, True),
         (PROVISIONAL, _provisional, True),

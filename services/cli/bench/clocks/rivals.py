@@ -1,4 +1,4 @@
-"""A take in, the times of its samples as other ways of dating would tell them out."""
+"""Methods that estimate sample times: ours, and rivals such as regression and block minima."""
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -7,18 +7,18 @@ from dextouch.clocks import OnlineClock, fit_clock
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
 from services.cli.bench.clocks.scenes import Scene, Take
 
-# A smoothed regression forgets half of what it knows in so long.
+# Half-life of the forgetting regression.
 HALF_TIME_S = 90.0
 BLOCK_S = 1.0
 LINE_BLOCKS = 60
-# Blocks whose minimum lies so many spreads above the line are congestion.
+# Blocks whose minimum is this many spreads above the line are congested.
 OUTLIER_SPREADS = 3.0
 
 
 def descriptor(
     scene: Scene, *, has_time: bool = True, has_sequence: bool = True
 ) -> StreamDescriptor:
-    """What a glove of this scene would declare: 16 bits of sequence, 32 of time where it ticks."""
+    """Stream descriptor of a glove in this scene: 16-bit sequence, 32-bit ticks."""
     return StreamDescriptor(
         name="glove",
         kind="tactile",
@@ -51,12 +51,12 @@ def ours_offline(take: Take) -> Int64[np.ndarray, " n"]:
 
 
 def arrivals(take: Take) -> Int64[np.ndarray, " n"]:
-    """The arrivals as they are."""
+    """Unmodified arrival times."""
     return take.t_host_ns.copy()
 
 
 def least_squares(take: Take) -> Int64[np.ndarray, " n"]:
-    """One straight line through the whole take."""
+    """Linear regression over the whole take."""
     x_s, y_ns = _points(take)
     slope, level = np.polyfit(x_s, y_ns, 1)
     return _times(take, slope * x_s + level)
@@ -84,7 +84,7 @@ def smoothed_offset(take: Take) -> Int64[np.ndarray, " n"]:
 
 
 def block_minima(take: Take) -> Int64[np.ndarray, " n"]:
-    """A line through the minima of the last minute's seconds, without outliers, by sample."""
+    """Robust line through the per-second minima of the last minute, sample by sample."""
     x_s, y_ns = _points(take)
     minima: list[tuple[float, float]] = []
     slope, level = 0.0, float(y_ns[0])
@@ -119,19 +119,19 @@ def _points(take: Take) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, 
 
 
 def half_tick_ns(scene: Scene) -> int:
-    """What a fit that hangs on the earliest arrivals must add: stamps are cut down to ticks."""
+    """Half a tick, the mean truncation of stamps, which fits to the earliest arrivals must add."""
     return scene.tick_ns // 2
 
 
 def _times(take: Take, offset_ns: np.ndarray, *, below: bool = False) -> Int64[np.ndarray, " n"]:
     reference_ns = take.t_host_ns[0] - take.t_device_ns[0]
-    # Regressions through the middle of the arrivals have the half tick in them already.
+    # Regressions through all arrivals include the half tick already.
     reference_ns += half_tick_ns(take.scene) if below else 0
     return take.t_device_ns + reference_ns + np.rint(offset_ns).astype(np.int64)
 
 
 def _robust_line(points: Float64[np.ndarray, "n 2"]) -> tuple[float, float]:
-    """Slope and level, without the points that stand out after a first fit."""
+    """Slope and offset, excluding outliers of a first fit."""
     x, y = points.T
     if len(x) < 3:
         return 0.0, float(y.min())

@@ -1,8 +1,8 @@
-"""Simulated takes of device clocks whose truth is known, by the name of a scene and a seed.
+"""Simulated takes of device clocks with known truth, by scene and seed.
 
-A device samples at its own rate by its own clock; its packets wait in queues and in the polling of
-a bus, never overtake each other, and some get lost. Truth is known, so that every way of dating
-samples can be scored.
+A device samples at its own rate by its own clock; its packets are delayed by queues and bus
+polling, keep their order, and some are lost. The truth is known, so that every method can be
+scored.
 """
 
 from dataclasses import dataclass, replace
@@ -12,9 +12,9 @@ from jaxtyping import Int64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
 
-# What a stamp of one direction can never show; scores are taken after it is subtracted.
+# The constant path delay, unobservable from one-way stamps, is subtracted before scoring.
 BASE_DELAY_NS = 2_000_000
-# Crystals wander with the room's temperature, over minutes.
+# Crystals drift with the room temperature over minutes.
 WANDER_PERIOD_S = 120.0
 WRONG_S = 0.02
 LATE_PATH_S = 60.0
@@ -24,22 +24,22 @@ DEVICE_ORIGIN_NS = 987_654_321_000
 
 @dataclass(frozen=True)
 class Scene:
-    """How a device's clock runs and what its packets suffer on their way.
+    """Parameters of a device's clock and of the path of its packets.
 
     Attributes:
         rate_hz: samples a second of the device's clock.
         skew_ppm: how much faster the host's clock runs.
         wander_ppm: amplitude of the skew's slow sine.
         jitter_ms: mean of the exponential queueing delay.
-        outliers: share of samples that wait for `outlier_ms` more, exponential too.
-        grid_ms: arrivals happen at whole multiples of it (polling of a bus, timer of a chip).
-        drops: share of samples that get lost.
+        outliers: share of samples delayed by further `outlier_ms` (mean, exponential).
+        grid_ms: arrivals are at multiples of it (bus polling, chip timer).
+        drops: share of lost samples.
         step_ms: jump of the device's clock in the middle; 0 for none.
-        stop_ms: how long the device stands still each time, its clock with it.
-        num_stops: how often, evenly spread.
-        late_path_ms: how much longer samples are on their way from the middle on, for a quarter of
-            the take, a minute at most.
-        wrong_stamps: share of stamps that are 20 ms ahead.
+        stop_ms: duration of each stop of the device and its clock.
+        num_stops: number of stops, evenly spread.
+        late_path_ms: additional path delay from the middle on, for a quarter of the take, a minute
+            at most.
+        wrong_stamps: share of stamps that are wrong by +20 ms.
         tick_ns: resolution of the device's stamps.
     """
 
@@ -65,14 +65,14 @@ class Scene:
 
 @dataclass(frozen=True)
 class Take:
-    """What a host records of a scene, and the truth.
+    """A simulated take: recorded data and truth.
 
     Attributes:
         sequence: numbers of the samples that arrived, counted by the device.
         t_device_ns: the device's stamps.
         t_host_ns: arrivals on the host's clock.
-        true_ns: when the samples were taken, on the host's clock.
-        step_true_ns: when the device's clock jumped; None where it did not.
+        true_ns: true sampling times, on the host's clock.
+        step_true_ns: time of the clock step; None if there is none.
     """
 
     scene: Scene
@@ -123,7 +123,7 @@ def find_scene(name: str) -> Scene:
     """A scene by name.
 
     Raises:
-        UnknownNameError: there is none of that name.
+        UnknownNameError: no such scene.
     """
     known = SCENES | MORE_SCENES | STOP_SCENES | STAMPLESS_SCENES
     if name not in known:
@@ -132,10 +132,10 @@ def find_scene(name: str) -> Scene:
 
 
 def simulate(scene: Scene, *, seconds: float, seed: int) -> Take:
-    """One take of a scene.
+    """Simulate one take of a scene.
 
     Raises:
-        InvalidInputError: no length of time.
+        InvalidInputError: a duration of zero or less.
     """
     if not seconds > 0:
         raise InvalidInputError(f"simulated take: got {seconds} s, expected more than 0")

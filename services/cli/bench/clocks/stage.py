@@ -1,4 +1,4 @@
-"""The stage `clocks`: its options in, a report out."""
+"""Entry point of the benchmark stage `clocks`."""
 
 import argparse
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ _USUAL = {"seconds": 600.0, "rounds": 5}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument(
         "--seconds", type=float, help=f"length of a take ({_USUAL['seconds']:g}; quick 60)"
     )
@@ -31,11 +31,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Date the samples of every scene in every way.
+    """Run every method on every scene.
 
     Raises:
-        UnknownNameError: a scene that there is not.
-        InvalidInputError: takes too short to judge, or no round.
+        UnknownNameError: an unknown scene.
+        InvalidInputError: takes that are too short, or no round.
     """
     plan = _plan(options)
     names = list(SCENES | MORE_SCENES | STOP_SCENES)

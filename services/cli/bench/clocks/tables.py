@@ -1,4 +1,4 @@
-"""Results of the clocks stage in; its tables, its chart and its verdicts out."""
+"""Tables, charts and requirements of the clocks benchmark."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,7 @@ _TINY_US = 1e-3
 
 
 def tables(results: Sequence[Result], stampless: Sequence[Result]) -> list[ResultTable]:
-    """Errors of all ways in all scenes, streams without stamps, steps, and costs."""
+    """Errors of all methods in all scenes, streams without stamps, steps, and costs."""
     found = [
         _error_table("RMS error in ms, constant path delay removed", results, "rms_ms"),
         _error_table("99th percentile of the error in ms", results, "p99_ms"),
@@ -47,7 +47,7 @@ def panels(results: Sequence[Result]) -> list[Panel]:
 
 
 def requirements(results: Sequence[Result], stampless: Sequence[Result]) -> list[Requirement]:
-    """What clocks promise, of the worst round of the worst scene."""
+    """Requirements on clocks, for the worst round of the worst scene."""
     seven = [result for result in results if result.scene in SCENES]
     online = [result for result in seven if result.way == OURS_ONLINE]
     offline = [result for result in seven if result.way == OURS_OFFLINE]
@@ -87,7 +87,7 @@ def requirements(results: Sequence[Result], stampless: Sequence[Result]) -> list
 
 
 def _gain(results: Sequence[Result]) -> float | None:
-    """Least ratio of the arrivals' error to ours; online without the scenes that have a step."""
+    """Minimum ratio of the arrivals' error to ours; online without scenes that have a step."""
     gains = []
     arrivals = {r.scene: r.rms_ms for r in results if r.way == ARRIVALS}
     for result in results:
@@ -105,7 +105,7 @@ def _worst(results: Sequence[Result], what: str) -> float | None:
 
 
 def _names(results: Sequence[Result]) -> tuple[list[str], list[str]]:
-    """Scenes and ways in the order they were measured."""
+    """Scenes and methods in the order of measurement."""
     return (
         list(dict.fromkeys(result.scene for result in results)),
         list(dict.fromkeys(result.way for result in results)),

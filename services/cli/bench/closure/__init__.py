@@ -1,1 +1,1 @@
-"""What retargeting is worth: human takes of the twin, played again by its robot hand."""
+"""Evaluation of retargeting in the twin: human takes replayed by the robot hand."""

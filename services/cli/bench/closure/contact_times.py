@@ -1,4 +1,4 @@
-"""Touch of a human take and its replay in; how early or late contacts began and ended out."""
+"""Contact timing errors between a human take and its replay."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,16 +12,16 @@ from dextouch.tactile.layout import SIDES, split_pads
 from dextouch.tactile.pad_forces import PADS
 from services.twin.recorder import TruthStream
 
-# The hand as a whole comes last: touched when any of its pads is.
+# The whole hand comes last: in contact if any of its pads is.
 PLACES: Final = (*PADS, "hand")
 _NS_PER_MS: Final = 1e6
 
 
 @dataclass(frozen=True)
 class ContactTimes:
-    """First and last contact of each place of the left and the right hand.
+    """First and last contact of each pad of the left and the right hand.
 
-    `first_ms` and `last_ms` are zero where a place was never `touched`.
+    `first_ms` and `last_ms` are zero for pads never `touched`.
     """
 
     touched: Bool[np.ndarray, "2 7"]
@@ -31,7 +31,7 @@ class ContactTimes:
 
 @dataclass(frozen=True)
 class TimingErrors:
-    """Replay minus human, milliseconds, of places that both touched with, over many takes."""
+    """Replay minus human in milliseconds, for pads with contact in both, over many takes."""
 
     hand_first_ms: tuple[float, ...]
     hand_last_ms: tuple[float, ...]
@@ -42,7 +42,7 @@ class TimingErrors:
 
 
 def contact_times(streams: Mapping[str, TruthStream]) -> ContactTimes:
-    """Contact of every place in the streams `tactile_left` and `tactile_right`."""
+    """Contact times of every pad in the streams `tactile_left` and `tactile_right`."""
     touched = np.zeros((len(SIDES), len(PLACES)), dtype=bool)
     first, last = np.zeros(touched.shape), np.zeros(touched.shape)
     for row, side in enumerate(SIDES):
@@ -62,7 +62,7 @@ def contact_times(streams: Mapping[str, TruthStream]) -> ContactTimes:
 def timing_errors(pairs: Sequence[tuple[ContactTimes, ContactTimes]]) -> TimingErrors:
     """Errors of all takes, as (human, replay) pairs.
 
-    `num_missing` counts pads that only the human touched with, `num_extra` those of the replay.
+    `num_missing` counts pads with contact in the human take only, `num_extra` in the replay only.
     """
     hand_first: list[float] = []
     hand_last: list[float] = []

@@ -1,4 +1,4 @@
-"""A human take's streams in; the robot's trajectory by each way to transfer the wrist out."""
+"""Methods that transfer a human take to robot commands, by wrist, fingers and force."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -55,11 +55,11 @@ _GRID_S: Final = _GRID_NS / _NS_PER_S
 
 @dataclass(frozen=True)
 class Method:
-    """One way from a human take to robot commands.
+    """A method to derive robot commands from a human take.
 
-    `wrist`: the human's pose as it is, with one offset for the take, or with an offset that touch
-    decides at every step. `anchors`: whether touching fingertips are led to the human's places.
-    `presses`: whether commands lead what was reached by what was felt.
+    `wrist`: the human's pose unchanged, with one offset for the take, or with a touch-dependent
+    offset at every step. `anchors`: whether touching fingertips are moved to the human's positions.
+    `presses`: whether commands are offset according to the measured touch.
     """
 
     wrist: Wrist
@@ -68,7 +68,7 @@ class Method:
 
     @property
     def name(self) -> str:
-        """For tables."""
+        """Label in tables."""
         fingers = ", fingertips anchored" if self.anchors else ""
         return f"{self.wrist} wrist{fingers}, {'pressing' if self.presses else 'as reached'}"
 
@@ -96,7 +96,7 @@ class RetargetedHand:
     pad_forces_n: Float64[np.ndarray, "steps 6"]
 
     def offset_m(self, wrist: Wrist) -> Float64[np.ndarray, "steps 3"]:
-        """Where the robot's wrist is in the human's, at every step."""
+        """Offset of the robot's wrist in the human wrist frame, at every step."""
         num_steps = len(self.joints_rad)
         if wrist == "touch":
             return touch_offsets_m(self.points, self.pad_forces_n, _GRID_S)
@@ -104,7 +104,7 @@ class RetargetedHand:
         return np.tile(offset, (num_steps, 1))
 
     def commands(self, method: Method, servos: HandServos) -> HandCommands:
-        """What this hand is commanded at every step."""
+        """Commands of this hand at every step."""
         offset_m = self.offset_m(method.wrist)
         Ts_world_robot = shifted_wrist(self.Ts_world_human, offset_m)
         joints = self.joints_rad
@@ -118,7 +118,7 @@ class RetargetedHand:
 
 @dataclass(frozen=True)
 class RetargetedTake:
-    """Both hands of a human take, its head, and where its objects lay at the start."""
+    """Both hands and the head of a human take, with the initial object poses."""
 
     left: RetargetedHand
     right: RetargetedHand
@@ -127,7 +127,7 @@ class RetargetedTake:
 
 
 def retarget_take(episode: TruthEpisode) -> RetargetedTake:
-    """Retarget both hands at the rate of their keypoints and put everything on the model grid.
+    """Retarget both hands at their keypoint rate and resample everything to the model grid.
 
     Raises:
         InvalidInputError: an episode of robot hands, which has no keypoints.
@@ -173,7 +173,7 @@ def _retargeted(streams: dict[str, TruthStream], side: Side) -> RetargetedHand:
 def robot_trajectory(
     take: RetargetedTake, method: Method, servos: HandServos = TWIN_SERVOS
 ) -> HandTrajectory:
-    """What the robot is commanded at every step of the grid."""
+    """Robot commands at every step of the grid."""
     left, right = (hand.commands(method, servos) for hand in (take.left, take.right))
     return HandTrajectory(
         left.Ts_world_wrist,

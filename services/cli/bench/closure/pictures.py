@@ -1,4 +1,4 @@
-"""Images of a human take and of its replays in; one contact sheet, a row each, out."""
+"""Contact sheet of a human take and its replays, one row each."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -14,7 +14,7 @@ from services.cli.bench.closure.replay import human_take, replay
 from services.twin.recorder import TruthStream
 
 CAMERA: Final = "camera_head"
-# Approach, grasp, lift, carry, set down, let go, gone.
+# Approach, grasp, lift, carry, set down, release, withdraw.
 _AT_S: Final = (0.4, 1.0, 1.4, 1.9, 2.5, 3.1, 3.6, 4.2, 5.3)
 _GAP_PX: Final = 4
 

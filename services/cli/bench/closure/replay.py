@@ -1,4 +1,4 @@
-"""Human takes in; the same takes by the twin's robot hand, with success and contact times, out."""
+"""Replay of human takes by the twin's robot hand, with success and contact times."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -26,7 +26,7 @@ _IMAGE_PX: Final = 128
 
 @dataclass(frozen=True)
 class Replay:
-    """What came of one take on the robot hand."""
+    """Result of replaying one take with the robot hand."""
 
     succeeded: bool
     streams: dict[str, TruthStream]
@@ -47,7 +47,7 @@ class ClosureTake:
 
 @lru_cache(maxsize=4)
 def closure_stage(task: str, domain: Domain) -> Stage:
-    """The stage of a task and domain, compiled once a process."""
+    """The stage of a task and domain, compiled once per process."""
     return Stage(task, domain, TwinSettings(image_height_px=_IMAGE_PX, image_width_px=_IMAGE_PX))
 
 
@@ -59,9 +59,9 @@ def human_take(task: str, seed: int, images: tuple[str, ...] = ()) -> TruthEpiso
 def replay(
     task: str, take: RetargetedTake, trajectory: HandTrajectory, images: tuple[str, ...] = ()
 ) -> Replay:
-    """Play a trajectory with the robot hand, the objects lying where the human found them.
+    """Play a trajectory with the robot hand, from the initial object poses of the human take.
 
-    The trajectory goes through 67-D actions and back, as in every episode.
+    The trajectory is converted to 67-D actions and back, as in every episode.
     """
     stage = closure_stage(task, "robot")
     anchor = stage.start(Plan(take.object_poses, trajectory))
@@ -77,7 +77,7 @@ def replay(
 def close_take(
     task: str, seed: int, methods: Iterable[Method], done: Callable[[str], None] | None = None
 ) -> list[ClosureTake]:
-    """One human take, replayed by every method."""
+    """Replay one human take with every method."""
     episode = human_take(task, seed)
     take = retarget_take(episode)
     human_contact = contact_times(episode.streams)

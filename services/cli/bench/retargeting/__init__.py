@@ -1,1 +1,1 @@
-"""`dextouch bench retargeting`: hands of known joint angles, followed by ours and by others."""
+"""Benchmark of retargeting on hands with known joint angles, beside rival solvers."""

@@ -1,4 +1,4 @@
-"""What was measured in; what retargeting promises, and whether it holds, out."""
+"""Requirements on retargeting, with measured values and verdicts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -21,7 +21,7 @@ from services.cli.bench.retargeting.sequences import RATE_HZ
 
 # (library, how many times as fast), each with its vectors from the wrist to 15 points.
 PROMISED_SPEED = ((DEX, 150.0), (DEXI, 5.0))
-# A turn at the velocity limit is rounded like all numbers.
+# Tolerance for rounding at the velocity limit.
 _ROUNDING_DEG = 1e-6
 
 
@@ -31,7 +31,7 @@ def requirements(
     pinches: Mapping[str, PinchScore],
     cold: ColdStart,
 ) -> list[Requirement]:
-    """The table of promises; what was not measured in this run says so."""
+    """Build the table of requirements; some may be unmeasured in this run."""
     return [
         *_speed(speeds),
         *_exactness([robot[name][OURS_EXACT] for name in (NATURAL, FULL)]),
@@ -43,7 +43,7 @@ def requirements(
 
 
 def worst_ratio(speeds: Sequence[Speed], ours: str, rival: str) -> float | None:
-    """How many times our time the rival takes: median of the rounds, of the worse input."""
+    """Rival's time relative to ours: median over the rounds, for the worse input."""
     times = {(speed.method, speed.motion): speed.cpu_us for speed in speeds}
     motions = {motion for method, motion in times if method == rival}
     ratios = [times[rival, motion].over(times[ours, motion]).median for motion in motions]
@@ -51,7 +51,7 @@ def worst_ratio(speeds: Sequence[Speed], ours: str, rival: str) -> float | None:
 
 
 def velocity_limit_deg() -> float:
-    """The largest turn of a joint from one sample to the next that our default allows."""
+    """Maximum joint change between samples under our default velocity limit."""
     return float(np.rad2deg(RetargetOptions().velocity_limit_rad_s / RATE_HZ))
 
 

@@ -1,7 +1,7 @@
-"""Joint angles of a hand in; which of its fingers touch each other or the palm out.
+"""Self-collision check of a hand: which fingers touch each other or the palm.
 
-Fingers are capsules, the palm is a box, as in the twin. A sequence of robot postures must be free
-of contact, or it asks for what no hand can do: every second random posture is not.
+Fingers are capsules, the palm is a box, as in the twin. A sequence of robot postures must be
+collision-free to be feasible, which every second random posture is not.
 """
 
 from itertools import combinations
@@ -23,7 +23,7 @@ _PALM_SAMPLES: Final = np.linspace(0.0, 1.0, 6)
 def touching(hand: TwinHand, joints_rad: np.ndarray) -> Bool[np.ndarray, "time 5"]:
     """Fingers, thumb … little, that touch another finger or the palm.
 
-    The first link of a finger turns in the palm and is not held against it.
+    The first link of a finger rotates inside the palm and is not checked against it.
 
     Args:
         hand: kinematics and shape.
@@ -44,7 +44,7 @@ def _capsules(hand: TwinHand, joints_rad: np.ndarray) -> tuple[np.ndarray, np.nd
     """Both ends [T, 5, 3, 3] of the links' axes, wrist coordinates, and radii [5, 3]; metres."""
     points = hand.kinematics.chain_points_m(joints_rad)
     starts, ends, radii = points[:, :, :-1], points[:, :, 1:].copy(), np.array(hand.shape.radii_m)
-    # The tip is on the skin: the axis of the last capsule ends one radius before it.
+    # The tip is on the surface: the axis of the last capsule ends one radius before it.
     last = ends[:, :, 2] - starts[:, :, 2]
     length = np.linalg.norm(last, axis=-1, keepdims=True)
     ends[:, :, 2] -= last / length * radii[:, 2, None]
@@ -74,7 +74,7 @@ def segment_distance_m(
     pp, qq = _dot(along_p, along_p), _dot(along_q, along_q)
     pq, pb, qb = _dot(along_p, along_q), _dot(along_p, between), _dot(along_q, between)
     determinant = pp * qq - pq**2
-    # Of parallel segments any point of the first will do.
+    # For parallel segments any point of the first is valid.
     parallel = determinant < 1e-12 * pp * qq
     s = np.where(parallel, 0.0, (pq * qb - pb * qq) / np.where(parallel, 1.0, determinant))
     t = (pq * s.clip(0.0, 1.0) + qb) / qq

@@ -1,6 +1,6 @@
-"""Errors of every method on the same motions, and times taken in turns.
+"""Comparison of retargeting methods on the same motions: errors, and times in turns.
 
-A rival that does not finish has no score or speed; what the others measured stays.
+A rival that does not finish has no score or speed; results of the others are kept.
 """
 
 import gc
@@ -42,15 +42,15 @@ _NOISE_STREAM = 7
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured.
+    """Extent of the measurement.
 
     Args:
         num_seeds: robot motions of each kind and side.
         num_samples: of each of them, at 60 Hz; also of a round of the timing.
-        num_people: of each side who pinch, smallest first, 1 … 5.
+        num_people: pinching people per side, smallest first, 1 … 5.
         num_rounds: of the timing.
-        num_postures: of each side, searched for from nothing.
-        seed: the first.
+        num_postures: per side, for cold starts.
+        seed: of the first motion.
     """
 
     num_seeds: int
@@ -153,7 +153,7 @@ def compare_speed(effort: Effort, rivals: Rivals, bar: Bar) -> list[Speed]:
 
 
 def scale_of(motion: Motion) -> float:
-    """How much longer the robot's fingers are than the tracked ones: what rivals are told."""
+    """Ratio of the robot's finger lengths to the tracked ones, the scale given to rivals."""
     tracked_m = ours.profile_of(motion).bone_m.sum()
     return float(robot_bone_m(RobotHand(motion.side)).sum() / tracked_m)
 
@@ -190,7 +190,7 @@ def _timed_motions(input_name: str, effort: Effort) -> list[Motion]:
 def _subjects(
     motions: Sequence[Motion], rivals: Rivals
 ) -> dict[str, Callable[[int], Timed | None]]:
-    """What times a method on one of the motions; None once a rival did not finish."""
+    """Functions that time a method on a motion; they return None once a rival did not finish."""
     profiles = [ours.profile_of(motion) for motion in motions]
     scales = [scale_of(motion) for motion in motions]
 

@@ -1,4 +1,4 @@
-"""A clean motion in, the same with faults of every kind and what may be said of each finger out."""
+"""Motions with injected faults of every kind, and the truth for each finger."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from services.cli.bench.retargeting.sequences import Motion
 
 SAMPLE_RATE_HZ = 60
 DROPOUT_SAMPLES = 60
-# Longest of the other faults, and what is left clean after each.
+# Maximum duration of the other faults, and of the clean samples after each.
 MAX_FAULT_SAMPLES = 8
 CLEAN_SAMPLES = 10
 OUTLIER_M = 0.05
@@ -25,8 +25,8 @@ class FuzzedMotion:
 
     Attributes:
         keypoints_m: wrist coordinates.
-        kind: which of `FAULTS` a sample suffers from; -1 none.
-        hit: fingers with a broken point.
+        kind: index in `FAULTS` of each sample's fault; -1 none.
+        hit: fingers with a corrupted point.
         since_fault: clean samples since the last fault; large before the first.
     """
 
@@ -97,7 +97,7 @@ FAULTS: Mapping[str, Callable[[np.ndarray, Generator], None]] = {
 
 
 def fuzzed(motion: Motion, rng: Generator) -> FuzzedMotion:
-    """Faults of all kinds, one after another, with clean samples in between."""
+    """Inject faults of all kinds one after another, with clean samples in between."""
     keypoints = motion.keypoints_m.copy()
     num = len(keypoints)
     kind = np.full(num, -1, dtype=np.int64)
@@ -112,7 +112,7 @@ def fuzzed(motion: Motion, rng: Generator) -> FuzzedMotion:
         kind[at : at + length] = index
         at += length + CLEAN_SAMPLES + int(rng.integers(CLEAN_SAMPLES))
     changed = (keypoints != motion.keypoints_m).any(axis=-1)
-    # A finger's own four points; the metacarpal is not looked at.
+    # A finger's own four points, without the metacarpal.
     hit = np.stack([changed[:, chain_indices(chain)[-4:]].any(axis=1) for chain in CHAINS], axis=1)
     rows = np.arange(num)
     last = np.maximum.accumulate(np.where(kind >= 0, rows, -num))

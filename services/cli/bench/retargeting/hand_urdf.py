@@ -1,4 +1,4 @@
-"""The tables of a robot hand in; the URDF text that rivals read and its links' names out."""
+"""URDF of a robot hand for rival solvers, generated from its kinematic tables."""
 
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable
@@ -11,15 +11,15 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import CHAINS
 
 WRIST_LINK: Final = "wrist"
-# A URDF must name an effort and a speed; neither is used by anybody here.
+# URDF requires effort and velocity limits; neither is used here.
 _EFFORT, _VELOCITY = "2", "10"
 
 
 def hand_urdf(hand: RobotHand) -> str:
     """URDF of one hand: joints by their firmware names, links by `link_name`, no shapes.
 
-    The root link is the wrist frame. Turns that the tables give as quaternions become roll, pitch
-    and yaw, exact to rounding.
+    The root link is the wrist frame. Quaternions of the tables are converted to roll, pitch and
+    yaw, exact to rounding.
     """
     robot = ET.Element("robot", name=f"{hand.side}_hand")
     ET.SubElement(robot, "link", name=WRIST_LINK)
@@ -54,7 +54,7 @@ def tip_name(chain: str) -> str:
 def roll_pitch_yaw(R: np.ndarray) -> tuple[float, float, float]:
     """Angles (rad) about fixed x, then y, then z of a rotation [3, 3], as URDF wants them.
 
-    At a pitch of ±90° roll and yaw are not told apart: all of it goes into roll.
+    At a pitch of ±90° roll and yaw are not unique: yaw is zero.
     """
     pitch = float(np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0])))
     if np.hypot(R[0, 0], R[1, 0]) < 1e-9:

@@ -1,4 +1,4 @@
-"""Keypoints in; our own solver's joint angles and times out, sample by sample and at once."""
+"""Our retargeting solver under the benchmark: live sample by sample, and in batch."""
 
 import time
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from services.twin.hands import twin_hand
 OURS = "ours"
 OURS_LIVE = "ours, live"
 OURS_EXACT = "ours, exact"
-# A finger is found where its tip is nearer than this.
+# A finger counts as solved if its tip error is below this.
 FOUND_M = 1e-4
 
 
@@ -28,12 +28,12 @@ class Timed(NamedTuple):
 
 
 def options_of(name: str) -> RetargetOptions:
-    """The options of one of our rows: the default, but for the one without a temporal term."""
+    """Options of one of our rows: the default, or without the temporal term."""
     return RetargetOptions(temporal_weight_m2=0.0) if name == OURS_EXACT else RetargetOptions()
 
 
 def answer(name: str, motion: Motion) -> Float64[np.ndarray, "time 20"]:
-    """Joint angles of a recording whose person is not known before."""
+    """Joint angles of a recording of an unknown person."""
     return (
         HandRetargeter(motion.side, options=options_of(name))
         .retarget(motion.keypoints_m)
@@ -42,12 +42,12 @@ def answer(name: str, motion: Motion) -> Float64[np.ndarray, "time 20"]:
 
 
 def profile_of(motion: Motion) -> HandProfile:
-    """The person, measured before any clock runs, as rivals are told a scale."""
+    """Hand profile measured before timing, as the scale is for rivals."""
     return HandRetargeter(motion.side).measure(motion.keypoints_m)
 
 
 def time_batch(motion: Motion, profile: HandProfile) -> Timed:
-    """A recording at once, by `retarget`."""
+    """Time a whole recording with `retarget`."""
     retargeter = HandRetargeter(motion.side, profile)
     begun_s = time.process_time()
     result = retargeter.retarget(motion.keypoints_m)
@@ -55,7 +55,7 @@ def time_batch(motion: Motion, profile: HandProfile) -> Timed:
 
 
 def time_live(motion: Motion, profile: HandProfile) -> Timed:
-    """Sample by sample, by `step`."""
+    """Time sample by sample with `step`."""
     retargeter = HandRetargeter(motion.side, profile)
     samples = list(motion.keypoints_m)
     results, calls_ns = [], [time.perf_counter_ns()]
@@ -69,7 +69,7 @@ def time_live(motion: Motion, profile: HandProfile) -> Timed:
 
 
 class ColdStart(NamedTuple):
-    """Fingers searched for from nothing, and how many were found: once, and with retries."""
+    """Number of fingers in cold starts, and of those solved with one start and with retries."""
 
     num_fingers: int
     num_found_once: int
@@ -77,7 +77,7 @@ class ColdStart(NamedTuple):
 
 
 def cold_start(num_postures: int, seed: int) -> ColdStart:
-    """Both hands, postures anywhere within the limits, each without any before it."""
+    """Solve independent random postures of both hands within the joint limits."""
     found = {1: 0, RetargetOptions().num_starts: 0}
     num_fingers = 0
     for side in ("left", "right"):

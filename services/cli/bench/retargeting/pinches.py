@@ -1,6 +1,6 @@
-"""Seeds in; people's hands of known bones that pinch with the thumb and each finger out.
+"""Pinch motions of simulated people with known bones and joint angles.
 
-The joint angles of a pinch are solved for: in the middle of it the tips are less than 3 mm apart.
+The joint angles of a pinch are solved numerically: at its centre the tips are less than 3 mm apart.
 """
 
 from dataclasses import dataclass
@@ -29,13 +29,13 @@ HELD: Final = 28
 RESTING: Final = 10
 # Postures solved for while a pinch is held; in between the tips part by far less than 3 mm.
 _ROLL_SOLVES: Final = 5
-# Half closed, thumb first, from which hands come and to which they go.
+# Half-closed start and end posture, thumb first.
 _RELAXED_RAD: Final = (0.1, -0.3, 0.2, 0.3, *(0.35, 0.0, 0.45, 0.25) * 4)
 # Postures that a solved pinch stays near, as flexion of the fingers' three flexing joints: one at
 # its begin, one at its end, so that the tips roll on each other while held.
 _PINCH_CURLS_RAD: Final = ((0.75, 0.0, 0.85, 0.40), (0.60, 0.05, 1.05, 0.55))
 _PINCH_THUMB_RAD: Final = ((0.4, -0.6, 0.3, 0.4), (0.3, -0.7, 0.4, 0.5))
-# One millimetre between the tips weighs as much as 14 degrees away from the posture.
+# Weight: one millimetre between the tips equals 14 degrees of deviation from the posture.
 _NEAR_RAD: Final = 0.25
 _GAP_SCALE_M: Final = 1e-3
 
@@ -57,12 +57,12 @@ class PinchMotion(Motion):
 
 
 class Person(HumanHand):
-    """A human hand of some size whose bones are all a little off the average.
+    """A human hand of given size with individual deviations of all bones.
 
     Args:
         side: of the hand.
-        size: against the average hand, above zero.
-        seed: of the differences of the bones; the knuckles' places differ alike.
+        size: relative to the average hand, above zero.
+        seed: of the deviations of bones and knuckle positions.
 
     Raises:
         InvalidInputError: a size of zero or less.
@@ -99,7 +99,7 @@ def people(side: Side, seed: int) -> list[Person]:
 
 
 def pinch_motion(person: Person, side: Side) -> PinchMotion:
-    """Four pinches one after the other: closing, held while the tips roll, opening; 440 samples.
+    """Four consecutive pinches: closing, holding while the tips roll, opening; 440 samples.
 
     Raises:
         LimitExceededError: this hand cannot bring a pair of tips together within its limits.
@@ -170,7 +170,7 @@ def _together(person: Person, finger: int, near_rad: np.ndarray) -> Float64[np.n
 def _roll(
     person: Person, finger: int, first: np.ndarray, last: np.ndarray
 ) -> Float64[np.ndarray, "time 20"]:
-    """From one pinch to another with the tips together all the way."""
+    """Transition from one pinch posture to another with the tips in contact."""
     between = _glide(first, last, _ROLL_SOLVES)[1:-1]
     solved = np.array([first, *(_together(person, finger, near) for near in between), last])
     when = np.linspace(0, _ROLL_SOLVES - 1, HELD)
@@ -180,6 +180,6 @@ def _roll(
 
 
 def _glide(first: np.ndarray, last: np.ndarray, num_samples: int) -> Float64[np.ndarray, "time 20"]:
-    """From the first posture to the last without a jerk, both ends included."""
+    """Smooth transition between two postures, both ends included."""
     t = np.linspace(0.0, 1.0, num_samples)[:, None]
     return np.asarray(first + (last - first) * t**3 * (10 - 15 * t + 6 * t**2))

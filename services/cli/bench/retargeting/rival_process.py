@@ -1,10 +1,10 @@
-"""A rival at work in a process of its own, which ends where a call takes too much processor time.
+"""Rival solver in a child process with a limit of processor time per call.
 
-A rival that never returns, as one does for a NaN, would take the whole measurement with it. Its
-process therefore sets an alarm before each call; the alarm ends the process, whatever it is in. It
-counts the time of the process, not of the clock on the wall: a busy machine ends no rival.
-Run as a module this is that process: requests come by its standard input, answers leave by its
-standard output, both as a line of JSON and, behind it, numbers as bytes.
+A rival that never returns, as one does for NaN, would block the whole measurement. Its process
+therefore sets a timer before each call, which kills the process. The timer counts processor time,
+not wall time, so a busy machine does not abort a rival. Run as a module, this is the child process:
+requests on standard input and responses on standard output are a line of JSON followed by arrays as
+bytes.
 """
 
 import json
@@ -28,14 +28,14 @@ from services.cli.bench.retargeting.ours import Timed
 from services.cli.bench.retargeting.rivals import Rival, Setup, find_rival, set_up
 from services.cli.bench.retargeting.sequences import Motion
 
-# Of processor time; the slowest call of a rival takes some hundredths of a second.
+# Limit of processor time; the slowest call of a rival takes hundredths of a second.
 CALL_LIMIT_S = 10.0
 # Rivals start in the middle of all limits and need samples to come from there; not timed or judged.
 NUM_WARM_UP = 10
 
 
 class RivalProcess(AbstractContextManager["RivalProcess"]):
-    """One rival at work in its own process, started at the first request and after a time-out."""
+    """One rival in its own process, started on the first request and after a timeout."""
 
     def __init__(self, rival: Rival) -> None:
         self.rival = rival
@@ -89,7 +89,7 @@ class RivalProcess(AbstractContextManager["RivalProcess"]):
         return self._process
 
     def _ended(self) -> LimitExceededError | UnavailableError:
-        """What the end of the process means; the next request starts another."""
+        """Error for an ended process; the next request starts another one."""
         status = self._stop()
         if status == -signal.SIGPROF:
             return LimitExceededError(
@@ -107,7 +107,7 @@ class RivalProcess(AbstractContextManager["RivalProcess"]):
             return None
         for pipe in (process.stdin, process.stdout):
             if pipe is not None:
-                # What a dead process did not read is still in the buffer.
+                # The buffer still holds what the dead process did not read.
                 try:
                     pipe.close()
                 except BrokenPipeError:
@@ -116,7 +116,7 @@ class RivalProcess(AbstractContextManager["RivalProcess"]):
 
 
 def serve(name: str, requests: IO[bytes], answers: IO[bytes]) -> None:
-    """Answer requests until there are no more; every call of the rival is under the alarm."""
+    """Process requests until the end of input, each call of the rival with the timer set."""
     rival = find_rival(name)
     with tempfile.TemporaryDirectory(prefix="dextouch-bench-") as folder:
         while line := requests.readline():
@@ -133,11 +133,11 @@ def serve(name: str, requests: IO[bytes], answers: IO[bytes]) -> None:
 
 
 def follow(setup: Setup) -> tuple[np.ndarray, dict[str, Any]]:
-    """All references through the rival, one call a sample; the first is repeated before.
+    """Run the rival on all references, one call per sample, after a warm-up on the first.
 
     Returns:
-        Joint angles [T, joints] in its own order, and the times: `cpu_s` of all calls together,
-        `call_s` each, neither with what lies between the calls.
+        Joint angles [T, joints] in its own order, and the times: `cpu_s` of all calls and `call_s`
+        of each, without the time between calls.
     """
     warm_up = setup.references[:1] * NUM_WARM_UP
     joints, calls_s, cpus_s = [], [], []
@@ -170,7 +170,7 @@ def _receive(pipe: IO[bytes], shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _main() -> None:
-    # Libraries print to the standard output, which is the answers' pipe: theirs goes elsewhere.
+    # Libraries print to standard output, which is the response pipe, so it is redirected.
     answers = os.fdopen(os.dup(sys.stdout.fileno()), "wb")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
     with answers:

@@ -1,4 +1,4 @@
-"""The name of a rival and a hand in; a retargeter of that library, set up for this hand, out.
+"""Rival retargeting libraries with their objectives, configured for our hand.
 
 dex-retargeting and its port dexi-rs know three objectives, here in the form that does best on a
 hand with five full fingers: vectors from the wrist to PIP, DIP and tip of every finger, the same
@@ -81,16 +81,16 @@ def find_rival(name: str) -> Rival:
 
 
 def missing_modules(rival: Rival) -> list[str]:
-    """What is not installed of a rival; nothing is imported."""
+    """Modules of a rival that are not installed, checked without importing."""
     return [module for module in _MODULES[rival.library] if find_spec(module) is None]
 
 
 def references(
     rival: Rival, keypoints_m: np.ndarray, scale: float
 ) -> Float64[np.ndarray, "time 15 3"]:
-    """What a rival follows: vectors or positions of every sample [T, 25, 3], metres.
+    """Reference vectors or positions for a rival from samples [T, 25, 3], metres.
 
-    Positions are scaled here; vectors by the libraries, which DexPilot's thresholds count on.
+    Positions are scaled here; vectors by the libraries, as DexPilot's thresholds require.
     """
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     wrist = keypoints[:, _WRIST_NODE, None]
@@ -105,14 +105,14 @@ def references(
 def set_up(
     rival: Rival, keypoints_m: np.ndarray, side: str, *, scale: float, folder: Path
 ) -> Setup:
-    """A fresh retargeter for the robot hand of one side, and its references.
+    """Create a retargeter for the robot hand of one side, with its references.
 
     Args:
         rival: which.
         keypoints_m: [T, 25, 3], wrist coordinates.
         side: of the hand.
-        scale: size of the robot's hand against the tracked one.
-        folder: where the URDF is written.
+        scale: size of the robot's hand relative to the tracked one.
+        folder: for the URDF.
 
     Raises:
         UnavailableError: its library is not installed.
@@ -156,5 +156,5 @@ def _config(objective: str) -> dict[str, Any]:
 
 
 def _library(name: str) -> ModuleType:
-    """By name, since the platform must not need it."""
+    """Import by name, since it is an optional dependency."""
     return importlib.import_module(name)

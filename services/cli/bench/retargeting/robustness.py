@@ -1,4 +1,4 @@
-"""Samples that a tracker loses in; what each method makes of them out."""
+"""Behaviour of retargeting methods on lost samples and nodes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -20,7 +20,7 @@ _NUM_SAMPLES, _LOST_SAMPLE = 60, 30
 
 @dataclass(frozen=True)
 class Outcome:
-    """What one method made of one fault."""
+    """Result of one method on one fault."""
 
     method: str
     fault: str
@@ -28,7 +28,7 @@ class Outcome:
 
 
 def faulty_motions(seed: int) -> dict[str, Motion]:
-    """One motion with each fault in it; what is lost is NaN, as trackers send it."""
+    """One motion per fault; lost nodes are NaN, as from trackers."""
     motion = robot_motion("right", _NUM_SAMPLES, seed, natural=True)
     node, hand = motion.keypoints_m.copy(), motion.keypoints_m.copy()
     node[_LOST_SAMPLE, NODE_INDEX["index", "tip"]] = np.nan
@@ -41,7 +41,7 @@ def faulty_motions(seed: int) -> dict[str, Motion]:
 
 
 def try_faults(seed: int, rivals: Rivals, bar: Bar) -> list[Outcome]:
-    """Every method on every fault; a call that does not come back is ended."""
+    """Run every method on every fault; a hanging call is aborted."""
     names, faults = [OURS, *rivals], faulty_motions(seed)
     whole = robot_motion("right", _NUM_SAMPLES, seed, natural=True)
     outcomes = []
@@ -54,7 +54,7 @@ def try_faults(seed: int, rivals: Rivals, bar: Bar) -> list[Outcome]:
 
 
 def table_rows(outcomes: Sequence[Outcome]) -> list[tuple[str, ...]]:
-    """One row a method, one column a fault."""
+    """One row per method, one column per fault."""
     rows: Mapping[str, list[str]] = {one.method: [] for one in outcomes}
     for one in outcomes:
         rows[one.method].append(one.text)

@@ -1,4 +1,4 @@
-"""True and found joint angles of motions in; errors of tips, joints and pinches out."""
+"""Errors of fingertips, joints and pinches of retargeted motions."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,13 +12,13 @@ from dextouch.hands.robot_hand import RobotHand
 from services.cli.bench.retargeting.pinches import PinchMotion
 from services.cli.bench.retargeting.sequences import Motion
 
-# Rivals answer in float32, which may lie beyond a limit by its rounding.
+# Rivals answer in float32, which may exceed a limit by rounding.
 LIMIT_TOLERANCE_RAD = 1e-6
 
 
 @dataclass(frozen=True)
 class RobotScore:
-    """How well known joint angles of the robot's own hand were found again, all motions as one.
+    """Errors in recovering known joint angles of the robot's own hand, pooled over motions.
 
     Tip errors are distances in the wrist frame, not relative to the knuckle.
 
@@ -38,7 +38,7 @@ class RobotScore:
 
 @dataclass(frozen=True)
 class PinchScore:
-    """How pinches of people arrive at the robot, all motions as one.
+    """Quality of people's pinches on the robot hand, pooled over motions.
 
     Attributes:
         gap_mean_mm: distance of the robot's tips where the human ones are less than 3 mm apart.
@@ -46,7 +46,7 @@ class PinchScore:
         same_angle_deg: mean difference of robot and human joint angles over all samples.
         max_step_deg: the largest turn of a joint from one sample to the next.
         num_outside: joint angles beyond the robot's limits.
-        num_pinched: tip distances that the first two are about.
+        num_pinched: number of tip distances behind the first two.
     """
 
     gap_mean_mm: float
@@ -83,7 +83,7 @@ def score_robot(motions: Sequence[Motion], answers: Sequence[np.ndarray]) -> Rob
 
 
 def score_pinches(motions: Sequence[PinchMotion], answers: Sequence[np.ndarray]) -> PinchScore:
-    """What is left of people's pinches in the answers [T, 20].
+    """Score the answers [T, 20] to motions of pinching people.
 
     Raises:
         InvalidInputError: no motion, no sample with a pinch, or answers of another length.

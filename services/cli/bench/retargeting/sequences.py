@@ -1,7 +1,7 @@
-"""Seeds in; motions of hands with known joint angles, their keypoints, and faults in them out.
+"""Synthetic hand motions with known joint angles, their keypoints, noise and dropouts.
 
-Nothing is read from files: the same seed makes the same motion. Robot motions move all 20 joints
-on their own, at once and fast, and let no finger touch another. Human ones are in `pinches`.
+Motions are generated, deterministic by seed. Robot motions move all 20 joints independently,
+simultaneously and fast, without finger contact. Human ones are in `pinches`.
 """
 
 from dataclasses import dataclass, replace
@@ -19,16 +19,16 @@ from services.cli.bench.retargeting.collisions import touching
 from services.twin.hands import TwinHand, twin_hand
 
 RATE_HZ: Final = 60.0
-# No joint of a motion is faster: the hand itself reaches about 9.6 rad/s.
+# Maximum joint speed of motions; the real hand reaches about 9.6 rad/s.
 MAX_SPEED_RAD_S: Final = 9.0
 SINE_RANGE_HZ: Final = (0.15, 1.6)
 _NUM_SINES: Final = 3
-# What hands do in use: flexion, abduction and the two outer joints of a finger, then of the thumb.
+# Usual ranges: flexion, abduction and the two outer joints of a finger, then of the thumb.
 NATURAL_FINGER_RAD: Final = ((-0.15, 1.40), (-0.25, 0.25), (0.0, 1.75), (0.0, 1.25))
 NATURAL_THUMB_RAD: Final = ((-0.40, 0.90), (-0.90, 0.35), (0.0, 1.00), (0.0, 1.20))
 # Full range stops short of the limits, so that a sample at a limit has its truth inside.
 _FULL_SHARE: Final = 0.98
-# Fingers that would touch are drawn back towards the open hand, over so many samples.
+# Number of samples over which touching fingers are opened.
 _GATE_SAMPLES: Final = 25
 _GATE_STEP: Final = 0.1
 _MAX_TRIES: Final = 12
@@ -36,12 +36,12 @@ _MAX_TRIES: Final = 12
 
 @dataclass(frozen=True)
 class Motion:
-    """A hand of known joint angles at 60 Hz, and what a tracker sees of it.
+    """A hand motion with known joint angles at 60 Hz, and its tracked keypoints.
 
     Attributes:
         side: of the hand.
         joints_rad: the truth, firmware order.
-        keypoints_m: wrist coordinates, order of `dextouch.hands.skeleton`; NaN: not seen.
+        keypoints_m: wrist coordinates, order of `dextouch.hands.skeleton`; NaN: not tracked.
         tips_m: true fingertips, thumb … little, wrist coordinates.
     """
 
@@ -55,17 +55,17 @@ class Motion:
 
 
 def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> Motion:
-    """The robot's own hand: a sum of sines of 0.15 to 1.6 Hz a joint, free of contact.
+    """Robot hand motion: a sum of sines of 0.15 to 1.6 Hz per joint, collision-free.
 
     Args:
         side: of the hand.
         num_samples: at 60 Hz, at least 2.
         seed: of rates and phases.
-        natural: within what hands do in use; otherwise the joints' whole range.
+        natural: within the usual range of hands; otherwise the joints' whole range.
 
     Raises:
         InvalidInputError: fewer than 2 samples.
-        LimitExceededError: no motion of this seed is slow enough and free of contact.
+        LimitExceededError: no motion of this seed is slow enough and collision-free.
     """
     if num_samples < 2:
         raise InvalidInputError(f"motion: got {num_samples} samples, expected at least 2")
@@ -89,7 +89,7 @@ def robot_motion(side: Side, num_samples: int, seed: int, *, natural: bool) -> M
 
 
 def motion_of(hand: TwinHand, joints_rad: np.ndarray) -> Motion:
-    """The motion of a robot hand through joint angles [T, 20]; nodes that it lacks lie still."""
+    """Motion of a robot hand with joint angles [T, 20]; nodes that it lacks are static."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     points = hand.kinematics.chain_points_m(joints)
     keypoints = np.zeros((len(joints), NUM_KEYPOINTS, 3))
@@ -102,14 +102,14 @@ def motion_of(hand: TwinHand, joints_rad: np.ndarray) -> Motion:
 
 
 def with_noise(motion: Motion, sigma_m: float, rng: Generator) -> Motion:
-    """Every coordinate of every node but the wrist off by a normal error; the truth stays."""
+    """Add Gaussian noise to all nodes except the wrist; the truth is unchanged."""
     noise = rng.normal(0.0, sigma_m, motion.keypoints_m.shape)
     noise[:, NODE_INDEX["wrist", "wrist"]] = 0.0
     return replace(motion, keypoints_m=motion.keypoints_m + noise)
 
 
 def with_dropouts(motion: Motion, share: float, rng: Generator) -> Motion:
-    """Nodes not seen (NaN) now and then, the wrist always seen; the truth stays.
+    """Randomly drop nodes (NaN), except the wrist; the truth is unchanged.
 
     Raises:
         InvalidInputError: a share outside 0 … 1.
@@ -122,7 +122,7 @@ def with_dropouts(motion: Motion, share: float, rng: Generator) -> Motion:
 
 
 def cold_postures(side: Side, num_postures: int, seed: int) -> Motion:
-    """Postures anywhere within the limits that have nothing to do with each other."""
+    """Independent random postures within the limits."""
     hand = twin_hand(side, "robot")
     low, high = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     rng = np.random.default_rng([seed, int(side == "right")])
@@ -132,7 +132,7 @@ def cold_postures(side: Side, num_postures: int, seed: int) -> Motion:
 def _waves(
     hand: TwinHand, t_s: np.ndarray, rate_hz: np.ndarray, turn: np.ndarray, *, natural: bool
 ) -> Float64[np.ndarray, "time 20"]:
-    """Joint angles that swing through their range, slow components a little more than fast."""
+    """Oscillating joint angles over their range, with larger slow components."""
     low, high = hand.kinematics.lower_rad, hand.kinematics.upper_rad
     middle, half = 0.5 * (low + high), 0.5 * (high - low) * _FULL_SHARE
     if natural:
@@ -146,7 +146,7 @@ def _waves(
 
 
 def _without_contact(hand: TwinHand, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 20"]:
-    """The same motion with fingers drawn towards the open hand as far as keeps them apart."""
+    """The motion with fingers opened as far as needed to avoid contact."""
     fingers = joints_rad.reshape(len(joints_rad), NUM_FINGERS, -1)
     share = np.ones(fingers.shape[:2])
     while True:
@@ -158,7 +158,7 @@ def _without_contact(hand: TwinHand, joints_rad: np.ndarray) -> Float64[np.ndarr
 
 
 def _smooth_below(share: np.ndarray) -> Float64[np.ndarray, "time 5"]:
-    """A smooth curve nowhere above: the mean over a window of the least over that window."""
+    """A smooth lower bound: moving average of the moving minimum."""
     width = 2 * _GATE_SAMPLES + 1
     least = _windows(share, width).min(axis=-1)
     hat = np.hanning(width + 2)[1:-1]

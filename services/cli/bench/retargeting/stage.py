@@ -1,4 +1,4 @@
-"""The stage `retargeting`: its options in, a report out."""
+"""Entry point of the benchmark stage `retargeting`."""
 
 import argparse
 from contextlib import ExitStack
@@ -38,7 +38,7 @@ _NONE = "none"
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument(
         "--rounds", type=int, help=f"of the timing ({USUAL.num_rounds}; quick {QUICK.num_rounds})"
     )
@@ -54,7 +54,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
-    """Retarget hands of known joint angles and of people who pinch with every method.
+    """Run every method on robot motions and on pinching people.
 
     Raises:
         UnknownNameError: a rival that there is not.
@@ -103,7 +103,7 @@ def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
 
 
 def notes(chosen: list[Rival], left_out: list[Rival]) -> list[str]:
-    """How methods were run, and why some were not."""
+    """Notes on how methods were run, and why some were skipped."""
     told = [
         f"{OURS_EXACT} is without its temporal term; times are with the person's profile known, "
         "errors with a profile measured from the same samples"

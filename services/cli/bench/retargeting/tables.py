@@ -1,4 +1,4 @@
-"""What the retargeting stage measured in; its tables and its chart out."""
+"""Tables and charts of the retargeting benchmark."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -26,7 +26,7 @@ def tables(
     outcomes: Sequence[Outcome],
     rivals: Sequence[str] = (),
 ) -> list[ResultTable]:
-    """All tables of the stage; a rival without a result says that it did not finish."""
+    """All tables of the stage; rivals without a result are marked as not finished."""
     return [
         *[_speed_table(speeds, motion, rivals) for motion in (ROBOT_INPUT, PINCH_INPUT)],
         *[_robot_table(robot, name, rivals) for name in robot],
@@ -78,7 +78,7 @@ def _points(speeds: Sequence[Speed], motion: str, errors: Mapping[str, float]) -
 def _unfinished(
     rivals: Sequence[str], finished: Iterable[str], num_columns: int
 ) -> list[tuple[str, ...]]:
-    """A row of that many columns for each rival without a result."""
+    """A row for each rival without a result."""
     missing = set(rivals).difference(finished)
     return [
         (name, "did not finish", *[""] * (num_columns - 2)) for name in rivals if name in missing

@@ -1,1 +1,1 @@
-"""The stage `store` of `dextouch bench`: a take in; time, bytes and errors of stores out."""
+"""Benchmark of episode storage: time, size and image error of stores on one take."""

@@ -1,4 +1,4 @@
-"""What was measured in; what the store promises, and whether it holds, out."""
+"""Requirements on the store, with measured values and verdicts."""
 
 from collections.abc import Mapping, Sequence
 
@@ -7,7 +7,7 @@ from services.cli.bench.store.appends import SPOOL, SPOOL_SYNCED, AppendResult
 from services.cli.bench.store.compare import DesignResult
 from services.cli.bench.store.live import SPEED, LiveResult
 
-# The one default configuration that all promises are about, and the rival they name.
+# The default configuration that requirements refer to, and the rival compared with.
 OURS, RIVAL = "ours-h264", "zarr-jpeg"
 
 
@@ -16,7 +16,7 @@ def requirements(
     appends: Sequence[AppendResult],
     live: Sequence[LiveResult],
 ) -> list[Requirement]:
-    """The table of promises; what was not measured in this run says so."""
+    """Build the table of requirements; some may be unmeasured in this run."""
     ours, rival = results.get(OURS), results.get(RIVAL)
     return [
         *_against_rival(ours, rival),

@@ -1,4 +1,4 @@
-"""A folder in; how long a small numeric append takes, in the middle and at worst, out."""
+"""Latency of small numeric appends to the spool, median and tail."""
 
 import os
 import time
@@ -20,9 +20,9 @@ from services.cli.bench.store.workload import Workload
 
 STREAM = "tactile_left"
 SPOOL, SPOOL_SYNCED, ZARR = "spool", "spool, on the disk", "zarr append"
-# What no log can beat: as many bytes to a file, and the wait for them.
+# Lower bound for any log: the same bytes written and synced to a file.
 DISK = "bare write and fdatasync"
-# Slow ways get fewer appends, so that all take about as long.
+# Slow methods get fewer appends, so that all take about equally long.
 _NUM_APPENDS = {SPOOL: 4000, SPOOL_SYNCED: 1000, DISK: 1000, ZARR: 300}
 
 
@@ -39,15 +39,15 @@ class AppendResult:
 def measure_appends(
     workload: Workload, folder: Path, num_rounds: int, bar: Bar, *, share: float = 1.0
 ) -> list[AppendResult]:
-    """Append glove samples one by one to the spool, with and without waiting for the disk.
+    """Append glove samples one by one to the spool, with and without sync.
 
-    Beside it the disk without any log, and an array of zarr.
+    Compared with plain file writes, and with a zarr array.
 
     Args:
-        workload: whose left glove is appended, over and over.
+        workload: source of the left glove's samples, appended repeatedly.
         folder: for the spools.
         num_rounds: at least 1.
-        bar: shows how far it is.
+        bar: opens a progress bar.
         share: of the usual number of appends.
     """
     ways: dict[str, Callable[[Workload, Path, int], np.ndarray]] = {
@@ -124,7 +124,7 @@ def _bare(workload: Workload, folder: Path, count: int) -> np.ndarray:
 
 
 def _zarr(workload: Workload, folder: Path, count: int) -> np.ndarray:
-    """The plain way: an array that grows by a row at a time, in chunks of a second."""
+    """A zarr array that grows by one row at a time, in chunks of a second."""
     import zarr
 
     values = workload.numbers[STREAM].values

@@ -1,4 +1,4 @@
-"""Designs and a take in; time, bytes and image error of each, measured in turns, out."""
+"""Time, size and image error of each storage design on one take, measured in turns."""
 
 import gc
 import os
@@ -27,7 +27,7 @@ _WARM_SECONDS = 0.6
 
 @dataclass(frozen=True)
 class Effort:
-    """How much is measured: rounds, random windows a round, spans whose images are compared."""
+    """Extent of the measurement: rounds, random windows per round, spans of compared images."""
 
     num_rounds: int
     num_windows: int
@@ -37,7 +37,7 @@ class Effort:
 
 @dataclass(frozen=True)
 class DesignResult:
-    """What one design needs and how well it keeps the images; figures hold one value a round."""
+    """Cost and image quality of one design; figures hold one value per round."""
 
     name: str
     seconds: float
@@ -65,7 +65,7 @@ class WriteCost(NamedTuple):
 
 
 class ReadCost(NamedTuple):
-    """Milliseconds of one window, of three cameras' windows in turn and in threads, of touch."""
+    """Milliseconds for one window, three cameras' windows in turn and in threads, and touch."""
 
     window_ms: float
     three_cameras_ms: float
@@ -76,17 +76,17 @@ class ReadCost(NamedTuple):
 def compare(
     designs: Sequence[Design], workload: Workload, folder: Path, effort: Effort, bar: Bar
 ) -> dict[str, DesignResult]:
-    """Write and read one take with every design, each round with all of them.
+    """Write and read one take with every design in each round.
 
     Args:
-        designs: that are not missing anything; one that reads another's files needs that other.
+        designs: available ones; one that reads another's files requires that other.
         workload: the take.
-        folder: for what is written, a folder a design.
-        effort: how much is measured.
-        bar: shows how far it is.
+        folder: for the files, with a subfolder per design.
+        effort: extent of the measurement.
+        bar: opens a progress bar.
 
     Raises:
-        CorruptDataError: a design gave other numbers than were written.
+        CorruptDataError: a design returned other values than were written.
     """
     written = _write_rounds(designs, workload, folder, effort.num_rounds, bar)
     readers = {d.name: d.open(folder / (d.reads or d.name)) for d in designs}
@@ -122,10 +122,10 @@ def compare(
 def image_psnr(
     name: str, reader: OpenStore, workload: Workload, num_spans: int
 ) -> dict[str, float]:
-    """Mean PSNR of each camera over spans spread over the take; the numbers must be exact.
+    """Mean PSNR of each camera over spans of the take; numeric values must be exact.
 
     Raises:
-        CorruptDataError: other numbers, or images of another shape, than were written.
+        CorruptDataError: other values, or images of another shape, than were written.
     """
     spans = np.linspace(0, workload.num_starts - 1, num_spans + 2).astype(int)[1:-1]
     psnr_db = {}
@@ -141,7 +141,7 @@ def image_psnr(
 
 
 def expected_window(workload: Workload, camera: str, start: int) -> StoreWindow:
-    """The window as it went in."""
+    """The original window."""
     touched = slice(2 * start, 2 * start + WINDOW_TACTILE)
     seen = slice(start, start + WINDOW_IMAGES)
     return StoreWindow(
@@ -184,7 +184,7 @@ def _write_rounds(
 
 def _write_once(design: Design, workload: Workload, folder: Path, _round_index: int) -> WriteCost:
     shutil.rmtree(folder, ignore_errors=True)
-    # What the design before left to the disk must not be charged to this one.
+    # Pending writes of the previous design must not be charged to this one.
     os.sync()
     gc.collect()
     cpu_s, wall_s = _cpu_s(), time.perf_counter()
@@ -193,7 +193,7 @@ def _write_once(design: Design, workload: Workload, folder: Path, _round_index: 
 
 
 def _cpu_s() -> float:
-    """Processor time of this process with all its threads, and of processes it waited for."""
+    """Processor time of this process with all threads, and of its finished children."""
     used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return sum(usage.ru_utime + usage.ru_stime for usage in used)
 

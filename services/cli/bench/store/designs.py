@@ -1,4 +1,4 @@
-"""What a store must do to be measured: write one take, open it, give windows of it."""
+"""Interface of storage designs under comparison: write a take, open it, read windows."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -26,8 +26,7 @@ class StoreWindow:
 class OpenStore(ABC):
     """A written take, open for reading.
 
-    `window` is called for different cameras from different threads at once, never for one camera
-    from two.
+    `window` may be called concurrently for different cameras, never for the same one.
     """
 
     @abstractmethod
@@ -35,9 +34,9 @@ class OpenStore(ABC):
         """The window that starts at image `start` of a camera; only that camera is decoded."""
 
     def windows(self, cameras: Sequence[str], start: int, *, threaded: bool) -> list[StoreWindow]:
-        """The same span of several cameras, one after the other or a thread each.
+        """The same span of several cameras, sequentially or in one thread each.
 
-        A design that has a better way of its own for this overrides it.
+        A design may override it with a faster implementation.
         """
         if not threaded:
             return [self.window(camera, start) for camera in cameras]
@@ -47,7 +46,7 @@ class OpenStore(ABC):
 
 @runtime_checkable
 class ReadsTouch(Protocol):
-    """An open store that can give the touch of a window without its images."""
+    """An open store that can read the touch of a window without images."""
 
     def touch(self, start: int) -> tuple[np.ndarray, np.ndarray]:
         """34 samples of the left and of the right hand, those of the window at image `start`."""
@@ -55,26 +54,26 @@ class ReadsTouch(Protocol):
 
 @runtime_checkable
 class Design(Protocol):
-    """One way to keep a take on disk."""
+    """A storage design."""
 
     @property
     def name(self) -> str:
-        """Short and unique; what `--designs` takes and the table shows."""
+        """Short, unique name for `--designs` and tables."""
 
     @property
     def reads(self) -> str | None:
-        """Name of the design whose files this one only reads otherwise; None: it writes its own."""
+        """Name of the design whose files this one reads; None if it writes its own."""
 
     def missing(self) -> str | None:
-        """Why this design cannot run here (a package, a codec); None when it can."""
+        """Missing dependency (package or codec); None if the design is available."""
 
     def write(self, workload: Workload, folder: Path) -> None:
         """Write the take as a station would: image by image, in the order of time.
 
         Args:
             workload: the take.
-            folder: does not exist yet; everything that is written goes below it.
+            folder: new folder for all files.
         """
 
     def open(self, folder: Path) -> OpenStore:
-        """Open what `write` left in the folder."""
+        """Open the files of `write`."""

@@ -1,4 +1,4 @@
-"""A take in; how well our store keeps up when it arrives several times as fast as in life, out."""
+"""Live recording of a station at a multiple of real time, to measure lag and drops."""
 
 import shutil
 import time
@@ -21,10 +21,10 @@ _RECORDING_ID = "live"
 
 @dataclass(frozen=True)
 class LiveResult:
-    """One paced run.
+    """Result of one paced run.
 
-    `num_late` rows were handed over more than LATE_S after they were due, `num_dropped` images
-    left out before the encoder; `finish_s` went by from the last row to the committed recording.
+    `num_late` rows were accepted more than LATE_S late, `num_dropped` images were dropped before
+    the encoder; `finish_s` is the time from the last row to the committed recording.
     """
 
     speed: float
@@ -36,7 +36,7 @@ class LiveResult:
 
     @property
     def num_untimely(self) -> int:
-        """Rows that the store did not take in time."""
+        """Number of late or dropped rows."""
         return self.num_late + self.num_dropped
 
 
@@ -44,10 +44,10 @@ def write_live(workload: Workload, folder: Path, unit: str, *, speed: float = SP
     """Write a recording of the whole station at a multiple of real time.
 
     Args:
-        workload: the take; its stamps say when each row is due.
+        workload: the take; its stamps are the due times.
         folder: of a store, emptied first.
         unit: of the cameras.
-        speed: how many times as fast as in life.
+        speed: multiple of real time.
     """
     shutil.rmtree(folder, ignore_errors=True)
     attributes = RecordingAttributes(

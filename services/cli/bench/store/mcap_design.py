@@ -1,4 +1,4 @@
-"""A take ↔ one MCAP file with JPEG payloads: what robot loggers write."""
+"""Storage design: one MCAP file with JPEG payloads, as robot loggers write."""
 
 import importlib.util
 from collections import defaultdict
@@ -24,7 +24,7 @@ _FILE = "take.mcap"
 
 @dataclass(frozen=True)
 class McapDesign:
-    """The `mcap` library as it comes: chunks of 1 MiB, zstd; a message a sample."""
+    """The `mcap` library with defaults: chunks of 1 MiB, zstd; one message per sample."""
 
     name: str = "mcap-jpeg"
     reads: str | None = None

@@ -1,4 +1,4 @@
-"""A take ↔ an episode of our own store, through its public writer and reader."""
+"""Storage design: an episode of our store, through its public writer and reader."""
 
 import importlib.util
 from collections.abc import Iterator
@@ -32,7 +32,7 @@ _NUMERIC_KINDS: dict[str, tuple[StreamKind, str]] = {
 
 @dataclass(frozen=True)
 class OurDesign:
-    """Our store with cameras of one unit, all other choices left as they come."""
+    """Our store with default options and one camera unit."""
 
     unit: Literal["jpeg", "h264"]
     reads: str | None = None
@@ -127,7 +127,7 @@ def _descriptor(name: str, stream: TimedStream, what: tuple[StreamKind, str]) ->
 
 
 def episode_attributes(streams: tuple[StreamDescriptor, ...]) -> EpisodeAttributes:
-    """An episode about nothing in particular."""
+    """Placeholder attributes of an episode."""
     still = matrix_rows(np.eye(4))
     return EpisodeAttributes(
         episode_id=EPISODE_ID,

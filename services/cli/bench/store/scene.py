@@ -1,4 +1,4 @@
-"""A seed in; what one camera of the store benchmark sees comes out, image by image."""
+"""Synthetic camera images for the store benchmark."""
 
 from dataclasses import dataclass
 
@@ -9,7 +9,7 @@ from scipy.ndimage import gaussian_filter
 from services.cli.bench.store.workload import CAMERAS, IMAGE_RATE_HZ, IMAGE_SHAPE
 
 NOISE_SIGMA_LEVELS = 2.0
-# How far the view swings: the head is nearly still, wrists are not.
+# Amplitude of the camera motion: small for the head, large for the wrists.
 SWING_PX = {"camera_head": 4.0, "camera_wrist_left": 60.0, "camera_wrist_right": 60.0}
 _BACKGROUND_PX = (1000, 1300)
 _OBJECT_PX = 160
@@ -24,7 +24,7 @@ _CUTOFF_CYCLES = 64.0
 
 @dataclass(frozen=True)
 class Scene:
-    """The still parts of what one camera sees.
+    """Static parts of a camera's view.
 
     `pairs` holds each pixel of the background beside its right neighbour, and a fourth colour
     that is never seen: rows of 32 bytes are what numpy gathers fastest. `noise` is as wide as two

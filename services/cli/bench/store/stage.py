@@ -1,4 +1,4 @@
-"""The stage `store`: its options in, a report out."""
+"""Entry point of the benchmark stage `store`."""
 
 import argparse
 from collections.abc import Mapping, Sequence
@@ -37,7 +37,7 @@ _MIN_SECONDS = 1.0
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     names = ",".join(design.name for design in DESIGNS)
     parser.add_argument(
         "--seconds", type=float, help=f"length of the take ({_USUAL['seconds']:g}; quick 2)"
@@ -56,7 +56,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     """Write and read one take with every design, then appends and the live run.
 
     Raises:
-        UnknownNameError: a design that there is not.
+        UnknownNameError: an unknown design.
         InvalidInputError: a take too short for a window, or no round or window.
     """
     plan = _plan(options)

@@ -1,4 +1,4 @@
-"""Results of the store stage in; its tables and its chart out."""
+"""Tables and charts of the store benchmark."""
 
 from collections.abc import Mapping, Sequence
 

@@ -1,4 +1,4 @@
-"""A seed and a length in; the take of a whole station, images and numbers, out."""
+"""Synthetic take of a whole station for the store benchmark."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +24,7 @@ _SHAPES = {"keypoints": (25, 3), "wrist": (7,), "head": (7,), "action": (67,)}
 def make_take(
     seconds: float, seed: int, *, on_camera: Callable[[str], None] = lambda _: None
 ) -> Workload:
-    """The streams of one take; the same for the same seed and length.
+    """Generate the streams of one take, deterministic by seed and length.
 
     Args:
         seconds: length, of whole images.

@@ -1,4 +1,4 @@
-"""What every design of the store benchmark is given: the streams of one take, each at its rate."""
+"""Workload of the store benchmark: the streams of one take, each at its rate."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -72,7 +72,7 @@ class Workload:
         )
 
     def first(self, seconds: float) -> "Workload":
-        """The first seconds of the take: what designs warm up with."""
+        """The first seconds of the take, for warm-up."""
         return Workload(
             seconds,
             {name: stream.first(seconds) for name, stream in self.images.items()},

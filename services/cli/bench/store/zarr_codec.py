@@ -1,4 +1,4 @@
-"""Images ↔ JPEG chunks in zarr-python: the codec of the rival, by simplejpeg like ours."""
+"""JPEG codec for zarr-python, used by the rival design."""
 
 import asyncio
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""A take ↔ plain zarr-python arrays with one image a chunk: the rival everybody has at hand."""
+"""Storage design: plain zarr-python arrays with one image per chunk."""
 
 import importlib.util
 from dataclasses import dataclass

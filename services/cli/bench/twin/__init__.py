@@ -1,1 +1,1 @@
-"""The stage `twin`: time of a chunk by what is asked to be seen and by the solver of physics."""
+"""Benchmark of the twin: time per chunk by requested images and by physics solver."""

@@ -1,4 +1,4 @@
-"""Processor time of the twin's chunks by the cameras and steps that are asked for."""
+"""Processor time of the twin's chunks by requested cameras and steps."""
 
 import time
 from collections.abc import Callable

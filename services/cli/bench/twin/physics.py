@@ -1,4 +1,4 @@
-"""The twin's contacts under coarser solvers of MuJoCo, against the solver as it is served."""
+"""Contact errors of the twin under coarser MuJoCo solvers, relative to the default solver."""
 
 import time
 from collections.abc import Sequence

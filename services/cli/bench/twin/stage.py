@@ -1,4 +1,4 @@
-"""The stage `twin`: its options in, a report out."""
+"""Entry point of the benchmark stage `twin`."""
 
 import argparse
 from collections.abc import Mapping
@@ -37,7 +37,7 @@ QUICK: Final = {"rounds": 3, "seeds": 1, "solver_rounds": 1}
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument("--task", default="stand_bottle", choices=TASK_NAMES, help="(%(default)s)")
     parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 3)")
 

@@ -1,1 +1,1 @@
-"""The stage `world-model`: the time of an imagined chunk against its error in the twin's eyes."""
+"""Benchmark of the world model: time per imagined chunk and error against the twin."""

@@ -1,4 +1,4 @@
-"""Held-out demonstrations of the twin, made on the fly: what an imagined world is held against."""
+"""Held-out demonstrations of the twin, generated on the fly as ground truth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Imagined rollouts of held-out demonstrations: their processor time and how far off they are."""
+"""Imagined rollouts of held-out demonstrations: processor time and errors."""
 
 import time
 from collections.abc import Sequence

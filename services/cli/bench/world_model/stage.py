@@ -1,4 +1,4 @@
-"""The stage `world-model`: its options in, a report out."""
+"""Entry point of the benchmark stage `world-model`."""
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
@@ -53,7 +53,7 @@ TOGETHER: Final = (1, 4, 8)
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """The options of this stage."""
+    """Add the options of this stage."""
     parser.add_argument(
         "--checkpoint", type=Path, help="of the paper's form (default: the package's own)"
     )

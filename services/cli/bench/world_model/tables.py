@@ -1,4 +1,4 @@
-"""What the world-model stage measured in; its tables, charts and verdicts out."""
+"""Tables, charts and requirements of the world-model benchmark."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Final
