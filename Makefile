@@ -4,7 +4,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
-STAGE ?= store loader acquisition clocks calibration retargeting twin world-model evaluator
+STAGE ?= store loader acquisition clocks calibration retargeting closure twin world-model evaluator
 MADE := runs/reproduce
 export OMP_NUM_THREADS ?= 1
 

@@ -112,6 +112,15 @@ STAGES = {
         "tracker loses; ends with what retargeting promises and whether it holds. Rivals are an "
         "extra: pip install -c constraints.txt '.[bench]'.",
     ),
+    "closure": StageEntry(
+        "services.cli.bench.closure.stage",
+        "play human takes of the twin again with its robot hand",
+        "Records scripted human takes of the twin, retargets them, and plays them with the robot "
+        "hand where the human found the objects: with the wrist copied, moved by one offset or by "
+        "touch, with fingertips led to the human's, and with commands that press as hard as the "
+        "human did. Reports success, and how early or late contacts begin and end "
+        "(docs/twin_closure.md).",
+    ),
     "twin": StageEntry(
         "services.cli.bench.twin.stage",
         "step the twin by cameras and steps asked, and with coarser solvers",

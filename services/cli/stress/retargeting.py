@@ -7,7 +7,7 @@ import numpy as np
 from dextouch.errors import InvalidInputError
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetStatus
-from services.alignment.retargeting.touch_anchor import touch_shares
+from services.cli.bench.closure.touch_anchor import touch_shares
 from services.cli.bench.retargeting.fuzz import fuzzed
 from services.cli.bench.retargeting.sequences import Motion, motion_of, robot_motion
 from services.cli.stress.cells import Check, StageCells

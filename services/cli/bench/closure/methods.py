@@ -12,25 +12,25 @@ from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import SIDES, Side
 from dextouch.tactile.pad_forces import pad_forces_n
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.touch_anchor import anchored_joints, touch_shares
-from services.alignment.retargeting.touch_commands import (
-    HandCommands,
-    HandServos,
-    commands_from_touch,
-)
-from services.alignment.retargeting.wrist_transfer import (
-    MatchedPoints,
-    constant_offset_m,
-    matched_points,
-    shifted_wrist,
-    touch_offsets_m,
-)
 from services.alignment.synchronization.resampling import (
     GridPlacement,
     grid_times_ns,
     place_on_grid,
     poses_on_grid,
     vectors_on_grid,
+)
+from services.cli.bench.closure.touch_anchor import anchored_joints, touch_shares
+from services.cli.bench.closure.touch_commands import (
+    HandCommands,
+    HandServos,
+    commands_from_touch,
+)
+from services.cli.bench.closure.wrist_transfer import (
+    MatchedPoints,
+    constant_offset_m,
+    matched_points,
+    shifted_wrist,
+    touch_offsets_m,
 )
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.episodes import TruthEpisode

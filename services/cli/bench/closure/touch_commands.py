@@ -24,8 +24,8 @@ from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.geometry.transforms import transform
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from services.alignment.retargeting.touch_anchor import fingertip_jacobians
-from services.alignment.retargeting.wrist_transfer import NUM_PADS, robot_places_m
+from services.cli.bench.closure.touch_anchor import fingertip_jacobians
+from services.cli.bench.closure.wrist_transfer import NUM_PADS, robot_places_m
 
 # Turning is weighed against pushing with a lever of about half a grasp.
 _LEVER_M: Final = 0.05

@@ -11,7 +11,7 @@ from dextouch.geometry.transforms import apply, transform
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.hands.skeleton import NODE_INDEX
 from services.alignment.retargeting import HandRetargeter
-from services.alignment.retargeting.wrist_transfer import (
+from services.cli.bench.closure.wrist_transfer import (
     MatchedPoints,
     WristTransferOptions,
     constant_offset_m,

@@ -15,7 +15,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
-from services.alignment.retargeting.wrist_transfer import MatchedPoints
+from services.cli.bench.closure.wrist_transfer import MatchedPoints
 
 # Half a grasp converges to micrometres in a handful of steps; unreachable places take a few more.
 _ITERATIONS: Final = 15
