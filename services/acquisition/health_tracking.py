@@ -8,7 +8,7 @@ import numpy as np
 
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import TrackingEvents
+from services.acquisition.drivers.tracking import TrackingEvents
 from services.acquisition.health_blocks import Block, Rolling
 from services.acquisition.health_levels import Verdict, above
 from services.acquisition.schemas import Code

@@ -8,7 +8,9 @@ from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.camera.driver import CameraDecoder, CameraDriver
 from services.acquisition.devices.camera.mock import CameraSource
+from services.acquisition.devices.finger_tracker.mock import mock_finger_tracker
 from services.acquisition.devices.mocking import mock_of
+from services.acquisition.devices.pose_tracker.mock import mock_pose_tracker
 from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES, RobotStateDecoder
 from services.acquisition.devices.station_camera.mock import video_camera
@@ -24,11 +26,7 @@ from services.acquisition.mocks.replay import (
     ReplayStream,
     device_rng,
 )
-from services.acquisition.mocks.tracker_devices import (
-    TrackerPlace,
-    mock_finger_tracker,
-    mock_pose_tracker,
-)
+from services.acquisition.mocks.tracker_place import TrackerPlace
 
 LATENCY_SIGMA_MS = 0.2
 WRISTS = ("wrist_left", "wrist_right")

@@ -20,8 +20,8 @@ from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.counters import DeviceCounters
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_quality import ImageQuality
-from services.acquisition.drivers.pose_tracker import TrackingEvents
 from services.acquisition.drivers.reports import OrderFilter
+from services.acquisition.drivers.tracking import TrackingEvents
 
 logger = structlog.get_logger(__name__)
 

@@ -15,17 +15,16 @@ import pytest
 from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import VirtualClock
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
+from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_tracker import (
-    BridgeDriver,
-    BridgeFingerTrackerDecoder,
-    BridgePoseTrackerDecoder,
-)
+from services.acquisition.drivers.bridge_driver import BridgeDriver
 from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.bridge_server import BridgePort
-from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream

@@ -6,14 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from services.acquisition.devices.finger_tracker.driver import DESCRIPTOR_REPORT
+from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES
-from services.acquisition.drivers.finger_tracker import DESCRIPTOR_REPORT
 from services.acquisition.health import TICK_NS, HealthMonitor
 from services.acquisition.live import LiveView
 from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.mocks.finger_tracker import FingerTrackerSource
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.supervisor import DeviceSupervisor
 

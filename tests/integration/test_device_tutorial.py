@@ -7,9 +7,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from dextouch.episodes.spool_reader import SpoolReader
+from services.acquisition.mocks.pattern import pattern_streams
+from services.alignment.calibration.tactile_baseline import TactileCalibration
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs/tutorials/add_a_device.md").read_text(encoding="utf-8")
@@ -87,6 +90,13 @@ def test_a_take_is_recorded_and_the_dead_cell_is_found(lab):
     assert others.min() == 200
     assert 1000 < others.max() <= 4095
     assert "taxels_dead" in {entry.event for entry in spool.attributes.ledger}
+    # What the take knows of the glove makes pressures of its counts, in the hand's own order.
+    glove = TactileCalibration.from_record(spool.attributes.calibration, "left", num_cells=64)
+    (truth,) = (s for s in pattern_streams(4.0) if s.descriptor.name == "tactile_left")
+    palm_kpa = truth.values[:, 80:].reshape(-1, 15, 16)[0, ::2, ::2]
+    found_kpa = glove.to_kpa(counts)[0, 80:].reshape(15, 16)[::2, ::2]
+    alive = np.arange(64).reshape(8, 8) != 30
+    np.testing.assert_allclose(found_kpa[alive], palm_kpa[alive], atol=0.5 / 60 + 1e-6)
 
 
 def test_stations_take_its_settings_and_import_no_mock(lab):

@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import PacketError
 from services.acquisition.drivers.bridge_protocol import FrameConvention
-from services.acquisition.drivers.pose_tracker import NORM_TOLERANCE, are_finite
+from services.acquisition.drivers.tracking import NORM_TOLERANCE, are_finite
 
 Rows = Sequence[Sequence[float]]
 

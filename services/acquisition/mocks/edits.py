@@ -10,8 +10,6 @@ from typing import Literal
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.bridge_tracker import POSE_MAGIC as BRIDGE_POSE_MAGIC
-from services.acquisition.drivers.finger_tracker import MAGIC as FINGER_MAGIC
 from services.acquisition.drivers.packets import (
     CRC,
     HEADER,
@@ -29,11 +27,12 @@ from services.acquisition.drivers.reports import (
 )
 
 OUR_MAGIC = b"DX"
+FINGER_MAGIC = b"DXFT"
 # Where the numbers of a payload begin, and what they are.
 FLOATS = {
     FINGER_MAGIC: (4, "<f4"),
     b"DXPT": (4, "<f4"),
-    BRIDGE_POSE_MAGIC: (16, "<f4"),
+    b"DXPM": (16, "<f4"),
     b"DXRS": (0, "<f8"),
 }
 OTHER_SIDE = {SOURCES["left"]: SOURCES["right"], SOURCES["right"]: SOURCES["left"]}

@@ -13,7 +13,7 @@ import pytest
 from dextouch.errors import DeviceError, StaleDataError
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.mocks.bridge_process import pattern_source
+from services.acquisition.mock_bridge import pattern_source
 from services.acquisition.mocks.bridge_server import BridgeServer
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.settings import AcquisitionSettings
@@ -68,7 +68,7 @@ def server(kind):
 
 def test_a_bridge_without_samples_still_lives(kind, server, monkeypatch):
     # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
-    monkeypatch.setattr("services.acquisition.drivers.bridge_tracker.SILENCE_NS", 10**9)
+    monkeypatch.setattr("services.acquisition.drivers.bridge_driver.SILENCE_NS", 10**9)
     driver = driver_of(kind, server.port)
     driver.open()
     end_s = time.monotonic() + 1.2
@@ -102,7 +102,7 @@ def test_a_bridge_that_ends_is_lost(kind, server):
 
 @contextmanager
 def bridge_process(kind, *options):
-    command = [sys.executable, "-m", "services.acquisition.mocks.bridge_process", kind]
+    command = [sys.executable, "-m", "services.acquisition.mock_bridge", kind]
     with subprocess.Popen(
         [*command, DEVICES[kind][0], *options], stdout=subprocess.PIPE, text=True
     ) as process:

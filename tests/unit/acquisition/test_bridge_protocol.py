@@ -14,6 +14,7 @@ from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
 from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.drivers.bridge_protocol import (
     MAX_HELLO_BYTES,
     BridgeConnection,
@@ -22,7 +23,6 @@ from services.acquisition.drivers.bridge_protocol import (
     parse_hello,
 )
 from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder, encode_packet
-from services.acquisition.mocks.bridge_sources import BridgePoseSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
 

@@ -13,14 +13,21 @@ from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_
 from dextouch.geometry.transforms import pose_from_transform
 from dextouch.hands.skeleton import NODES
 from services.acquisition.clock import VirtualClock
-from services.acquisition.drivers.bridge_protocol import FrameConvention
-from services.acquisition.drivers.bridge_tracker import (
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
+from services.acquisition.devices.pose_tracker.bridge import (
     POSE_PAYLOAD,
-    BridgeDriver,
-    BridgeFingerTrackerDecoder,
     BridgePoseTrackerDecoder,
     TrackingResult,
 )
+from services.acquisition.devices.pose_tracker.mock import (
+    POSE_INDEX,
+    BridgePoseSource,
+    Jump,
+    Occlusion,
+)
+from services.acquisition.drivers.bridge_driver import BridgeDriver
+from services.acquisition.drivers.bridge_protocol import FrameConvention
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.sender_frame import (
     SenderFrame,
@@ -30,16 +37,12 @@ from services.acquisition.drivers.sender_frame import (
 from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.bridge_sources import (
     LEFT_HANDED,
-    POSE_INDEX,
     Y_UP,
-    BridgeFingerTrackerSource,
-    BridgePoseSource,
     hello_line,
     sign_of_life,
 )
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.pose_tracker import Jump, Occlusion
 
 MS = 1_000_000
 BOOT_NS = 7_000_000_000_000
@@ -376,7 +379,7 @@ def test_samples_that_come_with_the_hello_are_not_lost(stage):
 
 
 def test_a_bridge_without_a_hello_is_refused(stage, monkeypatch):
-    monkeypatch.setattr("services.acquisition.drivers.bridge_tracker.HELLO_READS", 2)
+    monkeypatch.setattr("services.acquisition.drivers.bridge_driver.HELLO_READS", 2)
     stage.port._hello = lambda: b"{"
     with pytest.raises(DeviceError, match="no hello"):
         stage.driver.open()

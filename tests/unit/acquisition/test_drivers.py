@@ -6,10 +6,7 @@ from dextouch.hands.skeleton import NODES
 from dextouch.images.jpeg import decode_jpeg, encode_jpeg
 from services.acquisition.devices.camera.driver import ENCODING_CODES, PAYLOAD_HEADER, CameraDecoder
 from services.acquisition.devices.camera.driver import MAGIC as CAMERA_MAGIC
-from services.acquisition.devices.robot_state.packets import MAGIC as ROBOT_MAGIC
-from services.acquisition.devices.robot_state.packets import PAYLOAD as ROBOT_PAYLOAD
-from services.acquisition.devices.robot_state.packets import RobotStateDecoder
-from services.acquisition.drivers.finger_tracker import (
+from services.acquisition.devices.finger_tracker.driver import (
     CHAIN_IDS,
     DESCRIPTOR_MAGIC,
     JOINT_IDS,
@@ -17,16 +14,20 @@ from services.acquisition.drivers.finger_tracker import (
     FingerTrackerDecoder,
     parse_node_order,
 )
-from services.acquisition.drivers.finger_tracker import MAGIC as FINGER_MAGIC
+from services.acquisition.devices.finger_tracker.driver import MAGIC as FINGER_MAGIC
+from services.acquisition.devices.pose_tracker.packets import MAGIC as POSE_MAGIC
+from services.acquisition.devices.pose_tracker.packets import PAYLOAD as POSE_PAYLOAD
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
+from services.acquisition.devices.robot_state.packets import MAGIC as ROBOT_MAGIC
+from services.acquisition.devices.robot_state.packets import PAYLOAD as ROBOT_PAYLOAD
+from services.acquisition.devices.robot_state.packets import RobotStateDecoder
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
-from services.acquisition.drivers.pose_tracker import MAGIC as POSE_MAGIC
-from services.acquisition.drivers.pose_tracker import PAYLOAD as POSE_PAYLOAD
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, TrackingState
 from services.acquisition.drivers.reports import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
+from services.acquisition.drivers.tracking import TrackingState
 
 POSE = (1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0)
 

@@ -7,12 +7,12 @@ import pytest
 
 from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.devices.camera.mock import CameraSource
+from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
+from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource
 from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.finger_tracker import FingerTrackerSource
-from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import ReplayStream
 
 FLAT = GloveCalibration(np.full(360, 120.0), np.full(360, 40.0))

@@ -8,9 +8,9 @@ from prometheus_client import CollectorRegistry, generate_latest
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.camera.driver import camera_descriptor
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.health import HealthMonitor
 from services.acquisition.health_advice import ADVICE
 from services.acquisition.health_levels import Board, Hysteresis

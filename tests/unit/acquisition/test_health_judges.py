@@ -10,9 +10,10 @@ from dextouch.streams.samples import Sample
 from dextouch.tactile.layout import expand_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.counters import StreamCounters
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove.packets import glove_descriptor
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, pose_descriptor
+from services.acquisition.drivers.tracking import pose_descriptor
 from services.acquisition.health_blocks import SampleBlocks
 from services.acquisition.health_camera import CameraJudge
 from services.acquisition.health_taxels import (

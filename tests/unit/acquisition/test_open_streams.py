@@ -9,8 +9,8 @@ from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import CellLayout, DecoderStatistics, Driver, build_drivers
+from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.pose_tracker import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.live import LiveView
 from services.acquisition.settings import AcquisitionSettings

@@ -7,15 +7,15 @@ import pytest
 
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.streams.descriptors import StreamDescriptor
-from services.acquisition.drivers.pose_tracker import (
+from services.acquisition.devices.pose_tracker.mock import Jump, Occlusion, PoseTrackerSource
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
+from services.acquisition.drivers.tracking import (
     MAX_EVENTS,
     PoseGate,
-    PoseTrackerDecoder,
     TrackingEvents,
     TrackingState,
 )
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
-from services.acquisition.mocks.pose_tracker import Jump, Occlusion, PoseTrackerSource
 from services.acquisition.mocks.replay import ReplayStream
 
 PERIOD_NS = 10_000_000

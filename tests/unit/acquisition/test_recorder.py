@@ -10,9 +10,9 @@ from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError
 from dextouch.streams.samples import Sample
 from services.acquisition.clock import VirtualClock
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.schemas import SaveTake, TakePrompt

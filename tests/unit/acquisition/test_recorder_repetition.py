@@ -6,8 +6,8 @@ import pytest
 
 from dextouch.errors import ConflictError
 from services.acquisition.clock import VirtualClock
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.schemas import SaveTake, TakePrompt

@@ -14,8 +14,8 @@ from dextouch.errors import InvalidInputError, StorageFullError
 from dextouch.streams.samples import Sample
 from services.acquisition import supervisor
 from services.acquisition.clock import RealClock, VirtualClock
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder
 from services.acquisition.schemas import SaveTake, TakePrompt

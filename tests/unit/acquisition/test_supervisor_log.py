@@ -3,8 +3,8 @@
 from structlog.testing import capture_logs
 
 from dextouch.errors import DeviceError
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import DeviceSupervisor
 

@@ -8,17 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError
-from services.acquisition.drivers.bridge_tracker import (
-    BridgeFingerTrackerDecoder,
-    BridgePoseTrackerDecoder,
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import FingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.mock import (
+    BridgeFingerTrackerSource,
+    FingerTrackerSource,
 )
-from services.acquisition.drivers.finger_tracker import FingerTrackerDecoder
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
-from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
+from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.finger_tracker import FingerTrackerSource
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 
 NUM_SENT = 6
 STREAMS = {stream.descriptor.name: stream for stream in pattern_streams(1.0)}

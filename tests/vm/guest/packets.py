@@ -3,8 +3,9 @@
 import numpy as np
 
 from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS
+from services.acquisition.devices.finger_tracker import driver as finger_tracker
+from services.acquisition.devices.pose_tracker import packets as pose_tracker
 from services.acquisition.devices.tactile_glove import packets as tactile_glove
-from services.acquisition.drivers import finger_tracker, pose_tracker
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import (
     DATA_REPORT,

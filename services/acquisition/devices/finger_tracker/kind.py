@@ -1,12 +1,13 @@
 """The kind `finger_tracker`."""
 
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import FingerTracker
 from services.acquisition.devices.finger_tracker.settings import FingerTrackerSettings
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.tracker_links import bridge_transport, report_transport
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_tracker import BridgeDriver, BridgeFingerTrackerDecoder
-from services.acquisition.drivers.finger_tracker import FingerTracker
+from services.acquisition.drivers.bridge_driver import BridgeDriver
 
 
 def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:

@@ -2,11 +2,12 @@
 
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind
+from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.pose_tracker.settings import PoseTrackerSettings
 from services.acquisition.devices.tracker_links import bridge_transport, report_transport
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_tracker import BridgeDriver, BridgePoseTrackerDecoder
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder
+from services.acquisition.drivers.bridge_driver import BridgeDriver
 
 
 def build(settings: PoseTrackerSettings, clock: StationClock) -> Driver:

@@ -15,7 +15,19 @@ from services.acquisition.devices.camera.driver import (
     camera_descriptor,
 )
 from services.acquisition.devices.camera.mock import CameraSource
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import (
+    FingerTrackerDecoder,
+    keypoints_descriptor,
+)
+from services.acquisition.devices.finger_tracker.mock import (
+    BridgeFingerTrackerSource,
+    FingerTrackerSource,
+)
 from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.devices.robot_state.packets import (
     STREAM_SIZES,
@@ -25,17 +37,9 @@ from services.acquisition.devices.robot_state.packets import (
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.drivers.base import Decoder
-from services.acquisition.drivers.bridge_tracker import (
-    BridgeFingerTrackerDecoder,
-    BridgePoseTrackerDecoder,
-)
-from services.acquisition.drivers.finger_tracker import FingerTrackerDecoder, keypoints_descriptor
-from services.acquisition.drivers.pose_tracker import PoseTrackerDecoder, pose_descriptor
 from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
-from services.acquisition.mocks.bridge_sources import BridgeFingerTrackerSource, BridgePoseSource
+from services.acquisition.drivers.tracking import pose_descriptor
 from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.finger_tracker import FingerTrackerSource
-from services.acquisition.mocks.pose_tracker import PoseTrackerSource
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
 from services.acquisition.transports.socket import READ_BYTES
 from services.cli.bench.acquisition.families import FULL_SCALE, NUM_VALUES, make_families

@@ -1,4 +1,4 @@
-"""Finger tracker over HID: reports come in, 25 keypoints a sample (m, wrist frame) go out."""
+"""Driver of a finger tracker by HID or USB: 25 keypoints of one hand in its wrist frame, in m."""
 
 import struct
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Poses of one tracked body come in; a pose tracker's HID reports, one a pose, go out."""
+"""A simulated pose tracker by HID, USB or a bridge, with occlusions, jumps and noise."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,13 +11,43 @@ from dextouch.geometry.rotations import (
     rotation_from_quaternion,
     rotation_from_vector,
 )
+from services.acquisition.devices.pose_tracker.bridge import (
+    POSE_MAGIC,
+    POSE_PAYLOAD,
+    BridgePoseTrackerDecoder,
+    TrackingResult,
+)
+from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder
+from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.bridge_protocol import (
+    PROTOCOL,
+    PROTOCOL_VERSION,
+    BridgedDevice,
+    BridgeHello,
+    FrameConvention,
+)
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.pose_tracker import MAGIC, PAYLOAD, TrackingState
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
+from services.acquisition.drivers.tracking import TrackingState, source_of
+from services.acquisition.mocks.bridge_sources import (
+    SOFTWARE,
+    Y_UP,
+    hello_line,
+)
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.mocks.replay import ReplayStream
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
 
+POSE_INDEX = 3
+RESULTS = {
+    TrackingState.UNINITIALIZED: TrackingResult.UNINITIALIZED,
+    TrackingState.CALIBRATING: TrackingResult.CALIBRATING_IN_PROGRESS,
+    TrackingState.OUT_OF_RANGE: TrackingResult.CALIBRATING_OUT_OF_RANGE,
+    TrackingState.FALLBACK_ROTATION_ONLY: TrackingResult.FALLBACK_ROTATION_ONLY,
+    TrackingState.RUNNING_OK: TrackingResult.RUNNING_OK,
+}
 DRIFT_M_PER_S = 0.5
 # Further than a body moves between two samples of any tracker.
 JUMP_M = (1.0, 0.0, 0.0)
@@ -144,3 +174,91 @@ def add_pose_noise(
     R = rotation_from_quaternion(noisy[:, 3:]) @ rotation_from_vector(turns_rad)
     noisy[:, 3:] = quaternion_from_rotation(R)
     return noisy
+
+
+class BridgePoseSource:
+    """An OpenVR-like source of one tracker: y up, matrices, and a flag that stays set when lost.
+
+    Args:
+        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
+        faults: position and rotation noise, per axis; occlusions and jumps.
+        rng: of the noise.
+        tracking: occlusions and jumps.
+        frame: the source's coordinates.
+    """
+
+    magic = POSE_MAGIC
+
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        faults: DeviceFaults,
+        rng: np.random.Generator,
+        tracking: Sequence[TrackingFault] = (),
+        frame: FrameConvention = Y_UP,
+    ) -> None:
+        source = source_of(stream.descriptor.name)
+        self._source = SOURCES[source]
+        self.tracked = TrackedPoses(stream, faults=faults, rng=rng, tracking=tracking)
+        self._matrices = _matrices(self.tracked.poses, frame.ours_from_theirs().T)
+        device = {"index": POSE_INDEX, "serial_number": f"LHR-{source}", "source": source}
+        self._hello = BridgeHello(
+            protocol=PROTOCOL,
+            version=PROTOCOL_VERSION,
+            kind="pose_tracker",
+            software=SOFTWARE,
+            devices=(BridgedDevice.model_validate(device),),
+            frame=frame,
+            length_unit="m",
+        )
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each sample is taken."""
+        return self.tracked.t_ns
+
+    def hello(self) -> bytes:
+        """Who is there."""
+        return hello_line(self._hello)
+
+    def fate(self, index: int) -> Fate:
+        """Whether this pose is occluded or jumps."""
+        return self.tracked.fate(index)
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet; its pose is flagged valid whatever the result says."""
+        result = RESULTS[TrackingState(int(self.tracked.states[index]))]
+        numbers = self._matrices[index].ravel()
+        payload = POSE_PAYLOAD.pack(POSE_INDEX, 1, result, t_device_ns / 1e9, *numbers)
+        packet = Packet(VERSION, self._source, sequence, t_device_ns, payload)
+        return [encode_packet(POSE_MAGIC, packet)]
+
+
+def _matrices(
+    poses: np.ndarray, theirs_from_ours: Float64[np.ndarray, "3 3"]
+) -> Float64[np.ndarray, "n 3 4"]:
+    R = theirs_from_ours @ rotation_from_quaternion(poses[:, 3:]) @ theirs_from_ours.T
+    t = poses[:, :3] @ theirs_from_ours.T
+    return np.concatenate([R, t[:, :, None]], axis=2)
+
+
+def mock_pose_tracker(stream: ReplayStream, place: TrackerPlace) -> MockPair:
+    """A pose tracker.
+
+    Args:
+        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
+        place: link, faults, seed and clock.
+    """
+    where = stream.descriptor.name
+    name, faults = f"pose_tracker_{where}", place.faults
+    rng = device_rng(place.seed, f"noise_{name}")
+    if place.link == "bridge":
+        bridge = BridgePoseSource(stream, faults=faults, rng=rng)
+        return bridged_pair(name, bridge, BridgePoseTrackerDecoder(where), place)
+    source = PoseTrackerSource(stream, faults=faults, rng=rng)
+    port = REPORT_PORTS[place.link](name)
+    decoder = PoseTrackerDecoder(where)
+    driver = Driver(name, transport=port.transport, decoder=decoder, clock=place.clock)
+    device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)
+    return MockPair(device, driver)

@@ -1,4 +1,4 @@
-"""`python -m services.acquisition.mocks.bridge_process KIND PLACE`: a mock SDK process.
+"""`python -m services.acquisition.mock_bridge KIND PLACE`: a mock SDK process.
 
 It plays the made-up pattern of one hand or tracker over a bridge until it is ended, and writes one
 line of JSON with its port to the standard output once it listens.
@@ -12,12 +12,10 @@ import numpy as np
 
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import RealClock
+from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
+from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.mocks.bridge_server import BridgeServer
-from services.acquisition.mocks.bridge_sources import (
-    BridgeFingerTrackerSource,
-    BridgePoseSource,
-    BridgeSource,
-)
+from services.acquisition.mocks.bridge_sources import BridgeSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 

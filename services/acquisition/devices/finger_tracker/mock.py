@@ -1,0 +1,199 @@
+"""A simulated finger tracker, which has an order of nodes of its own, by HID, USB or a bridge."""
+
+import numpy as np
+from jaxtyping import Int64
+
+from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS, chain_indices
+from dextouch.tactile.layout import Side
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import (
+    ALL_SEEN,
+    CHAIN_IDS,
+    DESCRIPTOR_MAGIC,
+    JOINT_IDS,
+    MAGIC,
+    VALIDITY,
+    FingerTracker,
+)
+from services.acquisition.drivers.bridge_protocol import (
+    PROTOCOL,
+    PROTOCOL_VERSION,
+    BridgedDevice,
+    BridgeHello,
+    FrameConvention,
+)
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.drivers.reports import (
+    DATA_REPORT,
+    DESCRIPTOR_REPORT,
+    split_into_reports,
+)
+from services.acquisition.mocks.bridge_sources import (
+    LEFT_HANDED,
+    SOFTWARE,
+    hello_line,
+)
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.ledger import Fate
+from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
+
+# What an occluded tracker does not see.
+_HIDDEN = chain_indices("thumb")
+
+
+class FingerTrackerSource:
+    """Reports of one finger tracker.
+
+    Args:
+        stream: [n, 25, 3] in m, wrist frame.
+        side: which hand.
+        noise_m: standard deviation of each coordinate.
+        rng: of the noise and of the device's node order.
+        faults: when the thumb is not seen.
+    """
+
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        side: Side,
+        noise_m: float,
+        rng: np.random.Generator,
+        faults: DeviceFaults | None = None,
+    ) -> None:
+        self._stream = stream
+        self._side = side
+        self._order = rng.permutation(NUM_KEYPOINTS)
+        self._seen = seen_nodes(stream.t_ns, self._order, faults or DeviceFaults())
+        noise = noise_m * rng.standard_normal(stream.values.shape)
+        self._points = (stream.values + noise)[:, self._order].astype("<f4")
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each sample is taken."""
+        return self._stream.t_ns
+
+    def fate(self, index: int) -> Fate:
+        """Whether all nodes are seen."""
+        return Fate.SENT if self._seen[index] == ALL_SEEN else Fate.MARKED
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet, split into reports."""
+        payload = VALIDITY.pack(int(self._seen[index])) + self._points[index].tobytes()
+        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
+        return split_into_reports(DATA_REPORT, sequence, encode_packet(MAGIC, packet))
+
+    def answer(self, report: bytes) -> list[bytes]:
+        """What the device says to the host's report: its nodes, when asked for them."""
+        if report[:1] != bytes([DESCRIPTOR_REPORT]):
+            return []
+        payload = bytes(
+            number
+            for node in self._order
+            for number in (CHAIN_IDS[NODES[node][0]], JOINT_IDS[NODES[node][1]])
+        )
+        packet = Packet(VERSION, SOURCES[self._side], 0, 0, payload)
+        return split_into_reports(DESCRIPTOR_REPORT, 0, encode_packet(DESCRIPTOR_MAGIC, packet))
+
+
+def seen_nodes(
+    t_ns: np.ndarray, order: np.ndarray, faults: DeviceFaults
+) -> Int64[np.ndarray, " n"]:
+    """For each sample one bit a node, in the device's order: whether the device sees it.
+
+    Args:
+        t_ns: of the samples, from the start of the stream.
+        order: our index of each of the device's nodes.
+        faults: when the thumb is hidden.
+    """
+    hidden = sum(1 << int(place) for place in np.flatnonzero(np.isin(order, _HIDDEN)))
+    seen = np.full(len(t_ns), ALL_SEEN, dtype=np.int64)
+    for start_s, stop_s in faults.occluded_s:
+        seen[(t_ns >= start_s * 1e9) & (t_ns < stop_s * 1e9)] &= ~hidden
+    return seen
+
+
+class BridgeFingerTrackerSource:
+    """A finger tracker's SDK: left-handed, in centimetres, nodes in its own order.
+
+    Args:
+        stream: [n, 25, 3] in m, wrist frame.
+        side: which hand.
+        rng: of the order of the nodes and of the noise.
+        frame: the SDK's coordinates.
+        faults: position noise, and when the thumb is not seen.
+    """
+
+    magic = MAGIC
+
+    def __init__(
+        self,
+        stream: ReplayStream,
+        *,
+        side: Side,
+        rng: np.random.Generator,
+        frame: FrameConvention = LEFT_HANDED,
+        faults: DeviceFaults | None = None,
+    ) -> None:
+        faults = faults or DeviceFaults()
+        self._stream = stream
+        self._side = side
+        self._order = rng.permutation(NUM_KEYPOINTS)
+        theirs_from_ours = frame.ours_from_theirs().T
+        self._seen = seen_nodes(stream.t_ns, self._order, faults)
+        noise_m = faults.position_noise_m * rng.standard_normal(stream.values.shape)
+        points_cm = 100.0 * (stream.values + noise_m)[:, self._order] @ theirs_from_ours.T
+        self._points = points_cm.astype("<f4")
+        self._hello = BridgeHello(
+            protocol=PROTOCOL,
+            version=PROTOCOL_VERSION,
+            kind="finger_tracker",
+            software=SOFTWARE,
+            devices=(BridgedDevice(index=0, serial_number=f"MF-{side}", source=side),),
+            frame=frame,
+            length_unit="cm",
+            nodes=tuple(NODES[node] for node in self._order),
+        )
+
+    @property
+    def t_ns(self) -> Int64[np.ndarray, " n"]:
+        """When each sample is taken."""
+        return self._stream.t_ns
+
+    def hello(self) -> bytes:
+        """Who is there, and the order of the nodes."""
+        return hello_line(self._hello)
+
+    def fate(self, index: int) -> Fate:
+        """Whether all nodes are seen."""
+        return Fate.SENT if self._seen[index] == ALL_SEEN else Fate.MARKED
+
+    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
+        """One packet."""
+        payload = VALIDITY.pack(int(self._seen[index])) + self._points[index].tobytes()
+        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
+        return [encode_packet(MAGIC, packet)]
+
+
+def mock_finger_tracker(side: Side, stream: ReplayStream, place: TrackerPlace) -> MockPair:
+    """A finger tracker of one hand.
+
+    Args:
+        side: which hand.
+        stream: [n, 25, 3] in m, wrist frame.
+        place: link, faults, seed and clock.
+    """
+    name, faults = f"finger_tracker_{side}", place.faults
+    rng = device_rng(place.seed, f"noise_{name}")
+    if place.link == "bridge":
+        bridge = BridgeFingerTrackerSource(stream, side=side, rng=rng, faults=faults)
+        return bridged_pair(name, bridge, BridgeFingerTrackerDecoder(side), place)
+    source = FingerTrackerSource(
+        stream, side=side, noise_m=faults.position_noise_m, rng=rng, faults=faults
+    )
+    port = REPORT_PORTS[place.link](name, answer=source.answer)
+    driver = FingerTracker(name, side, transport=port.transport, clock=place.clock)
+    device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)
+    return MockPair(device, driver)
