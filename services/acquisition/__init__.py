@@ -1,1 +1,1 @@
-"""The station: device bytes come in, spooled and uploaded recordings with their health go out."""
+"""The station: it reads devices, judges their health, records takes and uploads them."""

@@ -1,4 +1,4 @@
-"""`python -m services.acquisition`: flags and environment in, a station out."""
+"""Command line of one station: `python -m services.acquisition`."""
 
 import sys
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dextouch.serving.logs import configure_logging
 from dextouch.serving.settings import load_settings, run
 from services.acquisition.app import create_app
-from services.acquisition.heap import keep_for_life
+from services.acquisition.memory import keep_for_life
 from services.acquisition.settings import AcquisitionSettings
 
 

@@ -1,4 +1,4 @@
-"""Settings in, the station's application out: devices, recorder and uploads live as long as it."""
+"""The application of one station; its devices, recorder and uploads live as long as it."""
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager

@@ -1,4 +1,4 @@
-"""The station's one clock: arrival stamps come out, and what paces itself waits on it."""
+"""The one clock of a station, which stamps arrivals and on which everything waits."""
 
 import threading
 import time

@@ -1,4 +1,4 @@
-"""What a take holds and what its devices counted come in; whether it is complete goes out."""
+"""The check of a take: whether it is complete, what its ledger counts and its quality."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

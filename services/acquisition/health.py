@@ -1,4 +1,4 @@
-"""Counters and blocks of the readers come in; levels, findings and events by stream go out."""
+"""The health monitor of a station, which judges all of its streams once a second."""
 
 import threading
 from collections.abc import Callable, Mapping, Sequence

@@ -1,4 +1,4 @@
-"""The code of a finding comes in, what an operator does about it goes out: one line a code."""
+"""What an operator does about each code of the health: one line a code."""
 
 from collections.abc import Mapping
 from typing import Final

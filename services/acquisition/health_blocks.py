@@ -1,4 +1,4 @@
-"""Samples come in from the reader threads; blocks of stamps and values go out, for the judges."""
+"""Blocks of the newest samples of each stream, from reader threads to the judges."""
 
 import threading
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""What a camera's driver found in its images comes in; frozen, blurred, clipped go out."""
+"""Judge of a camera's images: frozen, blurred, clipped or left out."""
 
 from typing import Literal, Protocol, runtime_checkable
 

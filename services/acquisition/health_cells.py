@@ -1,4 +1,4 @@
-"""Readings of pressure cells come in; since when each rests, is pinned or is silent goes out.
+"""Judge of pressure cells without a tare: dead, stuck, saturated or gone.
 
 `CellHistory` serves all gloves; `CellJudge` judges those of other makers, of which no tare is
 known: cells that are stuck, pinned at full scale, or gone. A cell that never held a number is no

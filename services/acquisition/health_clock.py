@@ -1,4 +1,4 @@
-"""Device stamps and arrivals of one device come in; skew, residual and steps of its clock go out.
+"""Judge of a device's clock: its skew, residual and steps against the station's.
 
 Runs at the evaluation, never in the reader. Devices that neither stamp nor number their samples are
 judged by the count of samples that they must have sent.

@@ -1,4 +1,4 @@
-"""Changes of levels come in; the newest of them go out, and how often each finding was raised.
+"""Log of the newest changes of levels, with the number of times each finding was raised.
 
 A station lives for weeks: the log takes all of its memory at the start and never more.
 """

@@ -1,4 +1,4 @@
-"""Single judgements come in; levels with hysteresis and findings by code go out."""
+"""Levels of findings with hysteresis, made of single judgements."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

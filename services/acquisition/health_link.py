@@ -1,4 +1,4 @@
-"""Counters and arrivals of one stream come in; rate, loss, damage and lateness go out."""
+"""Judge of a stream's link: its rate, loss, damage, gaps and lateness."""
 
 from collections import deque
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""The health report comes in; Prometheus metrics go out, made when someone scrapes."""
+"""Prometheus metrics of the health report, made when someone scrapes."""
 
 from collections.abc import Callable, Iterator, Mapping
 from typing import Final

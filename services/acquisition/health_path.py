@@ -1,4 +1,4 @@
-"""A measured and a calibrated path delay of one stream come in; whether they agree goes out."""
+"""Judge of a measured path delay against the calibrated one."""
 
 import math
 from collections.abc import Mapping

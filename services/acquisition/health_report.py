@@ -1,4 +1,4 @@
-"""Counters, findings and figures come in; what a viewer is told about streams and devices goes out.
+"""The health report: what a viewer is told about each stream and device.
 
 Silence is judged here, whenever someone asks: a stream that is not heard tells no figures.
 """

@@ -1,4 +1,4 @@
-"""Raw counts of one glove come in; dead, stuck, saturated and drifting taxels go out.
+"""Judge of the taxels of our own glove: dead, stuck, saturated or drifting.
 
 A taxel that never changes says nothing by itself: a hand at rest looks the same. It is found by
 its neighbours, which move while it does not, or by a reading that no load explains.

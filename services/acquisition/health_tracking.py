@@ -1,4 +1,4 @@
-"""Poses and keypoints come in; lost tracking, jumps and jitter at rest go out."""
+"""Judges of trackers: lost tracking, jumps, and jitter at rest."""
 
 from collections import deque
 from collections.abc import Mapping

@@ -1,4 +1,4 @@
-"""Time requests and samples of devices that answer come in; their streams' path delays go out.
+"""Measurement of path delays of devices that answer requests for their time.
 
 A device that tells its time now and then shows the offset of its clock, which stamps of one
 direction cannot. What a sample's estimated time lies behind that offset is its path delay.

@@ -1,4 +1,4 @@
-"""Readings of all devices and an operator's actions come in; spooled, checked takes go out."""
+"""The recorder of a station: an operator's actions, one take at a time."""
 
 import shutil
 import threading
@@ -19,7 +19,7 @@ from dextouch.streams.descriptors import StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import begin_take
-from services.acquisition.heap import give_back_free_memory
+from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
 from services.acquisition.schemas import (
     Action,

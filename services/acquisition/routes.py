@@ -1,4 +1,4 @@
-"""The station over HTTP: recorder actions come in; state, health and live views go out."""
+"""HTTP routes of a station: the recorder, its health, live views and uploads."""
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager

@@ -1,4 +1,4 @@
-"""Drivers come in, a running station goes out: supervisors, recorder and live views together."""
+"""A running station: supervisors of its devices, recorder, health and live views."""
 
 import threading
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""One take from its first reading to its check: samples into its spool, facts about them out."""
+"""One take from its first reading to its check, in a spool that outlives the process."""
 
 import threading
 from collections.abc import Callable, Mapping

@@ -1,4 +1,4 @@
-"""A station's health comes in while a take runs; what was found in its streams goes out.
+"""What the health finds in the streams of a take while it runs.
 
 The same findings that the API, the metrics and the dashboard show become entries of the take's
 ledger, words in its check, and figures of its quality.

@@ -29,7 +29,7 @@ from dextouch.schemas.recordings import (
 )
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
-from services.acquisition.heap import give_back_free_memory
+from services.acquisition.memory import give_back_free_memory
 from services.acquisition.schemas import UploadStatus
 
 logger = structlog.get_logger(__name__)

@@ -10,7 +10,7 @@ import structlog
 
 from dextouch.clients.episode_store import EpisodeStoreClient
 from services.acquisition.clock import VirtualClock
-from services.acquisition.heap import keep_for_life
+from services.acquisition.memory import keep_for_life
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript

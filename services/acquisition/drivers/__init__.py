@@ -1,1 +1,1 @@
-"""Drivers: a transport's bytes come in, timed samples in SI units and honest counters go out."""
+"""What drivers of all devices share: packets, frames of bytes, images, tracking and bridges."""

@@ -1,4 +1,4 @@
-"""What an SDK process says over a bridge comes in: who it is, and packets checked and in order.
+"""The protocol between a station and the process that holds a closed SDK.
 
 The bytes are documented in docs/device_packets.md, "Bridges".
 """

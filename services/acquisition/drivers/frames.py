@@ -1,4 +1,4 @@
-"""Bytes in any portions come in; what a family's own rules call a frame goes out, one by one."""
+"""Search for frames in bytes of any portions, and the counters of what it finds."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Images of one camera come in, samples with JPEG or H.264 bytes go out, from a thread of its own.
+"""Encoding of a camera's images to JPEG or H.264, in a thread of its own.
 
 The store takes an H.264 stream only in closed groups of GOP_IMAGES images, counted from the first
 image of the take. Hence images are dropped before they are encoded, never after; an encoder goes

@@ -1,4 +1,4 @@
-"""Images of one camera come in; whether they are frozen, blurred or badly exposed goes out.
+"""Checks of a camera's images: frozen, blurred, badly exposed or left out.
 
 Cheap enough for every image of a 720p camera: a checksum of a few pixels of each image, and of
 every third image sharpness and exposure at a quarter of the size.

@@ -1,4 +1,4 @@
-"""A sender's matrix [R | t] in its own coordinates comes in; the pose in our frame goes out."""
+"""Conversion of poses from the coordinates of an SDK to our world frame."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""What a bridge says comes in; a local socket that says it to every station goes out."""
+"""A simulated bridge: a local socket that says the same to every station."""
 
 import contextlib
 import socket

@@ -1,4 +1,4 @@
-"""A stored episode comes in; its streams, ready to be played by mock devices, go out."""
+"""Streams of a stored episode, ready to be played by mock devices."""
 
 from dextouch.episodes import EpisodeReader
 from dextouch.schemas.episodes import Matrix

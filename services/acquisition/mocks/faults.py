@@ -1,4 +1,4 @@
-"""A seeded script of faults: true sample times come in, what happens to packets goes out."""
+"""A seeded script of faults: what happens to each packet of a mock device, and when."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""What mocks did to every packet comes in; the truth to score counters against goes out."""
+"""The ledger of what a mock did to every packet, against which counters are scored."""
 
 import json
 from array import array

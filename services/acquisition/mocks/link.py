@@ -1,4 +1,4 @@
-"""Bytes sent and bytes read come in; whether the host listens and has kept up goes out."""
+"""What a mock device knows of the host: whether it listens, and has kept up."""
 
 import threading
 

@@ -1,4 +1,4 @@
-"""A length comes in; made-up streams of two moving, pressing hands go out."""
+"""Made-up streams of two moving, pressing hands."""
 
 from collections.abc import Callable
 from itertools import pairwise

@@ -1,4 +1,4 @@
-"""The device's end of a pty, HID device or socket: bytes in, read by a real transport."""
+"""The device's end of a pseudo terminal, HID device or socket with a real transport behind it."""
 
 import contextlib
 import errno

@@ -1,4 +1,4 @@
-"""An episode's stream as plain arrays comes in; a device that plays it as packets goes out."""
+"""A device that plays a stream of an episode as packets."""
 
 import zlib
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""A simulated USB device's reports come in; a pyusb backend that replays them goes out."""
+"""A pyusb backend that replays the reports of a simulated USB device."""
 
 import errno
 import threading

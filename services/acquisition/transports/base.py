@@ -1,4 +1,4 @@
-"""What a driver needs of a port: bytes come in by `read`, go out by `write`, loss is an error."""
+"""The interface that a driver needs of a port; every failure of the link is an error."""
 
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable

@@ -1,4 +1,4 @@
-"""A HID device by hidapi's hidraw backend: something that opens it comes in, reports go out."""
+"""Transport to a HID device by hidapi's hidraw backend."""
 
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable

@@ -1,4 +1,4 @@
-"""A serial port by pyserial: a port name or a device's serial number comes in, bytes go out."""
+"""Transport to a serial port by pyserial, found by its name or a serial number."""
 
 import contextlib
 import os

@@ -1,4 +1,4 @@
-"""A stream socket: something that connects comes in, bytes go out, the far end closing is loss."""
+"""Transport over a stream socket; the far end closing it is a loss of the device."""
 
 import socket
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""A USB device's interrupt reports by pyusb: ids come in, the same reports as over HID go out."""
+"""Transport to a USB device by pyusb, which gives the same reports as over HID."""
 
 import contextlib
 import errno

@@ -1,4 +1,4 @@
-"""Nothing comes in; memory that a take has left unused goes back to the operating system.
+"""Give-back of memory that a take has left unused to the operating system.
 
 A take's bytes come and go in many sizes and threads. What lies free in between stays with the
 process, a little more after each take, until glibc is told to give it back. What holds itself in
