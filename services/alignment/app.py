@@ -15,7 +15,7 @@ from services.alignment.settings import AlignmentSettings
 
 
 def create_app(settings: AlignmentSettings) -> FastAPI:
-    """The service; it reads recordings from and writes episodes to the store's folder."""
+    """Create the service, which reads recordings from a store and writes episodes to it."""
     store = EpisodeStore(settings.store_url)
     jobs = JobRunner(store, settings)
 

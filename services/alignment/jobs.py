@@ -129,7 +129,7 @@ def _write(
 
 
 def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: OnProgress) -> None:
-    """Take the samples of every stream and write them; a stream without any is left out."""
+    """Write the samples of every stream; empty streams are omitted."""
     num_streams = len(episode.streams)
     for number, stream in enumerate(episode.streams):
         name, announced = stream.descriptor.name, False

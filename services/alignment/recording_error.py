@@ -36,7 +36,7 @@ CLEARLY_BETTER = 0.5
 
 @runtime_checkable
 class Episode(Protocol):
-    """What the comparison reads of an episode (`dextouch.episodes.EpisodeReader`)."""
+    """The part of `dextouch.episodes.EpisodeReader` that the comparison uses."""
 
     @property
     def attributes(self) -> EpisodeAttributes:
@@ -52,7 +52,7 @@ class Episode(Protocol):
 
 @dataclass(frozen=True)
 class Match:
-    """Which true sample each sample of a stream is.
+    """Correspondence of the samples of a stream with the true ones.
 
     `offset_ns` is episode time minus true time of each pair; `num_dropped` true samples between
     the first and the last pair have none.
@@ -65,12 +65,12 @@ class Match:
 
     @property
     def mean_offset_ns(self) -> float:
-        """The constant part."""
+        """Mean offset in nanoseconds."""
         return float(self.offset_ns.mean())
 
     @property
     def rms_ms(self) -> float:
-        """What is left without the constant part."""
+        """Standard deviation of the offset in milliseconds."""
         return float(np.std(self.offset_ns.astype(np.float64)) / NS_PER_MS)
 
 
@@ -126,7 +126,7 @@ def compare_with_truth(
 def match_samples(
     episode: Episode, truth: Episode, name: str, origin_ns: int, reach_ns: int
 ) -> Match:
-    """Find the true sample of every sample: near in time, and equal in what they hold.
+    """Match every sample with its true one, near in time and of similar values.
 
     A constant delay may be longer than a period, so moving the stream by whole periods, up to
     `reach_ns`, is tried too, and believed where the values then fit clearly better.
@@ -143,7 +143,7 @@ def match_samples(
 
 
 def _difference(mine: StreamData, true: StreamData, shift_ns: int, period_ns: int) -> float:
-    """Mean difference of values if the stream is moved; infinite if it then lies elsewhere."""
+    """Mean difference of values with the stream shifted; infinite without overlap."""
     step = max(1, len(mine) // MAX_COMPARED_SAMPLES)
     t_ns, values = mine.t_ref_ns[::step] + shift_ns, mine.values[::step].astype(np.float64)
     inside = (t_ns >= true.t_ref_ns[0] - period_ns) & (t_ns <= true.t_ref_ns[-1] + period_ns)
@@ -221,7 +221,7 @@ def _true_poses(
 def _true_joints(
     truth: Episode, side: str, at_ns: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n 20"], np.ndarray]:
-    """The robot's joints, or what retargeting makes of the true human hand."""
+    """The robot's joints, or those retargeted from the true human hand."""
     is_robot = "joints_measured" in truth.streams
     name = "joints_measured" if is_robot else f"keypoints_{side}"
     stream, period_ns = truth.read(name), truth.streams[name].period_ns()

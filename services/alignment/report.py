@@ -21,7 +21,7 @@ EXPECTED_STREAMS = (
 
 
 class AlignmentReport(BaseModel):
-    """What became of a recording.
+    """Report of one aligned recording.
 
     `created` is False where the same recording had been aligned with the same options before.
     `duration_s` is that of the model grid. `absent` lists streams that an episode may have and this

@@ -21,7 +21,7 @@ WHY = {
 
 
 def report_line(report: AlignmentReport) -> str:
-    """One line."""
+    """A report as one line of text."""
     verb = "aligned" if report.created else "was aligned already"
     lost = sum(clock.num_dropped for clock in report.clocks)
     absent = f"; absent: {', '.join(report.absent)}" if report.absent else ""
@@ -37,7 +37,7 @@ def report_line(report: AlignmentReport) -> str:
 
 
 def _doubts(report: AlignmentReport) -> list[str]:
-    """Streams whose times may be wrong, and why."""
+    """Streams whose times may be wrong, with the reasons."""
     found = []
     for clock in report.clocks:
         whys = {
@@ -53,7 +53,7 @@ def _doubts(report: AlignmentReport) -> list[str]:
 
 
 def report_page(report: AlignmentReport) -> Group:
-    """Everything that the report says, as tables."""
+    """A report as tables for the terminal."""
     parts: list[Text | Table] = [
         Text(f"{report.recording_id} → {report.episode_id}", style="bold"),
         Text(

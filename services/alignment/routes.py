@@ -34,7 +34,7 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
         response: Response,
         wait: bool = Query(default=False),  # noqa: FBT001 - a query parameter
     ) -> AlignmentJob | AlignmentList:
-        """Start aligning recordings; asked again, the same alignments answer.
+        """Submit recordings for alignment; submitting again returns the same jobs.
 
         `recording_id` gives one job, `recording_ids` a list of them, all taken or none. With
         `wait=true` the answer comes when all have ended (200); the failure of a single one is then
@@ -62,12 +62,12 @@ def alignments_router(jobs: JobRunner) -> APIRouter:
 
     @router.get("/{alignment_id}")
     async def one(alignment_id: str) -> AlignmentJob:
-        """Where one alignment stands."""
+        """The state of one alignment."""
         return jobs.queue.get(alignment_id)
 
     @router.post("/{alignment_id}/cancel")
     async def cancel(alignment_id: str) -> AlignmentJob:
-        """End an alignment that waits or runs; one that is done or has failed is a conflict."""
+        """Cancel an alignment that waits or runs; one that is done or failed is a conflict."""
         return await jobs.cancel(alignment_id)
 
     return router

@@ -17,7 +17,7 @@ from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
 from services.acquisition.schemas import TakePrompt
 from services.alignment.calibration.tactile_baseline import TactileCalibration
-from services.alignment.calibration.tactile_faults import STATES, judge_taxels
+from services.alignment.calibration.tactile_faults import STATES, classify_taxels
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_glove_calibration import (
     calibrate_glove,
@@ -195,7 +195,7 @@ def test_a_wandering_touch_shows_the_still_taxels_among_the_moving():
     deads = {80 + 16 * 7 + 4: 0, 80 + 16 * 10 + 10: None, 80 + 16 * 4 + 9: 500}
     glove = Glove(9, faults=deads)
     tare = measure_tare(glove.take(0.0), side="left")
-    states = named(judge_taxels([glove.take(kpa, 900)], tare))
+    states = named(classify_taxels([glove.take(kpa, 900)], tare))
     kinds = {t: s for t, s in states.items() if s != "unproven"}
     assert kinds == dict(zip(deads, ["dead", "dead", "stuck"], strict=True))
     # Fingertips were not touched: nobody knows.

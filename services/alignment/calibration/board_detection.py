@@ -58,7 +58,7 @@ class FoundBoards:
     pattern: str
 
     def only(self, chosen: Sequence[int]) -> "FoundBoards":
-        """The same with some of the photos, by their place in `photos`."""
+        """A subset of the photos, by index into `photos`."""
         return FoundBoards(
             tuple(self.points_board[index] for index in chosen),
             tuple(self.pixels_px[index] for index in chosen),
@@ -74,7 +74,7 @@ Detector = Callable[[np.ndarray], View | None]
 
 
 def find_boards(images: Sequence[np.ndarray], board: Chessboard | CharucoBoard) -> FoundBoards:
-    """Look for a board on every photo; a photo may be without it.
+    """Detect a board in every photo; photos without it are skipped.
 
     Both ways in which ChArUco boards are printed are tried, and the one that fits is named.
 
@@ -142,7 +142,7 @@ def _chessboard(board: Chessboard) -> Detector:
 
 
 def _charuco(board: CharucoBoard) -> dict[str, Detector]:
-    """Detectors by the board's printing; boards printed before OpenCV 4.6 start otherwise."""
+    """Detectors by marker layout, which OpenCV 4.6 changed."""
     import cv2
 
     if board.dictionary not in DICTIONARIES:

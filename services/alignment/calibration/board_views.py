@@ -17,7 +17,7 @@ POLISH_ROUNDS = 5
 
 @dataclass(frozen=True)
 class BoardViews:
-    """Where a board's corners were seen, and by which camera.
+    """Detected corners of a board in several views, and the camera's intrinsics.
 
     Attributes:
         points_board: a view each, [k ≥ 4, 3] corners in board coordinates (m).
@@ -54,7 +54,7 @@ class BoardViews:
                 raise NonFiniteError(f"board view {index}: NaN or infinity among the corners")
 
     def only(self, views: np.ndarray) -> "BoardViews":
-        """The same with some of the views."""
+        """A subset of the views."""
         return BoardViews(
             [self.points_board[index] for index in views],
             [self.pixels_px[index] for index in views],
@@ -87,7 +87,7 @@ class BoardViews:
 def project(
     points_board: np.ndarray, Ts_camera_board: np.ndarray, K: np.ndarray, distortion: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n k 2"], Float64[np.ndarray, "n k 2 6"]]:
-    """Pixels of corners [n, k, 3], and how they change with twists of the board's poses.
+    """Project corners [n, k, 3], with the Jacobian by twists of the board's poses.
 
     Raises:
         InvalidInputError: a corner lies behind the camera.
@@ -130,7 +130,7 @@ def _bend(
 
 
 def polish(measurement: Measurement, Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "n 4 4"]:
-    """Poses moved to the minimum of each view's own pixels."""
+    """Refine each view's pose to the least reprojection error."""
     Ts = Ts_camera_board
     for _ in range(POLISH_ROUNDS):
         seen = measurement(Ts)

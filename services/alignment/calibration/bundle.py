@@ -24,7 +24,7 @@ SMALLEST_STEP = 1e-10
 
 
 class Linearised(NamedTuple):
-    """A measurement's normal equations at predicted poses, for twists of those poses.
+    """Normal equations of a measurement, linearized at predicted poses.
 
     Attributes:
         information: [n, 6, 6].
@@ -42,7 +42,7 @@ Measurement = Callable[[np.ndarray], Linearised]
 
 @dataclass(frozen=True)
 class Bundle:
-    """What fits best.
+    """Result of the bundle adjustment.
 
     Attributes:
         X: the mount.
@@ -57,7 +57,7 @@ class Bundle:
 
 
 def pose_measurement(Ts_measured: np.ndarray, information: np.ndarray) -> Measurement:
-    """Poses [n, 4, 4] that were measured, each with the information [n, 6, 6] of its twist."""
+    """Measurement of poses [n, 4, 4] with information matrices [n, 6, 6] of their twists."""
     inverse = invert(Ts_measured)
 
     def linearise(Ts: np.ndarray) -> Linearised:
@@ -79,7 +79,7 @@ def solve_bundle(
     *,
     is_mount_known: bool = False,
 ) -> Bundle:
-    """Mount and target from all views together.
+    """Estimate mount and target pose from all views together.
 
     Args:
         Ts_world_tracker: [n, 4, 4].
@@ -127,7 +127,7 @@ def solve_bundle(
 def predicted_jacobians(
     Ts: np.ndarray, X_B: np.ndarray
 ) -> tuple[Float64[np.ndarray, "n 6 12"], Float64[np.ndarray, "n 6 6"]]:
-    """How predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z turn and shift with X, Z and with D.
+    """Jacobians of the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z by X, Z and D.
 
     Args:
         Ts: [n, 4, 4] the predicted poses B.

@@ -31,7 +31,7 @@ INVERTED_SHARE = 0.2
 
 
 class Series(NamedTuple):
-    """Two series of poses of the same moments, and what the messages call them."""
+    """Two series of simultaneous poses, with their names in messages."""
 
     task: str
     body: str
@@ -40,13 +40,13 @@ class Series(NamedTuple):
     names: tuple[str, str]
 
     def only(self, views: np.ndarray) -> "Series":
-        """The same with some of the views."""
+        """A subset of the views."""
         body, target = self.Ts_world_body[views], self.Ts_mounted_target[views]
         return self._replace(Ts_world_body=body, Ts_mounted_target=target)
 
 
 class Agreement(NamedTuple):
-    """The views that agree, the mount X and the target's pose Z that they show."""
+    """Consistent views, with the mount X and the target's pose Z that they determine."""
 
     views: np.ndarray
     X: Float64[np.ndarray, "4 4"]
@@ -54,7 +54,7 @@ class Agreement(NamedTuple):
 
 
 def agreeing_views(series: Series) -> Agreement:
-    """Mount and target in closed form, without the few views that are far off.
+    """Closed-form mount and target, without outlier views.
 
     Raises:
         DegenerateMotionError: the views that agree show no mount.
@@ -64,7 +64,7 @@ def agreeing_views(series: Series) -> Agreement:
 
 
 def agreeing_with_mount(series: Series, X: np.ndarray) -> Agreement:
-    """The target where the mount X is known already, without the few views that are far off.
+    """Target pose for a known mount X, without outlier views.
 
     Raises:
         InvalidInputError: the views contradict each other.
@@ -103,7 +103,7 @@ def _closed_form(series: Series) -> Float64[np.ndarray, "4 4"]:
 
 
 def park(Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray) -> Float64[np.ndarray, "4 4"]:
-    """Rotation by an orthogonal fit of rotation vectors, then linear translation."""
+    """Hand-eye solution of Park and Martin (1994): rotation first, then translation."""
     pairs = view_pairs(len(Ts_world_body))
     A = invert(Ts_world_body[pairs[:, 1]]) @ Ts_world_body[pairs[:, 0]]
     B = Ts_mounted_target[pairs[:, 1]] @ invert(Ts_mounted_target[pairs[:, 0]])
@@ -123,7 +123,7 @@ def park(Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray) -> Float64[np
 def view_errors(
     series: Series, X: np.ndarray
 ) -> tuple[Float64[np.ndarray, "4 4"], Float64[np.ndarray, "n 2"]]:
-    """The target's pose, and how far each view puts it from there: angle (rad), distance (m)."""
+    """Mean target pose, and each view's deviation from it: angle (rad), distance (m)."""
     Ts_world_target = series.Ts_world_body @ X @ series.Ts_mounted_target
     Z = nearest_pose(Ts_world_target)
     E = invert(Z) @ Ts_world_target
@@ -132,7 +132,7 @@ def view_errors(
 
 
 def check_sides(series: Series, errors: np.ndarray) -> None:
-    """Refuse a series that fits much better when one side is turned round.
+    """Refuse a series that fits much better when one side is inverted.
 
     A mistaken side cannot be told from the other by consistency alone: with both turned round the
     views agree again, on mount and target exchanged. The shorter mount is the likelier one.

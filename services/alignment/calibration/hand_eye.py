@@ -45,7 +45,7 @@ MAX_SIGMA_TRANSLATION_M = 0.01
 
 @dataclass(frozen=True)
 class HandEyeNoise:
-    """Noise to expect (one sigma an axis); what the views show corrects it.
+    """Expected noise, one sigma for each axis; refined from the views.
 
     The first three hold for a Vive tracker and a sharp board. `board_*` are of a board's pose that
     a solver found, in the camera's axes; they count only where no corners are given.
@@ -154,7 +154,7 @@ def solve_hand_eye(
 def _weighted(
     series: Series, agreed: Agreement, corners: BoardViews | None, noise: HandEyeNoise
 ) -> tuple[Bundle, dict[str, float]]:
-    """The bundle with the noise that the views show, and that noise."""
+    """The bundle weighted with the noise estimated from the views, and that noise."""
     tracker, board = series.Ts_world_body, series.Ts_mounted_target
     X_B = invert(tracker) @ agreed.Z
     Ts = invert(agreed.X) @ X_B
@@ -201,7 +201,7 @@ def board_components(Ts_camera_board: np.ndarray, noise: HandEyeNoise) -> dict[s
 
 
 def _check_budget(result: HandEyeResult) -> None:
-    """Refuse a mount that stays too uncertain."""
+    """Refuse a mount whose standard deviation is too large."""
     if (
         result.sigma_rotation_rad <= MAX_SIGMA_ROTATION_RAD
         and result.sigma_translation_m <= MAX_SIGMA_TRANSLATION_M

@@ -91,7 +91,7 @@ def calibrate_camera(
 
 
 def calibrate_found(found: FoundBoards) -> CameraCalibration:
-    """Intrinsics from corners that were found before.
+    """Intrinsics from corners that are already detected.
 
     Raises:
         InvalidInputError: too few photos.
@@ -133,7 +133,7 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
 
 
 def leave_one_out_rms_px(found: FoundBoards) -> Float64[np.ndarray, " n"]:
-    """What each photo leaves over when the camera is calibrated from the others.
+    """Leave-one-out reprojection error of each photo, RMS in pixels.
 
     Only the board's pose is fitted to the photo itself; unlike `rms_px` the figure grows where
     the other photos do not determine the camera.
@@ -200,7 +200,7 @@ def _tilt_spread_rad(turns_rad: np.ndarray) -> float:
 
 
 def _check_views(spread_rad: float, relative: float) -> None:
-    """Refuse views that do not show the focal length."""
+    """Refuse views that do not determine the focal length."""
     if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
         raise DegenerateMotionError(
             f"intrinsics: the board's directions differ by {np.rad2deg(spread_rad):.0f} degrees "

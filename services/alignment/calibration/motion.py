@@ -19,11 +19,11 @@ AXIS_NAMES = ("x", "y", "z")
 
 
 class DegenerateMotionError(InvalidInputError):
-    """The motion does not show what is asked for; the message names the missing motion."""
+    """The motion does not determine the result; the message names the missing motion."""
 
 
 def checked_poses(task: str, **series: np.ndarray) -> list[Float64[np.ndarray, "n 4 4"]]:
-    """Series of poses as float64 [n, 4, 4], all of one length.
+    """Validate series of poses: float64 [n, 4, 4], all of one length.
 
     Raises:
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.
@@ -59,7 +59,7 @@ def view_pairs(num_views: int) -> np.ndarray:
 
 
 def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
-    """Refuse turns about one axis only, or hardly any.
+    """Refuse rotation about a single axis, or hardly any.
 
     Args:
         task: for the message.
@@ -93,7 +93,7 @@ def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
 
 
 def _missing_axes(missing: np.ndarray) -> list[str]:
-    """The body's own axes that lie deepest in the space [m, 3] of missing turns, m names."""
+    """Names of the body axes closest to the m missing directions of rotation [m, 3]."""
     depth = np.square(missing).sum(axis=0)
     deepest = sorted(np.argsort(-depth, kind="stable")[: len(missing)])
     return [AXIS_NAMES[index] for index in deepest]

@@ -29,14 +29,14 @@ class Component:
 
     @property
     def covariances(self) -> Float64[np.ndarray, "n 6 6"]:
-        """What the source adds to each view's covariance."""
+        """Contribution of the source to each view's covariance."""
         return self.sigma**2 * self.shapes
 
 
 def sensor_components(
     sensor: str, maps: np.ndarray, sigmas: tuple[float, float]
 ) -> dict[str, Component]:
-    """Noise of a sensor of poses, in its own axes.
+    """Rotation and translation noise of a pose sensor, in its own axes.
 
     Args:
         sensor: for the names of the two components.

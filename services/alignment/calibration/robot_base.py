@@ -42,7 +42,7 @@ MAX_SIGMA_TRANSLATION_M = 0.01
 
 @dataclass(frozen=True)
 class RobotBaseNoise:
-    """Noise to expect (one sigma an axis); what the pairs show corrects it."""
+    """Expected noise, one sigma for each axis; refined from the pairs."""
 
     tracker_rotation_rad: float = 8.7e-4
     tracker_translation_m: float = 5e-4
@@ -89,7 +89,7 @@ def solve_robot_base(
     T_effector_tracker: np.ndarray | None = None,
     noise: RobotBaseNoise | None = None,
 ) -> RobotBaseResult:
-    """The robot's base in the tracked world, from pairs of poses of the same moments.
+    """Estimate the robot's base in the tracked world from simultaneous pairs of poses.
 
     Args:
         Ts_world_tracker: [n ≥ 4, 4, 4] poses of a tracker that the effector carries.
@@ -168,7 +168,7 @@ def _check_places(Ts_base_effector: np.ndarray) -> None:
 def _weighted(
     series: Series, agreed: Agreement, noise: RobotBaseNoise, *, is_mount_known: bool
 ) -> tuple[Bundle, dict[str, float]]:
-    """The bundle with the noise that the pairs show, and that noise."""
+    """The bundle weighted with the noise estimated from the pairs, and that noise."""
     tracker, measured = series.Ts_world_body, series.Ts_mounted_target
     X_B = invert(tracker) @ agreed.Z
     Ts = invert(agreed.X) @ X_B
@@ -197,7 +197,7 @@ def _weighted(
 
 
 def _check_budget(result: RobotBaseResult) -> None:
-    """Refuse a base that stays too uncertain."""
+    """Refuse a base whose standard deviation is too large."""
     if (
         result.sigma_rotation_rad > MAX_SIGMA_ROTATION_RAD
         or result.sigma_translation_m > MAX_SIGMA_TRANSLATION_M

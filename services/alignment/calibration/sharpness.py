@@ -21,7 +21,7 @@ STEP_PX = 0.5
 
 
 def max_edge_width_px(photo: np.ndarray) -> float:
-    """Wider edges on a photo of this size are blurred."""
+    """Edge width above which a photo of this size counts as blurred."""
     return MAX_EDGE_WIDTH_PX * max(1.0, float(np.hypot(*photo.shape)) / USUAL_DIAGONAL_PX)
 
 

@@ -97,7 +97,7 @@ class TactileCalibration:
         return cls(side, tare, gain, cells, state)
 
     def refused_taxels(self, counts: np.ndarray) -> UInt8[np.ndarray, "320"]:
-        """Why each taxel is not measured in a whole take, index into `REASONS`; 0: it is.
+        """Reason why each taxel is unusable in a take, as index into `REASONS`; 0 for usable.
 
         Beside what the calibration refuses: cells that stand still although not at their tare
         (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the samples.
@@ -142,12 +142,12 @@ class TactileCalibration:
         return raw[:, self.cells]
 
     def gains(self) -> Float64[np.ndarray, "320"]:
-        """Gains by taxel; 1 where the taxel is refused and its gain says nothing."""
+        """Gains by taxel; 1 for refused taxels, whose gain is meaningless."""
         return np.where(self.state == OK, self.gain_counts_per_kpa[self.cells], 1.0)
 
 
 class TaxelSurvey:
-    """What `refused_taxels` must know of a take, gathered piece by piece.
+    """Incremental detection of unusable taxels in a take that is read in pieces.
 
     Args:
         calibration: of the glove.
@@ -161,7 +161,7 @@ class TaxelSurvey:
         self._num_samples = 0
 
     def add(self, counts: np.ndarray) -> None:
-        """Take in consecutive raw readings [T, cells].
+        """Add consecutive raw readings [T, cells].
 
         Raises:
             ShapeError: not [T, cells].
@@ -178,7 +178,7 @@ class TaxelSurvey:
         self._num_samples += len(taxels)
 
     def refused(self) -> UInt8[np.ndarray, "320"]:
-        """Why each taxel is not measured in all that was added; see `refused_taxels`."""
+        """Reasons for everything added so far; see `refused_taxels`."""
         calibration = self._calibration
         reasons = calibration.state.copy()
         if self._first is None or self._num_samples < MIN_SAMPLES_TO_JUDGE:
@@ -206,7 +206,7 @@ def _row(record: Record, name: str, size: int) -> Float64[np.ndarray, " size"]:
 
 
 def _cells(record: Record, side: Side, num_cells: int, glove: str) -> Int64[np.ndarray, "320"]:
-    """The map that comes with the calibration, else that of our own gloves."""
+    """The cell map of the calibration, or the default of our own gloves."""
     name = f"{glove}_cells"
     if name not in record:
         if num_cells == NUM_RAW_TAXELS:
@@ -236,7 +236,7 @@ def _cells(record: Record, side: Side, num_cells: int, glove: str) -> Int64[np.n
 
 
 def _states(record: Record, name: str, num_cells: int) -> UInt8[np.ndarray, " cells"]:
-    """States of the raw cells; a calibration without them refuses none."""
+    """States of the raw cells; all OK in a calibration without them."""
     if name not in record:
         return np.full(num_cells, OK, dtype=np.uint8)
     states = _row(record, name, num_cells)

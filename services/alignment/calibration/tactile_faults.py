@@ -56,7 +56,7 @@ _NEIGHBOURS = neighbours()
 _NUM_NEIGHBOURS = (_NEIGHBOURS >= 0).sum(axis=1)
 
 
-def judge_taxels(
+def classify_taxels(
     takes: Sequence[np.ndarray],
     tare: TaxelTare,
     *,
@@ -105,7 +105,7 @@ def _always_full(
 
 
 def _blocks(takes: Sequence[np.ndarray], side: Side) -> Iterator[Float64[np.ndarray, "time 320"]]:
-    """The takes in pieces: eight neighbours of every reading of a long take would fill memory."""
+    """Pieces of the takes, since eight neighbours of every reading would not fit in memory."""
     for take in takes:
         for start in range(0, len(take), BLOCK):
             block = np.asarray(take[start : start + BLOCK], dtype=np.float64)

@@ -19,7 +19,7 @@ from services.alignment.calibration.tactile_faults import (
     SATURATED_RATIO,
     SILENT_RATIO,
     UNPROVEN,
-    judge_taxels,
+    classify_taxels,
     kind_of_silence,
 )
 from services.alignment.calibration.tactile_tare import (
@@ -46,7 +46,7 @@ MAX_CREEPING = 0.25
 
 @dataclass(frozen=True)
 class TaxelPress:
-    """One take during which a known pressure lay on some taxels.
+    """A take under known pressure on some of the taxels.
 
     Args:
         pressure_kpa: above 0; force / area for a weight.
@@ -76,7 +76,7 @@ class TaxelPress:
 
 @dataclass(frozen=True)
 class TaxelGain:
-    """Counts a kPa of each of the 320 taxels, anatomical order.
+    """Gain of each of the 320 taxels in counts per kPa, anatomical order.
 
     Attributes:
         gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
@@ -129,7 +129,7 @@ def fit_gain(
     points = _points(tare, presses, full_scale_counts)
     _check_direction(points)
     takes = [press.counts for press in presses]
-    state = judge_taxels(takes, tare, full_scale_counts=full_scale_counts)
+    state = classify_taxels(takes, tare, full_scale_counts=full_scale_counts)
     silent = _silent_under_pressure(points)
     state[silent & (state != SATURATED)] = kind_of_silence(takes, tare.side)[
         silent & (state != SATURATED)
@@ -170,7 +170,7 @@ def _points(tare: TaxelTare, presses: Sequence[TaxelPress], full_scale_counts: f
 
 
 def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelTare) -> None:
-    """Refuse takes in which the pressure came, went or grew."""
+    """Refuse takes in which the pressure was not constant."""
     half = len(raw) // 2
     creep = np.abs(np.median(raw[:half], axis=0) - np.median(raw[half:], axis=0))
     response = np.abs(level.mean_counts - tare.level.mean_counts)
@@ -186,7 +186,7 @@ def _check_steady(raw: np.ndarray, level: Level, press: TaxelPress, tare: TaxelT
 
 
 def _check_direction(points: _Points) -> None:
-    """Refuse takes in which nothing answers, or in which counts fall under pressure."""
+    """Refuse takes without any response, or in which counts fall under pressure."""
     response = (points.counts[:-1] - points.counts[-1])[points.used[:-1]]
     answering = np.abs(response) >= MIN_MOVE_COUNTS
     if points.saturated.any() and not answering.any():
@@ -206,7 +206,7 @@ def _check_direction(points: _Points) -> None:
 
 
 def _silent_under_pressure(points: _Points) -> Bool[np.ndarray, "320"]:
-    """Taxels that show next to nothing in every press under which the others answer."""
+    """Taxels without response in every press to which the others respond."""
     response = points.counts[:-1] - points.counts[-1]
     usual = np.array(
         [

@@ -29,13 +29,13 @@ _PADS = [slice(start, start + 16) for start in range(0, NUM_TIP_TAXELS, 16)] + [
 
 @dataclass(frozen=True)
 class GloveCalibration:
-    """What a station must know of one glove; `gain` is None after a tare alone."""
+    """Calibration of one glove; `gain` is None if only the tare was measured."""
 
     tare: TaxelTare
     gain: TaxelGain | None
 
     def matrices(self) -> dict[str, Float64[np.ndarray, "1 360"]]:
-        """By the names that recordings carry; all in scan order.
+        """Matrices by their names in recordings; all in scan order.
 
         A taxel whose gain was refused gets the median gain of its pad, so that counts of a faulty
         taxel stay finite; `…_state` says which ones (index into `tactile_faults.STATES`). Cells
@@ -61,7 +61,7 @@ class GloveCalibration:
         return {name: np.asarray(row, dtype=np.float64)[None] for name, row in found.items()}
 
     def num_by_state(self) -> dict[str, int]:
-        """How many taxels are in each state; states that none is in are left out."""
+        """Number of taxels in each state that occurs."""
         if self.gain is None:
             return {}
         counts = np.bincount(self.gain.state, minlength=len(STATES))
@@ -101,7 +101,7 @@ def calibrate_glove(
 
 
 def filled_gain(gain: TaxelGain) -> Float64[np.ndarray, "320"]:
-    """Gains with refused ones replaced by the median of their pad, or of all where a pad has none.
+    """Gains in which refused taxels have the median of their pad, or of the glove.
 
     Raises:
         InvalidInputError: not one gain is known.

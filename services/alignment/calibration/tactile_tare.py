@@ -24,7 +24,7 @@ MAX_RESTLESS = 0.05
 
 @dataclass(frozen=True)
 class Level:
-    """What each cell reads over a take in which nothing changes, in counts.
+    """Constant level of each cell over a take, in counts.
 
     Attributes:
         mean_counts: middle of the readings, knocks left out.
@@ -80,7 +80,7 @@ def measure_tare(rest_counts: np.ndarray, *, side: Side) -> TaxelTare:
 
 
 def steady_level(counts: Float64[np.ndarray, "time 360"]) -> Level:
-    """Middle, sigma and noise of each cell's readings; knocks are left out."""
+    """Robust level, its sigma, and noise of each cell's readings; knocks are excluded."""
     median = np.median(counts, axis=0)
     spread = 1.4826 * np.median(np.abs(counts - median), axis=0)
     reach = np.maximum(CLIP_SIGMAS * spread, MIN_CLIP_COUNTS)
@@ -94,7 +94,7 @@ def steady_level(counts: Float64[np.ndarray, "time 360"]) -> Level:
 
 
 def rounding_rms_counts(noise_counts: np.ndarray) -> Float64[np.ndarray, "..."]:
-    """How far the mean of readings in whole counts lies from the true one, RMS over all values.
+    """RMS error of the mean of rounded readings, over all true values.
 
     Noise of `noise_counts` (with the rounding's own 1/12) dithers the steps away: the bias of a
     rounded value x is Σ (−1)^k sin(2πkx) exp(−2π²k²σ²)/(πk) for Gaussian noise σ (Widrow and

@@ -28,7 +28,7 @@ def estimate_tap_offset(
     threshold_kpa: float = 2.0,
     max_offset_s: float = 0.2,
 ) -> TimeOffset:
-    """Offset between a pressure stream and a height stream from taps at least 0.5 s apart.
+    """Estimate the offset between pressure and height from taps at least 0.5 s apart.
 
     Args:
         t_pressure_ns: stamps [n], int64, strictly increasing.
@@ -80,7 +80,7 @@ def _checked(
 
 
 def _onsets(t_s: np.ndarray, pressure: np.ndarray, threshold: float) -> tuple[list[float], float]:
-    """Middles of the intervals in which touches began, and the usual interval."""
+    """Midpoints of the sample intervals in which touches begin, and the usual interval."""
     touching = pressure > threshold
     starts = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
     onsets: list[float] = []
@@ -94,7 +94,7 @@ def _onsets(t_s: np.ndarray, pressure: np.ndarray, threshold: float) -> tuple[li
 def _bend_s(
     t_s: np.ndarray, height: np.ndarray, onset_s: float, max_offset_s: float
 ) -> float | None:
-    """When a fall near a touch stops; None where nothing falls."""
+    """Time at which a fall near a touch stops; None without a fall."""
     bends = np.arange(onset_s - max_offset_s, onset_s + max_offset_s, SEARCH_STEP_S)
     best, found = np.inf, None
     for bend in bends.tolist():

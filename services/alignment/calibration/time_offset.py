@@ -43,7 +43,7 @@ def estimate_time_offset(
     *,
     max_offset_s: float = 1.0,
 ) -> TimeOffset:
-    """Offset between two streams that saw the same motion.
+    """Estimate the offset between two streams that measured the same motion.
 
     Args:
         t_a_ns: stamps [n] of stream a, int64, strictly increasing.
@@ -100,7 +100,7 @@ def _checked(
 def _low_passed(
     t_s: np.ndarray, values: np.ndarray, step_s: float
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
-    """The signal on a uniform grid, without what is faster than hands move."""
+    """The signal on a uniform grid, low-pass filtered without phase."""
     num = int((t_s[-1] - t_s[0]) / step_s) + 1
     grid = t_s[0] + step_s * np.arange(num)
     uniform = np.stack([np.interp(grid, t_s, column) for column in values.T], axis=1)
@@ -155,7 +155,7 @@ def _correlation(t_a: np.ndarray, a: np.ndarray, t_b: np.ndarray, b: np.ndarray)
 def _refined(
     grid_a: np.ndarray, a: np.ndarray, spline_b: CubicSpline, start_s: float
 ) -> tuple[float, float]:
-    """Gauss–Newton on the offset; gain and zero of every component are solved for on the way."""
+    """Gauss–Newton on the offset; gain and offset of every component are eliminated."""
     slope_b = spline_b.derivative()
     offset_s, sigma_s = start_s, np.inf
     for _ in range(MAX_ITERATIONS):

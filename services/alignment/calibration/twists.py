@@ -16,7 +16,7 @@ from dextouch.geometry.transforms import transform
 
 
 def hat(vectors: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """Matrices with which vectors [..., 3] are multiplied crosswise from the left."""
+    """Skew-symmetric (cross product) matrices of vectors [..., 3]."""
     x, y, z = np.moveaxis(np.asarray(vectors, dtype=np.float64), -1, 0)
     crossed = np.zeros((*x.shape, 3, 3))
     crossed[..., 0, 1], crossed[..., 0, 2], crossed[..., 1, 2] = -z, y, -x
@@ -39,12 +39,12 @@ def move(twists: np.ndarray) -> Float64[np.ndarray, "*batch 4 4"]:
 
 
 def twist(T: np.ndarray) -> Float64[np.ndarray, "*batch 6"]:
-    """The twists that `move` makes these transforms of."""
+    """Twists of transforms; the inverse of `move`."""
     return np.concatenate([vector_from_rotation(T[..., :3, :3]), T[..., :3, 3]], axis=-1)
 
 
 def right_jacobian_inverse(vectors_rad: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:
-    """How the rotation vector of R changes with a small turn of R in its own frame.
+    """Inverse right Jacobian of SO(3) at a rotation vector.
 
     For angles below half a turn (Solà et al. 2018, A micro Lie theory, eq. 144).
     """
@@ -61,7 +61,7 @@ def right_jacobian_inverse(vectors_rad: np.ndarray) -> Float64[np.ndarray, "*bat
 
 
 def twist_jacobian(Ts: np.ndarray) -> Float64[np.ndarray, "n 6 6"]:
-    """How the twists of transforms [n, 4, 4] change with small moves of them, T · move(v)."""
+    """Jacobian of the twists of transforms [n, 4, 4] by T · move(v)."""
     J = np.zeros((len(Ts), 6, 6))
     J[:, :3, :3] = right_jacobian_inverse(twist(Ts)[:, :3])
     J[:, 3:, 3:] = Ts[:, :3, :3]
@@ -69,7 +69,7 @@ def twist_jacobian(Ts: np.ndarray) -> Float64[np.ndarray, "n 6 6"]:
 
 
 def nearest_pose(Ts: np.ndarray) -> Float64[np.ndarray, "4 4"]:
-    """Middle of poses [n, 4, 4]: rotation nearest to the mean matrix, mean translation."""
+    """Mean of poses [n, 4, 4]: rotation nearest to the mean matrix, mean translation."""
     return transform(nearest_rotation(Ts[:, :3, :3].mean(axis=0)), Ts[:, :3, 3].mean(axis=0))
 
 

@@ -24,7 +24,7 @@ class FingerPoints(NamedTuple):
 
 
 def finger_points(keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> FingerPoints:
-    """The points that fingers are made of.
+    """Select the points of every finger from keypoints.
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3], order of `dextouch.hands.skeleton`; NaN or infinity marks a

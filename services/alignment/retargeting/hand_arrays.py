@@ -59,7 +59,7 @@ def hand_arrays(hand: HandModel) -> np.ndarray:
 
 
 def joint_places(hand: HandModel) -> Bool[np.ndarray, "fingers 6"]:
-    """Which places of the solver's [fingers, 6] angles are joints, in the order of the hand's."""
+    """Indices of the hand's joints in the solver's [fingers, 6] angles."""
     counts = np.array([len(finger.joints) for finger in hand.fingers])
     return np.asarray(np.arange(MAX_JOINTS) < counts[:, None])
 

@@ -54,7 +54,7 @@ class HandShape(NamedTuple):
 
 
 def seen_nodes(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
-    """A copy of keypoints in which all three numbers of what is no place are NaN."""
+    """A copy of keypoints in which nodes with any invalid coordinate are NaN throughout."""
     nodes = np.array(keypoints_m, dtype=np.float64)
     # False for NaN, too.
     is_place = (np.abs(nodes) < NOWHERE).all(axis=-1)
@@ -89,7 +89,7 @@ def _thinned(samples: np.ndarray, most: int) -> np.ndarray:
 
 
 def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> HandShape:
-    """Refuse keypoints that are not metres of a human hand in our order of nodes.
+    """Refuse keypoints that are not a human hand in metres, in our order of nodes.
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3], any axes, of either hand; NaN where a node is not seen.
@@ -144,7 +144,7 @@ def _check_size(size: float, where: str) -> None:
 
 
 def _rigid_pairs() -> Int64[np.ndarray, "pairs 2"]:
-    """Nodes whose distance is the same in every posture: bones, and those of the palm."""
+    """Pairs of nodes at a constant distance in every posture: bones, and within the palm."""
     pairs = []
     for chain in CHAINS:
         nodes = chain_indices(chain)
@@ -199,7 +199,7 @@ def _compared(
 
 @lru_cache(maxsize=1)
 def _orders() -> tuple[tuple[str, tuple[int, ...]], ...]:
-    """Ours, then other orders that trackers and their users produce: name, and our node of each."""
+    """Known orders of nodes, ours first: name, and our node at each place."""
     orders = []
     for is_wrist_last, is_turned in product((False, True), repeat=2):
         for chains in permutations(CHAINS):
@@ -225,7 +225,7 @@ def _orders() -> tuple[tuple[str, tuple[int, ...]], ...]:
 
 @lru_cache(maxsize=1)
 def _places_of_orders() -> Int64[np.ndarray, "orders 25"]:
-    """Where each of our nodes is in each of those orders; −1 nowhere."""
+    """Index of each of our nodes in each known order; −1 if absent."""
     places = np.full((len(_orders()), NUM_KEYPOINTS), -1)
     for index, (_, holds) in enumerate(_orders()):
         for place, node in enumerate(holds):

@@ -27,7 +27,7 @@ RIGID_TRAVEL = 0.5
 
 @dataclass(frozen=True)
 class HandProfile:
-    """What is constant of one person's hand, thumb … little, wrist axes.
+    """Constant geometry of one person's hand, thumb … little, in wrist axes.
 
     Attributes:
         bone_m: MCP–PIP, PIP–DIP, DIP–tip (of the thumb CMC–MCP, MCP–IP, IP–tip).
@@ -58,7 +58,7 @@ class HandProfile:
 
     @property
     def is_rigid(self) -> bool:
-        """Whether this is the robot's own hand (or a copy), whose bones and knuckles hold exactly.
+        """Whether this is the robot's own hand (or a copy), with exact bones and knuckles.
 
         People's tracked bones and knuckles shift by millimetres with the posture; to hold them
         fixed would bend fingers that are straight.
@@ -103,7 +103,7 @@ def profile_name(side: str) -> str:
 def calibrated_profile(
     calibration: Mapping[str, Sequence[Sequence[float]]], side: str
 ) -> HandProfile | None:
-    """The person's hand of a recording's calibration; None where it has none.
+    """The hand profile of a recording's calibration; None if it has none.
 
     Raises:
         ShapeError, InvalidInputError: it is no hand.

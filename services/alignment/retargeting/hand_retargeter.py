@@ -34,7 +34,7 @@ IMPLAUSIBLE = arrays.IMPLAUSIBLE
 
 
 class RetargetStatus(IntEnum):
-    """How much of a finger's answer is the solver's own; of a sample, the worst that applies.
+    """How a finger was solved; for a sample, the worst status of its fingers.
 
     PARTIAL: some of its points were missing. REACQUIRED: it was lost and searched again; live, it
     is on its way to where it is tracked, at the rate limit. UNCONVERGED: the search did not come to
@@ -139,7 +139,7 @@ class HandRetargeter:
         valid: np.ndarray | None = None,
         elapsed_s: float = NOMINAL_PERIOD_S,
     ) -> RetargetResult:
-        """Joint angles of one more sample, live; what is not tracked holds its last angles.
+        """Joint angles of the next sample, live; fingers that are not tracked hold their angles.
 
         No joint goes further from one output to the next than `velocity_limit_rad_s` allows in the
         time elapsed, nor than `max_step_rad`, whatever was lost before: a finger that is found
@@ -178,7 +178,7 @@ class HandRetargeter:
         valid: np.ndarray | None = None,
         t_s: np.ndarray | None = None,
     ) -> RetargetResult:
-        """Joint angles of a whole recording; what is not tracked is interpolated in time.
+        """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
         Args:
             keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
@@ -216,7 +216,7 @@ class HandRetargeter:
         return replace(result, joints_rad=self._fill(result, np.cumsum(elapsed_s)))
 
     def measure(self, keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> HandProfile:
-        """The profile of a person from calibration samples.
+        """Measure the profile of a person from calibration samples.
 
         Args:
             keypoints_m: [T, 25, 3] of an open, closing and spreading hand.

@@ -28,7 +28,7 @@ _MEAN_PALM_M: Final = float(np.linalg.norm(mean_hand_m("right")[KNUCKLE_NODES[1]
 
 @dataclass(frozen=True)
 class SideEvidence:
-    """Which hand the keypoints are of.
+    """Evidence for the left or the right hand.
 
     Attributes:
         side: None where neither fingers nor thumb show it.
@@ -43,7 +43,7 @@ class SideEvidence:
 
 
 def find_side(samples: np.ndarray) -> SideEvidence:
-    """Which hand keypoints [T, 25, 3] are of, in any axes and unit; NaN where not seen.
+    """Classify keypoints [T, 25, 3] as left or right, in any axes and unit; NaN if not seen.
 
     Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
     hand and away from it on a left one. Where they hardly bend, the base of the thumb tells, which
@@ -69,7 +69,7 @@ def find_side(samples: np.ndarray) -> SideEvidence:
 
 
 def _thumb_height(samples: np.ndarray, across: np.ndarray) -> float:
-    """Of the thumb's base over wrist and knuckles, along a right hand's palm normal."""
+    """Height of the thumb's base over wrist and knuckles, along a right hand's palm normal."""
     knuckles = samples[:, KNUCKLE_NODES].mean(axis=1)
     palm = knuckles - samples[:, WRIST_NODE]
     normal = np.cross(across, palm)
@@ -79,7 +79,7 @@ def _thumb_height(samples: np.ndarray, across: np.ndarray) -> float:
 
 
 def _mean(values: np.ndarray) -> float:
-    """Mean of what is known; zero, which says nothing, where nothing is."""
+    """Mean of the finite values; zero if there are none."""
     known = values[np.isfinite(values)]
     return float(known.mean()) if known.size else 0.0
 

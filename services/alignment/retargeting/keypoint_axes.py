@@ -26,7 +26,7 @@ MAX_OFF_RAD: Final = float(np.deg2rad(20.0))
 
 @dataclass(frozen=True)
 class KeypointAxes:
-    """Keypoints in wrist axes, and what was seen of them.
+    """Keypoints in wrist axes, with the facts of their conversion.
 
     Attributes:
         keypoints_m: [T, 25, 3] in wrist axes (fingers along -z, thumb side +x), metres; not
@@ -48,7 +48,7 @@ def calibration_name(side: Side) -> str:
 
 
 def calibration_record(frame: WristFrame, side: Side) -> dict[str, Matrix]:
-    """Matrices that a recording carries of a calibrated wrist frame: 4 × 4, and sigma in rad."""
+    """Matrices of a calibrated wrist frame in recordings: 4 × 4, and sigma in rad."""
     name = calibration_name(side)
     return {
         name: matrix_rows(frame.T_tracker_wrist),
@@ -59,7 +59,7 @@ def calibration_record(frame: WristFrame, side: Side) -> dict[str, Matrix]:
 def calibrated_frame(
     calibration: Mapping[str, Matrix], side: Side
 ) -> Float64[np.ndarray, "4 4"] | None:
-    """T_keypoints_wrist of a recording's calibration; None where it has none.
+    """T_keypoints_wrist of a recording's calibration; None if it has none.
 
     Raises:
         ShapeError, NonFiniteError, InvalidInputError: it is no rigid transform.
@@ -73,14 +73,14 @@ def calibrated_frame(
 def to_wrist_axes(
     keypoints_m: np.ndarray, T_keypoints_wrist: np.ndarray
 ) -> Float64[np.ndarray, "time 25 3"]:
-    """Keypoints [T, 25, 3] of a tracker's axes in wrist axes; what is not seen becomes NaN."""
+    """Convert keypoints [T, 25, 3] from a tracker's axes to wrist axes; NaN if not seen."""
     return apply(invert(T_keypoints_wrist), seen_nodes(keypoints_m))
 
 
 def hand_axes_check(
     keypoints_m: np.ndarray, side: Side, calibration: Mapping[str, Matrix]
 ) -> KeypointAxes:
-    """Keypoints of one hand of a recording in wrist axes.
+    """Convert keypoints of one hand of a recording to wrist axes, and check them.
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3], metres, order of `dextouch.hands.skeleton`, in wrist axes or,

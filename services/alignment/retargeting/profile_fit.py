@@ -58,7 +58,7 @@ EVERY_SAMPLE_ALONE = RetargetOptions(pinch_far_m=0.0051, temporal_weight_m2=0.0)
 
 
 def unknown_person(hand: np.ndarray, robot_bone_m: np.ndarray) -> np.ndarray:
-    """Nothing is known: every sample's own bones, and its own knuckles. One record `PERSON`."""
+    """Record `PERSON` without a profile: bones and knuckles of each sample are used."""
     record = np.zeros(1, dtype=PERSON)
     num = len(robot_bone_m)
     record["bone_m"][0, :num] = robot_bone_m
@@ -70,7 +70,7 @@ def unknown_person(hand: np.ndarray, robot_bone_m: np.ndarray) -> np.ndarray:
 
 
 def person_arrays(profile: HandProfile, hand: HandModel) -> np.ndarray:
-    """A profile, of the fingers that the hand has, as the solver reads it: one record `PERSON`."""
+    """Record `PERSON` of a profile, for the fingers that the robot hand has."""
     sigma_m = max(profile.point_sigma_m, LEAST_SIGMA_M)
     record = np.zeros(1, dtype=PERSON)
     rows, num = chains_of(hand), len(hand.fingers)
@@ -165,7 +165,7 @@ def _spread(rows: np.ndarray) -> np.ndarray:
 def _knuckle_motion(
     points_m: np.ndarray, whole: np.ndarray, hand: HandModel
 ) -> Float64[np.ndarray, "n 5 3"]:
-    """Where the robot's knuckles are when its fingers point like the tracked ones; NaN: unknown."""
+    """Knuckles of the robot when its fingers point like the tracked ones; NaN if unknown."""
     # The solver takes keypoints by their number: here there are just the fingers' own, in turn.
     own, rows = hand_arrays(hand), chains_of(hand)
     nodes = own["nodes"][0, : len(rows)]
@@ -205,7 +205,7 @@ def _knuckle_motion(
 def _fit_knuckle(
     seen_m: np.ndarray, moved_m: np.ndarray
 ) -> tuple[Float64[np.ndarray, "3"], float, float]:
-    """Place, travel and what is left (standard deviation an axis) of one knuckle."""
+    """Position, travel and residual (standard deviation per axis) of one knuckle."""
     if not np.isfinite(moved_m).all():
         moved_m = np.zeros_like(seen_m)
     centred = moved_m - moved_m.mean(axis=0)

@@ -14,7 +14,7 @@ RIGID_TOLERANCE: Final = 1e-6
 
 
 def rigid_transform(matrix: object, *, what: str) -> Float64[np.ndarray, "4 4"]:
-    """A matrix of a calibration as float64 [4, 4], if it is a rigid transform.
+    """Validate a matrix of a calibration as a rigid transform, float64 [4, 4].
 
     Args:
         matrix: 4 rows of 4 numbers.
@@ -44,7 +44,7 @@ def rigid_transform(matrix: object, *, what: str) -> Float64[np.ndarray, "4 4"]:
 def pose_difference(
     Ts_world_a: np.ndarray, Ts_world_b: np.ndarray
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    """Distance (m) and angle (rad) between two poses of each moment."""
+    """Distance (m) and angle (rad) between simultaneous poses."""
     Ts_world_a = np.asarray(Ts_world_a, dtype=np.float64)
     Ts_world_b = np.asarray(Ts_world_b, dtype=np.float64)
     distance = np.linalg.norm(Ts_world_a[:, :3, 3] - Ts_world_b[:, :3, 3], axis=-1)

@@ -76,7 +76,7 @@ class WristFrame:
 
 
 def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints") -> WristFrame:
-    """The wrist frame from a palm in any posture of the fingers.
+    """Estimate the wrist frame from the palm, in any posture of the fingers.
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
@@ -133,7 +133,7 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
 def calibrate_wrist(
     keypoints_m: np.ndarray, side: Side, *, where: str = "flat-hand take"
 ) -> WristFrame:
-    """The wrist frame from a take in which the hand lies flat, fingers straight.
+    """Estimate the wrist frame from a take of the flat hand, fingers straight.
 
     Only samples with straight fingers count: in a grip, ring and little metacarpals give way.
 
@@ -170,7 +170,7 @@ def calibrate_wrist(
 def _palm(
     samples: np.ndarray, where: str
 ) -> tuple[Float64[np.ndarray, "9 3"], Bool[np.ndarray, " 9"]]:
-    """Mean places of the palm's nodes without samples far off, and which nodes count."""
+    """Mean positions of the palm's nodes without outliers, and which nodes are used."""
     seen = samples[:, list(PALM_NODES)]
     num_seen = np.isfinite(seen[..., 0]).sum(axis=0)
     is_used = num_seen >= max(1.0, MIN_SEEN_PART * len(samples))

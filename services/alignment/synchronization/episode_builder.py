@@ -56,14 +56,14 @@ class BuiltEpisode:
     streams: tuple[EpisodeStream, ...]
 
     def complete_attributes(self) -> EpisodeAttributes:
-        """The attributes with the figures that are known when every block was made."""
+        """The attributes with the figures that are known once every block was produced."""
         found = {name: n for stream in self.streams for name, n in stream.quality.items()}
         return self.attributes.model_copy(update={"quality": self.attributes.quality | found})
 
 
 @dataclass(frozen=True)
 class _Stretch:
-    """What of a recording becomes the episode: valid steps, and why the others do not."""
+    """The part of a recording that becomes the episode, and why the rest does not."""
 
     gridded: GriddedStreams
     origin_ns: int
@@ -78,7 +78,7 @@ def build_episode(
     options: AlignmentOptions,
     on_progress: OnProgress = lambda _: None,
 ) -> BuiltEpisode:
-    """Date all streams, find the longest stretch without a gap, and put actions on its grid.
+    """Fit all clocks, find the longest stretch without a gap, and make actions on its grid.
 
     Streams that the recording lacks are left out. Time 0 of the episode is the first moment at
     which all streams that make up the action are there. Values of other streams are read only
@@ -212,7 +212,7 @@ def check_complete(recording: Recording) -> None:
 
 
 def _seen(stream: LoadedStream) -> LoadedStream:
-    """Without samples that show nothing at all; single missing keypoints stay."""
+    """Drop samples without any keypoint; single missing keypoints stay."""
     if stream.values.dtype.kind != "f":
         return stream
     finite = np.isfinite(stream.values)

@@ -21,7 +21,7 @@ IMAGES_AT_ONCE = 8 * GOP_IMAGES
 
 @dataclass
 class EpisodeStream:
-    """One stream of an episode, whose samples are made while they are written.
+    """One stream of an episode, whose samples are produced while they are written.
 
     `quality` is complete when all blocks were taken.
     """
@@ -31,14 +31,14 @@ class EpisodeStream:
     quality: dict[str, float] = field(default_factory=dict)
 
     def blocks(self) -> Iterator[Block]:
-        """Its samples in order, once; times are those of the episode."""
+        """The samples in order, once, with times of the episode."""
         return self.source
 
 
 def made_stream(
     descriptor: StreamDescriptor, t_ref_ns: np.ndarray, values: np.ndarray
 ) -> EpisodeStream:
-    """A stream that alignment itself makes."""
+    """A stream that alignment itself computes, such as actions."""
     return EpisodeStream(descriptor, iter([Block(t_ref_ns, values)]))
 
 

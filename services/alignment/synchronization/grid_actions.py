@@ -28,7 +28,7 @@ REQUIRED: Mapping[Domain, tuple[str, ...]] = {
 
 @dataclass(frozen=True)
 class GriddedStreams:
-    """Streams that actions are made of, and where the grid's steps fall among their samples.
+    """Streams that actions are computed from, and the placement of the grid among their samples.
 
     `valid` marks the steps at which every one of them can be read without reaching across a gap.
     """
@@ -52,7 +52,7 @@ class GridActions:
 def place_streams(
     streams: Mapping[str, LoadedStream], grid_ns: np.ndarray, *, max_gap_ns: int
 ) -> GriddedStreams:
-    """Find every stream's neighbours of every step."""
+    """Find the neighbouring samples of every step in every stream."""
     at = {
         name: place_on_grid(
             stream.t_ns, grid_ns, period_ns=stream.descriptor.period_ns(), max_gap_ns=max_gap_ns

@@ -26,7 +26,7 @@ MAX_CHECKED = 2000
 
 @dataclass(frozen=True)
 class HandJoints:
-    """Both hands' joints on the grid, left before right, and figures about the retargeting."""
+    """Joint angles of both hands on the grid, left before right, with quality figures."""
 
     joints_rad: Float64[np.ndarray, "n 40"]
     quality: dict[str, float]
@@ -104,7 +104,7 @@ def _quality(side: str, result: RetargetResult, at: GridPlacement) -> dict[str, 
 
 
 def status_on_grid(status: np.ndarray, at: GridPlacement) -> UInt8[np.ndarray, " n"]:
-    """The worse status of the samples that each step is made of."""
+    """Status of each step: the worse of its two samples."""
     left = np.where(at.weight == 1, at.left + 1, at.left)
     right = np.where(at.weight == 0, at.left, at.left + 1)
     return np.maximum(status[left], status[right]).astype(np.uint8)

@@ -15,7 +15,7 @@ STAGE_BEGINS: dict[Stage, float] = {
 
 
 class Progress(NamedTuple):
-    """Where an alignment stands: `share` from 0 to 1 never goes back."""
+    """Progress of an alignment; `share` goes from 0 to 1 and never decreases."""
 
     share: float
     stage: Stage

@@ -47,7 +47,7 @@ Conversion = Callable[[np.ndarray], np.ndarray]
 
 @runtime_checkable
 class Recording(Protocol):
-    """What alignment reads of a recording (`dextouch.episodes.RecordingReader`)."""
+    """The part of `dextouch.episodes.RecordingReader` that alignment uses."""
 
     @property
     def attributes(self) -> RecordingAttributes:
@@ -73,7 +73,7 @@ class Recording(Protocol):
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive samples of one stream as the episode holds them; finite."""
+    """Consecutive samples of one stream in the units of the episode; finite."""
 
     t_ns: Int64[np.ndarray, " n"]
     values: Shaped[np.ndarray, "n ..."]
@@ -90,7 +90,7 @@ class LoadedStream:
 
 @dataclass(frozen=True)
 class DatedStream:
-    """One stream on the host's clock whose values are read when they are asked for.
+    """One stream on the host's clock, whose values are read on demand.
 
     `descriptor` is that of the episode; `quality` are figures for the record, and `calibration`
     matrices that the episode carries beside those of the recording.
@@ -141,7 +141,7 @@ def piece_rows(descriptor: StreamDescriptor) -> int:
 
 
 def date_stream(recording: Recording, name: str) -> DatedStream:
-    """Read the stamps of one stream, date them and find how its values become the episode's.
+    """Fit the clock of one stream and choose the conversion of its values.
 
     Raises:
         ClockFitError: its stamps fit no clock.
@@ -175,7 +175,7 @@ def date_stream(recording: Recording, name: str) -> DatedStream:
 
 
 def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
-    """A number of the calibration; None where it is not known."""
+    """A number of the calibration; None if it is missing."""
     matrix = calibration.get(name)
     if matrix is None:
         return None
@@ -191,7 +191,7 @@ def _as_it_is(values: np.ndarray) -> np.ndarray:
 def _keypoints_conversion(
     descriptor: StreamDescriptor, calibration: dict[str, Matrix]
 ) -> Conversion:
-    """To wrist axes where the calibration says how the tracker's are turned; else as they came."""
+    """Conversion to wrist axes if the calibration has them; otherwise unchanged."""
     if descriptor.side is None:
         return _as_float64
     T_keypoints_wrist = calibrated_frame(calibration, descriptor.side)
@@ -205,7 +205,7 @@ def _as_float64(values: np.ndarray) -> np.ndarray:
 
 
 def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
-    """Raw readings of any maker's glove as kPa; what is not measured is zero, named and counted."""
+    """Pressures in kPa of any maker's glove; unusable taxels are zero and counted by reason."""
     name, side = raw.name, raw.descriptor.side
     if side is None:
         raise InvalidInputError(f"stream {name!r}: has no side, expected left or right")
@@ -245,7 +245,7 @@ def _base_of(calibration: dict[str, Matrix], stream: str) -> Float64[np.ndarray,
     if BASE_NAME not in calibration:
         raise InvalidInputError(
             f"stream {stream!r}: poses are in the robot's base, and calibration {BASE_NAME!r} "
-            "(4 by 4) is missing; solve it from paired poses (docs/calibration.md), or send poses "
+            "(4 by 4) is missing; run dextouch station calibrate robot-base, or send poses "
             "in the world",
             missing=[BASE_NAME],
         )
@@ -255,7 +255,7 @@ def _base_of(calibration: dict[str, Matrix], stream: str) -> Float64[np.ndarray,
 def _moved_poses(
     poses: np.ndarray, *, T_world_base: np.ndarray | None, T_tracker_body: np.ndarray | None
 ) -> np.ndarray:
-    """Poses of the body in the world; NaN for what is none: not finite, or a zero quaternion."""
+    """Poses of the body in the world; NaN for invalid poses (not finite, zero quaternion)."""
     is_turned = np.linalg.norm(poses[:, 3:], axis=1) >= LEAST_NORM
     is_pose = is_turned & np.isfinite(poses).all(axis=1)
     moved = np.where(is_pose[:, None], poses, np.nan).astype(poses.dtype)

@@ -39,7 +39,7 @@ class RefusedPart(BaseModel):
 def refused_edges(
     first_ns: Mapping[str, int], last_ns: Mapping[str, int], start_ns: int
 ) -> list[RefusedPart]:
-    """What the streams do not share at the recording's ends.
+    """Ends of the recording that not all streams cover.
 
     Args:
         first_ns: of the first sample of each stream that actions are made of.
@@ -57,7 +57,7 @@ def refused_edges(
 def refused_stretches(
     t_ns: np.ndarray, valid: Mapping[str, np.ndarray], taken: tuple[int, int], start_ns: int
 ) -> list[RefusedPart]:
-    """Steps of the grid that are not taken.
+    """Steps of the grid that are not in the episode.
 
     Args:
         t_ns: of the steps, at least two, on the clock of `start_ns`.

@@ -14,7 +14,7 @@ EDGE_PERIODS = 1.5
 
 @dataclass(frozen=True)
 class GridPlacement:
-    """Where each grid step falls among the samples of one stream.
+    """Neighbouring samples and weights of each grid step in one stream.
 
     `weight` of the right neighbour lies in [0, 1] inside the samples; within `EDGE_PERIODS`
     of the ends it may lie outside (the line through the last two samples goes on).

@@ -29,7 +29,7 @@ MIN_LATENESS_NS = 5e6
 
 @dataclass(frozen=True)
 class TimedStream:
-    """When each kept sample was taken, and how well that is known.
+    """Times of the kept samples on the host's clock, with the report of the clock fit.
 
     Attributes:
         kept: indices of the samples that have a time of their own; repeated ones are left out.
@@ -48,7 +48,7 @@ class TimedStream:
 
 @dataclass(frozen=True)
 class _Dated:
-    """Times on the host's clock, the path's delay still in them, and what is known of the clock."""
+    """Times on the host's clock including the path's delay, with facts about the clock."""
 
     t_host_ns: Int64[np.ndarray, " n"]
     method: ClockMethod
@@ -67,7 +67,7 @@ def time_stream(
     latency_ns: int = 0,
     latency_sigma_ns: float | None = None,
 ) -> TimedStream:
-    """Fit the device's clock and date every sample.
+    """Fit the device's clock and compute the time of every sample.
 
     The device's stamps are used where there are any (unless they are coarser than a quarter of
     the period and samples are numbered), else its sequence numbers times the nominal period, else
@@ -109,7 +109,7 @@ def time_stream(
 
 
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:
-    """Why the times are in doubt, if they are."""
+    """Reasons to doubt the times, if any."""
     skew_limit_ppm = MAX_SKEW_PPM if dated.method == "device" else MAX_RATE_ERROR_PPM
     doubts: dict[ClockWarning, bool] = {
         "skew": abs(dated.skew_ppm or 0.0) > skew_limit_ppm,
@@ -155,7 +155,7 @@ def _fitted(
 
 
 def _counted(batch: SampleBatch, period_ns: int) -> _Dated:
-    """Dates by counting where the arrivals look like those of a steady device, else arrivals."""
+    """Times by counting samples of a steady device, otherwise arrival times."""
     arrivals = _Dated(batch.t_host_ns, "arrival")
     if len(batch) < MIN_COUNTED_SAMPLES or (np.diff(batch.t_host_ns) < 0).any():
         return arrivals

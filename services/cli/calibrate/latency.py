@@ -106,8 +106,9 @@ def _from_taps(glove: TakenStream, tracker: TakenStream) -> TimeOffset:
 
 
 def _calibrated(glove: TakenStream, side: Side) -> TactileCalibration:
+    stream = glove.descriptor
     return TactileCalibration.from_record(
-        glove.calibration, side, num_cells=glove.descriptor.shape[0]
+        glove.calibration, side, num_cells=stream.shape[0], stream=stream.name
     )
 
 

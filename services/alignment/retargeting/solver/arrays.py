@@ -143,7 +143,7 @@ SCRATCH: Final = np.dtype(
 
 
 class Memory(NamedTuple):
-    """What one sample leaves for the next, changed in place.
+    """State that one sample leaves for the next, changed in place.
 
     Attributes:
         joints_rad: [F, 6], what came out.

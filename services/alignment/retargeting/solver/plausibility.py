@@ -35,7 +35,7 @@ def read_sample(hand, work, keypoints, valid):
 
 @compiled
 @no_type_check
-def see_finger(hand, person, tuning, work, finger, memory):
+def check_finger(hand, person, tuning, work, finger, memory):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
     Bones of a length or a bend that no finger has, and knuckles far from where they belong, are

@@ -26,7 +26,11 @@ from services.alignment.retargeting.solver.minimize import (
     minimize,
     solve_cold,
 )
-from services.alignment.retargeting.solver.plausibility import find_pinches, read_sample, see_finger
+from services.alignment.retargeting.solver.plausibility import (
+    check_finger,
+    find_pinches,
+    read_sample,
+)
 from services.alignment.retargeting.solver.points import linearize
 
 # How often fingers are pushed apart in one sample.
@@ -36,7 +40,7 @@ MAX_PUSHES = 4
 @compiled
 @no_type_check
 def set_box(hand, work, finger, before_rad, reach):
-    """Where the joints of a finger may go in this sample: limits, and what time allows."""
+    """Bounds of a finger's joints in this sample: limits, and the reach since the last one."""
     for joint in range(hand.num_joints[finger]):
         before = before_rad[finger, joint]
         lower, upper = hand.lower_rad[finger, joint], hand.upper_rad[finger, joint]
@@ -152,7 +156,7 @@ def solve_pinches(hand, person, tuning, work, memory, num_near, output):
 
 @compiled
 @no_type_check
-def tell_behind(hand, person, work, memory, output):
+def mark_reacquired(hand, person, work, memory, output):
     """Fingers that the box keeps from where they are tracked are REACQUIRED until they are there.
 
     Their tip error is that of the angles that come out.
@@ -203,7 +207,7 @@ def retarget_samples(tables, samples, memory, output):
             for joint in range(hand.num_joints[finger]):
                 work.sent[finger, joint] = joints[finger, joint]
             memory.unsolved_s[finger] += elapsed_s[t]
-            status[finger] = see_finger(hand, person, tuning, work, finger, memory)
+            status[finger] = check_finger(hand, person, tuning, work, finger, memory)
         num_near = find_pinches(hand, tuning, work, status)
         solve_alone(hand, person, tuning, work, memory, found)
         solve_pinches(hand, person, tuning, work, memory, num_near, found)
@@ -213,7 +217,7 @@ def retarget_samples(tables, samples, memory, output):
                     break
                 solve_alone(hand, person, tuning, work, memory, found)
                 solve_pinches(hand, person, tuning, work, memory, num_near, found)
-        tell_behind(hand, person, work, memory, found)
+        mark_reacquired(hand, person, work, memory, found)
         for finger in range(num_fingers):
             if status[finger] < IMPLAUSIBLE:
                 memory.unsolved_s[finger] = 0.0
