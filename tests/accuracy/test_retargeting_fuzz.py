@@ -1,4 +1,4 @@
-"""Samples with faults of every kind: finite, in limits, quick, told, and soon forgotten."""
+"""100 000 samples with faults of every kind: finite, in limits, quick, told, and soon forgotten."""
 
 import json
 import os
@@ -18,15 +18,7 @@ MAY_LOOK_RIGHT = {
 }
 
 
-@pytest.mark.parametrize(
-    ("whose", "num_samples"),
-    [
-        ("human", 15_000),
-        ("robot", 10_000),
-        pytest.param("human", 60_000, marks=pytest.mark.slow),
-        pytest.param("robot", 40_000, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("whose", "num_samples"), [("human", 60_000), ("robot", 40_000)])
 def test_faults_are_told_and_forgotten(whose, num_samples, capsys):
     done = subprocess.run(
         [sys.executable, str(CHILD), whose, str(num_samples), "1"],
@@ -58,7 +50,7 @@ def test_faults_are_told_and_forgotten(whose, num_samples, capsys):
     assert figures["num_wronged"] == 0
     assert figures["num_unconverged"] <= num_samples * 5 * 1e-4
     # Processor time of the thread; a page fault of a busy machine may count once.
-    assert figures["over_1_ms"] <= max(1, num_samples // 10_000)
+    assert figures["over_1_ms"] <= num_samples // 10_000
     assert figures["back_tip_mm"] <= 1.0
     assert figures["back_joint_p999_deg"] <= 1.0
     for name, number in untold.items():

@@ -18,7 +18,7 @@ from services.world_model.training.evaluation import evaluate_prediction, predic
 
 # Far from the seeds of training and of the checkpoint's own held-out set.
 FIRST_SEED = 20_000
-EPISODES_PER_TASK = 3
+EPISODES_PER_TASK = 2
 FALSE_ALARM_N = 0.5
 MAX_FALSE_ALARMS = 0.15
 

@@ -25,9 +25,10 @@ def solver():
     hand_retargeter.warm_up()
 
 
-async def written(path):
-    """The addresses, once they are there."""
-    while not path.is_file() or not path.read_text().endswith("\n"):  # noqa: ASYNC110 - a file
+async def written(path, running):
+    """The addresses, once they are there; what ended the services, if they never are."""
+    while not path.is_file() or not path.read_text().endswith("\n"):
+        assert not running.done(), running.result()
         await asyncio.sleep(0.05)
     return json.loads(path.read_text())
 
@@ -47,7 +48,7 @@ async def test_all_services_in_one_process(solver, tmp_path, capsys):
     settings = up.UpSettings(data=tmp_path / "data", json=tmp_path / "urls.json", without=WITHOUT)
     stop = asyncio.Event()
     running = asyncio.create_task(up.run(settings, stop))
-    urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json", running), START_LIMIT_S)
     expected = set(up.BUILDERS) - set(WITHOUT)
     assert set(urls) == expected
     async with httpx.AsyncClient(trust_env=False, timeout=60) as client:
@@ -88,9 +89,9 @@ async def test_a_saved_take_becomes_an_episode_by_itself(solver, tmp_path, monke
     )
     stop = asyncio.Event()
     running = asyncio.create_task(up.run(settings, stop))
-    urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json", running), START_LIMIT_S)
     async with httpx.AsyncClient(trust_env=False, timeout=60) as client:
-        recording_id = await save_a_take(client, urls["acquisition"], 6.0)
+        recording_id = await save_a_take(client, urls["acquisition"], 4.0)
         jobs = []
         while not jobs or jobs[0]["state"] in {"waiting", "running"}:
             await asyncio.sleep(0.2)
@@ -170,7 +171,7 @@ async def test_without_worlds(tmp_path):
     )
     stop = asyncio.Event()
     running = asyncio.create_task(up.run(settings, stop))
-    urls = await asyncio.wait_for(written(tmp_path / "urls.json"), START_LIMIT_S)
+    urls = await asyncio.wait_for(written(tmp_path / "urls.json", running), START_LIMIT_S)
     assert set(urls) == {"episode_store", "alignment", "acquisition", "dashboard"}
     stop.set()
     assert await running == 0
