@@ -99,7 +99,7 @@ def _replaced(folder: Path, *, force: bool) -> Iterator[None]:
     if not force:
         raise ConflictError(f"{folder}: exists already; choose another folder or add --force")
     if not (folder / "meta" / "info.json").is_file():
-        raise ConflictError(f"{folder}: is no LeRobot data set, so --force does not remove it")
+        raise ConflictError(f"{folder}: is not a LeRobot data set, so --force does not remove it")
     aside = folder.with_name(f".{folder.name}.{uuid.uuid4().hex}.old")
     folder.rename(aside)
     written = False

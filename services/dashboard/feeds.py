@@ -87,7 +87,7 @@ class Feeds:
             answer = await self.upstream("acquisition").json("GET", station_api.REFUSED_PATH)
             return station_api.refused_views(answer)
         except DexTouchError:
-            return ()  # the station topic tells why
+            return ()  # reported by the station topic
 
     async def _stored(self) -> TakesView:
         """Stored takes, newest first, or why there are none."""
@@ -148,7 +148,7 @@ class Feeds:
             answer = await self.upstream("acquisition").json("GET", station_api.CAMERAS_PATH)
             views = [view.model_dump() for view in station_api.camera_views(answer)]
         except DexTouchError:
-            views = []  # the station topic tells why
+            views = []  # reported by the station topic
         return [topic_message("cameras", views)]
 
     async def _taxel_messages(self) -> list[Message]:

@@ -243,5 +243,5 @@ def _read(model: type[ModelT], answer: object) -> ModelT:
         return model.model_validate(answer)
     except ValidationError as error:
         raise UnavailableError(
-            f"acquisition: an answer of an unknown form ({error.error_count()} fields do not fit)"
+            f"acquisition: unexpected response ({error.error_count()} invalid fields)"
         ) from error

@@ -149,7 +149,7 @@ def unreachable_station(reason: str) -> StationView:
     return StationView(
         reachable=False,
         level="ERROR",
-        summary="acquisition does not answer",
+        summary="acquisition does not respond",
         note=reason,
         note_level="ERROR",
         streams=(),

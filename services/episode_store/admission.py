@@ -109,8 +109,8 @@ class DiskReserve:
         free = self.free_bytes()
         if free - num_bytes < reserve:
             raise StorageFullError(
-                f"{what}: {num_bytes} bytes do not fit, {free} bytes are free and {reserve} stay "
-                "so; what was acknowledged is kept, free space on the store's disk",
+                f"{what}: {num_bytes} bytes exceed the {free} free bytes ({reserve} reserved); "
+                "acknowledged batches are kept, free space on the store's disk",
                 reason="disk",
                 got=free,
                 expected=reserve + num_bytes,

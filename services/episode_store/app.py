@@ -53,7 +53,7 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        _mend(store)
+        _recover(store)
         # The first listing of a large store takes seconds, so it is warmed up in the background.
         threading.Thread(target=_warm_up, args=(catalog,), name="warm-up", daemon=True).start()
         try:
@@ -80,17 +80,17 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
     return app
 
 
-def _mend(store: EpisodeStore) -> None:
+def _recover(store: EpisodeStore) -> None:
     """Commit the stages of terminated writers and remove unrecoverable ones."""
     try:
         for group in store.recover():
-            logger.warning("recover_recording", kind=group.kind, id=group.item_id)
+            logger.warning("recording_recovered", kind=group.kind, id=group.item_id)
     except StorageError as error:
         # The service still serves everything else; `dextouch store repair` reports details.
-        logger.error("fail_recovery", error=error.message)  # noqa: TRY400
+        logger.error("recovery_failed", error=error.message)  # noqa: TRY400
     removed = store.sweep()
     if removed:
-        logger.info("remove_unfinished_writes", count=removed)
+        logger.info("unfinished_writes_removed", count=removed)
 
 
 def _intake(
@@ -121,4 +121,4 @@ def _warm_up(catalog: Catalog) -> None:
     try:
         catalog.warm_up()
     except StorageError as error:
-        logger.warning("fail_warm_up", reason=error.message)
+        logger.warning("warm_up_failed", reason=error.message)

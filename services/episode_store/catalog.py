@@ -69,7 +69,7 @@ class _Shelf(Generic[S]):
                 continue  # deleted while we were listing
             except StorageError as error:
                 logger.warning(
-                    "left_out_of_catalog", kind=self._kind, id=item_id, reason=error.message
+                    "omitted_from_catalog", kind=self._kind, id=item_id, reason=error.message
                 )
                 known[item_id] = (revision, None)
         self._known = known

@@ -139,7 +139,7 @@ class Ingest:
             if upload is not None:
                 upload.abandon()
             shutil.rmtree(path)
-        logger.warning("expire_upload", recording_id=recording_id)
+        logger.warning("upload_expired", recording_id=recording_id)
         return True
 
     def close(self) -> None:

@@ -22,13 +22,13 @@ Measure what a station must know of its devices. Everything goes into one folder
   pictures/                  coverage and residuals, to look at
 
 A whole calibration:
-  1. glove     at a running station, which records rest and known pressures as you are told
+  1. glove     at a running station, which records rest and known pressures step by step
                dextouch station calibrate glove --side left --url http://127.0.0.1:8083 \\
                  --to calibration
   2. camera    25 photos of a printed board, everywhere in the image, near and far, tilted
                dextouch station calibrate camera --camera head --photos photos/head \\
                  --board charuco:5x7:30mm:22mm --to calibration
-  3. hand-eye  20 photos of a fixed board with the tracker's pose at each, turned about all axes
+  3. hand-eye  20 photos of a fixed board with the tracker's pose at each, rotated about all axes
                dextouch station calibrate hand-eye --camera head --photos photos/mount \\
                  --poses photos/mount/poses.csv --board charuco:5x7:30mm:22mm --to calibration
   4. show      age and sigma of everything; warns after seven days
@@ -38,39 +38,39 @@ Where the station needs them:
   wrist        gloves whose keypoints are not in wrist axes: a take of the flat hand
   profile      once a person: a take in which the hand opens, closes and spreads
   robot-base   robots that report poses in their base: pairs of poses of tracker and effector
-  latency      streams whose path delay nobody states: a take of brisk motion, or of taps
+  latency      streams with unknown path delay: a take of brisk motion, or of taps
 
 More: docs/calibration_guide.md"""
 
 _CAMERA = """\
-What good photos are: 25 of them; the board in every ninth of the image, also in the corners;
-near and far; each of its edges once nearer to the camera by 20 to 45 degrees; still and sharp.
-The residual says nothing about accuracy (it is as small for 8 photos as for 40): look at ±.
+Good photos: 25 of them, with the board in every ninth of the image including the corners, near and
+far, tilted towards each of its edges by 20 to 45 degrees, static and sharp. The residual is not a
+measure of accuracy (it is as small for 8 photos as for 40): check the sigma (±).
 
   --photos FOLDER            calibrate with the photos of a folder
-  --photos FOLDER --watch    look on while photos come in, say what is missing, then calibrate
+  --photos FOLDER --watch    watch for new photos, report what is missing, then calibrate
   --photos FOLDER --url URL  take still views from a running station into the folder, likewise
-  --check                    only say what the photos cover and what to do next"""
+  --check                    only report the coverage of the photos and advice"""
 
 _HAND_EYE = """\
-The board stands still; the tracker with its camera is held still at every photo. Turn it by 30
-degrees and more about at least two of its axes, better three. The camera must be calibrated first
-(--intrinsics says where, when not in the same folder). With poses of the board in the file no
-photos are needed. When poses are refused as inverted, --invert turns that side round."""
+The board is fixed; hold the tracker with its camera still at every photo. Rotate it by 30 degrees
+or more about at least two of its axes, better three. The camera must be calibrated first
+(--intrinsics names its folder, if it is another one). With poses of the board in the file no
+photos are needed. If poses are refused as inverted, --invert inverts that side."""
 
 _GLOVE = """\
-  --url URL                  a running station records all takes: this command says what to do
-                             (rest, then each pressure), checks every take and asks again where one
-                             is not good. The takes are read from the station's --spool; on another
-                             machine give --store URL, and they are read once they are uploaded
-  --rest TAKE --presses CSV  takes that are there: folders of a spool, or ids with --store URL
+  --url URL                  a running station records all takes: this command guides you (rest,
+                             then each pressure), checks every take and repeats invalid ones. The
+                             takes are read from the station's --spool; on another machine give
+                             --store URL, and they are read after their upload
+  --rest TAKE --presses CSV  existing takes: folders of a spool, or ids with --store URL
 
-The list of presses is a CSV: take and pressure_kpa, or mass_kg and area_cm2 of a weight; and if
-wanted sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds from the take's start).
+The list of presses is a CSV: take and pressure_kpa, or mass_kg and area_cm2 of a weight; optional
+columns are sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds in the take).
   take,pressure_kpa,sigma_kpa,pads
   spool/bladder-10,10,0.1,all
   spool/bladder-30,30,0.3,all
-Without presses only the tare is measured, which may be done every day; the gain stays."""
+Without presses only the tare is measured, for example daily; the gain is kept."""
 
 _WRIST = """\
 Record one second or more of the flat hand, fingers straight; once for each person and glove.
@@ -80,17 +80,17 @@ example:
 
 _PROFILE = """\
 Record ten seconds in which the hand opens, closes and spreads its fingers. Without a profile every
-recording's own motion is used, which shows less of the hand.
+recording's own motion is used, which is less accurate.
 
 example:
   dextouch station calibrate profile --side left --take spool/fist-left --to calibration"""
 
 _ROBOT_BASE = """\
-Fix a tracker to the robot's effector and stop at 20 places all over the workspace, turned by 30
-degrees and more about all axes. The file holds a pair of 4x4 matrices for each:
+Fix a tracker to the robot's effector and stop at 20 poses all over the workspace, rotated by 30
+degrees or more about all axes. The file holds a pair of 4x4 matrices for each:
   [[T_world_tracker, T_base_effector], ...]
-Where the tracker sits on the effector is found too, unless --same-frame says that both series
-are poses of the same frame.
+The mount of the tracker on the effector is estimated too, unless --same-frame states that both
+series are poses of the same frame.
 
 example:
   dextouch station calibrate robot-base --poses pairs.json --to calibration"""

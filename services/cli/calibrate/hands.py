@@ -1,4 +1,4 @@
-"""`dextouch station calibrate wrist` and `profile`: how a glove sits on a hand, and whose it is."""
+"""Commands `dextouch station calibrate wrist` and `profile`: glove axes and hand sizes."""
 
 import argparse
 from datetime import UTC, datetime
@@ -24,7 +24,7 @@ def calibrate_wrist_axes(options: argparse.Namespace) -> dict[str, object]:
 
     Raises:
         NotFoundError: no such take, or it has no keypoints of this hand.
-        InvalidInputError: the hand is not flat, not this one, or its nodes are no hand.
+        InvalidInputError: the hand is not flat, of the other side, or its nodes are not a hand.
     """
     taken = _keypoints(options)
     frame = calibrate_wrist(taken.batch.values, options.side, where=f"take {options.take!r}")
@@ -55,7 +55,7 @@ def calibrate_wrist_axes(options: argparse.Namespace) -> dict[str, object]:
 def measure_person(options: argparse.Namespace) -> dict[str, object]:
     """Measure bones and knuckles of the person who wears a glove, from a take of moving fingers.
 
-    Keypoints are turned to wrist axes by the calibration in `--to`, else by the take's own.
+    Keypoints are rotated to wrist axes by the calibration in `--to`, or else by the take's own.
 
     Raises:
         NotFoundError: no such take, or it has no keypoints of this hand.

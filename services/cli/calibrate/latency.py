@@ -1,7 +1,7 @@
-"""`dextouch station calibrate latency`: the path delay of one stream, relative to another one.
+"""Command `dextouch station calibrate latency`: path delay of a stream relative to another one.
 
-Either two pose streams see the same brisk motion (trackers held together), or a glove and a tracker
-see a hand that taps a table.
+Either two pose streams record the same brisk motion (trackers held together), or a glove and a
+tracker record a hand that taps a table.
 """
 
 import argparse
@@ -21,13 +21,13 @@ from services.alignment.calibration.time_offset import TimeOffset, estimate_time
 from services.cli.calibrate.record import write_entry
 from services.cli.calibrate.takes import TakenStream, read_stream
 
-# Norm of a quaternion below which a tracker has lost its target and sends zeros.
+# Quaternion norm below which a pose counts as lost, since trackers then send zeros.
 MIN_NORM = 0.5
 HEIGHT = 2
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Measure how much later one stream arrives than another, beyond what is calibrated already.
+    """Measure the delay of one stream relative to another, in addition to calibrated latencies.
 
     Raises:
         DegenerateMotionError: too little, too slow or too regular motion, or no taps.
@@ -49,7 +49,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
             f"latency of {options.stream!r} against {options.reference!r}: got streams of kind "
             f"{kinds[1]} and {kinds[0]}, expected two poses, or a pose and a glove"
         )
-    # The offset is what must be added to the stream's times: it arrives later by its negative.
+    # The offset is added to the stream's times: the latency is its negative.
     name = f"{options.stream}_latency"
     latency_ns = (stream.number(f"{name}_ns") or 0.0) - found.offset_ns
     known_ns = reference.number(f"{options.reference}_latency_sigma_ns") or 0.0
@@ -85,7 +85,7 @@ def _from_motion(a: TakenStream, b: TakenStream) -> TimeOffset:
     try:
         return estimate_time_offset(t_a_ns, a_rad_s, t_b_ns, b_rad_s)
     except DegenerateMotionError:
-        # Two tracking systems may have worlds that are turned to each other: speeds are the same.
+        # The worlds of two tracking systems may be rotated to each other, but speeds are equal.
         speeds = np.linalg.norm(a_rad_s, axis=1), np.linalg.norm(b_rad_s, axis=1)
         return estimate_time_offset(t_a_ns, speeds[0], t_b_ns, speeds[1])
 
@@ -126,10 +126,10 @@ def _angular_velocity(
 def _poses(
     stream: TakenStream,
 ) -> tuple[Int64[np.ndarray, " n"], Float64[np.ndarray, "n 7"], Bool[np.ndarray, " n"]]:
-    """Times, poses, and where the tracker saw its target.
+    """Times, poses, and a mask of valid tracking.
 
     Raises:
-        InvalidInputError: it hardly ever did.
+        InvalidInputError: too few valid poses.
     """
     t_ns, values = stream.timed()
     poses = values.astype(np.float64)

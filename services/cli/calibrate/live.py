@@ -132,7 +132,7 @@ def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
 
 def _why_nothing_is_kept(view: BoardView | None, *, still: bool) -> str:
     if view is None:
-        return "no board in the last image; does --board tell the inner corners of this one?"
+        return "no board in the last image; does --board match this board?"
     if not still or view.is_blurred:
         return "the board in the last image moves or is blurred; hold it still"
     return "the board is where it was; hold it elsewhere"
@@ -182,7 +182,7 @@ def run(options: argparse.Namespace, board: Board) -> None:
         UnavailableError: the station does not respond.
     """
     session = Session(board, options.to, options.camera)
-    print("Ctrl-C ends the collecting and calibrates with what is there")
+    print("Ctrl-C ends the collection and calibrates with the photos so far")
     try:
         if options.url is None:
             follow_folder(session, folder_arrivals(options.photos))

@@ -60,7 +60,7 @@ def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
     bytes_ = np.frombuffer(data, dtype=np.uint8)
     photo = cv2.imdecode(bytes_, cv2.IMREAD_GRAYSCALE) if data else None
     if photo is None:
-        raise CorruptDataError(f"{where}: {len(data)} bytes are no image")
+        raise CorruptDataError(f"{where}: {len(data)} bytes are not an image")
     return np.asarray(photo, dtype=np.uint8)
 
 

@@ -1,4 +1,4 @@
-"""`dextouch station calibrate robot-base`: where a robot's base stands in the tracked world."""
+"""Command `dextouch station calibrate robot-base`: pose of a robot's base in the tracked world."""
 
 import argparse
 from datetime import UTC, datetime
@@ -17,10 +17,11 @@ PAIRS_HELP = "JSON: [[T_world_tracker, T_base_effector], …], each 4x4, both of
 
 
 def calibrate(options: argparse.Namespace) -> dict[str, object]:
-    """Find the base from pairs of poses of a tracker on the effector and of the effector itself.
+    """Estimate the base from pairs of poses of a tracker on the effector and of the effector.
 
     Raises:
-        DegenerateMotionError: the effector was turned or moved too little; names the axes.
+        DegenerateMotionError: the effector was rotated or moved too little; the message names the
+            axes.
         InvalidInputError: too few pairs, or pairs that contradict each other.
         NotFoundError: no such file.
     """

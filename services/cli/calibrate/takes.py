@@ -1,4 +1,4 @@
-"""Streams of takes that calibrations are made from: of a station's spool or of an episode store."""
+"""Streams of takes for calibrations, from a station's spool or an episode store."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +17,7 @@ from services.alignment.synchronization.stream_clock import time_stream
 
 @dataclass(frozen=True)
 class TakenStream:
-    """All samples of one stream of a take, and the calibration that the take carries."""
+    """All samples of one stream of a take, with the take's calibration."""
 
     take: str
     descriptor: StreamDescriptor
@@ -25,7 +25,7 @@ class TakenStream:
     calibration: dict[str, Matrix]
 
     def number(self, name: str) -> float | None:
-        """A 1 × 1 matrix of the calibration; None where it is missing."""
+        """Value of a 1 × 1 matrix of the calibration; None if missing."""
         matrix = self.calibration.get(name)
         return None if matrix is None else float(matrix[0][0])
 
@@ -33,7 +33,7 @@ class TakenStream:
         """Times on the host's clock without the calibrated latency, and the values at them.
 
         Raises:
-            ClockFitError: the stamps fit no clock.
+            ClockFitError: no clock can be fitted to the stamps.
         """
         latency_ns = self.number(f"{self.descriptor.name}_latency_ns")
         timing = time_stream(self.batch, self.descriptor, latency_ns=round(latency_ns or 0.0))
@@ -41,7 +41,7 @@ class TakenStream:
 
 
 def read_stream(take: str, name: str, store: str | None) -> TakenStream:
-    """One stream of a spool folder, or of a recording in a store.
+    """Read one stream of a spool folder, or of a recording in a store.
 
     Args:
         take: path of a spool folder, or id of a recording.

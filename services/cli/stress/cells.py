@@ -185,7 +185,7 @@ def run_cell(cell: Cell | Exemption) -> Finding:
     begin_s = time.perf_counter()
     try:
         cell.run(check)
-    except Exception as error:  # noqa: BLE001 - an error that nobody expected is the finding
+    except Exception as error:  # noqa: BLE001 - an unexpected error is the finding
         text = " ".join(str(error).split())
         check.true(f"expected: {type(error).__name__}: {text[:200]}", holds=False)
     verdict: Verdict = "held" if check.held else "failed"

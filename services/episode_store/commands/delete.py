@@ -26,7 +26,7 @@ def delete(context: Context) -> Outcome:
         )
     for item_id, kind in [(item_id, context.kind_of(item_id)) for item_id in options.ids]:
         context.store.delete(item_id, kind=kind, for_good=options.for_good)
-        context.say(f"{item_id}  {'deleted for good' if options.for_good else 'in the trash'}")
+        context.say(f"{item_id}  {'deleted permanently' if options.for_good else 'in the trash'}")
     return {"deleted": options.ids, "for_good": options.for_good}, 0
 
 
@@ -45,7 +45,10 @@ def _delete_all_of(context: Context) -> Outcome:
     asked = options.operator or options.recording
     for victim in plan_deletion(root, request):
         context.say(f"{victim.place}/{victim.folder}  {victim.reason}")
-    if not options.yes and context.ask(f"Type {asked} to remove all this for good: ") != asked:
+    if (
+        not options.yes
+        and context.ask(f"Type {asked} to delete all of this permanently: ") != asked
+    ):
         raise InvalidInputError("delete: not confirmed; nothing was removed")
     path = Path(options.receipt or f"deletion-{datetime.now(UTC):%Y%m%dT%H%M%SZ}.json")
     checkpoints = Path(options.checkpoints) if options.checkpoints else None

@@ -68,7 +68,7 @@ def list_items(context: Context) -> Outcome:
         result |= found | {"num_matching": result["num_matching"] + found["num_matching"]}
         totals.append(f"{num_in_all} {each}" + "s" * (num_in_all != 1))
     if kind != "episode" and root is not None:
-        result["unfinished"] = _list_broken_off(context, root)
+        result["unfinished"] = _list_interrupted(context, root)
     if not result["num_matching"] and not result.get("unfinished"):
         context.say(f"nothing matches, of {' and '.join(totals)}")
     return result, 0
@@ -104,14 +104,14 @@ def _outcome(row: EpisodeSummary | RecordingSummary | Attributes) -> str:
     return _OUTCOMES[row.success] + "  recovered" * row.recovered
 
 
-def _list_broken_off(context: Context, root: Path) -> list[str]:
+def _list_interrupted(context: Context, root: Path) -> list[str]:
     """List interrupted takes, whose stages `recover` can complete; returns their names."""
     names = []
     for place, folder in unfinished(root):
         if place == "stage" and (folder / STAGE_FILE).is_file() and not is_held(folder):
             kind, name = _stage_name(folder)
             names.append(name)
-            context.say(f"{name}  {kind}  broken off; `dextouch store repair` completes it")
+            context.say(f"{name}  {kind}  interrupted; `dextouch store repair` completes it")
     return names
 
 
@@ -235,7 +235,7 @@ def _files(context: Context, kind: Kind, item_id: str) -> GroupFiles:
 
 def _inspect_unfinished(kind: str, folder: Path) -> ItemReport:
     if not folder.is_dir() or folder.is_symlink():
-        finding = Finding(f"{kind} {folder.name}: is no folder; move it away", foreign=True)
+        finding = Finding(f"{kind} {folder.name}: is not a folder; move it away", foreign=True)
         return ItemReport(kind, folder.name, findings=(finding,))
     if kind == "stage":
         return inspect_stage(folder)

@@ -116,7 +116,7 @@ class RolloutClient:
         )
         answer = decode_answer(reply.body, max_bytes=MAX_ANSWER_BYTES)
         if answer.origin is None:
-            raise UnavailableError("start: the answer holds no anchor; is the service too old?")
+            raise UnavailableError("start: the response has no anchor; is the service too old?")
         return Rollout(self._link, query, answer, answer.origin)
 
     def close(self) -> None:

@@ -212,4 +212,4 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
     try:
         return CommitRecord.model_validate(plain), digest
     except ValidationError as error:
-        raise CorruptDataError(f"{what}: {COMMIT_FILE} is no commit record ({error})") from error
+        raise CorruptDataError(f"{what}: {COMMIT_FILE} is not a commit record ({error})") from error

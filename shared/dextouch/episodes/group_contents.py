@@ -89,7 +89,7 @@ class CommittedGroup(Generic[A]):
             digest.update(data)
             num_bytes += len(data)
         if digest.hexdigest() != entry.sha256:
-            raise CorruptDataError(f"{self.what}: sha256 of array {name!r} does not hold")
+            raise CorruptDataError(f"{self.what}: sha256 of array {name!r} does not match")
         return num_bytes
 
 
@@ -157,7 +157,7 @@ def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[
         attributes = model.model_validate_json(text)
         expected = {stream.name: stream_arrays(stream, kind) for stream in attributes.streams}
     except (ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
-        raise StorageError(f"{what}: attributes of an unknown kind ({error})") from error
+        raise StorageError(f"{what}: attributes are invalid ({error})") from error
     _check_arrays(expected, record.arrays, what)
     return CommittedGroup(files, kind, attributes, record.arrays, content_sha256, what)
 

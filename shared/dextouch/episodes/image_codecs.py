@@ -103,7 +103,9 @@ class ImageChunks:
                 min_factor=2 if form.half_size else 1,
             )
         except ValueError as error:
-            raise CorruptDataError(f"{len(data)} bytes are no whole JPEG ({error})") from error
+            raise CorruptDataError(
+                f"{len(data)} bytes are not a complete JPEG ({error})"
+            ) from error
         # A half of an odd size is rounded up there and down here.
         out[...] = image[: out.shape[0], : out.shape[1]]
 

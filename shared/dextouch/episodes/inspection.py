@@ -131,7 +131,7 @@ def _inspect_array(contents: Group, name: str, progress: Progress) -> tuple[list
             progress(len(payload))
     # Also detects damage for which a forger has adapted the checksums.
     if not findings and digest.hexdigest() != contents.entries[name].sha256:
-        findings.append(Finding(f"{what}: sha256 does not hold", name))
+        findings.append(Finding(f"{what}: sha256 does not match", name))
     return findings, num_bytes
 
 
@@ -207,7 +207,7 @@ def _inspect_batches(folder: Path, names: list[str]) -> ItemReport:
         with open_log(folder) as data:
             records = find_records(data)
             for start, stop in records.damage:
-                message = f"{what}: bytes {start} … {stop - 1} of its log are no record"
+                message = f"{what}: bytes {start} … {stop - 1} of its log are not a record"
                 findings.append(Finding(message))
             for row in records.rows:
                 stream = int(row["stream"])

@@ -67,8 +67,8 @@ def read_rows(folder: Path, name: str) -> np.ndarray:
     if not good[:num_good].all():
         bad = int(np.flatnonzero(~good[:num_good])[0])
         raise CorruptDataError(
-            f"journal of {name!r}: row {bad} of {num_good} does not hold, yet later ones do; "
-            "this is no torn end but damage, restore the file from a copy"
+            f"journal of {name!r}: row {bad} of {num_good} is invalid, but later ones are valid; "
+            "this is damage, not a torn tail: restore the file from a copy"
         )
     return rows[:num_good]
 

@@ -73,7 +73,9 @@ class OldGroup:
             text = json.dumps(json.loads(group or b"")["attributes"][ATTRIBUTES_KEY])
             self._attributes = model.model_validate_json(text)
         except (ValueError, KeyError, TypeError, AttributeError, ValidationError) as error:
-            raise CorruptDataError(f"{self._what}: is no group of version 1 ({error})") from error
+            raise CorruptDataError(
+                f"{self._what}: is not a group of version 1 ({error})"
+            ) from error
         self._content_sha256 = str(digest)
 
     @property

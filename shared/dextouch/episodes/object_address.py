@@ -110,5 +110,5 @@ def parse_address(
         # Option names only: the values may be secret.
         names = sorted({str(problem["loc"][0]) for problem in error.errors()})
         problem = error.errors(include_input=False)[0]["msg"]
-        raise InvalidInputError(f"{where}: options {names} do not fit ({problem})") from None
+        raise InvalidInputError(f"{where}: invalid options {names} ({problem})") from None
     return ObjectAddress(parts.hostname, prefix, options)

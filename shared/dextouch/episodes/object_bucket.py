@@ -85,9 +85,7 @@ class Bucket:
                 },
             )
         except (BaseError, ValueError) as error:
-            raise InvalidInputError(
-                f"{address}: options do not fit ({_first_line(error)})"
-            ) from error
+            raise InvalidInputError(f"{address}: invalid options ({_first_line(error)})") from error
 
     def __reduce__(self) -> tuple[type["Bucket"], tuple[ObjectAddress]]:
         return Bucket, (self.address,)

@@ -184,8 +184,8 @@ class ObjectStorage:
         if is_current(self.group(kind, item_id), what=f"{kind} {item_id}"):
             return False
         raise StorageError(
-            f"{kind} {item_id!r}: is of an older version, which cannot be brought over in "
-            f"{self._address}; copy it to a local store, migrate it there and write it here anew"
+            f"{kind} {item_id!r}: is of an older version, which cannot be migrated in "
+            f"{self._address}; copy it to a local store, migrate it there and write it here again"
         )
 
     def recover(self) -> builtins.list[RecoveredGroup]:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.episodes.spool_log import LOG_FILE, BatchLogWriter, body_at, open_log, read_records
+from dextouch.episodes.spool_log import LOG_FILE, SpoolLogWriter, body_at, open_log, read_records
 from dextouch.episodes.spool_reader import read_attributes
 from dextouch.errors import ConflictError
 
@@ -35,7 +35,7 @@ def recover(path: Path) -> RecoveryReport:
     try:
         if not (path / LOG_FILE).exists():
             # The process died before it created the log.
-            BatchLogWriter(path).close()
+            SpoolLogWriter(path).close()
         records = read_records(path)
         rows = records.rows[: _num_trusted(path, records.rows)]
         kept = (
@@ -43,7 +43,7 @@ def recover(path: Path) -> RecoveryReport:
             if len(rows) == len(records.rows)
             else int(records.rows["offset"][len(rows)])
         )
-        BatchLogWriter(path, end=kept).close()
+        SpoolLogWriter(path, end=kept).close()
     finally:
         os.close(lock)
     counts = {

@@ -102,8 +102,8 @@ def repair_group(
     if all(finding.foreign for finding in report.findings):
         return RepairReport(kind, item_id, LEFT, notes=notes)
     if copy is not None:
-        _mend_from(folder, kind, copy)
-    _mend_metadata(files, kind)
+        _repair_from(folder, kind, copy)
+    _rewrite_metadata(files, kind)
     report = inspect_group(files, kind)
     if all(finding.foreign for finding in report.findings):
         return RepairReport(kind, item_id, MENDED, notes=notes)
@@ -192,7 +192,7 @@ def _write_once(
     return write_salvaged(root, attributes, streams, source)
 
 
-def _mend_metadata(files: LocalGroup, kind: Kind) -> None:
+def _rewrite_metadata(files: LocalGroup, kind: Kind) -> None:
     """Rewrite the `zarr.json` of arrays, which is fully determined by the commit record."""
     try:
         contents = open_contents(files, kind)
@@ -204,7 +204,7 @@ def _mend_metadata(files: LocalGroup, kind: Kind) -> None:
 
 def _put(folder: Path, name: str, data: bytes) -> None:
     """Replace a file of a group; symbolic links on its path are removed, their targets kept."""
-    with disk_errors(f"mend {name} of {folder.name}"):
+    with disk_errors(f"repair {name} of {folder.name}"):
         place = folder
         for part in name.split("/"):
             place = place / part
@@ -216,7 +216,7 @@ def _put(folder: Path, name: str, data: bytes) -> None:
         replace_file(place, data)
 
 
-def _mend_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
+def _repair_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
     """Copy all files that differ or are damaged here and are intact in the copy."""
     theirs = open_contents(copy, kind)
     what = f"{kind} {folder.name}"
@@ -225,7 +225,7 @@ def _mend_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
         data = copy.get(name)
         if data is not None:
             _put(folder, name, data)
-    _mend_metadata(LocalGroup(folder), kind)
+    _rewrite_metadata(LocalGroup(folder), kind)
     bad_here = _damaged_arrays(LocalGroup(folder), kind)
     bad_there = _damaged_arrays(copy, kind)
     for name in sorted(bad_here - bad_there):
@@ -238,7 +238,7 @@ def _put_shard(folder: Path, name: str, data: bytes) -> None:
     # Written beside the group, so that no partial group is ever visible.
     partial = folder.parent.parent / STAGING / f"mend-{folder.name}-{uuid.uuid4().hex}"
     _put(folder, name, b"")
-    with disk_errors(f"mend {name} of {folder.name}"):
+    with disk_errors(f"repair {name} of {folder.name}"):
         partial.mkdir(parents=True)
         write_file(partial / "shard", data)
         (partial / "shard").replace(folder / name)
@@ -290,7 +290,7 @@ def _known(
     record, group = _commit_of(files, what), get_metadata(files, METADATA_FILE, what)
     if group is None or (record and sha256_hex(group) != record[0].attributes_sha256):
         raise CorruptDataError(
-            f"{what}: attributes are damaged, without which nobody can say what the samples are; "
+            f"{what}: attributes are damaged, and samples cannot be interpreted without them; "
             "name a copy with --from, or delete it"
         )
     model = EpisodeAttributes if kind == "episode" else RecordingAttributes

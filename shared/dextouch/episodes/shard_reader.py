@@ -45,7 +45,7 @@ def _without_crc(data: memoryview | bytes, start: int, length: int, what: str) -
     body, crc = bytes(data[start : stop - CRC_BYTES]), data[stop - CRC_BYTES : stop]
     if length < CRC_BYTES or google_crc32c.value(body) != int.from_bytes(crc, "little"):
         raise CorruptDataError(
-            f"{what}: checksum does not hold ({length} bytes read); "
+            f"{what}: checksum mismatch ({length} bytes read); "
             "the file is damaged or truncated, restore it from a copy"
         )
     return body
@@ -153,7 +153,7 @@ class ShardReader:
         ends = np.concatenate([np.zeros(1, "<u8"), index.sum(axis=1)])
         if not inside or int(ends[-1]) != end or not np.array_equal(index[:, 0], ends[:-1]):
             raise CorruptDataError(
-                f"{self._what}: shard index does not fit the {end} bytes of its storage chunks"
+                f"{self._what}: shard index is inconsistent with the {end} bytes of its chunks"
             )
 
     def _check_claim(self, index: np.ndarray) -> None:

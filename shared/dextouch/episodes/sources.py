@@ -89,7 +89,7 @@ class _MappedFiles:
 
 
 _MAPPED = _MappedFiles(MAX_MAPPED_FILES)
-# A lock that another thread held at the fork would stay held in the child for ever.
+# A lock that another thread held at the fork would stay locked in the child forever.
 os.register_at_fork(after_in_child=_MAPPED.forget)
 
 

@@ -13,7 +13,7 @@ from types import TracebackType
 from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
 from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
-from dextouch.episodes.spool_log import BatchLogWriter, RecordBody, read_bodies, read_records
+from dextouch.episodes.spool_log import RecordBody, SpoolLogWriter, read_bodies, read_records
 from dextouch.episodes.spool_reader import (
     CLOSED_FILE,
     RECORDING_FILE,
@@ -88,7 +88,7 @@ class SpoolWriter:
         self._lock = lock_spool(path)
         if resume:
             end = self._count()
-        self._log = BatchLogWriter(path, end=end)
+        self._log = SpoolLogWriter(path, end=end)
         # Records that a crashed process wrote but did not sync count as kept from here on.
         self._is_dirty = resume
         self.flush()

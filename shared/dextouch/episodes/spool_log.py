@@ -154,8 +154,8 @@ def read_records(folder: Path) -> LogRecords:
     if records.damage:
         start, stop = records.damage[0]
         raise CorruptDataError(
-            f"log of spool {folder.name!r}: bytes {start} … {stop - 1} are no record, yet whole "
-            "ones follow; this is no torn end but damage, restore the file from a copy"
+            f"log of spool {folder.name!r}: bytes {start} … {stop - 1} are not a record, but valid "
+            "ones follow; this is damage, not a torn tail: restore the file from a copy"
         )
     for stream in np.unique(records.rows["stream"]):
         rows = records.rows[records.rows["stream"] == stream]
@@ -227,7 +227,7 @@ class RecordBody:
         return RecordBody(data, google_crc32c.value(data), num_samples)
 
 
-class BatchLogWriter:
+class SpoolLogWriter:
     """Appends records to a spool's log; each append is one write.
 
     Args:

@@ -143,8 +143,8 @@ def _publish(
     """Publish a stage with a valid commit record, under another id if its own is taken."""
     attributes = read_committed(stage, record.kind)
     if attributes_id(attributes) != record.id or is_taken(record.kind, record.id):
-        # What can be made again was told so, and so was a migration that never got to put its
-        # group into place.
+        # A group that can be recomputed has no `stage.json`, nor has a migration that was
+        # interrupted before it put its group into place.
         if not (stage / STAGE_FILE).is_file():
             return None
         record = change_attributes(stage, record, _as_recovered(attributes, is_taken))

@@ -149,8 +149,8 @@ class StreamWriter:
     def _check_unbroken(self) -> None:
         if self._is_broken:
             raise StorageError(
-                f"{self.descriptor.name}: a block was broken off half written, and nothing can "
-                "follow it; leave the writer's context, which keeps or removes what came before"
+                f"{self.descriptor.name}: a block was interrupted, and nothing can follow it; "
+                "leave the writer's context, which keeps or removes the blocks before it"
             )
 
     def finish(self) -> dict[str, ArrayEntry]:
@@ -168,7 +168,7 @@ class StreamWriter:
         entries[name] = entries[name].model_copy(update={"encoder": self._images.encoder})
         counts = {array: entry.shape[0] for array, entry in entries.items()}
         if len(set(counts.values())) != 1:
-            raise StorageError(f"{name}: a block was written in part ({counts}); write it anew")
+            raise StorageError(f"{name}: a block was written partially ({counts}); write it again")
         return entries
 
     def _flush(self) -> None:
@@ -227,7 +227,7 @@ class _EncodedImages:
             if self._codec == "h264" and is_keyframe(data) != begins:
                 raise InvalidInputError(
                     f"{where}: is {'no' if begins else 'a'} key frame; expected closed groups of "
-                    f"{GOP_IMAGES} images, each beginning with one; decode and encode it anew"
+                    f"{GOP_IMAGES} images, each beginning with one; decode and encode it again"
                 )
         self._num_given += len(values)
 

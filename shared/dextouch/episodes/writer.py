@@ -72,7 +72,7 @@ class EpisodeWriter:
                 self.add_stream(descriptor)
         except BaseException:
             self.discard()
-            self._leave(broken_off=True, error=None)
+            self._leave(interrupted=True, error=None)
             raise
 
     def add_stream(self, descriptor: StreamDescriptor) -> None:
@@ -191,16 +191,16 @@ class EpisodeWriter:
             if kind is None and not self._is_discarded:
                 self._commit()
         except BaseException as failure:
-            self._leave(broken_off=True, error=failure)
+            self._leave(interrupted=True, error=failure)
             raise
-        self._leave(broken_off=kind is not None, error=error)
+        self._leave(interrupted=kind is not None, error=error)
 
     def discard(self) -> None:
         """Discard everything written when the context is left, normally or not."""
         self._is_discarded = True
 
-    def _leave(self, *, broken_off: bool, error: BaseException | None) -> None:
-        keep = broken_off and self._recoverable and not self._is_discarded
+    def _leave(self, *, interrupted: bool, error: BaseException | None) -> None:
+        keep = interrupted and self._recoverable and not self._is_discarded
         try:
             if keep:
                 keep = self._keep(error)

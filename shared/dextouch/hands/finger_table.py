@@ -73,7 +73,8 @@ def _check_unique(names: Iterable[str], what: str) -> None:
     for name in names:
         if name in seen:
             raise InvalidInputError(
-                f"{what} {name!r} stands twice; names must differ, fingers share no hinge", got=name
+                f"{what} {name!r} appears twice; names must differ, fingers share no hinge",
+                got=name,
             )
         seen.add(name)
 

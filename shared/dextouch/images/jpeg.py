@@ -29,7 +29,9 @@ def decode_jpeg(data: bytes, *, where: str = "image") -> UInt8[np.ndarray, "h w 
     try:
         return simplejpeg.decode_jpeg(data, colorspace="RGB")
     except ValueError as error:
-        raise CorruptDataError(f"{where}: {len(data)} bytes are no JPEG image ({error})") from error
+        raise CorruptDataError(
+            f"{where}: {len(data)} bytes are not a JPEG image ({error})"
+        ) from error
 
 
 def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
@@ -41,5 +43,7 @@ def jpeg_size(data: bytes, *, where: str = "image") -> tuple[int, int]:
     try:
         height_px, width_px, _, _ = simplejpeg.decode_jpeg_header(data)
     except ValueError as error:
-        raise CorruptDataError(f"{where}: {len(data)} bytes are no JPEG image ({error})") from error
+        raise CorruptDataError(
+            f"{where}: {len(data)} bytes are not a JPEG image ({error})"
+        ) from error
     return height_px, width_px

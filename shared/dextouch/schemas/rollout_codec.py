@@ -234,7 +234,7 @@ def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> Origin:
         off = max(np.abs(R.T @ R - np.eye(3)).max(), np.abs(T[3] - bottom).max())
         if off > RIGID_TOLERANCE or np.linalg.det(R) < 0:
             raise DegenerateRotationError(
-                f"{where}: {name} is no rigid transform (off by {off:.1e}, expected at most "
+                f"{where}: {name} is not a rigid transform (off by {off:.1e}, expected at most "
                 f"{RIGID_TOLERANCE:.0e})"
             )
         poses.append(T)

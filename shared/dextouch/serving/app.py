@@ -140,7 +140,7 @@ def _add_error_handlers(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> Response:
         # Starlette re-raises it after this response, for the server's log.
-        logger.error("answer_failed", path=request.url.path, error=type(error).__name__)
+        logger.error("request_failed", path=request.url.path, error=type(error).__name__)
         ours = DexTouchError("unexpected error in the service; its log tells more by request id")
         response = _problem_response(request, ours)
         response.headers["x-request-id"] = request.state.request_id

@@ -44,7 +44,7 @@ class ChildProcess:
 
     @property
     def pid(self) -> int:
-        """Process id, also after the process has ended."""
+        """Process id, valid also after the process has ended."""
         return self._process.pid
 
     @property
@@ -53,17 +53,17 @@ class ChildProcess:
         return self._process.poll() is None
 
     def send(self, order: Mapping[str, object]) -> None:
-        """Send an order; if the process has ended, `receive` says so."""
+        """Send a request; if the process has ended, `receive` raises."""
         assert self._process.stdin is not None  # noqa: S101 - it is a pipe
         with suppress(BrokenPipeError):
             self._process.stdin.write(json.dumps(order).encode() + b"\n")
             self._process.stdin.flush()
 
     def receive(self) -> dict[str, Any]:
-        """Wait for the next answer.
+        """Wait for the next response.
 
         Raises:
-            UnavailableError: the process ended instead; `details` has its `exit_status`.
+            UnavailableError: the process ended; `details` has its `exit_status`.
         """
         assert self._process.stdout is not None  # noqa: S101 - it is a pipe
         line = self._process.stdout.readline()
@@ -72,18 +72,18 @@ class ChildProcess:
             return answer
         status = self.close()
         if status == -signal.SIGKILL:
-            how = "killed; if nobody did that, memory ran out"
+            how = "killed; probably out of memory"
         else:
             how = f"signal {-status}" if status < 0 else f"exit status {status}; see its log"
         raise UnavailableError(f"the process ended ({how})", exit_status=status)
 
     def kill(self) -> None:
-        """End the process at once, whatever it is at; `close` it afterwards."""
+        """Kill the process; `close` it afterwards."""
         self._process.kill()
         self._process.wait(STOP_TIMEOUT_S)
 
     def close(self) -> int:
-        """Wait until the process has finished its order and ended; returns its exit status."""
+        """Wait for the current request and the end of the process; returns its exit status."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             try:
                 self._process.communicate(timeout=STOP_TIMEOUT_S)
@@ -94,14 +94,14 @@ class ChildProcess:
 
 
 def serve_parent(*, niceness: int) -> tuple[Iterator[dict[str, Any]], Answer]:
-    """Orders of the parent, in the child, and the function that answers them.
+    """In the child: requests of the parent, and the function that sends responses.
 
-    What the child prints goes to standard error, so that it cannot get between the answers.
+    Standard output of the child is redirected to standard error, to keep responses separate.
 
     Args:
-        niceness: added to this process's, so that the parent goes first when cores are short.
+        niceness: added to this process's, so that the parent has priority.
     """
-    # The parent decides when to end; a Ctrl-C at the terminal reaches both.
+    # The parent decides when to end; Ctrl-C at the terminal reaches both processes.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(niceness)
     answers = os.fdopen(os.dup(1), "wb")

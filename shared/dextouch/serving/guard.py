@@ -157,7 +157,7 @@ class GuardMiddleware:
         try:
             self._guard.check_sender(HTTPConnection(scope), needs_key=True, is_unsafe=True)
         except AccessDeniedError as error:
-            logger.warning("refuse_websocket", path=scope["path"], error=error.message)
+            logger.warning("websocket_refused", path=scope["path"], error=error.message)
             reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
             await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
             return

@@ -110,15 +110,13 @@ def _checked_body(data: bytes) -> bytes:
     if len(body) != length:
         raise PacketError(f"batch: got {len(body)} bytes after the header, expected {length}")
     if google_crc32c.value(body) != crc32c:
-        raise PacketError("batch: checksum does not hold; it was damaged on its way, send it again")
+        raise PacketError("batch: checksum mismatch; it was damaged in transit, send it again")
     return body
 
 
 def _check_count(descriptor: StreamDescriptor, count: int) -> None:
     if count == 0:
-        raise InvalidInputError(
-            f"{descriptor.name}: an empty batch; send it when there are samples"
-        )
+        raise InvalidInputError(f"{descriptor.name}: an empty batch, expected at least one sample")
     if count > MAX_BATCH_SAMPLES:
         raise _too_many(descriptor.name, count)
 

@@ -82,7 +82,7 @@ class WorldWorker(Generic[State]):
         """
         if len(self._waiting) >= self._max_waiting:
             raise LimitExceededError(
-                f"world {self.world.description.name}: {len(self._waiting)} chunks wait, "
+                f"world {self.world.description.name}: {len(self._waiting)} chunks are pending, "
                 f"expected at most {self._max_waiting}; try again",
                 retry_after_s=1,
             )

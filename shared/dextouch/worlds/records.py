@@ -123,7 +123,7 @@ class RecordStore:
         """Forget a rollout.
 
         Raises:
-            NotFoundError: there is none (any more).
+            NotFoundError: unknown, deleted or expired.
         """
         if not await self._store.delete(KEY_PREFIX + rollout_id):
             raise _unknown(rollout_id)

@@ -315,7 +315,7 @@ def chunk_seed(rollout_seed: int, chunk: int, world_digest: str) -> int:
 def _over(info: RolloutInfo) -> EndedError:
     last_chunk = info.next_chunk - 1 if info.next_chunk else None
     return EndedError(
-        f"rollout {info.id}: is over: {info.ended}; its last good chunk is "
+        f"rollout {info.id}: has ended: {info.ended}; its last good chunk is "
         f"{'none' if last_chunk is None else last_chunk} and its last good step {info.last_step}; "
         "start a new one, or branch from there with other actions",
         reason=str(info.ended),

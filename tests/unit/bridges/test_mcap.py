@@ -295,7 +295,7 @@ def test_files_of_others_are_refused_with_a_reason(other, tmp_path):
     with pytest.raises(NotFoundError):
         import_mcap(path, other)
     path.write_bytes(b"PK\3\4 this is a zip")
-    with pytest.raises(InvalidInputError, match="no MCAP file"):
+    with pytest.raises(InvalidInputError, match="not an MCAP file"):
         import_mcap(path, other)
     with pytest.raises(InvalidInputError, match=r"attributes\.json"):
         import_mcap(foreign(path), other)

@@ -130,7 +130,7 @@ def test_lerobot_replaces_only_what_is_a_data_set(store, dextouch, tmp_path):
     (folder / "meta" / "info.json").unlink()
     status, _, err = dextouch(*words, "--force")
     assert status == main.EXIT_REFUSED
-    assert "no LeRobot data set" in err
+    assert "not a LeRobot data set" in err
 
 
 def test_rerun_files_are_written(store, dextouch, tmp_path):

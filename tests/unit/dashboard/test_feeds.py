@@ -106,7 +106,7 @@ async def test_answer_of_another_form_is_named(feeds, services):
     services.health = {"streams": [{"stream": "x", "device": "y", "level": "FINE"}]}
     view = await feeds.station()
     assert not view.reachable
-    assert "answer of an unknown form" in view.note
+    assert "unexpected response" in view.note
 
 
 async def test_services(upstreams):
@@ -144,7 +144,7 @@ async def test_a_foreign_list_is_no_crash(feeds, services):
     services.episodes = [{"name": "?"}]
     view = await feeds.takes()
     assert view.takes == ()
-    assert view.note.startswith("The store does not list its takes: episode_store: an answer of an")
+    assert view.note.startswith("The store does not list its takes: episode_store: unexpected")
 
 
 async def test_why_no_take_is_shown_is_said(feeds, services):

@@ -88,7 +88,7 @@ def test_the_reserve_stays_free_but_for_finishing(tmp_path):
         tmp_path / "not" / "there", min_free_bytes=1000, free_bytes=lambda _: 1500
     )
     reserve.check_upload(500)
-    with pytest.raises(StorageFullError, match="do not fit") as caught:
+    with pytest.raises(StorageFullError, match="bytes exceed the") as caught:
         reserve.check_upload(501)
     assert caught.value.details["retry_after_s"] > 1
     reserve.check_commit(1500)

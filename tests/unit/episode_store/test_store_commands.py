@@ -164,7 +164,7 @@ def test_what_was_broken_off_is_seen(store, word):
         stream.close()
     os.close(writer._lock)
     *_, last = word("list")[1].splitlines()
-    assert last == "r-3  recording  broken off; `dextouch store repair` completes it"
+    assert last == "r-3  recording  interrupted; `dextouch store repair` completes it"
     assert json.loads(word("list", "--json", "-")[1])["unfinished"] == ["r-3"]
     assert word("repair")[0] == 0
     *_, last = word("list")[1].splitlines()

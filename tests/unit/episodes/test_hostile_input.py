@@ -204,11 +204,11 @@ def rows_and_chunks(name, rows):
         (rename_array, "not in the commit record"),
         (add_array, "elsewhere"),
         (lambda record: record["arrays"].clear(), "not in the commit record"),
-        (lambda record: record.update(arrays=[]), "no commit record"),
+        (lambda record: record.update(arrays=[]), "not a commit record"),
         (lambda record: record.update(id="other"), "commit record says episode other"),
         (lambda record: record.update(id="../../x"), "commit record says"),
         (lambda record: record.update(kind="recording"), "commit record says"),
-        (lambda record: record.update(extra=1), "no commit record"),
+        (lambda record: record.update(extra=1), "not a commit record"),
         (lambda record: record.update(format_version=[2]), "format version"),
     ],
 )
@@ -256,7 +256,7 @@ def test_forged_offsets(store, folder, name, forged):
     path = shard_of(folder, name)
     chunks, index = chunks_of(path, num_chunks(folder, name))
     write_shard(path, chunks, forged(index))
-    words = "need at least" if forged(index)[0] == [0, 0] else "does not fit"
+    words = "need at least" if forged(index)[0] == [0, 0] else "is inconsistent"
     with pytest.raises(CorruptDataError, match=f"{name}.*{words}"):
         store.open(ID).read(name)
     with pytest.raises(CorruptDataError, match=f"{name}.*{words}"):

@@ -196,7 +196,7 @@ def test_what_follows_a_block_that_was_broken_off_is_refused(store, monkeypatch)
         record(writer, 0, 9)
         with pytest.raises(StorageFullError):
             record(writer, 9)
-        with pytest.raises(StorageError, match=r"force: .*broken off.*leave the writer"):
+        with pytest.raises(StorageError, match=r"force: .*interrupted.*leave the writer"):
             record(writer, 10)
 
     failed = []
@@ -210,7 +210,7 @@ def test_a_take_with_a_block_broken_off_is_not_committed_as_if_whole(store, monk
     writer = store.writer(kind="recording", attributes=take(FORCE))
     with pytest.raises(RuntimeError, match="stamps"):
         record(writer, 0, 9)
-    with pytest.raises(StorageError, match="broken off"):
+    with pytest.raises(StorageError, match="interrupted"):
         writer.__exit__(None, None, None)
     # Of the values a storage chunk is there, of the stamps none.
     assert store.list(kind="recording") == []

@@ -61,7 +61,7 @@ def test_rows_around_a_hole_are_refused(tmp_path, rows):
     second, third = row(12, PAYLOADS[1]), row(24, PAYLOADS[2])
     part = PAYLOADS[0] + b"??" + PAYLOADS[1] + PAYLOADS[2]
     write_log(tmp_path, [rows[0], second, third], part)
-    with pytest.raises(CorruptDataError, match="row 1 of 3 does not hold"):
+    with pytest.raises(CorruptDataError, match="row 1 of 3 is invalid"):
         read_rows(tmp_path, "force")
 
 

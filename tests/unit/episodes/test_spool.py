@@ -188,7 +188,7 @@ def test_a_damaged_header_in_the_middle_is_refused_and_changes_nothing(gloves, p
     whole = bytearray(file.read_bytes())
     whole[len(LOG_MAGIC) + 3 * GLOVE_RECORD + place] ^= 1
     file.write_bytes(whole)
-    with pytest.raises(CorruptDataError, match="no record, yet whole ones follow"):
+    with pytest.raises(CorruptDataError, match="not a record, but valid ones follow"):
         spool.recover(gloves)
     assert file.read_bytes() == bytes(whole)
     with pytest.raises(CorruptDataError, match="restore the file"):
@@ -203,7 +203,7 @@ def test_a_record_that_is_missing_is_refused(gloves):
     # Every record behind lies where it does not say; none holds.
     assert spool.SpoolReader(gloves).num_samples("glove_left") == 3
     file.write_bytes(whole[:start] + bytes(GLOVE_RECORD) + whole[start + GLOVE_RECORD :])
-    with pytest.raises(CorruptDataError, match="no record"):
+    with pytest.raises(CorruptDataError, match="not a record"):
         spool.SpoolReader(gloves).num_samples("glove_left")
 
 

@@ -41,12 +41,12 @@ def test_document_types_are_refused(doctype, encoding, tmp_path):
 @pytest.mark.parametrize(
     ("model", "error", "message"),
     [
-        (b"", InvalidInputError, "broken XML"),
-        (b"\x00\xff\xfe", InvalidInputError, "broken XML"),
+        (b"", InvalidInputError, "invalid XML"),
+        (b"\x00\xff\xfe", InvalidInputError, "invalid XML"),
         (
             b'<?xml version="1.0" encoding="klingon"?><robot/>',
             InvalidInputError,
-            "unknown enc|broken",
+            "unknown enc|invalid",
         ),
         (b'<?xml version="1.0" encoding="utf-7"?><robot/>', InvalidInputError, "unknown text enc"),
         (b"<html/>", InvalidInputError, "expected <robot> .URDF. or <mujoco>"),
@@ -66,10 +66,10 @@ def test_files_that_are_no_model_are_refused(model, error, message, tmp_path, mo
 @pytest.mark.parametrize(
     ("mapping", "error", "message"),
     [
-        (b"\xff\xfe", InvalidInputError, "no UTF-8"),
-        (b"a = " + b"[" * 60_000, InvalidInputError, "broken TOML"),
+        (b"\xff\xfe", InvalidInputError, "invalid UTF-8"),
+        (b"a = " + b"[" * 60_000, InvalidInputError, "invalid TOML"),
         (b"#" * (2**16 + 1), LimitExceededError, "more than 65536 bytes"),
-        (b"a = 1\na = 2", InvalidInputError, "broken TOML"),
+        (b"a = 1\na = 2", InvalidInputError, "invalid TOML"),
     ],
 )
 def test_files_that_are_no_mapping_are_refused(mapping, error, message, tmp_path):
@@ -92,7 +92,7 @@ def test_paths_that_are_no_files_are_refused(tmp_path):
 def test_truncated_models_are_refused(model, mapping, tmp_path):
     # The last cut that still misses the end of the outermost element.
     for cut in [*range(0, len(model.rstrip()), 97), len(model.rstrip()) - 1]:
-        refused(tmp_path, model[:cut], mapping, "broken XML")
+        refused(tmp_path, model[:cut], mapping, "invalid XML")
 
 
 WORDS = ["nan", "-1e300", "0 0", "world", "fixed", "joint_3", "", "]", '"', "<", "palm", "1e-320"]

@@ -120,8 +120,8 @@ def with_first(**changes):
     ("fingers", "error", "message"),
     [
         ([], InvalidInputError, "no finger"),
-        ([GOOD, GOOD], InvalidInputError, "chain 'index' stands twice"),
-        ([GOOD, GOOD._replace(chain="ring")], InvalidInputError, "'index_0' stands twice"),
+        ([GOOD, GOOD], InvalidInputError, "chain 'index' appears twice"),
+        ([GOOD, GOOD._replace(chain="ring")], InvalidInputError, "'index_0' appears twice"),
         ([GOOD._replace(chain="pinky")], UnknownNameError, "'pinky'; valid: index, little"),
         ([GOOD._replace(joints=())], InvalidInputError, "got 0 hinges, expected 1 … 6"),
         ([finger("index", 7, (0, 1, 2), 1)], InvalidInputError, "got 7 hinges"),

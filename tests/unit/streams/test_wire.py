@@ -124,7 +124,7 @@ def test_samples_that_arrive_at_one_time_are_taken():
 
 def test_bytes_that_are_no_image_are_refused():
     arrays = STAMPS | {"image_bytes": np.zeros(8, "u1"), "image_end": np.array([4, 8])}
-    with pytest.raises(InvalidInputError, match="image 0 of the batch: 4 bytes are no JPEG"):
+    with pytest.raises(InvalidInputError, match="image 0 of the batch: 4 bytes are not a JPEG"):
         wire.decode_batch(
             framed(pack({"stream": "camera_head", "number": 0}, arrays)), CAMERA, number=0
         )

@@ -127,7 +127,7 @@ async def test_in_a_failed_batch_only_the_guilty_fails():
 async def test_a_full_queue_refuses_and_recovers():
     worker = WorldWorker(GatedSum(), max_waiting=2)
     first, others = await queue_behind_one(worker, [job(), job()])
-    with pytest.raises(LimitExceededError, match="2 chunks wait") as caught:
+    with pytest.raises(LimitExceededError, match="2 chunks are pending") as caught:
         await worker.step(job())
     assert caught.value.details["retry_after_s"] == 1
     worker.world.gate.set()

@@ -62,7 +62,7 @@ def read_sidecar(folder: Path, episode_index: int) -> Sidecar | None:
         sidecar = Sidecar.model_validate_json(data)
     except ValidationError as error:
         raise CorruptDataError(
-            f"{path}: is no description of an episode ({error}); remove it to import the frames "
+            f"{path}: is not a description of an episode ({error}); remove it to import the frames "
             "as a dataset of other origin"
         ) from error
     if sidecar.episode_index != episode_index:

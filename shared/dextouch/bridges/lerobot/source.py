@@ -152,7 +152,7 @@ class LeRobotFolder:
 def _read_info(folder: Path) -> DatasetInfo:
     path = layout.confined(folder, layout.INFO_FILE)
     if not path.is_file():
-        raise NotFoundError(f"{path}: is missing; {folder} is no LeRobot dataset")
+        raise NotFoundError(f"{path}: is missing; {folder} is not a LeRobot dataset")
     with disk_errors(f"read {path}"):
         if path.stat().st_size > MAX_INFO_BYTES:
             raise CorruptDataError(f"{path}: is larger than {MAX_INFO_BYTES} bytes")

@@ -205,7 +205,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None) -> pa.Table:
             return file.read(columns=wanted, use_threads=False)
     except (pa.ArrowException, OSError) as error:
         raise CorruptDataError(
-            f"{path}: is no whole parquet file ({error}); copy the dataset anew"
+            f"{path}: is not a complete parquet file ({error}); copy the dataset again"
         ) from error
 
 
@@ -218,7 +218,7 @@ def table_rows(table: pa.Table, *, where: str) -> list[dict[str, Any]]:
     try:
         return table.to_pylist()
     except (pa.ArrowException, ValueError, OverflowError) as error:
-        raise CorruptDataError(f"{where}: holds values that are none ({error})") from error
+        raise CorruptDataError(f"{where}: holds invalid values ({error})") from error
 
 
 def column_values(table: pa.Table, name: str, shape: Sequence[int], *, where: str) -> np.ndarray:
@@ -256,5 +256,5 @@ def _plain(table: pa.Table, name: str, shape: Sequence[int], where: str) -> np.n
         )
     values = column.to_numpy(zero_copy_only=False)
     if values.dtype.kind not in "biuf":
-        raise CorruptDataError(f"{where}: column {name!r} holds no numbers ({column.type})")
+        raise CorruptDataError(f"{where}: column {name!r} does not hold numbers ({column.type})")
     return values.reshape(table.num_rows, *row_shape)

@@ -110,7 +110,7 @@ class CameraVideo:
                     self._output = av.open(path, "w", format="mp4")
                 self._stream = self._output.add_stream_from_template(template)
         except (av.error.InvalidDataError, IndexError) as error:
-            raise CorruptDataError(f"{where}: is no H.264 stream ({error})") from error
+            raise CorruptDataError(f"{where}: is not an H.264 stream ({error})") from error
         self._stream.time_base = Fraction(1, self._fps)
 
     def _mux(self, data: bytes) -> None:

@@ -110,7 +110,7 @@ def _opened(span: VideoSpan) -> Iterator[tuple[InputContainer, VideoStream]]:
             yield container, stream
     except (av.error.FFmpegError, ValueError) as error:
         raise CorruptDataError(
-            f"{span.path}: is no whole mp4 file ({error}); copy the dataset anew"
+            f"{span.path}: is not a complete mp4 file ({error}); copy the dataset again"
         ) from error
 
 
@@ -133,5 +133,5 @@ def _check_place(span: VideoSpan, place: int, expected: int) -> None:
     if place != expected:
         raise CorruptDataError(
             f"{span.path}: image {expected} of {span.count} after {span.from_s:.3f} s is missing "
-            f"(the next one is {place}); copy the dataset anew"
+            f"(the next one is {place}); copy the dataset again"
         )

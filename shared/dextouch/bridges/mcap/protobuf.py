@@ -165,7 +165,7 @@ def _decode_bytes(table: Table, field: Field, raw: bytes) -> object:
     try:
         return raw.decode()
     except UnicodeDecodeError as error:
-        raise CorruptDataError(f"protobuf: field {field.name!r} is no text") from error
+        raise CorruptDataError(f"protobuf: field {field.name!r} is not text") from error
 
 
 def decode(table: Table, message: str, data: bytes) -> Values:

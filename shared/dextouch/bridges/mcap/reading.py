@@ -101,7 +101,7 @@ def _attributes(path: Path, kind: str, text: bytes) -> EpisodeAttributes | Recor
             return EpisodeAttributes.model_validate_json(plain)
         return RecordingAttributes.model_validate_json(plain)
     except (ValueError, RecursionError, ValidationError) as error:
-        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} does not fit ({error})") from error
+        raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} is invalid ({error})") from error
 
 
 class _Pending:

@@ -50,12 +50,12 @@ def records(path: Path) -> Iterator[McapRecord]:
         raise NotFoundError(f"{path}: no such file; expected an MCAP file")
     with disk_errors(f"read {path}"), path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            raise InvalidInputError(f"{path}: is no MCAP file (other first bytes)")
+            raise InvalidInputError(f"{path}: is not an MCAP file (wrong magic bytes)")
         file.seek(0)
         try:
             yield from _records(file, path)
         except EOFError as error:
-            raise CorruptDataError(f"{path}: ends too early ({error}); copy it again") from error
+            raise CorruptDataError(f"{path}: is truncated ({error}); copy it again") from error
         except (McapError, ValueError, KeyError, struct.error, zstandard.ZstdError) as error:
             raise CorruptDataError(
                 f"{path}: is damaged or truncated ({type(error).__name__}: {error}); copy it "

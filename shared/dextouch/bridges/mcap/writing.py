@@ -82,7 +82,7 @@ class _Export:
         counts = {stream.name: reader.num_samples(stream.name) for stream in self._streams}
         self._counts = counts
         firsts = [int(reader.stamps_ns(name)[0]) for name, count in counts.items() if count]
-        # MCAP's times cannot be negative; the messages' own stamps stay as they are.
+        # MCAP's times cannot be negative; the messages' own stamps are unchanged.
         self._zero_ns = min([0, *firsts])
         self._schema_ids: dict[str, int] = {}
         self._channel_ids: list[int] = []

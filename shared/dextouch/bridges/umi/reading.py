@@ -90,7 +90,7 @@ def _meta(archive: ZarrZipReader, path: Path) -> _Meta:
         meta = _Meta.model_validate_json(json.dumps(plain))
     except ValidationError as error:
         raise CorruptDataError(
-            f"{path}: attributes in meta/.zattrs do not fit ({error})"
+            f"{path}: attributes in meta/.zattrs are invalid ({error})"
         ) from error
     if not set(meta.cameras) <= set(MODEL_CAMERAS) or len(set(meta.cameras)) != len(meta.cameras):
         raise CorruptDataError(f"{path}: got cameras {meta.cameras}, expected of {MODEL_CAMERAS}")
@@ -107,7 +107,7 @@ def _ends(archive: ZarrZipReader, path: Path, meta: _Meta) -> list[int]:
     rows = {name: archive.metadata(name).shape[0] for name in names}
     rising = bool((np.diff(ends, prepend=0) > 0).all())
     if ends.dtype != np.int64 or not rising or set(rows.values()) != {int(ends[-1])}:
-        raise CorruptDataError(f"{path}: {ENDS} does not fit to the arrays of {rows} rows")
+        raise CorruptDataError(f"{path}: {ENDS} is inconsistent with the arrays of {rows} rows")
     longest = int(np.diff(ends, prepend=0).max())
     if longest > MAX_STEPS:
         raise LimitExceededError(

@@ -173,7 +173,7 @@ def zip_errors(path: Path) -> Iterator[None]:
             yield
     except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise CorruptDataError(
-            f"{path}: is no whole zip file ({error}); copy or export it again"
+            f"{path}: is not a complete zip file ({error}); copy or export it again"
         ) from error
     except NotImplementedError as error:
         raise StorageError(f"{path}: uses a zip feature that is not supported ({error})") from error
@@ -234,7 +234,7 @@ class ZarrZipReader:
             return {}
         value = self._json(key)
         if not isinstance(value, dict):
-            raise CorruptDataError(f"{self._path}: {key} is no JSON object")
+            raise CorruptDataError(f"{self._path}: {key} is not a JSON object")
         return value
 
     def metadata(self, name: str) -> ArrayMetadata:
@@ -252,7 +252,7 @@ class ZarrZipReader:
             try:
                 metadata = ArrayMetadata.model_validate_json(json.dumps(self._json(key)))
             except ValidationError as error:
-                raise CorruptDataError(f"{self._path}: {key} does not fit ({error})") from error
+                raise CorruptDataError(f"{self._path}: {key} is invalid ({error})") from error
             self._check(name, metadata)
             self._arrays[name] = metadata
         return self._arrays[name]
@@ -332,4 +332,4 @@ class ZarrZipReader:
         try:
             return json.loads(self._bytes(key, MAX_METADATA_BYTES))
         except (ValueError, RecursionError) as error:
-            raise CorruptDataError(f"{self._path}: {key} is no JSON ({error})") from error
+            raise CorruptDataError(f"{self._path}: {key} is not JSON ({error})") from error

@@ -112,8 +112,8 @@ class _Builder:
             self._parser.Parse(data, True)  # noqa: FBT003 - takes no keywords
         except expat.ExpatError as error:
             raise InvalidInputError(
-                f"{self._file} line {error.lineno}: got broken XML "
-                f"({expat.ErrorString(error.code)}); is the file whole?"
+                f"{self._file} line {error.lineno}: got invalid XML "
+                f"({expat.ErrorString(error.code)}); is the file complete?"
             ) from error
         except (ValueError, LookupError) as error:
             raise InvalidInputError(
@@ -154,6 +154,6 @@ def read_elements(path: Path) -> Element:
     Raises:
         NotFoundError, StorageError: a missing or unreadable file.
         LimitExceededError: over 8 MiB, 100 levels or 20 000 elements.
-        InvalidInputError: broken XML, or a document type.
+        InvalidInputError: invalid XML, or a document type.
     """
     return _Builder(path.name).parse(read_bounded(path, MAX_BYTES))

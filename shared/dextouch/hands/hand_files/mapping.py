@@ -153,10 +153,10 @@ def _parse(path: Path) -> dict[str, Any]:
     try:
         return tomllib.loads(data.decode("utf-8"))
     except UnicodeDecodeError as error:
-        raise InvalidInputError(f"{path.name}: got bytes that are no UTF-8: {error}") from error
+        raise InvalidInputError(f"{path.name}: got invalid UTF-8: {error}") from error
     # Deeply nested brackets hit the parser's recursion limit.
     except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise InvalidInputError(f"{path.name}: got broken TOML: {error}") from error
+        raise InvalidInputError(f"{path.name}: got invalid TOML: {error}") from error
 
 
 def _finger(where: str, values: Any) -> FingerMapping:  # noqa: ANN401

@@ -91,7 +91,7 @@ class MjcfSettings:
         values = np.array(element.numbers(kind, ORIENTATIONS[kind]))
         R = self._euler(values) if kind == "euler" else _READERS[kind](values, self)
         if R is None:
-            raise element.refusal(f"got {kind}={values.tolist()}, which is no rotation")
+            raise element.refusal(f"got {kind}={values.tolist()}, which is not a rotation")
         return R
 
     def _euler(self, values: np.ndarray) -> np.ndarray:
