@@ -1,1 +1,1 @@
-"""The verbs of DexTouch, in the order in which the data flows."""
+"""Services of DexTouch, in the order of the data flow."""

@@ -16,12 +16,12 @@ LINT = Path(sys.executable).with_name("lint-imports")
 # contract · file that offends · the offending line
 OFFENCES = [
     (
-        "The command line stands on the services",
+        "The command line is above the services",
         "shared/dextouch/errors.py",
         "import services.twin",
     ),
-    ("Services do not know each other", "services/twin/scene.py", "import services.evaluation"),
-    ("Layers of the nouns", "shared/dextouch/geometry/transforms.py", "import dextouch.schemas"),
+    ("Services do not import each other", "services/twin/scene.py", "import services.evaluation"),
+    ("Layers of dextouch", "shared/dextouch/geometry/transforms.py", "import dextouch.schemas"),
     ("torch only where networks are", "services/twin/scene.py", "import torch"),
     ("zarr only in dextouch.episodes", "services/alignment/jobs.py", "import zarr"),
     (
@@ -31,12 +31,12 @@ OFFENCES = [
     ),
     ("No cycles anywhere", "services/twin/scene.py", "import services.twin.world"),
     (
-        "World model: world stands on training",
+        "Layers of the world model",
         "services/world_model/network/conditioning.py",
         "import services.world_model.training.trainer",
     ),
     (
-        "Alignment: jobs stand on the stages",
+        "Layers of alignment",
         "services/alignment/retargeting/hand_retargeter.py",
         "import services.alignment.jobs",
     ),
