@@ -1,5 +1,6 @@
 """Under tests, and only there, every annotated array shape is checked at run time."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -19,6 +20,12 @@ settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
 
 ROOT = Path(__file__).parents[1]
+
+
+def pytest_collection_finish() -> None:
+    """All modules stay from here on, so that the garbage collector need not visit them again."""
+    gc.collect()
+    gc.freeze()
 
 
 def _shown_names() -> set[str]:
