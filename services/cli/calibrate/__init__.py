@@ -1,4 +1,4 @@
-"""Command `dextouch station calibrate`: cameras, hand-eye mounts and gloves."""
+"""Command `dextouch station calibrate`: cameras, mounts, gloves, wrists, robot bases, latencies."""
 
 from services.cli.calibrate.command import main
 

@@ -1,1 +1,1 @@
-"""Metrics of predictions, trajectories and policies against ground truth."""
+"""Metrics of predicted images, touch and policy scores against ground truth."""
