@@ -56,15 +56,20 @@ bench: $(VENV)/.dev      ## time the stages against their errors, one after anot
 
 # Every step goes on where it was broken off. The last one says which bounds are met, and which figures are those of docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model, its judge and the cloned policies anew, in runs/reproduce
-	$(BIN)/dextouch train data --store $(MADE)/train --tasks stand_bottle,stack_bowls --count 600 --images 4
-	$(BIN)/dextouch train data --store $(MADE)/train --count 450 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --count 600 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --tasks insert_peg,place_phone --count 650 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --tasks place_shoes --count 750 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --tasks stack_bowls --count 800 --images 4
+	$(BIN)/dextouch train data --store $(MADE)/train --tasks open_drawer --count 900 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/judge --first 1000 --count 300 --images 4
 	$(BIN)/dextouch train data --store $(MADE)/development --mix ladder --first 20000 --count 144 --images 4
 	$(BIN)/dextouch train state --episodes $(MADE)/train --output $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --seeds 1000:1200 --store $(MADE)/imagined \
+	$(BIN)/dextouch train imagined --episodes $(MADE)/judge --store $(MADE)/imagined \
 		--checkpoint $(MADE)/state.safetensors
-	$(BIN)/dextouch train imagined --episodes $(MADE)/development --seeds 20000:20072 \
-		--store $(MADE)/imagined_development --checkpoint $(MADE)/state.safetensors
+	$(BIN)/dextouch train imagined --episodes $(MADE)/train --seeds 0:300 --store $(MADE)/imagined \
+		--checkpoint $(MADE)/state.safetensors
+	$(BIN)/dextouch train imagined --episodes $(MADE)/development --store $(MADE)/imagined_development \
+		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
 		--development $(MADE)/development --development $(MADE)/imagined_development \
 		--output $(MADE)/success_probe.safetensors --training.num_training_steps 1500 --training.held_out_share 0.1
