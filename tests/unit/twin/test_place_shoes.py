@@ -23,7 +23,7 @@ def stage(request):
     return Stage("place_shoes", request.param, TwinSettings())
 
 
-@pytest.mark.parametrize("seed", [11, 12, 13])
+@pytest.mark.parametrize("seed", [11, *(pytest.param(n, marks=pytest.mark.slow) for n in (12, 13))])
 def test_demonstrators_succeed(stage, seed):
     attributes = record(stage, seed, BLIND).attributes
     assert attributes.success is True
