@@ -1,4 +1,4 @@
-"""`dextouch train WHAT …` in; episodes to learn from, or a measured checkpoint, out."""
+"""Command line of `dextouch train`: recording episodes and training checkpoints of every kind."""
 
 import importlib
 import sys

@@ -1,4 +1,4 @@
-"""Taxel pressures in; the few numbers per pad that small networks read out."""
+"""Features of taxel pressures for small networks: a few numbers per pad."""
 
 import numpy as np
 from jaxtyping import Float32

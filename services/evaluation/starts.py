@@ -1,4 +1,4 @@
-"""First observations in, digests out: how judging and training are kept apart."""
+"""Digests of first observations, by which training and evaluation starts are kept apart."""
 
 import hashlib
 from collections.abc import Iterable

@@ -1,4 +1,4 @@
-"""`train`, `serve` or `show` and flags in; a checkpoint, a running service or a description out."""
+"""Command line of the world model: `train`, `train-state`, `serve` and `show`."""
 
 import json
 import sys

@@ -1,4 +1,4 @@
-"""Flags and environment in, the frozen settings of training and serving out."""
+"""Settings of training and serving, from flags and environment variables."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A checkpoint in, a world out: observations and action chunks to imagined observations."""
+"""World of a paper-form checkpoint: imagines observations chunk by chunk."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

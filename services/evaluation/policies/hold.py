@@ -1,4 +1,4 @@
-"""Any observation in, the same pose out: the weakest policy there is."""
+"""Policy that holds the hands where they are: the weakest baseline."""
 
 import numpy as np
 from jaxtyping import Float64

@@ -1,4 +1,4 @@
-"""Figures and pictures of a run in; one self-contained HTML page out."""
+"""The HTML report of an evaluation: one self-contained page of figures and pictures."""
 
 from services.evaluation.reporting.from_episodes import action_picture, episode_picture
 from services.evaluation.reporting.page import write_report

@@ -1,4 +1,4 @@
-"""Numbers in; small SVG charts out that take their colours from the page."""
+"""Small SVG charts that take their colours from the page."""
 
 import math
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Pictures and scores of a run in; the charts and strips of the page out."""
+"""Charts and image strips of the report, drawn from the pictures and scores of a run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""An episode of the store in; its pictures for the report out."""
+"""Pictures of stored episodes for the report."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""A report (what report.json holds) and its pictures in; one HTML file that stands alone out.
+"""The HTML page of a report (the content of report.json) and its pictures, in one file.
 
 Every section is optional: what a run did not do is not on the page. The report may hold
 `about`, `stages`, `errors`, `world_model`, `policies`, `agreement` and `failures`; unknown keys

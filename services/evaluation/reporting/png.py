@@ -1,4 +1,4 @@
-"""RGB and RGBA images in; PNG bytes and data addresses out, with nothing but zlib."""
+"""PNG encoding of RGB and RGBA images, and data URLs of them, with zlib alone."""
 
 import base64
 import struct

@@ -1,4 +1,4 @@
-"""Figures of a report in; the tiles, bars and error rows of the page out."""
+"""Sections of the report's page: tiles, bars and rows of errors."""
 
 import math
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""A tensor in, the same tensor with one axis split into several out."""
+"""Splitting one axis of a tensor into several."""
 
 from torch import Tensor
 

@@ -1,4 +1,4 @@
-"""Times, actions, words, kind of action and scene in, one condition a latent frame or hand out.
+"""Condition vectors of the experts: flow time, actions, instruction, kind of action and scene.
 
 Dual rate (equation 4 of the paper): video latent j sees a[4j-3 … 4j], tactile step t sees a_t, and
 index 0 sees zeros.

@@ -1,4 +1,4 @@
-"""Clean latents and noise in, noisy ones out; a network's guess of the clean ones in, samples out.
+"""Flow matching (Lipman et al. 2023): noisy latents for training and Euler steps for sampling.
 
 Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0, so
 that the velocity is (x_t - x_0) / t and the last Euler step lands on its guess exactly.

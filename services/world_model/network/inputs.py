@@ -1,4 +1,4 @@
-"""What is asked of the model in (image, touch, actions, words, geometry), its tensors out.
+"""Input tensors of the joint model: image, touch, actions, instruction and geometry of a request.
 
 This is the only way into the network: the training loader and the world server both call
 `build_inputs`, so that a window means the same to both.

@@ -1,4 +1,4 @@
-"""Words of an instruction in, one vector for the condition out.
+"""Embedding of an instruction as one vector.
 
 Words are hashed into a small table, so that no vocabulary has to be kept and any text is
 accepted. Entries start at zero: a word never trained on says nothing.

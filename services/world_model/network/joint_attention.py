@@ -1,4 +1,4 @@
-"""Tokens of both experts and their modulations in, the same tokens after one joint layer out.
+"""Joint transformer layer of both experts.
 
 Mixture-of-Transformers: each stream has its own projections, norms, modulation and feed-forward
 network; only the attention is shared, over the tokens of both.

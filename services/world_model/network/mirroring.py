@@ -1,4 +1,4 @@
-"""67-D actions in, per-hand features out, with the left hand mirrored into the right-hand frame.
+"""Per-hand features of 67-D actions, with the left hand mirrored into the right-hand frame.
 
 In the wrist frame fingers point along -z, the thumb along +x; the right palm faces +y, the left
 -y. So the mirror image of a left hand is y → -y; in the head camera's optical frame it is x → -x.

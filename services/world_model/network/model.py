@@ -1,4 +1,4 @@
-"""The joint model: inputs and noise in, images and pressures of the future out."""
+"""The joint model of future images and pressures: two experts around shared attention."""
 
 import warnings
 from collections.abc import Iterator, Sequence

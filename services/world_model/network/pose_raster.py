@@ -1,4 +1,4 @@
-"""Poses and joint angles of a window in, a picture of both hands in the head image out.
+"""Raster of both hands in the head image, drawn from the poses and joint angles of a window.
 
 The paper conditions by AdaLN alone; a raster of the projected hands is our addition. It tells the
 network where in the image the hands will be, to about one cell.

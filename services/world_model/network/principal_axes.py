@@ -1,4 +1,4 @@
-"""Second moments in, an orthonormal basis with fixed signs and a scale for each channel out."""
+"""Principal axes from second moments: an orthonormal basis with fixed signs, and its scales."""
 
 import torch
 from jaxtyping import Float32, Float64

@@ -1,4 +1,4 @@
-"""Noisy tactile latents, the first latent and the condition in, tokens for the joint layers out."""
+"""Tactile expert: embeds tactile latents for the joint layers and predicts clean ones."""
 
 import torch
 from jaxtyping import Float32

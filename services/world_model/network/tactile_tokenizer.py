@@ -1,4 +1,4 @@
-"""Pressures of both hands in, one latent a hand and step out, and back ("Split-Hands").
+"""Tactile tokenizer ("Split-Hands"): one latent for the pressures of each hand and step.
 
 All ten fingertips share one encoder and both palms another; a pad is known by its place in the
 hand's latent. Pressures are coded by their square root, which gives light touch its weight. Tips

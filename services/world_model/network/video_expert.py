@@ -1,4 +1,4 @@
-"""Noisy video latents, the first latent and the condition in, tokens for the joint layers out."""
+"""Video expert: embeds video latents for the joint layers and predicts clean ones."""
 
 import torch
 from jaxtyping import Float32

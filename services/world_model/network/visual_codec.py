@@ -1,4 +1,4 @@
-"""Images of 1 + 4k steps in, latent tokens out, and back: principal axes of 8×8×4 patches.
+"""Visual codec: latent tokens of 1 + 4k images by principal axes of 8×8×4 patches.
 
 The first image stands alone (repeated four times), then groups of four, as causal video
 autoencoders do. Closed form: fitted once on training images, then frozen in the checkpoint.

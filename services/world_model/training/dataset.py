@@ -1,4 +1,4 @@
-"""Episodes in, random windows as requests and targets out.
+"""Random windows of episodes as training requests and targets.
 
 Windows are cut from whole episodes read once, through the same re-anchoring that the store's
 reader uses, so that an epoch touches no disk. `services.world_model.training.streaming` has the

@@ -1,4 +1,4 @@
-"""An episode store in, episodes as arrays on the model grid out, and their split by hash."""
+"""Episodes of a store as arrays on the model grid, and their split by hash."""
 
 from collections.abc import Sequence
 from typing import TypeVar

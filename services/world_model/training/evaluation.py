@@ -1,4 +1,4 @@
-"""A model and held-out episodes in, its errors and those of simple rivals out."""
+"""Errors of a model on held-out episodes, beside those of simple rivals."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

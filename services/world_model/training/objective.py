@@ -1,4 +1,4 @@
-"""True windows in, the two flow matching losses out."""
+"""Training losses: flow matching of video and tactile latents."""
 
 from dataclasses import dataclass
 

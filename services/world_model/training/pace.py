@@ -1,4 +1,4 @@
-"""An episode store in; how many windows a second are read, and how many are learned from, out."""
+"""Measurement of throughput: windows read and windows trained on in a second."""
 
 import time
 from collections.abc import Generator, Iterator

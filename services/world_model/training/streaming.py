@@ -1,4 +1,4 @@
-"""An episode store in, the trainer's windows read from the disk when they are needed out.
+"""Streaming dataset: windows are read from the disk when they are needed.
 
 For more episodes than memory holds. A window is read through the store's reader, which decodes one
 camera and the span of the window only.

@@ -1,4 +1,4 @@
-"""Training settings in, a measured checkpoint and a report out."""
+"""Training of the paper's form, from settings to a measured checkpoint and a report."""
 
 import json
 import math
