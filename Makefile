@@ -78,7 +78,7 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state
 		--training.num_training_steps 3600 --training.max_cpu_s 150 --output $(MADE)/cloned.safetensors
 	$(BIN)/dextouch bench evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
 		--cloned cloned=$(MADE)/cloned.safetensors --cloned "cloned early=$(MADE)/cloned_early.safetensors" \
-		--first-seed 30020 --repeats docs/evaluator.json --keep $(MADE)/evaluator --out $(MADE)/bench
+		--first-seed 30020 --starts 40 --repeats docs/evaluator.json --keep $(MADE)/evaluator --out $(MADE)/bench
 
 fix: $(VENV)/.dev        ## format the code and apply automatic lint fixes
 	$(BIN)/ruff format .
