@@ -12,7 +12,7 @@ from dextouch.schemas.rollouts import Doubt, Observation
 from services.evaluation.calibration import Calibration
 from services.evaluation.demonstrations import Demonstration
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
-from services.evaluation.judge_network import ProbeShape
+from services.evaluation.judge_network import ProbeShape, probe_batch
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
 from services.evaluation.success_probe_training import (
@@ -97,6 +97,21 @@ def test_it_is_right_with_and_without_poses_and_images(judge, seen, imagined):
     fresh = [_episode(t, s, imagined=imagined) for t in toy.TASKS for s in range(700, 724)]
     told = judge.probabilities([replace(e.final, **seen) for e in fresh]) >= 0.5
     assert np.mean(told == [e.success for e in fresh]) >= 0.85
+
+
+def test_an_ending_with_images_and_poses_is_looked_at_twice(judge):
+    whole = [_episode(t, 700, imagined=True).final for t in toy.TASKS]
+    without_images = [replace(e, images=None) for e in whole]
+    without_poses = [replace(e, object_poses=None) for e in whole]
+    odds = judge.log_odds([*without_poses, *whole, *without_images])
+    num = len(toy.TASKS)
+    with torch.no_grad():
+        network = judge._network(probe_batch(whole, judge.shape)).numpy()
+    assert not np.allclose(network, odds[-num:], atol=0.1)
+    np.testing.assert_allclose(odds[num : 2 * num], (network + odds[-num:]) / 2, atol=1e-4)
+    # What has only one of them is seen once, whatever else is in the batch.
+    alone = np.concatenate([judge.log_odds([e]) for e in (*without_poses, *without_images)])
+    np.testing.assert_allclose(odds[[*range(num), *range(2 * num, 3 * num)]], alone, atol=1e-4)
 
 
 def test_its_figures_of_every_kind_are_kept(judge):
