@@ -6,9 +6,11 @@ LEROBOT := tests/benchmarks/lerobot
 LEROBOT_VENV ?= .venv-lerobot
 STAGE ?= store loader acquisition clocks calibration retargeting closure twin world-model evaluator
 MADE := runs/reproduce
+DOCS_VENV ?= .venv-docs
+SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz mutants fix clean bench bench-lerobot check-lerobot-export \
+.PHONY: demo test check slow vm fuzz mutants fix clean docs bench bench-lerobot check-lerobot-export \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -93,5 +95,15 @@ bench-lerobot: $(LEROBOT_VENV)/.complete   ## opt-in: our store beside LeRobotDa
 check-lerobot-export: $(LEROBOT_VENV)/.complete   ## opt-in: our exports open in lerobot itself
 	$(LEROBOT_VENV)/bin/python $(LEROBOT)/check_export.py
 
+# The site reads the docstrings of dextouch and needs neither torch nor mujoco, so it has an environment of its own.
+$(DOCS_VENV)/.complete: pyproject.toml constraints.txt
+	$(PYTHON) -m venv $(DOCS_VENV)
+	$(DOCS_VENV)/bin/pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[docs]'
+	touch $@
+
+docs: $(DOCS_VENV)/.complete   ## build the documentation site in build/docs; warnings are errors
+	$(DOCS_VENV)/bin/python -m sphinx --builder html --fresh-env --write-all --fail-on-warning --quiet docs $(SITE)
+	@echo "open $(SITE)/index.html"
+
 clean:
-	rm -rf demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf $(SITE) demo runs .pytest_cache .mypy_cache .ruff_cache .import_linter_cache

@@ -72,6 +72,15 @@ def test_station_settings_of_the_guide_are_taken(monkeypatch):
     assert len(names) == len(settings.devices)
 
 
+def test_every_package_of_the_library_has_an_api_page():
+    library = ROOT / "shared/dextouch"
+    packages = {path.parent.name for path in library.glob("*/__init__.py")}
+    pages = {path.stem: path.read_text(encoding="utf-8") for path in ROOT.glob("docs/api/*.rst")}
+    assert set(pages) == packages | {"errors"}
+    for name, text in pages.items():
+        assert text.endswith(f".. front-door:: dextouch.{name}\n")
+
+
 def test_make_bench_runs_every_stage():
     text = (ROOT / "Makefile").read_text(encoding="utf-8")
     listed = re.search(r"^STAGE \?= (.+)$", text, re.MULTILINE)

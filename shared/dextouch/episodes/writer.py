@@ -119,8 +119,8 @@ class EpisodeWriter:
 
         Args:
             name: of an added stream.
-            values: [n, *shape] of the stream's dtype; finite in episodes. For the units `jpeg` and
-                `h264` uint8 images [n, h, w, 3], or an object array of encoded images (bytes),
+            values: `[n, *shape]` of the stream's dtype; finite in episodes. For the units `jpeg`
+                and `h264` uint8 images [n, h, w, 3], or an object array of encoded images (bytes),
                 stored unchanged.
             t_ref_ns: [n], strictly increasing; episodes need exactly this stamp.
             t_host_ns: [n], non-decreasing; required for recordings.

@@ -52,7 +52,7 @@ def kendall(*, real: np.ndarray, imagined: np.ndarray) -> float:
 def mmrv(*, real: np.ndarray, imagined: np.ndarray, ties: str = "paper") -> float:
     """Mean maximum rank violation of scores [policies]: 0 is best.
 
-    (1/N) Σ_i max_j |real_i − real_j| · v_ij. Both rules count a pair in opposite order; they
+    `(1/N) Σ_i max_j |real_i − real_j| · v_ij`. Both rules count a pair in opposite order; they
     differ when one side ties.
 
     Args:
@@ -87,7 +87,7 @@ def bias(*, real: np.ndarray, imagined: np.ndarray) -> float:
 
 
 def mean_absolute_error(*, real: np.ndarray, imagined: np.ndarray) -> float:
-    """Mean of |imagined − real|, in the unit of the scores."""
+    """Mean absolute difference of imagined and real scores, in the unit of the scores."""
     a, b = _scores(real, imagined, "mean absolute error")
     return float(np.mean(np.abs(b - a)))
 
