@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from dextouch import __version__
+from dextouch.command_line import messages_aside
 from dextouch.errors import DexTouchError, UnknownNameError
 from services.cli.extras import missing_package
 
@@ -130,7 +131,8 @@ def _run(name: str, rest: list[str]) -> int:
     try:
         name, command, rest = find_command(name, rest)
         module = importlib.import_module(command.module)
-        return int(module.main([*command.before, *rest]) or 0)
+        with messages_aside(rest):
+            return int(module.main([*command.before, *rest]) or 0)
     except ModuleNotFoundError as error:
         refusal = missing_package(error)
         if refusal is None:

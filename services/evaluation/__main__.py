@@ -1,6 +1,5 @@
 """The commands of the evaluation service: train a policy or the probe, or score policies."""
 
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -10,8 +9,10 @@ from typing import Any
 
 from dextouch.clients.policy import Policy
 from dextouch.clients.rollouts import RolloutClient
+from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.serving.settings import load_settings
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
 from services.evaluation.demonstrations import read_demonstrations
@@ -34,19 +35,18 @@ from services.evaluation.settings import (
     TrainPolicySettings,
     TrainProbeSettings,
     command_line,
-    parse,
 )
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_training import train_success_probe
 
-USAGE = """usage: evaluation train-policy|train-probe|train-direct-judge|run [flags]
+USAGE = """usage: python -m services.evaluation COMMAND [flags]
 
   train-policy         imitate the successful robot episodes of a store
   train-probe          learn to tell success from the last images and touch
   train-direct-judge   the probe's rival: success from first observation and commands alone
   run                  roll policies out in a real and in imagined worlds, and score both
 
-Flags: evaluation COMMAND --help"""
+Each explains itself with --help."""
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 
@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run_train_policy(arguments: list[str]) -> int:
     """Train the cloned policy and keep it, and an early one if asked."""
-    settings = parse(TrainPolicySettings, arguments)
+    settings = load_settings(TrainPolicySettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
     trained = train_cloned_policy(
         read_cloning_episodes(*stores, tasks=settings.tasks),
@@ -87,7 +87,7 @@ def run_train_policy(arguments: list[str]) -> int:
 
 def run_train_probe(arguments: list[str]) -> int:
     """Train the success probe and keep it."""
-    settings = parse(TrainProbeSettings, arguments)
+    settings = load_settings(TrainProbeSettings, arguments)
 
     def read(urls: Sequence[str]) -> list[EndingEpisode]:
         stores = [EpisodeStore(url) for url in urls]
@@ -105,7 +105,7 @@ def run_train_probe(arguments: list[str]) -> int:
 
 def run_train_direct_judge(arguments: list[str]) -> int:
     """Train the direct judge and keep it."""
-    settings = parse(TrainDirectSettings, arguments)
+    settings = load_settings(TrainDirectSettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
     items = read_attempts(*stores, tasks=settings.tasks)
     command = command_line("train-direct-judge", arguments)
@@ -118,7 +118,8 @@ def _keep(checkpoint: Checkpoint, output: Path, json_path: Path | None) -> int:
     print(f"{output}  {output.stat().st_size / 1e6:.2f} MB")
     for name, value in checkpoint.metadata.metrics.items():
         print(f"  {name:<45} {value:.4g}")
-    _write_json(json_path, {"checkpoint": str(output), "metrics": checkpoint.metadata.metrics})
+    figures = {"checkpoint": str(output), "metrics": checkpoint.metadata.metrics}
+    write_result(json_path, figures, allow_nan=False)
     return 0
 
 
@@ -128,7 +129,7 @@ def run_evaluation(arguments: list[str]) -> int:
     Returns:
         0, or 1 when a rollout failed.
     """
-    settings = parse(RunSettings, arguments)
+    settings = load_settings(RunSettings, arguments)
     probe = SuccessProbe.load(settings.probe)
     policies, trained_on = gather_policies(settings)
     plan = EvaluationPlan(
@@ -148,7 +149,7 @@ def run_evaluation(arguments: list[str]) -> int:
             keep=log.keep,
         )
     figures = report.to_report()
-    _write_json(settings.json_path, figures)
+    write_result(settings.json_path, figures, allow_nan=False)
     if settings.html is not None:
         write_report(figures, ReportPictures(), settings.html)
     _print_scores(figures)
@@ -166,7 +167,7 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
     sources = [PolicySource.parse(text) for text in settings.policy]
     names = [source.name for source in sources]
     if unknown := sorted(set(settings.policy_arguments) - set(names)):
-        raise UnknownNameError("policy of --policy_arguments", unknown[0], names)
+        raise UnknownNameError("policy of --policy-arguments", unknown[0], names)
     names += [*settings.scripts, *settings.builtin]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise InvalidInputError(
@@ -231,12 +232,6 @@ def _print_failures(report: Mapping[str, Any], results: Path) -> None:
         print(f"  {row.policy} in {row.world}, {row.count} x: {row.message}", file=sys.stderr)
         if row.traceback:
             print(indent(row.traceback, "    "), file=sys.stderr)
-
-
-def _write_json(path: Path | None, content: Mapping[str, Any]) -> None:
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(content, indent=1, allow_nan=False), encoding="utf-8")
 
 
 if __name__ == "__main__":

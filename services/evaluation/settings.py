@@ -3,13 +3,12 @@
 import re
 import shlex
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
-from pydantic_settings import BaseSettings, CliApp
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic_settings import BaseSettings
 
-from dextouch.errors import InvalidInputError
-from dextouch.schemas.problems import first_problems
+from dextouch.command_line import JSON_HELP
 from dextouch.serving.settings import service_config
 from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
@@ -20,13 +19,16 @@ DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
 EARLY_POLICY = PRETRAINED / "behaviour_cloning_early.safetensors"
 DEFAULT_PROBE = PRETRAINED / "success_probe.safetensors"
 _SEEDS = re.compile(r"(\d+):(\d+)")
-SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
 class TrainPolicySettings(BaseSettings):
-    """Imitate the robot episodes of some stores that succeeded."""
+    """Train a closed-loop policy that imitates the successful robot episodes of some stores.
 
-    model_config = service_config("evaluation_train_policy")
+    Example:
+      dextouch train policy --episodes runs/episodes --output runs/cloned.safetensors
+    """
+
+    model_config = service_config("evaluation_train_policy", "dextouch train policy")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     output: Path = Path("runs/evaluation/behaviour_cloning.safetensors")
@@ -39,7 +41,7 @@ class TrainPolicySettings(BaseSettings):
         "beside the output as …_early.safetensors",
     )
     training: CloningSettings = CloningSettings()
-    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
     def early_output(self) -> Path:
         """Where the early policy goes."""
@@ -47,9 +49,13 @@ class TrainPolicySettings(BaseSettings):
 
 
 class TrainProbeSettings(BaseSettings):
-    """Learn to tell success on the robot episodes of some stores, true and imagined ones."""
+    """Train the judge of success on the robot episodes of some stores, true and imagined ones.
 
-    model_config = service_config("evaluation_train_probe")
+    Example:
+      dextouch train probe --episodes runs/true,runs/imagined --output runs/probe.safetensors
+    """
+
+    model_config = service_config("evaluation_train_probe", "dextouch train probe")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     development: tuple[str, ...] = Field(
@@ -61,19 +67,23 @@ class TrainProbeSettings(BaseSettings):
     output: Path = Path("runs/evaluation/success_probe.safetensors")
     tasks: tuple[str, ...] = ()
     training: ProbeSettings = ProbeSettings()
-    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class TrainDirectSettings(BaseSettings):
-    """Learn to tell success from first observations and commands, without imagining anything."""
+    """Train a judge that tells success from first observations and commands, imagining nothing.
 
-    model_config = service_config("evaluation_train_direct_judge")
+    Example:
+      dextouch train direct-judge --episodes runs/episodes --output runs/direct.safetensors
+    """
+
+    model_config = service_config("evaluation_train_direct_judge", "dextouch train direct-judge")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     output: Path = Path("runs/evaluation/direct_judge.safetensors")
     tasks: tuple[str, ...] = ()
     training: DirectSettings = DirectSettings()
-    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class ServedWorld(BaseModel):
@@ -87,13 +97,18 @@ class ServedWorld(BaseModel):
 
 
 class RunSettings(BaseSettings):
-    """Roll policies out in a real and in imagined worlds, and score both.
+    r"""Roll policies out in a real and in imagined worlds, and score both.
 
     How to write a policy of your own and score it: docs/policies.md. The exit status is 1 when a
     rollout failed; the others count.
+
+    Example:
+      dextouch evaluate --seeds 10000:10010 --tasks stand_bottle --json report.json \
+        --real.url http://127.0.0.1:8084 --real.world twin \
+        --imagined '{"model": {"url": "http://127.0.0.1:8085", "world": "world_model"}}'
     """
 
-    model_config = service_config("evaluation_run")
+    model_config = service_config("evaluation_run", "dextouch evaluate")
 
     real: ServedWorld = Field(description="the world that judges success itself, such as the twin")
     imagined: dict[str, ServedWorld] = Field(
@@ -123,7 +138,7 @@ class RunSettings(BaseSettings):
         description="every rollout is added here as a line of JSON when it ends; default: beside "
         "the report, as .jsonl; not the file of --json or --html",
     )
-    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
     html: Path | None = Field(default=None, description="write a page here")
 
     @field_validator("seeds")
@@ -156,19 +171,6 @@ class RunSettings(BaseSettings):
         """The seeds."""
         first, stop = self.seeds.split(":")
         return range(int(first), int(stop))
-
-
-def parse(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
-    """Settings from flags, then the environment, then defaults.
-
-    Raises:
-        InvalidInputError: values that do not fit; every one is named.
-        SystemExit: an unknown flag, or --help.
-    """
-    try:
-        return CliApp.run(cls, cli_args=arguments)
-    except ValidationError as error:
-        raise InvalidInputError(f"{cls.__name__}: {first_problems(error)}") from error
 
 
 def command_line(word: str, arguments: list[str]) -> str:

@@ -5,13 +5,11 @@ import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import ValidationError
-from pydantic_settings import BaseSettings, CliApp
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from dextouch.errors import InvalidInputError
+from dextouch.command_line import write_result
 from dextouch.serving.settings import load_settings
 from dextouch.worlds.serve import serve_worlds
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint
@@ -25,16 +23,15 @@ from services.world_model.state_checkpoints import is_state_checkpoint, read_sta
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
 
-USAGE = """usage: world_model train|train-state|serve|show [flags]
+USAGE = """usage: python -m services.world_model COMMAND [flags]
 
   train         learn from the episodes of a store and write a measured checkpoint
   train-state   the same for a state model: start readers and recurrent cores
   serve         serve a checkpoint's rollouts over HTTP
   show          say where a checkpoint comes from and how good it is
 
-Flags: world_model COMMAND --help"""
+Each explains itself with --help."""
 EXIT_USAGE = 2
-SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,7 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def run_train(arguments: list[str]) -> int:
     """Train with a progress bar; the report goes to the terminal and, if asked, to a file."""
-    settings = _parse(TrainCommand, arguments)
+    settings = load_settings(TrainCommand, arguments)
     columns = (
         TextColumn("training"),
         BarColumn(),
@@ -80,9 +77,7 @@ def run_train(arguments: list[str]) -> int:
 
         report = train(settings, on_progress)
     print(_table(report))
-    if settings.json_path is not None:
-        written = {**asdict(report), "checkpoint": str(report.checkpoint)}
-        settings.json_path.write_text(json.dumps(written, indent=2))
+    write_result(settings.json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
     return 0
 
 
@@ -90,7 +85,7 @@ def run_train_state(arguments: list[str]) -> int:
     """Train a state model; figures go to the terminal and, if asked, to a file."""
     from services.world_model.training.state_trainer import train_state
 
-    settings = _parse(TrainStateCommand, arguments)
+    settings = load_settings(TrainStateCommand, arguments)
     report = train_state(settings)
     print(
         f"{report.checkpoint}: {report.num_parameters:,} parameters, {report.cpu_s:.0f} CPU s, "
@@ -98,9 +93,7 @@ def run_train_state(arguments: list[str]) -> int:
     )
     for name, value in report.metrics.items():
         print(f"{name:<36} {value:.3f}")
-    if settings.json_path is not None:
-        written = {**asdict(report), "checkpoint": str(report.checkpoint)}
-        settings.json_path.write_text(json.dumps(written, indent=2))
+    write_result(settings.json_path, {**asdict(report), "checkpoint": str(report.checkpoint)})
     return 0
 
 
@@ -117,12 +110,11 @@ def run_serve(arguments: list[str]) -> int:
 
 def run_show(arguments: list[str]) -> int:
     """Print the history of one checkpoint, or of every one in a folder."""
-    settings = _parse(ShowCommand, arguments)
+    settings = load_settings(ShowCommand, arguments)
     path = settings.checkpoint
     found = [_history(file) for file in (list_checkpoints(path) if path.is_dir() else [path])]
     print(json.dumps(found, indent=2))
-    if settings.json_path is not None:
-        settings.json_path.write_text(json.dumps(found, indent=2))
+    write_result(settings.json_path, found)
     return 0
 
 
@@ -135,17 +127,6 @@ def _history(file: Path) -> dict[str, Any]:
     checkpoint = read_checkpoint(file)
     history = checkpoint.metadata.model_dump(mode="json", exclude={"train_fingerprints"})
     return {"file": file.name, "digest": checkpoint.digest, "form": "paper's form", **history}
-
-
-def _parse(kind: type[SettingsT], arguments: list[str]) -> SettingsT:
-    try:
-        return CliApp.run(kind, cli_args=arguments)
-    except ValidationError as error:
-        found = "; ".join(
-            f"{'.'.join(map(str, item['loc'])) or 'settings'}: {item['msg']}"
-            for item in error.errors(include_input=False, include_url=False)
-        )
-        raise InvalidInputError(f"{kind.__name__}: {found}") from error
 
 
 def _table(report: TrainingReport) -> str:

@@ -5,6 +5,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, Field
 from pydantic_settings import BaseSettings, CliImplicitFlag
 
+from dextouch.command_line import JSON_HELP
 from dextouch.serving.settings import service_config
 from dextouch.worlds.serve import WorldServiceSettings
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
@@ -149,34 +150,50 @@ class StateTrainSettings(BaseModel):
 
 
 class TrainStateCommand(BaseSettings, StateTrainSettings):
-    """`train-state` on the command line; figures are also written to `json_path`, if given."""
+    """Train a state model, start readers and recurrent cores, on whole episodes.
 
-    model_config = service_config("world_model_train_state")
+    Example:
+      dextouch train state --episodes runs/episodes --output runs/state.safetensors
+    """
 
-    json_path: Path | None = Field(default=None, alias="json", description="write figures here")
+    model_config = service_config("world_model_train_state", "dextouch train state")
+
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class TrainCommand(BaseSettings, TrainSettings):
-    """`train` on the command line; the report is also written to `json_path`, if given."""
+    """Train the joint visuo-tactile flow-matching model on windows of episodes.
 
-    model_config = service_config("world_model_train")
+    Example:
+      dextouch train world-model --episodes runs/episodes --output runs/tiny.safetensors
+    """
 
-    json_path: Path | None = Field(default=None, alias="json")
+    model_config = service_config("world_model_train", "dextouch train world-model")
+
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class ShowCommand(BaseSettings):
-    """`show` on the command line: a checkpoint file, or a folder of them."""
+    """Show where a world model's checkpoint, or every one in a folder, comes from.
 
-    model_config = service_config("world_model_show")
+    Example:
+      dextouch checkpoint --checkpoint runs/state.safetensors
+    """
+
+    model_config = service_config("world_model_show", "dextouch checkpoint")
 
     checkpoint: Path = PRETRAINED
-    json_path: Path | None = Field(default=None, alias="json")
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class WorldModelSettings(WorldServiceSettings):
-    """A served world model."""
+    """Serve the rollouts of a world model over HTTP.
 
-    model_config = service_config("world_model")
+    Example:
+      dextouch serve --checkpoint runs/state.safetensors --port 8085
+    """
+
+    model_config = service_config("world_model", "dextouch serve")
 
     checkpoint: Path = Field(
         default_factory=default_checkpoint, description="of either form (default: the package's)"

@@ -38,7 +38,7 @@ class PolicySource:
             raise InvalidInputError(
                 f"policy: got {text!r}, expected MODULE:FACTORY or NAME=MODULE:FACTORY, such as "
                 "mine=package.module:make_policy (the checkpoint of a cloned policy goes to "
-                "--cloned_policy)"
+                "--cloned-policy)"
             )
         module, factory = match["module"], match["factory"]
         return cls(match["name"] or f"{module}:{factory}", module, factory)

@@ -1,8 +1,10 @@
 """Service settings from flags and environment, and running a service from them."""
 
+import argparse
+import inspect
 import ipaddress
 import re
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import FastAPI
 from pydantic import (
@@ -14,8 +16,9 @@ from pydantic import (
     ValidationError,
     model_validator,
 )
-from pydantic_settings import BaseSettings, CliApp, SettingsConfigDict
+from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsConfigDict
 
+from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.problems import first_problems
 
@@ -28,6 +31,10 @@ HOST_NAME = re.compile(r"[a-z0-9_.-]+")
 ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
 DEFAULT_PORTS = {"http": 80, "https": 443}
 MAX_PORT = 65535
+# Defaults that say nothing to a user of the command line.
+_NO_DEFAULT = re.compile(r"\s*\((default: (null|\(\)|\{\})|default factory: [^)]*)\)$")
+_PLACEHOLDERS = {"int": "N", "float": "X", "Path": "PATH"}
+_LIST = re.compile(r"tuple\[(.+),\.\.\.\]")
 
 
 def canonical_host(text: str) -> str:
@@ -122,29 +129,72 @@ class ServiceSettings(BaseSettings):
         return self
 
 
-def service_config(service: str) -> SettingsConfigDict:
-    """The `model_config` of a service's settings class: variables DEXTOUCH_<SERVICE>_<FIELD>."""
+def service_config(service: str, command: str | None = None) -> SettingsConfigDict:
+    """The `model_config` of a service's settings class: variables DEXTOUCH_<SERVICE>_<FIELD>.
+
+    Args:
+        service: prefix of the variables.
+        command: as users type it, such as `dextouch station`; names the program in its help.
+    """
     return SettingsConfigDict(
         frozen=True,
         extra="forbid",
         env_prefix=f"DEXTOUCH_{service.upper()}_",
         env_nested_delimiter="__",
-        cli_prog_name=service,
-        cli_kebab_case=False,
+        cli_prog_name=command or service,
     )
 
 
 def load_settings(cls: type[SettingsT], arguments: list[str]) -> SettingsT:
     """Load settings from flags, then the environment, then defaults.
 
+    The help describes the command with the docstring of the class, which holds an example. Flags
+    have dashes (`--num-steps`, `--limits.max-chunks`), booleans are switches (`--mock`,
+    `--no-mock`), and lists are repeated or separated by commas.
+
     Raises:
         InvalidInputError: invalid values; all of them are listed.
         SystemExit: an unknown flag, or --help (after printing the usage).
     """
+    source = CliSettingsSource[SettingsT](
+        cls,
+        root_parser=CommandParser(
+            prog=cls.model_config.get("cli_prog_name"), description=inspect.getdoc(cls)
+        ),
+        add_argument_method=_add_argument,
+        cli_kebab_case="no_enums",
+        cli_implicit_flags=True,
+        cli_avoid_json=True,
+        cli_hide_none_type=True,
+        cli_parse_none_str="null",
+    )
     try:
-        return CliApp.run(cls, cli_args=arguments)
+        return CliApp.run(cls, cli_args=arguments, cli_settings_source=source)
     except ValidationError as error:
         raise InvalidInputError(f"settings of {cls.__name__}: {first_problems(error)}") from error
+
+
+def _add_argument(
+    context: argparse._ActionsContainer,
+    *flags: str,
+    **options: Any,  # noqa: ANN401 - argparse's own
+) -> None:
+    """Add one setting to a parser, with a readable placeholder and without empty defaults."""
+    if "metavar" in options:
+        options["metavar"] = _placeholder(options["metavar"], flags[0])
+    if options.get("help") not in (None, argparse.SUPPRESS):
+        options["help"] = _NO_DEFAULT.sub("", options["help"])
+    context.add_argument(*flags, **options)
+
+
+def _placeholder(kind: str, flag: str) -> str:
+    """What a value looks like in help: N, PATH, or the name of its flag; `NAME,…` for a list."""
+    if items := _LIST.fullmatch(kind):
+        return f"{_placeholder(items[1], flag.removesuffix('s'))},…"
+    if kind.startswith("dict[str,"):
+        return "JSON"
+    word = re.split(r"[-.]", flag)[-1].upper()
+    return word if kind in {"str", "SecretStr"} else _PLACEHOLDERS.get(kind, kind)
 
 
 def is_loopback(host: str) -> bool:

@@ -1,9 +1,10 @@
 """Settings: one class gives environment and flags, refuses what it does not know, and is frozen."""
 
 import json
+import re
 
 import pytest
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from dextouch.errors import InvalidInputError
 from dextouch.serving.settings import ServiceSettings, is_loopback, load_settings, service_config
@@ -87,3 +88,48 @@ def test_settings_are_frozen_and_closed():
 )
 def test_loopback(host, expected):
     assert is_loopback(host) is expected
+
+
+class Station(BaseModel):
+    """A nested group of settings."""
+
+    rate_hz: float = 15.0
+
+
+class CommandSettings(ServiceSettings):
+    """Count what is there.
+
+    Example:
+      dextouch probe --num-steps 3
+    """
+
+    model_config = service_config("probe", "dextouch probe")
+
+    num_steps: int = 1
+    is_mock: bool = False
+    names: tuple[str, ...] = ()
+    station: Station = Station()
+
+
+@pytest.mark.parametrize(
+    "flags",
+    [
+        "--num-steps 3 --is-mock --names a --names b --station.rate-hz 2",
+        "--num_steps 3 --is_mock true --names a,b --station.rate_hz=2",
+    ],
+)
+def test_both_spellings_of_flags_are_read(flags):
+    settings = load_settings(CommandSettings, flags.split())
+    assert (settings.num_steps, settings.is_mock) == (3, True)
+    assert (settings.names, settings.station.rate_hz) == (("a", "b"), 2.0)
+
+
+def test_help_names_the_command_and_shows_an_example(capsys):
+    with pytest.raises(SystemExit, match="0"):
+        load_settings(CommandSettings, ["--help"])
+    text = capsys.readouterr().out
+    assert text.startswith("usage: dextouch probe [-h]")
+    assert "\nExample:\n  dextouch probe --num-steps 3\n" in text
+    assert "--names NAME,…" in text
+    assert "--is-mock, --no-is-mock" in text
+    assert not re.search(r"--\S*_|tuple\[|null|factory", text)

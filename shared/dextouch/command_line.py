@@ -1,0 +1,118 @@
+"""Parser and JSON output that all commands share, so that they look and behave alike."""
+
+import argparse
+import json
+import re
+import sys
+import textwrap
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, redirect_stdout
+from contextvars import ContextVar
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, TextIO
+
+STANDARD_OUTPUT = Path("-")
+JSON_HELP = "also write the result as JSON to this file; - for standard output"
+_BOOLEANS = {"true": True, "false": False}
+_result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
+
+
+class HelpFormatter(argparse.HelpFormatter):
+    """Help text whose plain paragraphs are wrapped and whose indented lines stay as they are."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = textwrap.dedent(text).strip("\n").split("\n\n")
+        return "\n\n".join(_filled(paragraph, width, indent) for paragraph in paragraphs)
+
+
+def _filled(paragraph: str, width: int, indent: str) -> str:
+    if re.search(r"^\s", paragraph, flags=re.MULTILINE):
+        return textwrap.indent(paragraph, indent)
+    return textwrap.fill(paragraph, width, initial_indent=indent, subsequent_indent=indent)
+
+
+class CommandParser(argparse.ArgumentParser):
+    """Argument parser of a command; its `epilog` shows an example.
+
+    Flags are spelled with dashes and never abbreviated. Two older spellings are still read but not
+    shown: underscores (`--num_steps 8`) and booleans with a value (`--mock true`).
+    """
+
+    def __init__(self, **kwargs: Any) -> None:  # noqa: ANN401 - argparse's own
+        kwargs.setdefault("formatter_class", HelpFormatter)
+        kwargs.setdefault("allow_abbrev", False)
+        super().__init__(**kwargs)
+
+    def parse_known_args(  # type: ignore[override]
+        self,
+        args: Sequence[str] | None = None,
+        namespace: argparse.Namespace | None = None,
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse known arguments, with older spellings replaced."""
+        given = sys.argv[1:] if args is None else list(args)
+        return super().parse_known_args(self._respelled(given), namespace)
+
+    def _respelled(self, arguments: Sequence[str]) -> list[str]:
+        words: list[str] = []
+        for word in arguments:
+            if words and word in _BOOLEANS and self._is_boolean(words[-1]):
+                words[-1] = _switched(words[-1], word)
+                continue
+            flag, equals, value = word.partition("=")
+            if flag.startswith("--") and flag not in self._option_string_actions:
+                dashed = flag.replace("_", "-")
+                flag = dashed if dashed in self._option_string_actions else flag
+            if value in _BOOLEANS and self._is_boolean(flag):
+                words.append(_switched(flag, value))
+            else:
+                words.append(f"{flag}{equals}{value}")
+        return words
+
+    def _is_boolean(self, flag: str) -> bool:
+        action = self._option_string_actions.get(flag)
+        return isinstance(action, argparse.BooleanOptionalAction) and not flag.startswith("--no-")
+
+
+def _switched(flag: str, value: str) -> str:
+    return flag if _BOOLEANS[value] else f"--no-{flag.removeprefix('--')}"
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """Add `--json PATH`, for a result that `write_result` writes."""
+    parser.add_argument("--json", type=Path, metavar="PATH", help=JSON_HELP)
+
+
+def write_result(path: Path | None, result: object, *, allow_nan: bool = True) -> None:
+    """Write the result of a command as JSON.
+
+    Args:
+        path: file to write, `-` for standard output, None to write nothing.
+        result: values that JSON can hold.
+        allow_nan: False to refuse numbers that are not finite.
+
+    Raises:
+        ValueError: a number is not finite and `allow_nan` is False.
+    """
+    if path is None:
+        return
+    text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=allow_nan)
+    if path == STANDARD_OUTPUT:
+        print(text, file=_result_stream.get() or sys.stdout, flush=True)
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text + "\n", encoding="utf-8")
+
+
+@contextmanager
+def messages_aside(arguments: Sequence[str]) -> Iterator[None]:
+    """With `--json -` among the arguments, print everything but the result to standard error."""
+    if "--json=-" not in arguments and ("--json", "-") not in pairwise(arguments):
+        yield
+        return
+    token = _result_stream.set(sys.stdout)
+    try:
+        with redirect_stdout(sys.stderr):
+            yield
+    finally:
+        _result_stream.reset(token)

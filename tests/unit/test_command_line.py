@@ -1,0 +1,77 @@
+"""Commands' parser and JSON: old spellings are read, help stays as written, `-` is stdout alone."""
+
+import argparse
+import json
+import sys
+
+import pytest
+
+from dextouch.command_line import CommandParser, add_json, messages_aside, write_result
+
+
+def parser():
+    made = CommandParser(prog="dextouch probe", description="One\nparagraph.\n\n  two\n    lines")
+    made.add_argument("--num-steps", type=int)
+    made.add_argument("--mock", action=argparse.BooleanOptionalAction)
+    add_json(made)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("flags", "expected"),
+    [
+        (["--num-steps", "8"], (8, None)),
+        (["--num_steps", "8"], (8, None)),
+        (["--num_steps=8"], (8, None)),
+        (["--mock"], (None, True)),
+        (["--no-mock"], (None, False)),
+        (["--mock", "true"], (None, True)),
+        (["--mock", "false", "--num-steps", "8"], (8, False)),
+        (["--mock=false"], (None, False)),
+    ],
+)
+def test_older_spellings_are_read(flags, expected):
+    options = parser().parse_args(flags)
+    assert (options.num_steps, options.mock) == expected
+
+
+@pytest.mark.parametrize("flags", [["--num", "8"], ["--mock", "maybe"], ["--no-mock", "true"]])
+def test_other_spellings_are_refused(flags):
+    with pytest.raises(SystemExit, match="2"):
+        parser().parse_args(flags)
+
+
+def test_values_are_never_respelled():
+    text = argparse.ArgumentParser.parse_args(parser(), ["--json", "a_b/true"])
+    assert str(text.json) == "a_b/true"
+
+
+def test_help_wraps_paragraphs_and_keeps_examples(monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "\nOne paragraph.\n\n  two\n    lines\n" in parser().format_help()
+
+
+def test_a_result_is_written_to_a_new_folder(tmp_path):
+    write_result(tmp_path / "new" / "a.json", {"name": "Größe"})
+    assert (tmp_path / "new" / "a.json").read_text(encoding="utf-8").endswith("\n")
+    assert json.loads((tmp_path / "new" / "a.json").read_text(encoding="utf-8")) == {
+        "name": "Größe"
+    }
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        write_result(tmp_path / "b.json", float("nan"), allow_nan=False)
+
+
+@pytest.mark.parametrize("flags", [["--json", "-"], ["--json=-"]])
+def test_a_dash_leaves_standard_output_to_the_result(flags, capsys):
+    options = parser().parse_args(flags)
+    with messages_aside(flags):
+        sys.stdout.write("a message\n")
+        write_result(options.json, [1])
+    told = capsys.readouterr()
+    assert (json.loads(told.out), told.err) == ([1], "a message\n")
+
+
+def test_messages_stay_where_they_are_without_a_dash(capsys):
+    with messages_aside(["--json", "report.json"]):
+        sys.stdout.write("a message\n")
+    assert capsys.readouterr().out == "a message\n"
