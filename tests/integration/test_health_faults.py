@@ -61,7 +61,7 @@ def test_the_confusion_matrix(tmp_path):
         row, problems = judged(name, observe(scenario, tmp_path / str(number)))
         rows.append(row)
         wrong += problems
-    print("\n| fault | device | found | after (s) | besides |\n|---|---|---|---|---|")  # noqa: T201 - the matrix
+    print("\n| fault | device | finding | after (s) | also raised |\n|---|---|---|---|---|")  # noqa: T201 - the matrix
     print("\n".join(rows))  # noqa: T201
     assert wrong == []
 
