@@ -45,5 +45,5 @@ ADVICE: Final[Mapping[Code, str]] = {
     "disk": "Upload and delete takes, or use a larger disk for the spool.",
     "calibration_missing": "Calibrate with `dextouch station calibrate` before recording.",
     "calibration_age": "Calibrate again with `dextouch station calibrate`.",
-    "upload_refused": "Resolve the reason that the store gives, then send the take again from the page.",
+    "upload_refused": "Resolve the reason that the store gives, then send the take again.",
 }

@@ -16,14 +16,14 @@ from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
 HAZARDS: Final[Mapping[str, str]] = {
     "rotations": "near-singular rotations: angles of 0 and π, parallel columns, lost quaternions",
     "one_axis": "motion about one axis only, or none",
-    "clock": "clock steps, wraps, pauses and stamps that go back",
+    "clock": "clock steps, wraps, pauses and decreasing timestamps",
     "non_finite": "NaN, infinity, denormal and huge numbers",
     "touch": "zero and saturated touch",
-    "ends": "t = 0 and t = 1: ends of intervals, flow time, rates of none and all",
+    "ends": "t = 0 and t = 1: ends of intervals, flow time, rates of 0 and 1",
     "precision": "bfloat16 and float16 numbers",
     "device": "weights or inputs on another device",
     "long_run": "1000 steps: drift over 63 chunks of 16",
-    "batch": "one against many: a batch of 1 and of N",
+    "batch": "a batch of 1 compared with a batch of N",
 }
 
 Verdict = Literal["held", "failed", "does not apply", "not run"]
