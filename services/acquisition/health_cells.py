@@ -155,7 +155,7 @@ def cells_of(decoder: Decoder, calibration: Mapping[str, Matrix]) -> Cells | Non
     if layout.grid is not None and math.prod(layout.grid) != num_cells:
         raise InvalidInputError(
             f"{descriptor.device}: got cells on a grid of {layout.grid} in a sample of {num_cells} "
-            "numbers, expected as many; mend the driver of this glove"
+            "numbers, expected as many; fix the driver of this glove"
         )
     return Cells(layout.full_scale, layout.grid, _used_cells(decoder, calibration))
 

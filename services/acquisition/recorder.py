@@ -175,7 +175,7 @@ class Recorder:
                 if before is not None and before.success != how.success:
                     raise ConflictError(
                         f"take {how.recording_id!r} was saved with success={before.success}, got "
-                        f"{how.success}; what is saved is not changed"
+                        f"{how.success}; saved takes cannot be changed"
                     )
                 return self.status()
             self._expect("save")

@@ -49,7 +49,7 @@ class AcquisitionSettings(ServiceSettings):
         if (self.mock_store is None) != (self.mock_episode_id is None):
             raise ValueError(
                 f"got mock_store {self.mock_store!r} and mock_episode_id {self.mock_episode_id!r}, "
-                "expected both (the episode that mock devices play) or neither (a pattern)"
+                "expected both (the episode that mock devices replay) or neither (a pattern)"
             )
         if self.mock and self.devices:
             kinds = ", ".join(device.kind for device in self.devices)

@@ -295,9 +295,10 @@ def check_free_space(folder: Path, safety: SpoolSafety) -> None:
     free_bytes = disk.f_bavail * disk.f_frsize
     if free_bytes < safety.min_free_bytes:
         raise StorageFullError(
-            f"spool {folder.name!r}: no space left to go on: {free_bytes / MEBIBYTE:.0f} MiB free, "
-            f"{safety.min_free_bytes / MEBIBYTE:.0f} MiB are kept for closing takes; what was "
-            "recorded stays and can be saved, free space before the next take",
+            f"spool {folder.name!r}: no space left to continue: "
+            f"{free_bytes / MEBIBYTE:.0f} MiB free, {safety.min_free_bytes / MEBIBYTE:.0f} MiB are "
+            "reserved for closing takes; the data recorded so far can be saved; free space before "
+            "the next take",
             free_bytes=free_bytes,
         )
 

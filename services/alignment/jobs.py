@@ -92,7 +92,7 @@ def check_recordings(
         unknown = all(isinstance(error, NotFoundError) for error in refused.values())
         raise (NotFoundError if unknown else InvalidInputError)(
             f"alignments: {len(reasons)} of {len(recording_ids)} recordings cannot be aligned, so "
-            f"none was begun; leave them out: {told}{more}",
+            f"no job was started; omit them: {told}{more}",
             refused=reasons,
         )
     return episodes

@@ -182,10 +182,10 @@ class Ingest:
                 self._open.move_to_end(recording_id)
                 return self._open[recording_id]
         if self._store.exists(recording_id, kind="recording"):
-            raise ConflictError(f"recording {recording_id!r} is finished; it never changes")
+            raise ConflictError(f"recording {recording_id!r} is finished and cannot be changed")
         path = self._path(recording_id)
         if not path.exists():
-            raise NotFoundError(f"recording {recording_id!r}: no upload was begun under this id")
+            raise NotFoundError(f"recording {recording_id!r}: there is no upload with this id")
         upload = Upload(SpoolWriter.resume(path, sync=self._sync))
         self._keep(recording_id, upload)
         return upload
@@ -217,7 +217,7 @@ def _check_complete(upload: Upload, body: FinishRecording) -> None:
     if set(body.num_batches) != set(here):
         raise InvalidInputError(
             f"finish {recording_id}: got streams {sorted(body.num_batches)}, expected "
-            f"{sorted(here)}; announce 0 batches for a stream that never spoke"
+            f"{sorted(here)}; announce 0 batches for a stream without samples"
         )
     differing = {
         name: {"got": here[name], "expected": expected}

@@ -35,7 +35,7 @@ class KeyedLocks:
         try:
             if not lock.acquire(timeout=self._patience_s):
                 raise UnavailableError(
-                    f"{key}: still being worked on after {self._patience_s:g} s; try again later",
+                    f"{key}: still locked after {self._patience_s:g} s; try again later",
                     retry_after_s=RETRY_AFTER_S,
                 )
             try:

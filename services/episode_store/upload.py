@@ -51,8 +51,8 @@ class Upload:
             self._spool.append(stream, batch, flush=True)
         elif not _same(SpoolReader(self._spool.path).appended(stream, number), batch):
             raise ConflictError(
-                f"{recording_id} {stream}: batch {number} is here with other samples; "
-                "a batch never changes",
+                f"{recording_id} {stream}: batch {number} exists with other samples; "
+                "batches are immutable",
                 got=number,
                 expected=expected,
             )

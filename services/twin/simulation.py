@@ -97,7 +97,7 @@ class Simulation:
         if not np.isfinite(self.data.qpos).all():
             raise InvalidInputError(
                 f"twin: physics diverged before step {self.step_index}; expected finite poses; "
-                "send commands nearer to each other"
+                "send commands closer to each other"
             )
 
     def _interpolated(

@@ -33,7 +33,7 @@ def mock_of(name: str) -> Callable[[MockPlace], MockPair]:
     except IMPORT_FAILURES as error:
         raise InvalidInputError(
             f"mock of kind {name!r} ({kind.mock}): got {type(error).__name__}: {error}, expected "
-            "a function 'module:function' of a MockPlace; mend the package that brings the kind"
+            "a function 'module:function' of a MockPlace; fix the package that provides the kind"
         ) from error
 
     def checked(place: MockPlace) -> MockPair:
@@ -41,7 +41,7 @@ def mock_of(name: str) -> Callable[[MockPlace], MockPair]:
         if not isinstance(pair, MockPair):
             raise InvalidInputError(
                 f"mock of kind {name!r} ({kind.mock}): gave {type(pair).__name__}, expected a "
-                "services.acquisition.mocks.MockPair; mend the package that brings the kind"
+                "services.acquisition.mocks.MockPair; fix the package that provides the kind"
             )
         return pair
 

@@ -62,7 +62,7 @@ def device_kind(name: str) -> DeviceKind[Any]:
     if len(found) > 1:
         packages = ", ".join(f"{package_of(point)} ({point.value})" for point in found)
         raise InvalidInputError(
-            f"kind of device {name!r}: got {len(found)} packages that bring it, {packages}; "
+            f"kind of device {name!r}: got {len(found)} packages that provide it, {packages}; "
             f"expected one: uninstall the others, or rename their entry points of the group "
             f"{ENTRY_POINT_GROUP!r}"
         )
@@ -93,7 +93,7 @@ def _load(point: EntryPoint) -> object:
     except IMPORT_FAILURES as error:
         raise InvalidInputError(
             f"{_where(point)}: got {type(error).__name__}: {error}, expected a module that can be "
-            f"imported; mend or uninstall package {package_of(point)}"
+            f"imported; fix or uninstall package {package_of(point)}"
         ) from error
 
 

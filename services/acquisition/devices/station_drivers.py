@@ -39,7 +39,7 @@ def _build(device: DeviceSettings, clock: StationClock) -> Driver:
     if not isinstance(driver, Driver):
         raise InvalidInputError(
             f"kind of device {kind.name!r}: build gave {type(driver).__name__}, expected a "
-            "services.acquisition.devices.Driver; mend the package that brings this kind"
+            "services.acquisition.devices.Driver; fix the package that provides this kind"
         )
     return driver
 

@@ -127,7 +127,7 @@ def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
     """
     if packet.version != VERSION:
         raise DeviceError(
-            f"{device}: speaks packet version {packet.version}, expected {VERSION}; update the "
+            f"{device}: uses packet version {packet.version}, expected {VERSION}; update the "
             "device or this station",
             device=device,
             event="wrong_version",

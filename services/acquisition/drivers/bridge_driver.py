@@ -59,7 +59,7 @@ class BridgeDriver(Driver):
         """New samples; empty when nothing came.
 
         Raises:
-            StaleDataError: the bridge has been silent for 200 ms.
+            StaleDataError: the bridge has sent nothing for 200 ms.
             DeviceError: the bridge is gone or speaks another protocol.
         """
         if self._first:
@@ -73,8 +73,8 @@ class BridgeDriver(Driver):
         silence_ns = t_host_ns - self._t_heard_ns
         if silence_ns > SILENCE_NS:
             raise StaleDataError(
-                f"{self.name}: {self.info} has been silent for {silence_ns / 1e6:.0f} ms, expected "
-                "a sign of life every 50 ms; does the SDK process still run?",
+                f"{self.name}: {self.info} has sent nothing for {silence_ns / 1e6:.0f} ms, "
+                "expected a heartbeat every 50 ms; is the SDK process still running?",
                 device=self.name,
                 event="silent_bridge",
             )

@@ -117,7 +117,7 @@ def parse_hello(line: bytes, *, device: str) -> BridgeHello:
         ) from error
     if hello.version != PROTOCOL_VERSION:
         raise DeviceError(
-            f"{device}: the bridge speaks version {hello.version}, expected {PROTOCOL_VERSION}; "
+            f"{device}: the bridge uses version {hello.version}, expected {PROTOCOL_VERSION}; "
             "update the bridge or this station",
             device=device,
             event="wrong_version",
@@ -170,7 +170,7 @@ class BridgeConnection:
         device: our name of the device, for messages.
         source: where the wanted device sits.
         serial_number: of the wanted device; the only one of its source if None.
-        packets: finds the packets; an empty payload must be allowed, it is a sign of life.
+        packets: finds the packets; an empty payload must be allowed, as it is a heartbeat.
         payload_bytes: of a packet with a sample.
     """
 

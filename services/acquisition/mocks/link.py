@@ -59,7 +59,7 @@ class Link:
         """
         with self._changed:
             if not self._changed.wait_for(lambda: not self._is_open, KEEP_UP_TIMEOUT_S):
-                raise DeviceError("mock device: the host did not notice the unplugging for 20 s")
+                raise DeviceError("mock device: the host did not detect the unplugging for 20 s")
 
 
 class WatchedTransport:

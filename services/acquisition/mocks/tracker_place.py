@@ -52,7 +52,7 @@ class BridgedDevice(MockDevice):
         self._numbering = threading.Lock()
 
     def show_life(self) -> None:
-        """Send one sign of life; it has a number and no place in the ledger."""
+        """Send one heartbeat, which has a sequence number but no ledger entry."""
         with self._numbering:
             sequence = self._next_sequence
             self._next_sequence = (sequence + 1) % SEQUENCE_MODULUS

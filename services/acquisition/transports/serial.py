@@ -93,7 +93,7 @@ class SerialTransport:
         self.close()
         if self._closing is not None and self._closing.is_alive():
             raise DeviceError(
-                f"{self.info}: is still being closed, since the device takes nothing in; wait half "
+                f"{self.info}: is still being closed, because the device does not read; wait half "
                 "a minute or replug it"
             )
         self._address = self._find()
@@ -131,7 +131,7 @@ class SerialTransport:
         except OSError as error:
             raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
         if not data:
-            raise DeviceError(f"{self.info}: unplugged while reading (its end was reached)")
+            raise DeviceError(f"{self.info}: unplugged while reading (end of file)")
         return data
 
     def write(self, data: bytes) -> None:

@@ -120,7 +120,7 @@ def solve_bundle(
             return Bundle(X, Z, covariance)
     raise InvalidInputError(
         f"calibration: the bundle still moves by {np.abs(step).max():.1e} after {MAX_ROUNDS} "
-        "rounds; the views contradict each other, check that both series are of the same moments"
+        "rounds; the views are inconsistent; check that both series were taken at the same times"
     )
 
 

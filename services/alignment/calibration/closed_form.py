@@ -91,7 +91,7 @@ def _without_outliers(series: Series, given: np.ndarray | None) -> Agreement:
             raise InvalidInputError(
                 f"{series.task}: more than {MAX_OUTLIER_SHARE:.0%} of {num_views} views disagree "
                 f"with the others, among them {far_off}; check that both series are of the same "
-                "moments and the target stood still",
+                "moments and the target did not move",
                 views=far_off,
             )
         views = np.delete(views, int(np.argmax(ratios)))
@@ -174,7 +174,7 @@ def check_noise(task: str, errors: np.ndarray) -> None:
         raise InvalidInputError(
             f"{task}: the views contradict each other by {_told(errors)} RMS, expected at most "
             f"{np.rad2deg(MAX_ROTATION_RMS_RAD):.0f} degrees and {MAX_TRANSLATION_RMS_M * 1e3:.0f} "
-            "mm; check that both series belong to the same moments and the target stood still"
+            "mm; check that both series were taken at the same times and the target did not move"
         )
 
 

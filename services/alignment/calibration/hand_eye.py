@@ -214,11 +214,12 @@ def _check_budget(result: HandEyeResult) -> None:
     axis = AXIS_NAMES[int(np.argmax(np.abs(worst)))]
     others = " and ".join(name for name in AXIS_NAMES if name != axis)
     raise DegenerateMotionError(
-        f"{TASK}: the mount stays uncertain by {np.rad2deg(result.sigma_rotation_rad):.2f} degrees "
-        f"and {result.sigma_translation_m * 1e3:.1f} mm (one sigma), expected at most "
+        f"{TASK}: the uncertainty of the mount is "
+        f"{np.rad2deg(result.sigma_rotation_rad):.2f} degrees and "
+        f"{result.sigma_translation_m * 1e3:.1f} mm (one sigma), expected at most "
         f"{np.rad2deg(MAX_SIGMA_ROTATION_RAD):.1f} and {MAX_SIGMA_TRANSLATION_M * 1e3:.0f}; the "
-        f"turn about the tracker's {axis} axis is known worst: turn it more about {others}, take "
-        "more views, and bring the board nearer",
+        f"rotation about the tracker's {axis} axis is least certain: rotate it more about "
+        f"{others}, take more views, and move the board closer",
         missing_axes=[name for name in AXIS_NAMES if name != axis],
     )
 

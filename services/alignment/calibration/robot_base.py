@@ -203,7 +203,7 @@ def _check_budget(result: RobotBaseResult) -> None:
         or result.sigma_translation_m > MAX_SIGMA_TRANSLATION_M
     ):
         raise DegenerateMotionError(
-            f"{TASK}: the base stays uncertain by {np.rad2deg(result.sigma_rotation_rad):.2f} "
+            f"{TASK}: the uncertainty of the base is {np.rad2deg(result.sigma_rotation_rad):.2f} "
             f"degrees and {result.sigma_translation_m * 1e3:.1f} mm (one sigma), expected at most "
             f"{np.rad2deg(MAX_SIGMA_ROTATION_RAD):.1f} and {MAX_SIGMA_TRANSLATION_M * 1e3:.0f}; "
             "turn the effector by 30 degrees and more about all its axes, take more pairs over "

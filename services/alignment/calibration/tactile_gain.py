@@ -201,7 +201,7 @@ def _check_direction(points: _Points) -> None:
     if (response[answering] < 0).mean() > 0.5:
         raise InvalidInputError(
             "gain: counts fall under pressure; the rest take and a pressed take are probably "
-            "exchanged, or this glove counts downwards and needs a decoder that turns it round"
+            "exchanged, or this glove counts downwards and needs a decoder that inverts it"
         )
 
 

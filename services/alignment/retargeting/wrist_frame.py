@@ -113,9 +113,9 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
     sigma_rad = float(np.sqrt(np.trace(covariance)))
     if sigma_rad > MAX_SIGMA_RAD:
         raise InvalidInputError(
-            f"{where}: the wrist's axes stay uncertain by {np.rad2deg(sigma_rad):.1f} degrees (one "
-            f"sigma), expected at most {np.rad2deg(MAX_SIGMA_RAD):.0f}; the palm's nodes are off a "
-            f"palm by {np.sqrt(np.square(left_over).sum(1).mean()) * 1e3:.1f} mm RMS",
+            f"{where}: the uncertainty of the wrist's axes is {np.rad2deg(sigma_rad):.1f} degrees "
+            f"(one sigma), expected at most {np.rad2deg(MAX_SIGMA_RAD):.0f}; the palm's nodes "
+            f"deviate by {np.sqrt(np.square(left_over).sum(1).mean()) * 1e3:.1f} mm RMS",
             fault="uncertain",
         )
     has_wrist = is_used[PALM_NODES.index(WRIST_NODE)]

@@ -184,7 +184,7 @@ class ObjectStorage:
         if is_current(self.group(kind, item_id), what=f"{kind} {item_id}"):
             return False
         raise StorageError(
-            f"{kind} {item_id!r}: is of an older version, which cannot be migrated in "
+            f"{kind} {item_id!r}: has an older version, which cannot be migrated in "
             f"{self._address}; copy it to a local store, migrate it there and write it here again"
         )
 
@@ -220,12 +220,12 @@ class ObjectStorage:
             upload_group(self._bucket, kind, folder)
         except (StorageError, UnavailableError) as error:
             raise type(error)(
-                f"{error.message}; {kind} {folder.name!r} waits in {folder}, `recover` uploads it"
+                f"{error.message}; {kind} {folder.name!r} is kept in {folder}, `recover` uploads it"
             ) from error
         except KeyboardInterrupt as interrupt:
             if (folder / COMMIT_FILE).exists():
                 interrupt.add_note(
-                    f"{kind} {folder.name!r} waits in {folder}, `recover` uploads it"
+                    f"{kind} {folder.name!r} is kept in {folder}, `recover` uploads it"
                 )
             raise
 

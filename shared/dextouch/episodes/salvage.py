@@ -185,7 +185,7 @@ def write_salvaged(
     kind, item_id = kind_of(attributes), attributes_id(attributes)
     streams = _on_one_grid(streams) if kind == "episode" else list(streams)
     if not any(stream.kept.any() for stream in streams):
-        raise InvalidInputError(f"{kind} {item_id!r}: not one sample holds; delete it")
+        raise InvalidInputError(f"{kind} {item_id!r}: no sample is intact; delete it")
     lost = {stream.descriptor.name: stream.num_lost for stream in streams if stream.num_lost}
     free = _free_id(root, kind, item_id)
     update: dict[str, object] = {f"{kind}_id": free, "recovered": True}

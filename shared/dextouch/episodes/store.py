@@ -197,7 +197,7 @@ class EpisodeStore:
         if not isinstance(self._storage, LocalStorage):
             raise InvalidInputError(
                 "trash: got a store in a bucket, expected one in a folder; what is deleted from a "
-                "bucket comes back from its older versions only"
+                "bucket can only be restored from its older versions"
             )
         return self.root
 

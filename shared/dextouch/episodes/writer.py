@@ -85,7 +85,7 @@ class EpisodeWriter:
         """
         if len(self._streams) >= MAX_STREAMS:
             raise InvalidInputError(
-                f"{attributes_id(self._attributes)}: stream {descriptor.name!r} is one too many, "
+                f"{attributes_id(self._attributes)}: stream {descriptor.name!r} exceeds the limit, "
                 f"expected at most {MAX_STREAMS} streams; put some into one stream of a larger "
                 f"shape, or write a second {self._kind}"
             )

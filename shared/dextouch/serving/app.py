@@ -141,7 +141,9 @@ def _add_error_handlers(app: FastAPI) -> None:
     async def unexpected(request: Request, error: Exception) -> Response:
         # Starlette re-raises it after this response, for the server's log.
         logger.error("request_failed", path=request.url.path, error=type(error).__name__)
-        ours = DexTouchError("unexpected error in the service; its log tells more by request id")
+        ours = DexTouchError(
+            "unexpected error in the service; see the service's log for the request id"
+        )
         response = _problem_response(request, ours)
         response.headers["x-request-id"] = request.state.request_id
         return response

@@ -183,7 +183,7 @@ def test_a_nearly_full_disk_ends_the_take_before_anything_is_lost(
     play(recorder, clock, 30, first=15)
     status = recorder.status()
     assert status.state == "checking"
-    assert "no space left to go on" in status.problems[0]
+    assert "no space left to continue" in status.problems[0]
     assert recorder.save(ANYWAY).state == "saved"
     assert SpoolReader(recorder.spool_root / "take").num_samples("head") >= 15
     recorder.arm(PROMPT)

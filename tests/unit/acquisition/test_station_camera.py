@@ -177,7 +177,7 @@ def test_stamps_that_leave_the_clock_degrade_the_stream_and_say_so():
     assert driver.read()
     for _ in range(9):
         assert driver.read() == {}
-    with pytest.raises(DeviceError, match="not of this host's clock"):
+    with pytest.raises(DeviceError, match="not on this host's clock"):
         driver.read()
     driver.close()
     driver.open()

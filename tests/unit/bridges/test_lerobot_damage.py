@@ -185,7 +185,7 @@ DAMAGE = {
     "frame of another episode": (
         _column(DATA, "episode_index", 4, 1),
         CorruptDataError,
-        "lie apart",
+        "are not contiguous",
     ),
     "stamps go back": (_column(DATA, "dextouch.t_ref_ns", 4, 0), CorruptDataError, "t_ref_ns"),
     "image stamps go back": (

@@ -117,7 +117,7 @@ class CameraDecoder:
             raise DeviceError(
                 f"{self._stream}: sends {width_px} by {height_px} px in encoding {code}, expected "
                 f"{self._size[1]} by {self._size[0]} in {ENCODING_CODES[self._encoding]} "
-                f"({self._encoding}); set the camera or the station"
+                f"({self._encoding}); change the settings of the camera or of the station"
             )
         if self._encoding == "rgb8":
             image = self._raw(payload)

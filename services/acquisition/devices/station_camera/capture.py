@@ -137,11 +137,11 @@ class CaptureLink:
 
     def read(self) -> bytes:
         """Refused: a camera gives images (`capture`), not bytes."""
-        raise DeviceError(f"{self.info}: gives images, not bytes; read it by its capture")
+        raise DeviceError(f"{self.info}: provides images, not bytes; read it through its capture")
 
     def write(self, data: bytes) -> None:
         """Refused: a camera takes no bytes."""
-        raise DeviceError(f"{self.info}: takes no bytes, got {len(data)}")
+        raise DeviceError(f"{self.info}: accepts no data, got {len(data)}")
 
     def close(self) -> None:
         """Close the camera; closing twice is fine."""
@@ -256,14 +256,14 @@ class OpenCvCapture:
         if got != (request.height_px, request.width_px):
             raise DeviceError(
                 f"camera {self._source}: gives {got[1]} by {got[0]} px, expected "
-                f"{request.width_px} by {request.height_px}; ask for a size that it has"
+                f"{request.width_px} by {request.height_px}; choose a supported size"
             )
         rate_hz = video.get(cv2.CAP_PROP_FPS)
         # Cameras that do not tell their rate say 0.
         if rate_hz > 0 and abs(rate_hz / request.rate_hz - 1) > RATE_TOLERANCE:
             raise DeviceError(
                 f"camera {self._source}: gives {rate_hz:g} images a second, expected "
-                f"{request.rate_hz:g}; ask for a rate that it has"
+                f"{request.rate_hz:g}; choose a supported rate"
             )
 
 

@@ -70,8 +70,9 @@ class DriverStamps:
         if self._num_bad >= MAX_BAD_STAMPS:
             self.usable = False
             raise DeviceError(
-                f"{self._camera}: {self._num_bad} stamps in a row are not of this host's clock, "
-                "though the first ones were; from here on its images have arrival stamps only",
+                f"{self._camera}: {self._num_bad} timestamps in a row are "
+                "not on this host's clock, unlike the first ones; from now on its images have "
+                "arrival timestamps only",
                 device=self._camera,
             )
 

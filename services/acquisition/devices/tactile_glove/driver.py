@@ -131,15 +131,15 @@ class TactileGlove(Driver):
         where = f"{self.name}: the glove {identity.serial_number!r} at {self.info.address}"
         if self._serial_number not in (None, identity.serial_number):
             raise DeviceError(
-                f"{where} is not {self._serial_number!r}; are two gloves exchanged, or is the "
-                "serial number in the settings another glove's?",
+                f"{where} is not {self._serial_number!r}; are two gloves swapped, or is the "
+                "serial number in the settings that of another glove?",
                 device=self.name,
                 event="wrong_serial_number",
             )
         if identity.side != self._side:
             raise DeviceError(
                 f"{where} says it is {identity.side!r}, expected {self._side!r}; left and right "
-                "are swapped: exchange the gloves or their entries in the settings",
+                "are swapped: swap the gloves or their entries in the settings",
                 device=self.name,
                 event="wrong_side",
             )

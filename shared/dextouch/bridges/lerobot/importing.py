@@ -110,7 +110,7 @@ def _foreign_attributes(
 ) -> EpisodeAttributes:
     if options.K_head is None:
         raise InvalidInputError(
-            f"{source.folder}: says nothing about its head camera "
+            f"{source.folder}: has no information about its head camera "
             f"({features.cameras['camera_head']!r}); give K_head= in pixels"
         )
     name = re.sub(r"[^a-z0-9_-]+", "-", source.folder.resolve().name.lower()).strip("-_")

@@ -102,7 +102,7 @@ class LeRobotFolder:
         values = column_values(table, name, feature.shape, where=where)
         if values.dtype.name != feature.dtype:
             raise CorruptDataError(
-                f"{where}: column {name!r} is {values.dtype}, info.json promises {feature.dtype}"
+                f"{where}: column {name!r} is {values.dtype}, info.json declares {feature.dtype}"
             )
         return values
 
@@ -121,7 +121,8 @@ class LeRobotFolder:
         start = entry.row.get(f"videos/{key}/from_timestamp")
         if not isinstance(start, float) or not 0 <= start < 1e9:
             raise CorruptDataError(
-                f"{self.folder}: episode {entry.index} does not say where {key!r} begins ({start})"
+                f"{self.folder}: episode {entry.index} does not specify where {key!r} "
+                f"begins ({start})"
             )
         path = self._path(self.info.video_path, entry, f"videos/{key}", video_key=key)
         shape = self.info.features[key].numbers()
@@ -132,7 +133,7 @@ class LeRobotFolder:
         places = {n: v for n, v in numbers.items() if isinstance(v, int) and v >= 0}
         if len(places) != len(numbers):
             raise CorruptDataError(
-                f"{self.folder}: episode {entry.index} does not say its file of {prefix!r}"
+                f"{self.folder}: episode {entry.index} does not specify its file of {prefix!r}"
             )
         return layout.confined(self.folder, layout.fill_path(template, **places, **values))
 
@@ -145,7 +146,7 @@ class LeRobotFolder:
         owners = column_values(table, "episode_index", [1], where=str(path))
         rows = np.flatnonzero(owners == entry.index)
         if len(rows) and int(rows[-1]) - int(rows[0]) + 1 != len(rows):
-            raise CorruptDataError(f"{path}: frames of episode {entry.index} lie apart")
+            raise CorruptDataError(f"{path}: frames of episode {entry.index} are not contiguous")
         return table.slice(int(rows[0]) if len(rows) else 0, len(rows))
 
 
@@ -161,7 +162,7 @@ def _read_info(folder: Path) -> DatasetInfo:
         plain = json.loads(data)
         version = plain["codebase_version"]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise CorruptDataError(f"{path}: is no description of a dataset ({error})") from error
+        raise CorruptDataError(f"{path}: is not a valid dataset description ({error})") from error
     if not isinstance(version, str) or not version.startswith("v3."):
         raise InvalidInputError(
             f"{path}: got format {version!r}, expected v3.x; convert it with "
@@ -170,7 +171,7 @@ def _read_info(folder: Path) -> DatasetInfo:
     try:
         return DatasetInfo.model_validate(plain)
     except ValidationError as error:
-        raise CorruptDataError(f"{path}: is no description of a dataset ({error})") from error
+        raise CorruptDataError(f"{path}: is not a valid dataset description ({error})") from error
 
 
 def _read_tasks(folder: Path) -> list[str]:

@@ -229,7 +229,7 @@ def column_values(table: pa.Table, name: str, shape: Sequence[int], *, where: st
             not numbers.
     """
     if name not in table.column_names:
-        raise CorruptDataError(f"{where}: has no column {name!r}, which info.json promises")
+        raise CorruptDataError(f"{where}: has no column {name!r}, which info.json declares")
     try:
         return _plain(table, name, shape, where)
     except pa.ArrowException as error:

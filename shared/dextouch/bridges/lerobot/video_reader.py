@@ -105,7 +105,7 @@ def _opened(span: VideoSpan) -> Iterator[tuple[InputContainer, VideoStream]]:
             _check_size(span, stream)
             base = stream.time_base
             if base is None:
-                raise CorruptDataError(f"{span.path}: says nothing about its times")
+                raise CorruptDataError(f"{span.path}: has no timestamps")
             container.seek(max(0, round((span.from_s - 0.5 / span.fps) / base)), stream=stream)
             yield container, stream
     except (av.error.FFmpegError, ValueError) as error:

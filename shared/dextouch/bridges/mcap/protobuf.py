@@ -114,7 +114,7 @@ def _read_varint(data: bytes, at: int) -> tuple[int, int]:
         number |= (byte & 0x7F) << (7 * index)
         if byte < 0x80:
             return number & ((1 << 64) - 1), at + index + 1
-    raise CorruptDataError(f"protobuf: number at byte {at} of {len(data)} has no end")
+    raise CorruptDataError(f"protobuf: number at byte {at} of {len(data)} is not terminated")
 
 
 def _signed(number: int) -> int:

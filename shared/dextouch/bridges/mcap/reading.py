@@ -180,7 +180,7 @@ class _Import:
         elif isinstance(record, Message):
             if record.channel_id not in self._channels:
                 raise CorruptDataError(
-                    f"{self._path}: a message of channel {record.channel_id}, which is not there"
+                    f"{self._path}: a message of channel {record.channel_id}, which does not exist"
                 )
             pending = self._channels[record.channel_id]
             if pending is not None:

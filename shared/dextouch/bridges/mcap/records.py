@@ -32,7 +32,7 @@ class _Bounded:
     def read(self, size: int = -1) -> bytes:
         wanted = self._left if size < 0 else size
         if wanted > self._left:
-            raise EOFError(f"{wanted} bytes wanted, {self._left} are left")
+            raise EOFError(f"{wanted} bytes requested, {self._left} are left")
         self._left -= wanted
         return self._file.read(wanted)
 
@@ -100,7 +100,7 @@ def _opened(chunk: Chunk, path: Path) -> Chunk:
         )
     if len(data) != chunk.uncompressed_size:
         raise CorruptDataError(
-            f"{path}: a chunk unfolds to {len(data)} bytes or more, it announces "
+            f"{path}: a chunk decompresses to {len(data)} bytes or more, it announces "
             f"{chunk.uncompressed_size}"
         )
     chunk.data, chunk.compression = data, ""
