@@ -1,1 +1,1 @@
-"""The station: it reads devices, judges their health, records takes and uploads them."""
+"""The station: it reads devices, monitors their health, records takes and uploads them."""

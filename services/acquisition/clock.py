@@ -1,4 +1,4 @@
-"""The one clock of a station, which stamps arrivals and on which everything waits."""
+"""Clock of a station, which timestamps arrivals and on which all threads wait."""
 
 import threading
 import time
@@ -43,23 +43,22 @@ class StationClock(Protocol):
 
 @runtime_checkable
 class HostTimes(Protocol):
-    """What a clock can tell of its host besides the time."""
+    """Suspend time and wall clock offset of a clock's host."""
 
     def suspended_ns(self) -> int:
         """How long the host has slept since the clock was made."""
         ...
 
     def wall_offset_ns(self) -> int:
-        """Wall clock minus a clock that nobody sets; a jump means that the wall clock was set."""
+        """Wall clock minus a monotonic clock; a jump means that the wall clock was set."""
         ...
 
 
 class RealClock:
-    """The host's monotonic clock, if wanted `speed` times as fast (for replays in less time).
+    """The host's monotonic clock, optionally `speed` times as fast (for faster replays).
 
-    It goes on while the host is suspended (`time.monotonic_ns` stands still then, and the time
-    asleep would vanish from a take), and nobody can set it. A faster clock also magnifies what
-    the operating system adds to each stamp.
+    It continues while the host is suspended, unlike `time.monotonic_ns`, and cannot be set. A
+    faster clock also magnifies the jitter of the operating system.
     """
 
     def __init__(self, speed: float = 1.0) -> None:
@@ -70,7 +69,7 @@ class RealClock:
         self._origin_ns = self._host_ns()
 
     def now_ns(self) -> int:
-        """Nanoseconds of `time.monotonic_ns` as it was at the start, counted on through sleep."""
+        """Nanoseconds since the origin of `time.monotonic_ns`, including time in suspend."""
         t_ns = self._host_ns()
         if self._speed == 1.0:
             return t_ns
@@ -119,11 +118,11 @@ class _RealWaiter:
 
 
 class VirtualClock:
-    """Time that jumps to the next thing to do as soon as everybody waits for it.
+    """Virtual clock that jumps to the next target as soon as all threads wait.
 
     The time moves when every open waiter waits and at least one of them drives time; it moves to
-    the earliest of their targets. A thread that runs holds the time still, so what it stamps is
-    exact and repeatable, and a take of minutes passes as fast as the processor allows.
+    the earliest of their targets. Time does not advance while a thread runs, so timestamps are
+    exact and reproducible, and a take of minutes runs as fast as the processor allows.
     """
 
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
@@ -138,14 +137,14 @@ class VirtualClock:
         return self._now_ns
 
     def waiter(self, *, drives_time: bool = False) -> Waiter:
-        """A waiter; from here on the time stands unless this waiter waits."""
+        """A waiter; from now on time advances only while this waiter waits."""
         waiter = _VirtualWaiter(self, self._lock, drives_time=drives_time)
         with self._lock:
             self._open.add(waiter)
         return waiter
 
     def suspend(self, duration_ns: int) -> None:
-        """Let the host sleep: time passes and nobody does anything meanwhile."""
+        """Suspend the host: time passes without any thread running."""
         with self._lock:
             self._now_ns += duration_ns
             self._suspended_ns += duration_ns

@@ -60,9 +60,9 @@ class StreamFacts:
         return max(self.counters.largest_gap_ns, *edges) / 1e9
 
     def taxels(self) -> TaxelCounts | None:
-        """Dead, stuck and saturated taxels of the take; None of streams that are no glove of ours.
+        """Dead, stuck and saturated taxels of the take; None for streams of other devices.
 
-        Cells of other gloves are judged by the health, whose findings the check takes over.
+        Cells of other gloves are checked by health monitoring, whose findings the check includes.
         """
         side, extremes = self.descriptor.side, self.counters.extremes
         if side is None or extremes is None or self.descriptor.kind != "tactile":
@@ -95,7 +95,7 @@ def check_take(facts: Sequence[StreamFacts], span: TakeSpan) -> TakeCheck:
 
 
 def take_ledger(facts: Sequence[StreamFacts]) -> tuple[LedgerEntry, ...]:
-    """What was noticed during the take, counted, for the recording's attributes."""
+    """Counted events of the take, for the recording's attributes."""
     entries = []
     for fact in facts:
         counted: Mapping[str, int] = {

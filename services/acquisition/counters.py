@@ -1,4 +1,4 @@
-"""What a reader thread counts about its device and streams; cheap to write, safe to read."""
+"""Counters of a reader thread for its device and streams; cheap to write, safe to read."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -1,4 +1,4 @@
-"""The health monitor of a station, which judges all of its streams once a second."""
+"""Health monitor of a station, which evaluates all of its streams once a second."""
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -48,16 +48,16 @@ STATION = "station"
 
 @runtime_checkable
 class Judge(Protocol):
-    """Judges one aspect of one stream at every evaluation."""
+    """Check of one aspect of one stream, run at every evaluation."""
 
     def judge(self, block: Block, now_ns: int) -> Verdict:
-        """One evaluation of what came since the last one."""
+        """Evaluate the samples since the last evaluation."""
         ...
 
 
 @dataclass
 class _Watched:
-    """One stream with its judges and what they said."""
+    """One stream with its checks and their latest results."""
 
     supervisor: DeviceSupervisor
     descriptor: StreamDescriptor
@@ -72,8 +72,8 @@ class _Watched:
 class HealthMonitor:
     """Evaluates all streams once a second, in its own thread; readers never wait for it.
 
-    What was seen once is looked at again after 0.2 s, so that a fault is confirmed soon. Silence
-    is noticed every 0.1 s for the event log, and at once by whoever asks.
+    New findings are evaluated again after 0.2 s, so that a fault is confirmed quickly. Silent
+    streams are detected every 0.1 s for the event log, and immediately in every report.
     """
 
     def __init__(
@@ -108,17 +108,17 @@ class HealthMonitor:
         self._thread = threading.Thread(target=self._run, name="health", daemon=True)
 
     def watch_disk(self, spool_root: Path) -> None:
-        """Judge from now on how long the disk of the takes lasts."""
+        """Start monitoring the free space on the disk of the takes."""
         self._disk = DiskJudge(spool_root, self._supervisors)
         # The first look begins the measurement of what arrives.
         self._disk.judge(self._clock.now_ns())
 
     def watch_uploads(self, refused: Callable[[], Mapping[str, str]]) -> None:
-        """Tell from now on which takes the store refused, and why."""
+        """Start monitoring which takes the store refused, and why."""
         self._uploads = UploadJudge(refused)
 
     def watch_paths(self, paths: PathWatch) -> None:
-        """Compare measured path delays with the calibration from now on."""
+        """Start comparing measured path delays with the calibration."""
         for watched in self._streams:
             name = watched.descriptor.name
             if paths.num_failures(name) is not None:
@@ -146,7 +146,7 @@ class HealthMonitor:
             self._evaluate_station(now_ns, confirming=False)
 
     def tick(self) -> None:
-        """What is due now: silences, confirmations, and each second a regular evaluation."""
+        """Run what is due: silence detection, confirmations, regular evaluations."""
         now_ns = self._clock.now_ns()
         self._notice_silence(now_ns)
         if now_ns >= self._due_ns:
@@ -163,7 +163,7 @@ class HealthMonitor:
                 self._evaluate_station(now_ns, confirming=True)
 
     def report(self) -> StationHealth:
-        """Every stream and device at this moment."""
+        """Current health of every stream and device."""
         now_ns = self._clock.now_ns()
         with self._lock:
             streams = tuple(self._stream_health(watched, now_ns) for watched in self._streams)
@@ -189,7 +189,7 @@ class HealthMonitor:
 
     @property
     def num_unjudged(self) -> int:
-        """Samples that no judge saw because the evaluation did not keep up."""
+        """Number of samples that were not evaluated because the evaluation did not keep up."""
         return self._live.blocks.dropped
 
     def _run(self) -> None:
@@ -247,7 +247,7 @@ class HealthMonitor:
 
 
 class _SameAs:
-    """The newest verdict of another stream's judge, for streams that share their stamps."""
+    """Latest verdict of another stream's check, for streams that share their timestamps."""
 
     def __init__(self, first: "_Remembering") -> None:
         self._first = first
@@ -268,7 +268,7 @@ class _Remembering:
 
 
 def watch(supervisor: DeviceSupervisor, live: LiveView) -> list[_Watched]:
-    """The streams of one device, each with the judges that its kind needs and no others."""
+    """The streams of one device, each with the checks for its kind."""
     watched = []
     clock: _Remembering | None = None
     driver = supervisor.driver
@@ -289,7 +289,7 @@ def watch(supervisor: DeviceSupervisor, live: LiveView) -> list[_Watched]:
 
 
 def _value_judges(driver: Driver, descriptor: StreamDescriptor, live: LiveView) -> list[Judge]:
-    """Judges of what the samples say, by the kind of the stream."""
+    """Checks of sample values, by the kind of the stream."""
     if descriptor.kind == "tactile":
         glove = live.glove(descriptor.name)
         cells = cells_of(driver.decoder, live.calibration)

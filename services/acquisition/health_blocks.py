@@ -1,4 +1,4 @@
-"""Blocks of the newest samples of each stream, from reader threads to the judges."""
+"""Ring buffers that pass the newest samples of each stream to the health checks."""
 
 import threading
 from collections.abc import Mapping, Sequence
@@ -21,8 +21,8 @@ JUDGED_VALUES = ("tactile", "pose", "keypoints")
 class Block:
     """Consecutive samples of one stream since the last evaluation.
 
-    `values` is None for streams whose values no judge looks at; `latency_ns` are times from a
-    read's stamp until its samples were spooled, one a delivery.
+    `values` is None for streams whose values are not checked; `latency_ns` is the time from the
+    read's timestamp until its samples were spooled, one per delivery.
     """
 
     t_host_ns: Int64[np.ndarray, " n"]

@@ -1,4 +1,4 @@
-"""Judge of a camera's images: frozen, blurred, clipped or left out."""
+"""Health check of a camera's images: frozen, blurred, clipped or missing."""
 
 from typing import Literal, Protocol, runtime_checkable
 
@@ -13,7 +13,7 @@ ERROR_AFTER_NS = 1_000_000_000
 
 @runtime_checkable
 class ImageQualityLike(Protocol):
-    """The part of a driver's image quality that is judged."""
+    """The part of a driver's image quality that is checked."""
 
     @property
     def frozen(self) -> bool:
@@ -32,7 +32,7 @@ class ImageQualityLike(Protocol):
 
     @property
     def gap(self) -> bool:
-        """The camera's own stamps left out an image within the last second."""
+        """An image is missing in the camera's own timestamps within the last second."""
         ...
 
     @property
@@ -43,11 +43,11 @@ class ImageQualityLike(Protocol):
 
 @runtime_checkable
 class ChecksImages(Protocol):
-    """A driver that looks at its images."""
+    """A driver that computes the quality of its images."""
 
     @property
     def quality(self) -> ImageQualityLike:
-        """What it found in the newest image it looked at."""
+        """Quality of the newest checked image."""
         ...
 
 

@@ -1,9 +1,8 @@
-"""Judge of pressure cells without a tare: dead, stuck, saturated or gone.
+"""Health check of pressure cells without a tare: dead, stuck, saturated or gone.
 
-`CellHistory` serves all gloves; `CellJudge` judges those of other makers, of which no tare is
-known: cells that are stuck, pinned at full scale, or gone. A cell that never held a number is no
-cell, and where a glove does not tell which cells are neighbours, one that never changed may be a
-slot that means nothing.
+`CellHistory` serves all gloves; `CellJudge` checks those of other manufacturers, which have no
+known tare: cells that are stuck, saturated, or missing. A position that never had a reading is not
+a cell. If the layout is unknown, a cell that never changed may be an unused position.
 """
 
 import math
@@ -41,7 +40,7 @@ _NEVER = np.iinfo(np.int64).max
 
 
 class CellHistory:
-    """What is known of each cell from all blocks so far, and the rows of the last 0.5 s.
+    """State of each cell from all blocks so far, and the rows of the last 0.5 s.
 
     Args:
         full_scale: the largest reading.
@@ -60,12 +59,12 @@ class CellHistory:
 
     @property
     def is_enough(self) -> bool:
-        """Whether enough time is known to judge anything."""
+        """Whether there is enough data for a verdict."""
         known = self.recent_ns
         return len(known) > 0 and bool(known[-1] - known[0] >= MIN_RECENT_SPAN_NS)
 
     def add(self, values: Shaped[np.ndarray, "n cells"], t_ns: np.ndarray) -> None:
-        """Take in the readings of a block, one row a sample; NaN is no reading."""
+        """Add the readings of a block, one row per sample; NaN is no reading."""
         if not len(t_ns):
             return
         if not len(self.last):
@@ -125,7 +124,7 @@ class CellHistory:
 
 @dataclass(frozen=True)
 class Cells:
-    """What is known of a glove of another maker.
+    """Cells of a glove of another manufacturer.
 
     `grid` are rows and columns in which its cells lie, None where nothing tells; `used` says which
     of them measure a taxel, None where no map tells.
@@ -181,7 +180,7 @@ def _used_cells(
 
 
 class CellJudge:
-    """Judges the cells of another maker's glove.
+    """Checks the cells of another manufacturer's glove.
 
     On a known grid a cell is silent when it does not change while its neighbours move: dead at
     rest, stuck under load. Without one, a loaded cell is stuck when it does not change for 5 s

@@ -1,7 +1,7 @@
-"""Judge of a device's clock: its skew, residual and steps against the station's.
+"""Health check of a device's clock: skew, residual and steps relative to the station's clock.
 
-Runs at the evaluation, never in the reader. Devices that neither stamp nor number their samples are
-judged by the count of samples that they must have sent.
+Runs at the evaluation, never in the reader. For devices without timestamps and sequence numbers,
+the expected number of samples serves as the clock.
 """
 
 from collections import deque
@@ -42,7 +42,7 @@ RESIDUAL_SHARES = (0.25, 0.5)
 
 
 class ClockJudge:
-    """Judges one device's clock by the first of its streams (all share their stamps)."""
+    """Checks one device's clock on the first of its streams (all share their timestamps)."""
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
         self._descriptor = descriptor

@@ -1,4 +1,4 @@
-"""Levels of findings with hysteresis, made of single judgements."""
+"""Levels of findings with hysteresis, computed from single evaluations."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +15,7 @@ Judgement = Literal["OK", "WARN", "ERROR"]
 
 
 def worst(levels: Sequence[Level], default: Level = "OK") -> Level:
-    """The most severe level; STALE stands above ERROR, since nothing newer is known."""
+    """The most severe level; STALE ranks above ERROR."""
     return max(levels, key=SEVERITY.index, default=default)
 
 
@@ -75,7 +75,7 @@ class Hysteresis:
 
 
 class Board:
-    """The findings of one stream (or of the station), each code with a hysteresis of its own."""
+    """Findings of one stream (or of the station), with separate hysteresis for each code."""
 
     def __init__(self) -> None:
         self._codes: dict[Code, Hysteresis] = {}

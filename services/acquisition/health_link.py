@@ -1,4 +1,4 @@
-"""Judge of a stream's link: its rate, loss, damage, gaps and lateness."""
+"""Health check of a stream's link: its rate, loss, damage, gaps and lateness."""
 
 from collections import deque
 from dataclasses import dataclass
@@ -53,7 +53,7 @@ class _Counts:
 
 
 class LinkJudge:
-    """Judges the last 10 s of one stream's way from the device to the spool."""
+    """Checks the last 10 s of one stream on its path from the device to the spool."""
 
     def __init__(self, supervisor: DeviceSupervisor, descriptor: StreamDescriptor) -> None:
         self._supervisor = supervisor
@@ -170,7 +170,7 @@ class LinkJudge:
         return (HealthFinding(code=code, level="ERROR", message=reason),)
 
     def _judge_stamps(self, block: Block) -> tuple[HealthFinding, ...]:
-        """Whether a device that tells its time goes on telling it."""
+        """Check that a device that sends timestamps continues to send them."""
         missing = int(np.count_nonzero(block.t_device_ns < 0))
         if not self._descriptor.capabilities.device_time or not missing:
             return ()

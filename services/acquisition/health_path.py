@@ -1,4 +1,4 @@
-"""Judge of a measured path delay against the calibrated one."""
+"""Health check that compares a measured path delay with the calibrated one."""
 
 import math
 from collections.abc import Mapping
@@ -15,7 +15,7 @@ MAX_SIGMAS = 5.0
 
 
 class PathJudge:
-    """Compares what a stream's device answers with what the station's calibration says.
+    """Compares a stream's measured path delay with the station's calibration.
 
     Args:
         stream: name of the stream.

@@ -1,6 +1,6 @@
-"""The health report: what a viewer is told about each stream and device.
+"""Health report of a station: the current state of each stream and device.
 
-Silence is judged here, whenever someone asks: a stream that is not heard tells no figures.
+Silent streams are detected here, for every report; a silent stream has no figures.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,4 +1,4 @@
-"""Judges of the station itself: its disk, its calibration and what the store refused."""
+"""Health checks of the station itself: disk, calibration and refused uploads."""
 
 import shutil
 import time

@@ -1,7 +1,7 @@
-"""Judge of the taxels of our own glove: dead, stuck, saturated or drifting.
+"""Health check of the taxels of our own glove: dead, stuck, saturated or drifting.
 
-A taxel that never changes says nothing by itself: a hand at rest looks the same. It is found by
-its neighbours, which move while it does not, or by a reading that no load explains.
+A taxel that does not change is not necessarily faulty, because a hand at rest looks the same. It is
+reported if its neighbours change while it does not, or if no load explains its reading.
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ _SCAN_COLUMNS = 20
 
 @dataclass(frozen=True)
 class GloveRecord:
-    """What the calibration says about the 320 taxels of one glove, in anatomical order."""
+    """Calibration of the 320 taxels of one glove, in anatomical order."""
 
     side: Side
     tare_counts: Float64[np.ndarray, "320"]
@@ -47,7 +47,7 @@ class GloveRecord:
 
 
 class TaxelJudge:
-    """Judges the 320 taxels of one glove from its raw counts."""
+    """Checks the 320 taxels of one glove from its raw counts."""
 
     def __init__(self, descriptor: StreamDescriptor, glove: GloveRecord) -> None:
         self._descriptor = descriptor

@@ -1,4 +1,4 @@
-"""Judges of trackers: lost tracking, jumps, and jitter at rest."""
+"""Health checks of trackers: lost tracking, jumps, and jitter at rest."""
 
 from collections import deque
 from collections.abc import Mapping
@@ -28,16 +28,16 @@ MIN_REST_SAMPLES = 40
 
 @runtime_checkable
 class TellsTracking(Protocol):
-    """A decoder that leaves out what a tracker sends while it does not track."""
+    """A decoder that drops a tracker's packets while it is not tracking."""
 
     @property
     def tracking(self) -> TrackingEvents:
-        """What was left out, by kind."""
+        """Number of dropped packets, by reason."""
         ...
 
 
 class TrackingJudge:
-    """Judges what a tracker's decoder left out: occluded, jumped, older than it pretends."""
+    """Checks the packets that a tracker's decoder dropped: occluded, jumped, stale."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
@@ -135,7 +135,7 @@ class PoseJudge:
 
 
 class FiniteJudge:
-    """Judges how much of a stream's values is missing (NaN): nodes not seen, broken cells.
+    """Checks the share of a stream's values that is missing (NaN): nodes not seen, broken cells.
 
     What never held a number is no part of the device (a glove model's empty cells).
     """

@@ -34,7 +34,7 @@ class _LiveGlove:
 
 
 class LiveView:
-    """Keeps the newest sample of each stream; nothing is computed until someone looks."""
+    """Keeps the newest sample of each stream; nothing is computed until it is requested."""
 
     def __init__(self, drivers: Sequence[Driver], calibration: Mapping[str, Matrix]) -> None:
         self._descriptors: dict[str, StreamDescriptor] = {

@@ -1,8 +1,8 @@
-"""Give-back of memory that a take has left unused to the operating system.
+"""Release of unused memory to the operating system after a take.
 
-A take's bytes come and go in many sizes and threads. What lies free in between stays with the
-process, a little more after each take, until glibc is told to give it back. What holds itself in
-a circle, as the requests and answers of an upload do, is not even free before it is looked for.
+A take allocates and frees memory in many sizes and threads. glibc keeps free memory in the process,
+a little more after each take, until `malloc_trim` is called. Objects in reference cycles, such as
+the requests and responses of an upload, are only freed by the garbage collector.
 """
 
 import ctypes
@@ -19,11 +19,11 @@ _TRIM = getattr(ctypes.CDLL(None), "malloc_trim", None)
 
 
 def keep_for_life() -> None:
-    """Take everything that exists for lasting: call it once, in a process that is one station.
+    """Exclude all existing objects from garbage collection; call once, in a station's process.
 
-    Looking for circles then passes over modules, classes and devices, which would hold up all
-    threads for tens of milliseconds, and is done by itself after fewer takes. numpy's cache of
-    small arrays, which would fill up over many takes as ever other sizes come by, is full (4 MB).
+    Otherwise each collection would visit modules, classes and devices and block all threads for
+    tens of milliseconds. Automatic collections then also run after fewer takes. It also fills
+    numpy's cache of small arrays (4 MB), which would otherwise grow over many takes.
     """
     small = [np.empty(n, np.uint8) for n in range(CACHED_BYTES) for _ in range(CACHED_ARRAYS)]
     small.clear()

@@ -36,11 +36,11 @@ class MockFactory:
     """Builds the devices that a set of streams needs.
 
     Args:
-        streams: of one episode; truth-only streams are left out.
+        streams: of one episode; streams with ground truth only are omitted.
         faults: what disturbs the devices.
         seed: of noise, calibration and faults.
         clock: of the station.
-        links: how the devices are connected, and what they speak.
+        links: how the devices are connected, and their protocols.
     """
 
     def __init__(

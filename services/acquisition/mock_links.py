@@ -1,4 +1,4 @@
-"""How a mock station's devices are connected, and which protocols they speak."""
+"""Settings of a mock station's connections: links and protocols of its devices."""
 
 from typing import Literal
 

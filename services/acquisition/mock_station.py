@@ -51,7 +51,7 @@ class MockStation:
         spool_root: folder of the takes.
         name: of the station.
         calibration: matrices beyond the gloves' and the path delays (such as `K_head`).
-        links: how the devices are connected, and what they speak.
+        links: how the devices are connected, and their protocols.
         safety: of the spool.
     """
 

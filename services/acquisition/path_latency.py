@@ -1,7 +1,7 @@
 """Measurement of path delays of devices that answer requests for their time.
 
-A device that tells its time now and then shows the offset of its clock, which stamps of one
-direction cannot. What a sample's estimated time lies behind that offset is its path delay.
+Exchanges with a device that answers time requests measure the offset of its clock, which one-way
+timestamps cannot. The difference to the estimated sample times is the path delay.
 """
 
 import math
@@ -67,7 +67,7 @@ class _StreamPath:
         self._queue.extend((sample.t_host_ns, sample.t_device_ns) for sample in samples)
 
     def follow(self) -> None:
-        """Date what came since the last call."""
+        """Estimate the times of the samples since the last call."""
         for _ in range(len(self._queue)):
             t_host_ns, t_device_ns = self._queue.popleft()
             try:
@@ -152,11 +152,11 @@ class _DevicePath:
 
 
 class PathWatch:
-    """Asks every device that can answer for its time once a second, in a thread of its own.
+    """Requests the time of every device that can answer once a second, in a separate thread.
 
-    Readers only append stamps, and nobody waits for an answer but this thread. By a virtual clock
-    nothing is asked: its time stands still while an answer is under way, so that all exchanges
-    would take no time, and their bytes would change what a take's packets arrive with.
+    Readers only append timestamps; only this thread waits for answers. With a virtual clock there
+    are no requests: its time does not advance during an exchange, and the replies would change
+    which packets of a take arrive together.
 
     Args:
         supervisors: of the station's devices.
@@ -233,7 +233,7 @@ def add_latencies(
     *,
     stated: Collection[str],
 ) -> dict[str, Matrix]:
-    """A recording's calibration with measured path delays where they are better than what it has.
+    """A recording's calibration, updated with more accurate measured path delays.
 
     Args:
         calibration: of the recording, measured delays of before included.

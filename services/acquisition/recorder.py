@@ -1,4 +1,4 @@
-"""The recorder of a station: an operator's actions, one take at a time."""
+"""Recorder of a station: the state machine of an operator's actions, one take at a time."""
 
 import shutil
 import threading
@@ -47,9 +47,9 @@ ACTIONS: Mapping[State, tuple[Action, ...]] = {
 class Recorder:
     """idle → armed → recording → checking → saved or discarded, one take at a time.
 
-    Everything goes to the spool first. A full disk ends the take; what is there stays and can be
-    saved or discarded. An action that names its recording may be repeated: what was done is not
-    done again, and an action meant for another take is refused.
+    All samples are written to the spool first. A full disk ends the take, which can still be saved
+    or discarded. Actions that name their recording are idempotent; an action for another take than
+    the current one is refused.
 
     Args:
         station: name of the station.
@@ -119,7 +119,7 @@ class Recorder:
             take.accept(readings)
 
     def arm(self, prompt: TakePrompt) -> RecorderStatus:
-        """Announce what is going to be recorded."""
+        """Set the prompt of the next take."""
         with self._lock:
             self._expect("arm")
             self._forget()
@@ -247,7 +247,7 @@ class Recorder:
         give_back_free_memory()
 
     def _settle(self) -> None:
-        """A take that the disk ended is checked as soon as somebody looks."""
+        """A take that ended because of the disk is checked on the next request."""
         if self._state == "recording" and self._take is not None and self._take.has_ended:
             self._finish()
 

@@ -37,7 +37,7 @@ def recorder_router(station: Station) -> APIRouter:
 
     @router.get("")
     async def status() -> RecorderStatus:
-        """Where the recorder stands."""
+        """Current state of the recorder."""
         return await run_in_threadpool(recorder.status)
 
     @router.post("/arm")

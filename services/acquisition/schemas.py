@@ -98,7 +98,7 @@ class TakeProblem(BaseModel):
 
 
 class StreamTake(BaseModel):
-    """What a take holds of one stream."""
+    """Summary of one stream in a take."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -122,7 +122,7 @@ class TakeCheck(BaseModel):
 
 
 class RecorderStatus(BaseModel):
-    """Where the recorder stands, and which actions it would take now."""
+    """Current state of the recorder, and the actions that are possible."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -137,7 +137,7 @@ class RecorderStatus(BaseModel):
 
 
 class HealthFinding(BaseModel):
-    """What one evaluation found wrong with a stream or the station."""
+    """Problem of a stream or of the station found by one evaluation."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -272,8 +272,8 @@ class CameraList(BaseModel):
 class UploadStatus(BaseModel):
     """One saved take and whether the store has it.
 
-    `stored_as` is its id in the store, which differs where another recording had that id already.
-    A `refused` take stays in the spool and is not sent again before somebody asks for it.
+    `stored_as` is its id in the store, which differs where another recording had that id already. A
+    `refused` take stays in the spool and is not sent again until a retry is requested.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

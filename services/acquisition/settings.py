@@ -21,8 +21,8 @@ class AcquisitionSettings(ServiceSettings):
     (`mock_faults=first_light`: its losses are findings of the health). Otherwise `devices` names
     the real ones, and `calibration` a JSON file of named matrices.
 
-    Takes reach the disk every `flush_period_s`, which is what a power loss costs at most. One ends
-    when less than `min_free_bytes` are left on the disk of the `spool`, and none begins then.
+    Takes are flushed to the disk every `flush_period_s`, the most that a power loss can lose. One
+    ends when less than `min_free_bytes` are left on the disk of the `spool`, and none begins then.
     """
 
     model_config = service_config("acquisition")

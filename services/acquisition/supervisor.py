@@ -1,4 +1,4 @@
-"""Threads beside devices and disk: counted readings in order, and a flushed spool, come of them."""
+"""Reader threads of devices, with reconnection and ordering, and the flush thread of the spool."""
 
 import os
 import threading
@@ -60,7 +60,7 @@ MEBIBYTE = 2**20
 
 
 class DeviceSupervisor:
-    """Reads one device for as long as the station runs and opens it again after every loss.
+    """Reads one device while the station runs, and reopens it after every disconnection.
 
     Args:
         driver: of the device; used by the supervisor's thread alone.
@@ -152,7 +152,7 @@ class DeviceSupervisor:
             self._events["lost_device"] += 1
 
     def _log_loss(self, message: str) -> None:
-        """Log what is new, and what goes on once a minute."""
+        """Log new problems at once, and continuing ones once a minute."""
         now_ns = self._clock.now_ns()
         last_message, logged_ns, count = self._logged
         if message == last_message and now_ns - logged_ns < LOG_AGAIN_NS:
@@ -216,12 +216,12 @@ def _judged_events(driver: Driver) -> dict[str, int]:
 
 
 class SequenceGuard:
-    """Leaves out what a link delivers twice or behind what was sent later.
+    """Drops samples that a link delivers twice or out of order.
 
-    A stream promises samples in the order in which they were taken; a packet that comes again, or
-    too late, would be a sample that never was at its place. It is counted and left out, so that
-    its place stays a gap. A device that starts anew (another counter *and* another clock) passes.
-    Streams of devices without a sequence cannot be judged and pass as they are.
+    The samples of a stream must be in the order in which they were taken. Duplicate and late
+    samples are counted and dropped; a dropped sample leaves a gap. Samples of a restarted device
+    (another counter *and* another clock) are kept. Streams of devices without sequence numbers
+    cannot be checked and are kept unchanged.
 
     Args:
         descriptor: of the stream.
@@ -238,7 +238,7 @@ class SequenceGuard:
         self._passed: deque[tuple[int, int]] = deque(maxlen=WINDOW_SAMPLES)
 
     def admit(self, samples: Sequence[Sample]) -> list[Sample]:
-        """The samples that go on, in order."""
+        """The samples to keep, in order."""
         if not self._judges:
             return list(samples)
         return [sample for sample in samples if self._passes(sample)]

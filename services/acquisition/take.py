@@ -40,7 +40,7 @@ class TakeOptions:
     """How takes are kept, and who counts what happens to devices besides their decoders.
 
     `device_events` gives, by device, counts of named events since the station's start; `health`
-    is what the station finds in its streams meanwhile.
+    provides the findings of the station in the meantime.
     """
 
     safety: SpoolSafety = field(default_factory=SpoolSafety)
@@ -51,8 +51,8 @@ class TakeOptions:
 class Take:
     """One running or ended take: reader threads append to its spool, a thread of its own flushes.
 
-    The only lock that readers take is held for the write of one append: what is written is made
-    before, and the disk is waited for elsewhere.
+    The only lock that readers take is held for the write of one append: data is encoded before, and
+    other threads wait for the disk.
 
     Args:
         spool: new, of this take.
@@ -133,7 +133,7 @@ class Take:
         return self.spool.encode(name, SampleBatch.from_samples(samples)), samples
 
     def end(self) -> TakeCheck:
-        """Take no more readings, make everything survive a power loss and judge it."""
+        """Accept no more readings, flush the spool to the disk and check the take."""
         with self._lock:
             span = self._end(None)
         self.flusher.join()

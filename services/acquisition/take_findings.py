@@ -1,7 +1,7 @@
-"""What the health finds in the streams of a take while it runs.
+"""Health findings in the streams of a take, collected while it runs.
 
-The same findings that the API, the metrics and the dashboard show become entries of the take's
-ledger, words in its check, and figures of its quality.
+The findings that the API, the metrics and the dashboard show become entries of the take's ledger,
+warnings of its check, and figures of its quality.
 """
 
 from collections.abc import Collection
@@ -31,7 +31,7 @@ _ADVICE: dict[str, str] = {code: advice for code, advice in ADVICE.items()}  # n
 
 @runtime_checkable
 class HealthSource(Protocol):
-    """The part of a station's health that a take looks at."""
+    """The part of a station's health that a take uses."""
 
     def report(self) -> StationHealth:
         """Every stream at this moment."""
@@ -47,10 +47,11 @@ class HealthSource(Protocol):
 
 
 class TakeFindings:
-    """What the health found in streams since this was made.
+    """Health findings in streams since this object was created.
 
     A finding counts as often as its level was raised or changed during the take, and once more if
-    it stood already when the take began. What was not confirmed before the end is not in it.
+    it was already raised when the take began. Findings that were not confirmed before the end are
+    not included.
 
     Args:
         health: of the station; without one there are no findings.
@@ -76,7 +77,7 @@ class TakeFindings:
                     self._first_ns[key] = t_host_ns
 
     def look(self) -> None:
-        """Keep the worst of each figure; called now and then during the take."""
+        """Update the worst value of each figure; called repeatedly during the take."""
         if self._health is None:
             return
         for stream in self._health.report().streams:

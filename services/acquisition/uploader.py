@@ -50,10 +50,10 @@ MAX_BATCH_BYTES = 8 * 2**20
 
 @runtime_checkable
 class RecordingStore(Protocol):
-    """What the uploader needs of a store's client; every call bears being repeated."""
+    """Interface of a store's client that the uploader needs; every call is idempotent."""
 
     def create(self, attributes: RecordingAttributes) -> RecordingStatus:
-        """Begin an upload, or say where it stands."""
+        """Begin an upload, or return its state."""
         ...
 
     def send_batch(
@@ -80,8 +80,8 @@ class Uploader:
     What the store acknowledged is not sent again, also not by the next process: batch n of a
     stream is always the same samples, and the store says which batch it expects next.
 
-    A take whose id another recording of the store has is stored under a second one, `second_id`.
-    A take that the store refuses for good is set aside: it stays in the spool until `retry`.
+    A take whose id another recording of the store has is stored under a second one, `second_id`. A
+    take that the store refuses permanently is quarantined: it stays in the spool until `retry`.
 
     Args:
         spool_root: folder of the takes.
@@ -122,7 +122,7 @@ class Uploader:
 
     @property
     def refused(self) -> Mapping[str, str]:
-        """What the store said about each take that is set aside, as the spool holds it now."""
+        """The store's reason for each quarantined take, as stored in the spool."""
         paths = sorted(path.parent for path in self._spool_root.glob(f"*/{REFUSED_FILE}"))
         reasons = {path.name: _refusal(path) for path in paths}
         return {name: reason for name, reason in reasons.items() if reason is not None}
@@ -144,10 +144,10 @@ class Uploader:
         return found
 
     def retry(self, recording_id: str) -> UploadStatus:
-        """Send a take again that was set aside.
+        """Send a quarantined take again.
 
         Raises:
-            NotFoundError: no such take was set aside.
+            NotFoundError: there is no such quarantined take.
         """
         path = self._spool_root / recording_id
         if not (path / REFUSED_FILE).is_file():

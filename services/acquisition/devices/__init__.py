@@ -1,7 +1,7 @@
 """Device kinds of a station, and everything that a lab's own kind of device is written with.
 
-A device that this project does not know comes from a package of its own, found by the entry point
-`dextouch.devices`: docs/tutorials/add_a_device.md builds one.
+Other packages can provide further devices through the entry point `dextouch.devices`:
+docs/tutorials/add_a_device.md builds one.
 """
 
 from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor

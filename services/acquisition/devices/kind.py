@@ -1,4 +1,4 @@
-"""What a station must know of one kind of device, and the base class of its settings."""
+"""Definition of a kind of device for a station, and the base class of its settings."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -33,11 +33,11 @@ class DeviceKind(Generic[SettingsT]):
     """One kind of device: how it is called, configured, read and simulated.
 
     Our own kinds and those of other packages are found by the entry point `dextouch.devices`, whose
-    name is that of the kind. Which cells a glove has is told by its decoder (`TellsCells`), so that
-    the health judges real and simulated gloves alike.
+    name is that of the kind. The decoder of a glove provides its cells (`TellsCells`), so that
+    health checks treat real and simulated gloves alike.
 
     Attributes:
-        name: what stands under `kind` in a station's settings: a-z, 0-9 and `_`.
+        name: the value of `kind` in a station's settings: a-z, 0-9 and `_`.
         settings: the class that validates the rest of them.
         build: makes the driver, not opened yet, from the settings and the station's clock. It
             raises InvalidInputError where the settings do not say where the device is.

@@ -98,7 +98,7 @@ def _load(point: EntryPoint) -> object:
 
 
 def _checked(point: EntryPoint, loaded: object) -> DeviceKind[Any]:
-    """Refuse what is no kind of this name."""
+    """Refuse an object that is not a `DeviceKind` with this name."""
     if not isinstance(loaded, DeviceKind):
         raise _wrong(point, f"{type(loaded).__name__}", "a services.acquisition.devices.DeviceKind")
     if loaded.name != point.name or not NAME.fullmatch(loaded.name):

@@ -44,12 +44,12 @@ def hand_name(side: Side, label: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class CellLayout:
-    """What a glove's cells can show, for the judgement of their health.
+    """Layout and range of a glove's cells, for health checks.
 
     Attributes:
         full_scale: the largest reading, in the unit of the stream.
-        grid: rows and columns in which the cells of a sample lie, row by row; None where nothing
-            tells which cells are neighbours. Cells that read NaN from the start do not exist.
+        grid: rows and columns of the cells of a sample, in row-major order; None if the neighbours
+            of cells are unknown. Cells that read NaN from the start do not exist.
     """
 
     full_scale: float
@@ -108,7 +108,7 @@ class Driver:
         """New samples by stream; empty when nothing came.
 
         Raises:
-            DeviceError: the device is gone or speaks another protocol.
+            DeviceError: the device is disconnected or uses another protocol.
         """
         data = self.transport.read()
         t_host_ns = self._clock.now_ns()
@@ -120,7 +120,7 @@ class Driver:
 
 
 def check_packet(packet: Packet, *, device: str, source: str | None) -> None:
-    """Refuse what a device of another version, or of the other hand, sends.
+    """Refuse packets of a device of another version or of the other hand.
 
     Raises:
         DeviceError: version or source differ.

@@ -13,19 +13,19 @@ SILENCE_NS = 200_000_000
 
 
 class BridgeDecoder(Decoder, Protocol):
-    """A decoder of what one device behind a bridge sends."""
+    """A decoder of the packets of one device behind a bridge."""
 
     @property
     def connection(self) -> BridgeConnection:
-        """What the bridge has told of itself."""
+        """The bridge's hello."""
         ...
 
 
 class BridgeDriver(Driver):
     """A device behind a bridge: waits for the hello, and takes silence for loss.
 
-    A bridge shows at least every 50 ms that it lives. One that is silent for 200 ms has stopped or
-    is cut off, which a socket alone would not tell for minutes.
+    A bridge shows at least every 50 ms that it lives. A bridge that sends nothing for 200 ms has
+    stopped or is disconnected, which the socket alone would not indicate for minutes.
     """
 
     def __init__(
@@ -40,7 +40,7 @@ class BridgeDriver(Driver):
         """Connect and learn who is there.
 
         Raises:
-            DeviceError: nobody answers, no hello within 2 s, or not the wanted device.
+            DeviceError: no connection, no hello within 2 s, or another device than requested.
         """
         super().open()
         self._t_heard_ns = self._clock.now_ns()
@@ -60,7 +60,7 @@ class BridgeDriver(Driver):
 
         Raises:
             StaleDataError: the bridge has sent nothing for 200 ms.
-            DeviceError: the bridge is gone or speaks another protocol.
+            DeviceError: the bridge is disconnected or uses another protocol.
         """
         if self._first:
             first, self._first = self._first, {}

@@ -41,7 +41,7 @@ class BridgedDevice(_Message):
 
 
 class FrameConvention(_Message):
-    """How the sender's coordinates lie in ours.
+    """Orientation of the sender's coordinates in ours.
 
     `axes` says for the sender's x, y and z in turn which axis of our frame points the same way.
     `handedness` says the same again in one word; a convention that contradicts itself is refused.
@@ -126,11 +126,11 @@ def parse_hello(line: bytes, *, device: str) -> BridgeHello:
 
 
 class FreshnessGate:
-    """Tells whether a sample is new: its stamp goes on, and it came within 200 ms of its time.
+    """Decides whether a sample is new: its timestamp advances and is at most 200 ms old.
 
-    The source's clock has any origin, so the age is counted from the fastest sample so far; that
-    reference may rise by 200 ppm, since clocks drift. What was already old when the connection
-    began cannot be seen.
+    The source's clock has an arbitrary origin, so the age is measured relative to the fastest
+    sample so far; that reference may drift by 200 ppm. A delay that existed when the connection
+    began cannot be detected.
     """
 
     def __init__(self) -> None:
@@ -141,7 +141,7 @@ class FreshnessGate:
         self._t_device_ns = 0
 
     def reset(self) -> None:
-        """Another source, or the same one started anew, may follow."""
+        """Another source, or the same one after a restart, may follow."""
         self._offset_ns = None
 
     def admits(self, t_device_ns: int, t_host_ns: int) -> bool:

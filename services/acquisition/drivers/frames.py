@@ -1,4 +1,4 @@
-"""Search for frames in bytes of any portions, and the counters of what it finds."""
+"""Search for frames in a byte stream split into arbitrary reads, and its counters."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -35,8 +35,8 @@ class DecoderStatistics:
 class SequenceCounter:
     """Counts lost, late and repeated packets and restarts by a sequence number of so many bits.
 
-    A number that goes back is late if it is missing among the last 64, else that of a device that
-    started anew.
+    A decreasing number is a late packet if it is missing among the last 64, otherwise a restart of
+    the device.
     """
 
     def __init__(self, statistics: DecoderStatistics, *, bits: int) -> None:
@@ -92,7 +92,7 @@ class SequenceCounter:
 
 
 class PortionedSearch(ABC, Generic[Found]):
-    """Gathers portions until a search can go on; the result does not depend on the portions.
+    """Collects reads until a search can continue; the result does not depend on the portions.
 
     What was read at once is searched as it came, without a copy. `_needed` is the length that the
     bytes must have before looking again can find more.
@@ -135,8 +135,8 @@ class PortionedSearch(ABC, Generic[Found]):
 class FrameSearch(PortionedSearch[Found]):
     """Looks for frames that begin with a mark.
 
-    Where a frame does not hold, the search goes on one byte further, never behind the claimed
-    frame, so that a damaged one costs only itself.
+    After an invalid frame the search continues one byte further, not after its claimed end, so that
+    only the damaged frame is lost.
 
     Args:
         mark: the bytes that every frame begins with.

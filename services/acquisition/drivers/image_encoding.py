@@ -1,4 +1,4 @@
-"""Encoding of a camera's images to JPEG or H.264, in a thread of its own.
+"""Encoding of a camera's images to JPEG or H.264 in a separate thread.
 
 The store takes an H.264 stream only in closed groups of GOP_IMAGES images, counted from the first
 image of the take. Hence images are dropped before they are encoded, never after; an encoder goes
@@ -116,7 +116,7 @@ class ImageEncoder:
 
 
 class EncodingQueue:
-    """Hands images to an encoder in a thread of its own; what finds the queue full is dropped.
+    """Passes images to an encoder in a separate thread; what finds the queue full is dropped.
 
     `put` and `collect` belong to the reader thread, `begin_group` to any.
 
@@ -148,7 +148,7 @@ class EncodingQueue:
             self._wanted += 1
 
     def put(self, image: StampedImage) -> bool:
-        """Queue an image, whose pixels nobody changes any more; False when it was dropped."""
+        """Queue an image, whose pixels must not change any more; False when it was dropped."""
         num_waiting = sum(not future.done() for future in self._waiting)
         if num_waiting >= self._max_waiting:
             self.num_dropped += 1
@@ -208,7 +208,7 @@ class GroupGate:
 
 
 def begin_take(drivers: Iterable[object]) -> dict[str, Matrix]:
-    """Tell all drivers that want to know that a take begins; what they know of their streams."""
+    """Notify drivers that a take begins; what they know of their streams."""
     aware = [driver for driver in drivers if isinstance(driver, TakeAware)]
     return {name: matrix for driver in aware for name, matrix in driver.begin_take().items()}
 
@@ -254,7 +254,7 @@ class GroupPreview:
 class WholeGroups:
     """H.264 samples of a device that encodes itself in; the same in whole groups out.
 
-    A group that lost an image is left out as a whole: the store could not take the rest of it.
+    A group that lost an image is dropped as a whole: the store could not take the rest of it.
     """
 
     def __init__(self) -> None:
@@ -287,6 +287,6 @@ class WholeGroups:
         return whole
 
     def reset(self) -> None:
-        """Leave out what was begun; the next sample need not follow."""
+        """Drop the unfinished group; the next sample need not follow."""
         self.num_left_out += len(self._group)
         self._group, self._whole_until = [], None

@@ -1,4 +1,4 @@
-"""Checks of a camera's images: frozen, blurred, badly exposed or left out.
+"""Checks of a camera's images: frozen, blurred, badly exposed or missing.
 
 Cheap enough for every image of a 720p camera: a checksum of a few pixels of each image, and of
 every third image sharpness and exposure at a quarter of the size.
@@ -30,14 +30,14 @@ _QUARTER = 4
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """What the newest images of one camera are like, and what was counted since the start.
+    """Quality of the newest images of one camera, and counters since the start.
 
     Attributes:
         frozen: more than three images in a row were equal.
         blurred: sharpness below 0.3 of the session's median.
         clipped_ratio: share of pixels at the dark or the bright end, 0 … 1.
-        gap: the driver's stamps left out at least one image within the last second.
-        num_checked: images whose sharpness and exposure were looked at.
+        gap: at least one image is missing in the driver's timestamps within the last second.
+        num_checked: images whose sharpness and exposure were checked.
         num_images: all images seen.
         num_frozen: images that were equal to at least three before them.
         num_blurred: of the checked ones.
@@ -100,7 +100,7 @@ class SessionMedian:
 
 
 class ImageChecker:
-    """Looks at the images of one camera in the order in which they come; used by one thread.
+    """Checks the images of one camera in order of arrival; used by one thread.
 
     Args:
         period_ns: nominal distance of two images.

@@ -71,7 +71,7 @@ class PacketDecoder(FrameSearch[Packet]):
         min_payload: smallest payload of this kind in bytes.
         max_payload: largest.
         others: further kinds on the same link with their smallest and largest payloads; their
-            packets are given too, but stand outside the sequence.
+            packets are returned too, but are not part of the sequence.
     """
 
     def __init__(
@@ -114,7 +114,7 @@ class PacketDecoder(FrameSearch[Packet]):
 
 
 def _common_start(magics: Sequence[bytes]) -> bytes:
-    """What all magics begin with, so that one search finds every kind.
+    """Common prefix of all magics, so that one search finds every kind.
 
     Raises:
         InvalidInputError: nothing.

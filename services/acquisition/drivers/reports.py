@@ -84,7 +84,7 @@ class ReportReassembler:
 
 
 class OrderFilter:
-    """Lets each packet through once and in order; what comes twice or late is left out.
+    """Lets each packet through once and in order; duplicate and late packets are dropped.
 
     Repetitions and late packets carry nothing that may become a sample behind a newer one. A larger
     step back is a restart of the device, whose packets are new.

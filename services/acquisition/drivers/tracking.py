@@ -1,4 +1,4 @@
-"""Gate and events of all trackers: which of their poses count, and what was left out and why.
+"""Gate and events of all trackers: which poses are used, and which were dropped and why.
 
 Of any pose source, only the running state counts, and a pose that the body cannot have
 reached since the last good one is a jump. Both leave a gap and an event, never another pose.
@@ -44,7 +44,7 @@ class TrackingState(IntEnum):
 
 @dataclass(slots=True)
 class TrackingEvent:
-    """A run of packets that were left out for one reason.
+    """A run of packets dropped for the same reason.
 
     `state` is the tracker's at the first of them; the times are arrivals of the first and of the
     last (host's monotonic clock).
@@ -69,7 +69,7 @@ class TrackingEvents:
         self._going_on: TrackingEvent | None = None
 
     def leave_out(self, kind: EventKind, *, state: int, sequence: int, t_host_ns: int) -> None:
-        """Note a packet that became no sample."""
+        """Record a dropped packet."""
         self.packets[kind] += 1
         event = self._going_on
         if event is not None and event.kind == kind:

@@ -1,4 +1,4 @@
-"""Simulated devices that speak real bytes, and what the mock of a lab's own device is made of."""
+"""Simulated devices that send real packets, and the building blocks for mocks of other devices."""
 
 from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript

@@ -1,4 +1,4 @@
-"""What a fault script makes wrong inside packets: pinned cells, NaN, another hand or version.
+"""Faults inside packets: pinned cells, NaN, another hand or version.
 
 Each family of packets has its own `PacketEdits`. What a family cannot say (a hand, a version)
 cannot be said wrongly either: such a fault is refused.

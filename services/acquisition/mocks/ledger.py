@@ -1,4 +1,4 @@
-"""The ledger of what a mock did to every packet, against which counters are scored."""
+"""Ledger of a mock's packets and their faults, against which counters are tested."""
 
 import json
 from array import array

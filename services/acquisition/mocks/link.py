@@ -1,4 +1,4 @@
-"""What a mock device knows of the host: whether it listens, and has kept up."""
+"""State of the host as seen by a mock device: whether it listens, and has kept up."""
 
 import threading
 
@@ -9,7 +9,7 @@ KEEP_UP_TIMEOUT_S = 20.0
 
 
 class Link:
-    """What a mock knows about the host's end."""
+    """State of the host's end as seen by a mock."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()

@@ -1,4 +1,4 @@
-"""Where a simulated glove stands in a mock station: what it plays, and what disturbs it."""
+"""Context of a simulated glove in a mock station: the data that it replays, and its faults."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

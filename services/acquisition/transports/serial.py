@@ -83,7 +83,7 @@ class SerialTransport:
         return TransportInfo("serial", self._address, self._serial_number)
 
     def open(self) -> None:
-        """Find and open the port; what lay in its buffer is dropped.
+        """Find and open the port; its input buffer is cleared.
 
         Raises:
             DeviceError: absent, taken by another process, still closing, or not to be opened.

@@ -39,7 +39,7 @@ def unix_connector(path: str) -> Callable[[], socket.socket]:
 
 
 class SocketTransport:
-    """One stream socket, connected anew at every opening."""
+    """One stream socket, reconnected at every opening."""
 
     def __init__(self, connect: Callable[[], socket.socket], *, address: str) -> None:
         self._connect = connect

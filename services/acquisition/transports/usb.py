@@ -44,9 +44,9 @@ class _Opened:
 class UsbTransport:
     """One USB device with an interrupt endpoint; `read` gives one report, b"" means nothing yet.
 
-    Every opening looks for the device anew, by its serial number, so that it is found again after
-    replugging wherever it then sits. Whoever held the interface (the kernel's HID driver) is
-    detached while it is open and gets it back at the close.
+    Every opening searches for the device by its serial number, so that it is found again after
+    replugging, on any port. The kernel's HID driver is detached while the interface is open, and
+    reattached on closing.
 
     Args:
         address: of the device.

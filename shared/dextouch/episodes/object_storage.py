@@ -220,12 +220,12 @@ class ObjectStorage:
             upload_group(self._bucket, kind, folder)
         except (StorageError, UnavailableError) as error:
             raise type(error)(
-                f"{error.message}; {kind} {folder.name!r} is kept in {folder}, `recover` uploads it"
+                f"{error.message}; {kind} {folder.name!r} waits in {folder}, `recover` uploads it"
             ) from error
         except KeyboardInterrupt as interrupt:
             if (folder / COMMIT_FILE).exists():
                 interrupt.add_note(
-                    f"{kind} {folder.name!r} is kept in {folder}, `recover` uploads it"
+                    f"{kind} {folder.name!r} waits in {folder}, `recover` uploads it"
                 )
             raise
 

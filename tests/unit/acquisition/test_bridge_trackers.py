@@ -357,7 +357,7 @@ def test_silence_is_loss_after_200_ms(stage):
     stage.pass_time(200 * MS)
     assert stage.driver.read() == {}
     stage.pass_time(1)
-    with pytest.raises(StaleDataError, match="silent for 200 ms"):
+    with pytest.raises(StaleDataError, match="sent nothing for 200 ms"):
         stage.driver.read()
 
 

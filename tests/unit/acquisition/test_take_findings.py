@@ -121,7 +121,7 @@ def test_problems_say_what_to_do_and_nothing_twice(health):
         ("camera_head", "image_blurred", "WARN"),
     ]
     assert found[1].message == (
-        "camera_head: image_blurred found once. Clean the lens and set its focus."
+        "camera_head: image_blurred found once. Clean the lens and adjust the focus."
     )
 
 

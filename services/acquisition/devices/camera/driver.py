@@ -50,7 +50,7 @@ class CameraDecoder:
     """Images of one fixed size and encoding; JPEG and H.264 images stay compressed.
 
     H.264 images come in whole groups only, since the store takes no others: a group that lost an
-    image is left out and counted as `refused`.
+    image is dropped and counted as `refused`.
     """
 
     def __init__(
@@ -173,7 +173,7 @@ class CameraDecoder:
 
 
 class CameraDriver(Driver):
-    """A camera bridge with what is known of its images."""
+    """Driver of a camera bridge."""
 
     def __init__(
         self, name: str, *, transport: Transport, decoder: CameraDecoder, clock: StationClock

@@ -1,4 +1,4 @@
-"""A simulated finger tracker, which has an order of nodes of its own, by HID, USB or a bridge."""
+"""Simulated finger tracker with its own node order, connected by HID, USB or a bridge."""
 
 import numpy as np
 from jaxtyping import Int64

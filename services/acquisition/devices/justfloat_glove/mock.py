@@ -38,7 +38,7 @@ def mock_justfloat_glove(place: MockPlace) -> MockPair:
 
 
 class JustFloatPacketEdits(PacketEdits):
-    """Faults inside a packet of bare numbers, which tells neither hand nor version."""
+    """Faults inside a packet that contains only numbers, without hand and version."""
 
     def pin(self, data: bytes, cells: Sequence[int], how: Pinned) -> bytes:
         """Numbers by their place."""
@@ -86,7 +86,7 @@ class JustFloatGloveSource:
         return self._stream.t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
-        """One packet; the device tells neither number nor time."""
+        """One packet; the device sends neither sequence number nor time."""
         del sequence, t_device_ns
         return [encode_justfloat(self._values[index])]
 

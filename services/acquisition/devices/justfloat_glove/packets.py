@@ -1,4 +1,4 @@
-"""Packets of gloves that send bare float32s, which can be told by their form alone.
+"""Packets of gloves that send only float32 values, which can be recognised only by their form.
 
 The family (VOFA's "justfloat") has neither checksum nor sequence nor time: N float32s, then the
 tail 00 00 80 7f, which is +infinity. A packet is released only between two tails exactly one
@@ -132,10 +132,10 @@ class JustFloatGloveDecoder:
     """Decodes one glove's byte stream.
 
     Args:
-        side: of the glove; it does not tell itself.
+        side: of the glove; the packets do not contain it.
         num_values: float32s of a packet (known versions send 401, 415 or 615).
         full_scale: the largest reading; packets with larger ones are held back.
-        rate_hz: nominal rate; the stream has no clock of its own.
+        rate_hz: nominal rate; the stream has no device clock.
         label: of a further glove of this hand.
     """
 
@@ -191,7 +191,7 @@ class JustFloatGloveDecoder:
 def justfloat_descriptor(
     side: Side, *, num_values: int, rate_hz: float, label: str | None = None
 ) -> StreamDescriptor:
-    """The raw stream of one glove; neither its unit nor its time is told by the device."""
+    """The raw stream of one glove; the device sends neither its unit nor its time."""
     return StreamDescriptor(
         name=f"tactile_{hand_name(side, label)}",
         kind="tactile",

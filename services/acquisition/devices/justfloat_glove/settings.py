@@ -8,7 +8,7 @@ from services.acquisition.devices.gloves import GloveSettings
 
 
 class JustFloatGloveSettings(GloveSettings):
-    """A glove on a serial line that tells nothing of itself.
+    """Settings of a glove on a serial port whose packets do not describe themselves.
 
     Attributes:
         num_values: float32s of a packet.

@@ -39,7 +39,7 @@ class BridgePoseTrackerDecoder:
     """Poses [x y z qw qx qy qz] (m, world frame) of one device of an OpenVR-like source.
 
     Only the result RUNNING_OK makes a sample. The pose-valid flag never does: such sources keep it
-    set while a lost tracker drifts. A running pose that is flagged invalid is left out too.
+    set while a lost tracker drifts. A running pose that is flagged invalid is dropped too.
 
     Args:
         stream: `wrist_left`, `wrist_right`, `head`, or the name of another place.

@@ -26,9 +26,8 @@ PAYLOAD = struct.Struct("<B3x7f")
 class PoseTrackerDecoder:
     """Poses [x y z qw qx qy qz] in the world frame, only while the tracker runs.
 
-    What a tracker sends in another state (some go on with a drifting pose and a "valid" flag), and
-    a pose that jumps, is counted and noted in `events` and not passed on: a gap, never a wrong
-    pose.
+    Packets in another state (some trackers keep sending a drifting pose flagged as valid), and
+    poses that jump, are counted, recorded in `events` and dropped: a gap, never a wrong pose.
     """
 
     def __init__(self, stream: str) -> None:
@@ -57,12 +56,12 @@ class PoseTrackerDecoder:
 
     @property
     def not_running(self) -> int:
-        """Packets left out since the tracker was not running."""
+        """Packets dropped because the tracker was not running."""
         return self.tracking.packets["occluded"]
 
     @property
     def jumped(self) -> int:
-        """Packets left out since their pose cannot have been reached."""
+        """Packets dropped because their pose could not have been reached."""
         return self.tracking.packets["jumped"]
 
     def reset(self) -> None:

@@ -28,7 +28,7 @@ StampPoint = Literal["start", "end"]
 
 @dataclass(frozen=True)
 class CaptureRequest:
-    """What a camera is asked for; it is refused if it gives another size or rate.
+    """Requested settings of a camera; it is refused if it gives another size or rate.
 
     Attributes:
         height_px: of the images.
@@ -95,7 +95,7 @@ class Capture(Protocol):
 
 
 class CaptureLink:
-    """The transport of a camera: opens it anew each time and says where it is.
+    """The transport of a camera: reopens it each time and returns its location.
 
     Args:
         opener: finds and opens the camera.

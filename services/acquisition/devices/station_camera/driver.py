@@ -41,7 +41,7 @@ STAMP_TICK_NS = 1_000
 
 @dataclass(frozen=True)
 class CameraTiming:
-    """What is known, or assumed, of when a camera takes its images.
+    """Known or assumed timing of a camera's images.
 
     Attributes:
         stamp_point: the end of the exposure at which the driver stamps.
@@ -91,7 +91,7 @@ class _CaptureDecoder:
 
 
 class StationCamera(Driver):
-    """A camera on this host; encodes in a thread of its own.
+    """A camera on this host; encodes in a separate thread.
 
     `t_host_ns` of a sample is when its image was fetched, `t_device_ns` the middle of its exposure
     by the driver's stamp, on the same clock.
@@ -99,9 +99,9 @@ class StationCamera(Driver):
     Args:
         stream: name of the stream and of the device.
         link: opens the camera.
-        request: what the camera is asked for.
+        request: requested settings of the camera.
         encoding: of the samples.
-        timing: what is known of its delays.
+        timing: its timing.
         clock: of the station.
         max_encode_wait_s: how long a read waits for the encoder, so that an image need not wait
             for the next one; half a period if None.
@@ -192,7 +192,7 @@ class StationCamera(Driver):
         return {self.name: samples} if samples else {}
 
     def close(self) -> None:
-        """Close the camera; what is being encoded comes with the first read after reopening."""
+        """Close the camera; images being encoded are returned by the first read after reopening."""
         super().close()
         self._queue.stop()
 

@@ -1,6 +1,6 @@
 """A simulated camera on the station's own bus.
 
-What a driver hands over is not bytes, so this mock stands behind the `Capture` protocol: images
+A camera driver delivers images, not bytes, so this mock implements the `Capture` protocol: images
 with the kernel's stamps, four buffers, an error when it is pulled out.
 """
 
@@ -102,7 +102,7 @@ class MockCapture:
         return self._port.exposure_ns
 
     def wait(self, timeout_s: float) -> bool:
-        """Fetch the next image; what was fetched before has been processed by now."""
+        """Fetch the next image; images fetched before have been processed by now."""
         self._port.link.add_consumed(len(self._unit))
         self._unit = self._port.take(timeout_s) or b""
         return bool(self._unit)

@@ -35,7 +35,7 @@ class DriverStamps:
         """Stamp and number of an image; without a usable clock the values for "none".
 
         Returns:
-            None when the image must be left out: repeated, or with a stamp that cannot be.
+            None if the image must be dropped: repeated, or with a stamp that cannot be.
 
         Raises:
             DeviceError: the stamps have left the host's clock; they are not used any more.

@@ -29,7 +29,7 @@ MAX_TARE_PACKETS = 600
 
 
 class Command(IntEnum):
-    """What the host can ask."""
+    """Commands of the host."""
 
     IDENTIFY = 1
     DIAGNOSTICS = 2
@@ -47,7 +47,7 @@ class Status(IntEnum):
 
 @dataclass(frozen=True)
 class Reply:
-    """What the device answered, with the host's stamps of request and reply."""
+    """Reply of the device, with the host's timestamps of request and reply."""
 
     command: Command
     body: bytes
@@ -67,7 +67,7 @@ class GloveIdentity:
 
 @dataclass(frozen=True)
 class GloveDiagnostics:
-    """What a glove counts itself since it started."""
+    """Counters of a glove since it started."""
 
     uptime_ns: int
     packets: int

@@ -95,7 +95,7 @@ class TactileGlove(Driver):
         return super().read()
 
     def identify(self) -> GloveIdentity:
-        """Serial number, firmware and side, as the glove tells them."""
+        """Serial number, firmware and side, as reported by the glove."""
         packet, _ = self._ask(Command.IDENTIFY)
         return parse_identity(self._body(Command.IDENTIFY, packet), packet.source)
 
@@ -198,7 +198,7 @@ class TactileGlove(Driver):
         return self._replies.pop(number)
 
     def _accept(self, packet: Packet, t_host_ns: int) -> None:
-        """A reply came (called by the decoder); those that nobody waits for are passed over."""
+        """A reply came (called by the decoder); unexpected replies are ignored."""
         with self._answered:
             if packet.sequence in self._asked:
                 self._replies[packet.sequence] = (packet, t_host_ns)

@@ -1,4 +1,4 @@
-"""A simulated glove of ours, with offsets and gains of its own, that answers commands."""
+"""Simulated glove of our own protocol, with its own offsets and gains, that answers commands."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -46,7 +46,7 @@ class GloveCalibration:
         )
 
     def matrices(self, side: Side) -> dict[str, Matrix]:
-        """What the calibration of a station says of this glove."""
+        """Calibration matrices of this glove."""
         return {
             f"tactile_{side}_tare_counts": matrix_rows(self.tare_counts[None]),
             f"tactile_{side}_gain_counts_per_kpa": matrix_rows(self.gain_counts_per_kpa[None]),
@@ -153,14 +153,14 @@ class TactileGloveSource:
 
 
 class _DeviceClock:
-    """What a mock device's clock shows now, told from the last packet that it made."""
+    """Current time of a mock device's clock, extrapolated from its last packet."""
 
     def __init__(self, device: MockDevice, clock: StationClock) -> None:
         self._device = device
         self._clock = clock
 
     def now_ns(self) -> int:
-        """Device time; before the first packet, time since an origin of its own."""
+        """Device time; before the first packet, time since an arbitrary origin."""
         ledger = self._device.ledger
         now_ns = self._clock.now_ns()
         if not ledger.t_device_ns:

@@ -1,4 +1,4 @@
-"""A simulated Wuji glove: its packets with pressures on a grid of its own choice."""
+"""A simulated Wuji glove: its packets, with pressures on a chosen grid."""
 
 from collections.abc import Callable, Sequence
 

@@ -80,7 +80,7 @@ class WujiFrames(FrameSearch[WujiPacket]):
         return WujiPacket(hand, sequence, time_ms, cells), PACKET_BYTES
 
     def _went_back(self, time_ms: int) -> bool:
-        """Whether the device's clock started anew; running over 2³² ms is none."""
+        """Whether the device's clock was restarted; running over 2³² ms is none."""
         last_ms, self._last_ms = self._last_ms, time_ms
         return last_ms is not None and (time_ms - last_ms) % (1 << TIME_BITS) >= 1 << TIME_BITS - 1
 

@@ -6,6 +6,6 @@ from services.acquisition.devices.gloves import GloveSettings
 
 
 class WujiGloveSettings(GloveSettings):
-    """A Wuji glove on a serial line; it tells which hand it is for."""
+    """A Wuji glove on a serial line; its packets contain the hand."""
 
     kind: Literal["wuji_glove"] = "wuji_glove"
