@@ -150,7 +150,7 @@ class JobRunner:
         return self.queue.get(alignment_id)
 
     def waiting_for(self) -> list[str]:
-        """What the service still waits for before it is ready."""
+        """Names of the conditions that must be met before the service is ready."""
         return [] if self.is_warm else ["solver"]
 
     async def _warm_up(self) -> None:

@@ -37,14 +37,14 @@ def align_recording(
     from two processes at once, gives the same episode and writes nothing.
 
     Args:
-        store: where the recording lies and the episode goes.
+        store: store of the recording and the episode.
         recording_id: of a finished recording.
         options: of the alignment.
         on_progress: called with the progress, in the caller's thread.
 
     Raises:
         NotFoundError: no such recording.
-        InvalidInputError: the recording lacks what an episode needs (the message names it).
+        InvalidInputError: the recording lacks data that an episode needs (the message names it).
         CorruptDataError, StorageError: the store's bytes are damaged or cannot be written.
     """
     recording = store.recording(recording_id)
@@ -56,7 +56,7 @@ def align_recording(
 
 
 def check_recording(store: EpisodeStore, recording_id: str, options: AlignmentOptions) -> str:
-    """Check that a recording has what an episode needs; returns the id of its episode.
+    """Check that a recording has the data that an episode needs; returns the id of its episode.
 
     Raises:
         NotFoundError: no such recording.

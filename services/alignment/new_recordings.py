@@ -69,7 +69,7 @@ class NewRecordings:
             await asyncio.sleep(period_s)
 
     async def look(self) -> None:
-        """Submit what is new; a recording that finds no room in the queue is left for next time.
+        """Submit new recordings; a recording that finds no room in the queue is left for next time.
 
         Raises:
             StorageError: the store cannot be listed, or jobs cannot be kept.

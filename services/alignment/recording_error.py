@@ -81,7 +81,7 @@ def compare_with_truth(
 
     Args:
         episode: made by alignment from the recording of the replay.
-        truth: what was replayed.
+        truth: the replayed episode.
         origin_in_truth_ns: true time of the episode's time 0. With it `latency_error_ms` is
             absolute; without it the median stream is taken as exact.
 
@@ -128,8 +128,8 @@ def match_samples(
 ) -> Match:
     """Match every sample with its true one, near in time and of similar values.
 
-    A constant delay may be longer than a period, so moving the stream by whole periods, up to
-    `reach_ns`, is tried too, and believed where the values then fit clearly better.
+    A constant delay may be longer than a period, so shifts by whole periods, up to `reach_ns`, are
+    tried too, and used if the values then match clearly better.
     """
     mine, true = episode.read(name), truth.read(name)
     period_ns = truth.streams[name].period_ns()

@@ -1,4 +1,4 @@
-"""Report of an alignment: clocks, retargeting quality and what was left out of the episode."""
+"""Report of an alignment: clocks, retargeting quality and parts that are not in the episode."""
 
 from collections.abc import Mapping
 

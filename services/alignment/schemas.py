@@ -20,7 +20,7 @@ ENDED: frozenset[JobState] = frozenset({"done", "failed", "cancelled"})
 
 
 class AlignmentRequest(BaseModel):
-    """Align finished recordings, one or up to a thousand; options left out are the service's."""
+    """Align one or up to a thousand recordings; missing options default to the service's."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -47,9 +47,9 @@ class AlignmentRequest(BaseModel):
 class AlignmentJob(BaseModel):
     """One alignment: `alignment_id` is the episode's id, `progress` goes from 0 to 1.
 
-    `stage` and `stream` say what is worked on, `eta_s` how long it will take if all goes on as
-    before; `attempts` counts how often work began. `report` is there when `state` is done,
-    `problem` when it is failed.
+    `stage` and `stream` are being processed, `eta_s` is the estimated remaining time; `attempts`
+    counts how often work began. `report` is there when `state` is done, `problem` when it is
+    failed.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -100,7 +100,7 @@ class AlignmentJob(BaseModel):
         return self._ended("failed", problem=problem)
 
     def cancelled(self) -> "AlignmentJob":
-        """Somebody cancelled it."""
+        """The job was cancelled."""
         return self._ended("cancelled")
 
     def interrupted(self) -> "AlignmentJob":

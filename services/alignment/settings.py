@@ -20,9 +20,9 @@ class AlignmentSettings(ServiceSettings):
 
     `store_url` is the folder that the episode store writes to; `jobs_folder` holds the jobs,
     `.alignments` in the store if not given; `options` are the defaults of a request; `num_workers`
-    alignments run at once, each in a process of its own (as many as processors if not given),
-    `max_waiting` more may wait, `max_kept` are remembered; a job whose process died `max_attempts`
-    times is failed.
+    alignments run at once, each in a separate process (by default one per processor), `max_waiting`
+    more may wait, `max_kept` are remembered; a job whose process died `max_attempts` times is
+    failed.
 
     With `align_new`, recordings that arrive in the store are aligned by themselves, each once; the
     store is listed every `look_period_s` (2 s for a folder, 30 s for a bucket if not given).

@@ -46,7 +46,7 @@ class FoundBoards:
         pixels_px: a photo each, [k, 2] where they are.
         image_size_px: width, height.
         photos: indices of the photos on which the board was found.
-        num_photos: all that were looked at.
+        num_photos: number of processed photos.
         pattern: how the board is printed.
     """
 

@@ -134,8 +134,8 @@ def view_errors(
 def check_sides(series: Series, errors: np.ndarray) -> None:
     """Refuse a series that fits much better when one side is inverted.
 
-    A mistaken side cannot be told from the other by consistency alone: with both turned round the
-    views agree again, on mount and target exchanged. The shorter mount is the likelier one.
+    Consistency alone cannot show which side is wrong: with both turned round the views agree again,
+    on mount and target exchanged. The shorter mount is the likelier one.
 
     Raises:
         InvalidInputError: names the side.

@@ -1,8 +1,8 @@
 """Hand-eye calibration: where a camera sits on its tracker, with standard deviations.
 
-A closed form starts it and a gate refuses motion that does not show the mount; then the noise of
-tracker and camera is estimated from what the views leave over, and a bundle weighted with it finds
-mount, board and every view's tracker error together. Its covariance is the answer's sigma.
+A closed form provides the initial values, and degenerate motion is refused. Then the noise of
+tracker and camera is estimated from the residuals, and a bundle adjustment weighted with it
+estimates mount, board and the tracker error of every view. Its covariance is that of the result.
 """
 
 from dataclasses import dataclass
@@ -78,7 +78,7 @@ class HandEyeResult:
         rotation_rms_rad: how far the views turn the board from there.
         translation_rms_m: how far they put it from there.
         board_spread_m: mean distance of the board's places from their middle.
-        noise: what the views show of the noise (one sigma an axis), named as in `HandEyeNoise`.
+        noise: estimated noise (one sigma per axis), named as in `HandEyeNoise`.
         left_out_views: views that were far off and did not count.
     """
 
@@ -101,18 +101,18 @@ def solve_hand_eye(
     views: BoardViews | None = None,
     noise: HandEyeNoise | None = None,
 ) -> HandEyeResult:
-    """Mount of a camera on a tracker, from views of a board that stands still.
+    """Estimate the mount of a camera on a tracker from views of a fixed board.
 
     Args:
         Ts_world_tracker: [n ≥ 4, 4, 4] poses of the tracker in the world.
         Ts_camera_board: [n, 4, 4] poses of the board in the camera, same moments.
-        views: the corners that the board's poses were found from; with them each view counts as
-            much as its pixels say, which is the better answer.
-        noise: what to expect; default `HandEyeNoise()`.
+        views: the corners from which the board's poses were computed; with them each view is
+            weighted by the information in its pixels, which is more accurate.
+        noise: expected noise; default `HandEyeNoise()`.
 
     Raises:
-        DegenerateMotionError: the tracker was turned too little, or about one axis only, or the
-            mount stays less known than half a degree and 10 mm.
+        DegenerateMotionError: the tracker was rotated too little, or about one axis only, or the
+            uncertainty of the mount exceeds half a degree or 10 mm.
         InvalidInputError: too few views, or views that contradict each other (an inverted series
             is named).
         ShapeError, NonFiniteError: no [n, 4, 4], or NaN.

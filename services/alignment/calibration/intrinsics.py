@@ -43,8 +43,9 @@ class CameraCalibration:
         sigma_fxfycxcy_px: standard deviations of fx fy cx cy; they show how good the calibration
             is. `rms_px` does not: it is as small for 8 views as for 40.
         sigma_distortion: of the distortion.
-        rms_px: of what is left between corners and model, both axes together.
-        rms_by_photo_px: the same by photo; one that stands out is blurred or the board was bent.
+        rms_px: of the residuals between corners and model, both axes together.
+        rms_by_photo_px: the same by photo; a much larger one means that the photo is blurred or the
+            board was bent.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
         unseen: parts of the image (thirds both ways) in which none was.
         advice: what would make the calibration better; empty where nothing would.
@@ -73,7 +74,7 @@ def calibrate_camera(
     """Intrinsics from photos of one board in different tilts and places.
 
     Args:
-        images: uint8 [h, w] or [h, w, 3], all of one size; photos without the board are left out.
+        images: uint8 [h, w] or [h, w, 3], all of one size; photos without the board are ignored.
         board: what is on the photos.
 
     Raises:

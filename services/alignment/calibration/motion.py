@@ -63,7 +63,7 @@ def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
 
     Args:
         task: for the message.
-        body: what was moved, for the message.
+        body: the moved object, for the error message.
         Ts_world_body: [n, 4, 4] its poses.
 
     Raises:

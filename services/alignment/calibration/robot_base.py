@@ -1,4 +1,4 @@
-"""Calibration of where a robot's base stands in the tracked world.
+"""Calibration of the pose of a robot's base in the tracked world.
 
 A tracker on the robot's end effector says T_world_tracker = T_world_base · T_base_effector ·
 T_effector_tracker in every pose. Where the tracker sits on the effector is found too, unless it
@@ -57,7 +57,7 @@ class RobotBaseNoise:
 
 @dataclass(frozen=True)
 class RobotBaseResult:
-    """Where the robot's base stands in the tracked world, and how well that is known (one sigma).
+    """Pose of the robot's base in the tracked world, with standard deviations.
 
     Attributes:
         T_world_base: the base.
@@ -67,7 +67,7 @@ class RobotBaseResult:
         covariance: [6, 6] of its twist: turn (rad) and shift (m) along the base's own axes.
         rotation_rms_rad: how far the pairs turn the base from there.
         translation_rms_m: how far they put it from there.
-        noise: what the pairs show of the noise (one sigma an axis).
+        noise: estimated noise (one sigma per axis).
         left_out_pairs: pairs that were far off and did not count.
     """
 

@@ -1,8 +1,8 @@
-"""Blur measurement on photos of a board, to leave blurred ones out of a calibration.
+"""Blur measurement on photos of a board, to exclude blurred ones from a calibration.
 
-A photo taken while camera or board moves shifts all corners along the motion, by half a pixel at
-6 px of blur, and nothing that the corners leave over shows it: the board's pose takes it up. The
-edges of the squares do show it, those across the motion more than those along it.
+A photo taken while camera or board moves shifts all corners along the motion, by half a pixel at 6
+px of blur, which the residuals do not show because the board's pose absorbs it. The edges of the
+squares do show it, those across the motion more than those along it.
 """
 
 import numpy as np

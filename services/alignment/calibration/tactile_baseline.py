@@ -82,8 +82,8 @@ class TactileCalibration:
             stream: of a further glove of this side, whose matrices begin with its name.
 
         Raises:
-            InvalidInputError: a matrix of this side is missing, of the wrong shape, or holds
-                what it cannot.
+            InvalidInputError: a matrix of this side is missing, has the wrong shape or invalid
+                values.
         """
         glove = stream or f"tactile_{side}"
         tare, gain = (
@@ -99,8 +99,9 @@ class TactileCalibration:
     def refused_taxels(self, counts: np.ndarray) -> UInt8[np.ndarray, "320"]:
         """Reason why each taxel is unusable in a take, as index into `REASONS`; 0 for usable.
 
-        Beside what the calibration refuses: cells that stand still although not at their tare
-        (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the samples.
+        In addition to taxels refused by the calibration: cells that are constant but not at their
+        tare (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the
+        samples.
 
         Args:
             counts: [T, cells] raw readings of the glove; NaN where it sent none.

@@ -113,7 +113,7 @@ def _blocks(takes: Sequence[np.ndarray], side: Side) -> Iterator[Float64[np.ndar
 
 
 def _least_neighbour(moved: Float64[np.ndarray, "time 320"]) -> Float64[np.ndarray, "time 320"]:
-    """How far the neighbours moved at least, the stillest quarter of them left out."""
+    """Smallest change of the neighbours, excluding the quarter that changed least."""
     around = np.where(_NEIGHBOURS >= 0, moved[:, _NEIGHBOURS], np.inf)
     around.sort(axis=2)
     rank = np.floor(STILL_NEIGHBOURS * _NUM_NEIGHBOURS).astype(np.int64)

@@ -51,8 +51,8 @@ class TaxelPress:
     Args:
         pressure_kpa: above 0; force / area for a weight.
         sigma_kpa: one standard deviation of it, 0 or more.
-        counts: [T ≥ 60, 360] raw readings while it lay.
-        taxels: which taxels (anatomical order) it lay on.
+        counts: [T ≥ 60, 360] raw readings during the press.
+        taxels: which taxels (anatomical order) were pressed.
 
     Raises:
         InvalidInputError: a pressure that is not above 0, or no taxel.
@@ -80,8 +80,8 @@ class TaxelGain:
 
     Attributes:
         gain_counts_per_kpa: 0 where refused (`state` is not `OK`).
-        sigma_counts_per_kpa: of the gain, 0 where refused. What is wrong about the pressures
-            themselves is common to all taxels and in it.
+        sigma_counts_per_kpa: of the gain, 0 where refused. It includes the errors of the pressures
+            themselves, which are common to all taxels.
         state: index into `tactile_faults.STATES`.
         residual_kpa: [press, 320] what each press is off the line, 0 where not used.
     """

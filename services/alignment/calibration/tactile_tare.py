@@ -27,10 +27,10 @@ class Level:
     """Constant level of each cell over a take, in counts.
 
     Attributes:
-        mean_counts: middle of the readings, knocks left out.
+        mean_counts: mean of the readings, without accidental contact.
         sigma_counts: of that middle: noise, slow noise and the rounding to whole counts.
         noise_counts: standard deviation of one reading.
-        clipped: part of the readings that were left out, 0 … 1.
+        clipped: share of excluded readings, 0 … 1.
     """
 
     mean_counts: Float64[np.ndarray, "360"]

@@ -36,10 +36,10 @@ def estimate_tap_offset(
         t_height_ns: stamps [m] of the tracker.
         height_m: height [m] above the table, of a point of the hand.
         threshold_kpa: pressure that counts as a touch.
-        max_offset_s: offsets beyond this are not looked for.
+        max_offset_s: largest offset to search.
 
     Returns:
-        What must be added to the tracker's stamps to line them up with the glove's.
+        The offset to add to the tracker's timestamps to align them with the glove's.
 
     Raises:
         DegenerateMotionError: no tap, or none that falls briskly onto the table.

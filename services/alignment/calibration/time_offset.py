@@ -29,7 +29,7 @@ SIGMA_FACTOR = 2.0
 
 @dataclass(frozen=True)
 class TimeOffset:
-    """`offset_ns` is what must be added to stream b's stamps to line it up with stream a."""
+    """Add `offset_ns` to the timestamps of stream b to align it with stream a."""
 
     offset_ns: int
     sigma_ns: int
@@ -50,7 +50,7 @@ def estimate_time_offset(
         signal_a: [n] or [n, k]: angular speed, or k components in common axes (better).
         t_b_ns: stamps [m] of stream b.
         signal_b: [m] or [m, k]; may have another unit and zero than a.
-        max_offset_s: offsets beyond this are not looked for.
+        max_offset_s: largest offset to search.
 
     Raises:
         DegenerateMotionError: no motion, too slow, too periodic, or not the same one.

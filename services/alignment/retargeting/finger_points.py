@@ -29,7 +29,7 @@ def finger_points(keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> F
     Args:
         keypoints_m: [T ≥ 1, 25, 3], order of `dextouch.hands.skeleton`; NaN or infinity marks a
             missing node.
-        valid: bool [T, 25], what the tracker itself trusts; None trusts every finite node.
+        valid: bool [T, 25], validity reported by the tracker; None trusts every finite node.
 
     Raises:
         ShapeError: not [T ≥ 1, 25, 3], or `valid` not [T, 25].

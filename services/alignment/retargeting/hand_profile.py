@@ -34,7 +34,7 @@ class HandProfile:
         knuckle_m: the MCP (of the thumb: the CMC) in the wrist frame.
         travel: how much of the travel that the robot's knuckle makes with flexion the tracked one
             makes: 0 for people, whose knuckles turn in place, 1 for the robot hand itself.
-        knuckle_sigma_m: standard deviation, an axis, of what is left of a knuckle's motion.
+        knuckle_sigma_m: standard deviation per axis of a knuckle's residual motion.
         point_sigma_m: standard deviation, an axis, of the tracker's noise.
     """
 
@@ -87,7 +87,7 @@ class HandProfile:
 
         Raises:
             ShapeError: not [5, 9].
-            InvalidInputError: not finite, or no hand.
+            InvalidInputError: not finite, or not a valid hand.
         """
         table = np.asarray(rows, dtype=np.float64)
         if table.shape != (NUM_FINGERS, NUM_COLUMNS):
@@ -106,7 +106,7 @@ def calibrated_profile(
     """The hand profile of a recording's calibration; None if it has none.
 
     Raises:
-        ShapeError, InvalidInputError: it is no hand.
+        ShapeError, InvalidInputError: it is not a valid hand.
     """
     rows = calibration.get(profile_name(side))
     return None if rows is None else HandProfile.from_rows(rows)

@@ -36,11 +36,11 @@ IMPLAUSIBLE = arrays.IMPLAUSIBLE
 class RetargetStatus(IntEnum):
     """How a finger was solved; for a sample, the worst status of its fingers.
 
-    PARTIAL: some of its points were missing. REACQUIRED: it was lost and searched again; live, it
-    is on its way to where it is tracked, at the rate limit. UNCONVERGED: the search did not come to
-    rest. IMPLAUSIBLE: bones or knuckle are not this hand's. MISSING: fewer than two points. The
-    last two hold what was before; a sample is IMPLAUSIBLE or MISSING if all fingers are, PARTIAL if
-    some are.
+    PARTIAL: some of its points were missing. REACQUIRED: it was lost and searched again; live, its
+    joints are approaching the tracked pose at the velocity limit. UNCONVERGED: the solver did not
+    converge. IMPLAUSIBLE: bones or knuckle do not match this hand. MISSING: fewer than two points.
+    With the last two, the finger keeps its previous angles; a sample is IMPLAUSIBLE or MISSING if
+    all fingers are, PARTIAL if some are.
     """
 
     SOLVED = arrays.SOLVED
@@ -74,13 +74,13 @@ class RetargetResult:
 class HandRetargeter:
     """Follows a tracked hand with the robot hand of the same side.
 
-    `retarget` may run in several threads at once; `step` goes on from the sample before and
-    belongs to one.
+    `retarget` may run in several threads at once; `step` continues from the previous sample, so a
+    retargeter can be used for one live stream only.
 
     Args:
         hand: "left" or "right" for the Wuji hand, or any hand with keypoints of its side.
-        profile: of the person; None measures it from what is retargeted (`retarget`), or goes by
-            each sample alone (`step`).
+        profile: of the person; if None, it is measured from the recording (`retarget`) or each
+            sample is used alone (`step`).
         options: of the solver.
 
     Raises:
@@ -148,7 +148,7 @@ class HandRetargeter:
 
         Args:
             keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
-            valid: bool [25], what the tracker trusts; None trusts every finite node.
+            valid: bool [25], validity reported by the tracker; None trusts every finite node.
             elapsed_s: since the sample before.
 
         Returns:
@@ -182,7 +182,7 @@ class HandRetargeter:
 
         Args:
             keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
-            valid: bool [T, 25], what the tracker trusts; None trusts every finite node.
+            valid: bool [T, 25], validity reported by the tracker; None trusts every finite node.
             t_s: [T] rising times, relative to any moment; None takes 60 Hz.
 
         Raises:
@@ -224,7 +224,7 @@ class HandRetargeter:
 
         Raises:
             ShapeError: wrong shapes.
-            InvalidInputError: wrong unit, or a finger that is whole in no sample.
+            InvalidInputError: wrong unit, or a finger that is complete in no sample.
         """
         return measure_profile(finger_points(keypoints_m, valid), self.hand)
 

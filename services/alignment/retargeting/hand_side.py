@@ -1,6 +1,7 @@
 """Check that tracked keypoints belong to the left or right hand that they claim to be.
 
-A mirror image keeps all distances; the sense in which fingers curl tells left from right.
+A mirror image keeps all distances; the direction in which fingers curl distinguishes left from
+right.
 """
 
 from dataclasses import dataclass
@@ -46,8 +47,8 @@ def find_side(samples: np.ndarray) -> SideEvidence:
     """Classify keypoints [T, 25, 3] as left or right, in any axes and unit; NaN if not seen.
 
     Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
-    hand and away from it on a left one. Where they hardly bend, the base of the thumb tells, which
-    lies on the palm's side of the metacarpals.
+    hand and away from it on a left one. If they hardly bend, the base of the thumb is used, which
+    is on the palm's side of the metacarpals.
     """
     across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]
     votes = []
@@ -95,7 +96,7 @@ def check_handedness(
         where: stream and recording, for the message.
 
     Returns:
-        What speaks for it; its `side` is None where the hand shows neither.
+        The evidence for it; its `side` is None where the hand shows neither.
 
     Raises:
         InvalidInputError: they are of the other hand.

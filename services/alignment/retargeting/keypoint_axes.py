@@ -1,7 +1,7 @@
 """Conversion of a recording's keypoints to wrist axes, as its calibration says.
 
 To be called once for each hand of a recording, before retargeting. Keypoints in other axes are
-never turned by guess: only a calibration turns them, and what it gives is looked at.
+never turned by guess: only a calibration rotates them, and the result is checked.
 """
 
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ class KeypointAxes:
             finite where a node was not seen.
         is_calibrated: whether the recording's calibration turned them; else they came so.
         off_rad: how far the palm, compared with the mean one, still is from wrist axes.
-        frame: what the palm shows after that: size, sigma, turns of single samples.
+        frame: orientation of the palm after the rotation: size, sigma, turns of single samples.
     """
 
     keypoints_m: Float64[np.ndarray, "time 25 3"]

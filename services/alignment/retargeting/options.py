@@ -17,10 +17,10 @@ class RetargetOptions:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit
             weight; at other rates in proportion to the rate. 0 follows every sample exactly.
         velocity_limit_rad_s: no joint turns faster from sample to sample.
-        max_step_rad: live (`HandRetargeter.step`), no joint goes further from one output to the
-            next, however much time lies between or was lost; the default is 9.6 rad/s at 60 Hz.
-            Motors that are led to their targets smoothly may be given the velocity limit times the
-            period of a slower tracker.
+        max_step_rad: live (`HandRetargeter.step`), largest change of a joint between two outputs,
+            regardless of the elapsed time; the default is 9.6 rad/s at 60 Hz. Motors that are led
+            to their targets smoothly may be given the velocity limit times the period of a slower
+            tracker.
         pinch_near_m: below this distance of thumb and fingertip the vector between them has its
             full weight.
         pinch_far_m: from here on it has none, and thumb and finger are solved apart.

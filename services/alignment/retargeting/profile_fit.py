@@ -115,7 +115,8 @@ def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
         hand: the robot hand of the same side, whose axes define how far fingers are bent.
 
     Raises:
-        InvalidInputError: a finger is whole in no sample, or its bones are no bones (unit, order).
+        InvalidInputError: a finger is complete in no sample, or its bone lengths are invalid (unit,
+            order).
     """
     whole = np.asarray(points.usable.all(axis=-1))
     _check_seen(whole, hand.side)

@@ -1,8 +1,8 @@
 """Estimation of the wrist frame in a tracker's own axes, with standard deviation.
 
 Wrist, metacarpals and knuckles are laid over the mean hand's by a similarity transform (Umeyama
-1991). One transform serves the whole recording: a frame of its own for each sample would take
-part of the fingers' motion, since the palm gives way with them, and the noise of nine nodes.
+1991). One transform serves the whole recording: a separate frame for each sample would absorb part
+of the fingers' motion, because the palm deforms with them, and the noise of nine nodes.
 """
 
 from dataclasses import dataclass
@@ -48,14 +48,14 @@ MAX_SIGMA_RAD: Final = float(np.deg2rad(12.0))
 
 @dataclass(frozen=True)
 class WristFrame:
-    """Where the wrist frame lies in the axes of keypoints, and how well that is known.
+    """Pose of the wrist frame in the axes of keypoints, with its covariance.
 
     Attributes:
         T_tracker_wrist: rigid; its origin is the wrist node (where that is not seen, where the
             palm says it is), its axes ours: fingers along -z, thumb side +x, right palm +y, left
             palm -y.
-        covariance: [3, 3] of the rotation (rad²), about the wrist's own axes: noise, and what is
-            left between this palm's shape and the mean one's.
+        covariance: [3, 3] of the rotation (rad²), about the wrist's own axes: noise, and the
+            difference between this palm's shape and the mean one.
         size: of the hand, 1 is the mean adult's.
         misfit_m: RMS distance of the palm's nodes from the mean hand's of that size.
         turn_rad: how far single samples turn from this frame, RMS.
@@ -80,8 +80,8 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
-            `dextouch.hands.skeleton`; NaN where a node is not seen. Up to 300 samples, evenly
-            spread, are looked at.
+            `dextouch.hands.skeleton`; NaN where a node is not seen. Up to 300 evenly spaced samples
+            are used.
         side: which hand.
         where: stream and recording, for the message.
 
@@ -239,7 +239,7 @@ def _turn_of_samples(
 
 
 def _covariance(left_over: np.ndarray, points: np.ndarray) -> Float64[np.ndarray, "3 3"]:
-    """Covariance of the rotation about the wrist's own axes, from what the fit leaves over."""
+    """Covariance of the rotation about the wrist's own axes, from the residuals of the fit."""
     # Rotation, offset and size are seven numbers.
     variance = np.square(left_over).sum() / (left_over.size - 7)
     centred = points - points.mean(axis=0)

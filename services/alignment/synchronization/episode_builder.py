@@ -80,9 +80,9 @@ def build_episode(
 ) -> BuiltEpisode:
     """Fit all clocks, find the longest stretch without a gap, and make actions on its grid.
 
-    Streams that the recording lacks are left out. Time 0 of the episode is the first moment at
-    which all streams that make up the action are there. Values of other streams are read only
-    while the episode's blocks are taken.
+    Streams that the recording lacks are omitted. Time 0 of the episode is the first moment at which
+    all streams that make up the action are there. Values of other streams are read only while the
+    episode's blocks are taken.
 
     Raises:
         InvalidInputError: streams or calibration that every episode needs are missing, or no

@@ -37,7 +37,7 @@ def retarget_hands(
     at: Mapping[str, GridPlacement],
     calibration: Mapping[str, Matrix],
 ) -> HandJoints:
-    """Retarget both hands, each in a thread of its own, and bring the joints to the grid.
+    """Retarget both hands, each in its own thread, and resample the joints onto the grid.
 
     Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
     take the line between their two neighbours, which `at` has found to be in no gap.
@@ -49,7 +49,7 @@ def retarget_hands(
             from the recording itself where it is absent.
 
     Raises:
-        InvalidInputError: keypoints that are no hand, of the other side or in other axes, see
+        InvalidInputError: keypoints that are not a hand, of the other side or in other axes, see
             `hand_axes_check` and `HandRetargeter.retarget`.
     """
     with ThreadPoolExecutor(len(SIDES), thread_name_prefix="retarget") as threads:

@@ -1,7 +1,7 @@
 """Streams of a recording on the host's clock, converted to the units of episodes.
 
 Stamps are read whole, values only where they are asked for, in pieces: an hour of images or
-pressures never lies in memory at once.
+pressures is never in memory at once.
 """
 
 from collections.abc import Callable, Iterator

@@ -32,7 +32,7 @@ class TimedStream:
     """Times of the kept samples on the host's clock, with the report of the clock fit.
 
     Attributes:
-        kept: indices of the samples that have a time of their own; repeated ones are left out.
+        kept: indices of the samples that have a time of their own; duplicates are dropped.
         t_host_ns: their times on the host's clock, strictly increasing.
         report: of the clock fit.
         num_steps: how often the device's clock was stepped.
@@ -77,7 +77,7 @@ def time_stream(
         batch: the whole take of one stream.
         descriptor: widths and ticks of its counters.
         latency_ns: calibrated constant path delay, taken away from all times.
-        latency_sigma_ns: how well it is known; None where nobody measured it.
+        latency_sigma_ns: how well it is known; None if it was not measured.
 
     Raises:
         ClockFitError: too few samples, or stamps that no clock gives; names the stream.

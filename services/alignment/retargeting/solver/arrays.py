@@ -146,7 +146,7 @@ class Memory(NamedTuple):
     """State that one sample leaves for the next, changed in place.
 
     Attributes:
-        joints_rad: [F, 6], what came out.
+        joints_rad: [F, 6], previous result.
         alone_rad: [F, 6], what fingers would do if there were no pinch.
         unsolved_s: [F] since a finger was solved; infinite if it never was.
         is_behind: [F] whether a finger that was lost is still on its way to where it is tracked.

@@ -24,11 +24,11 @@ def folder_of_code(*bases: Path) -> Path | None:
     """Where compiled code is kept: in the first of these folders that this user may write.
 
     Code of this version that an earlier, read-only one holds (of an image that another user built)
-    is copied. Code is run: it is taken only from folders of this user or root that nobody else may
-    write. Where the umask lets a group write new files, other users cannot enter the folder.
+    is copied. Code is run: it is used only from folders of this user or root that no other user can
+    write to. Where the umask lets a group write new files, other users cannot enter the folder.
 
     Args:
-        bases: for the code of all versions, best first; other users may read what is kept there.
+        bases: for the code of all versions, best first; other users may read the code in it.
 
     Returns:
         None where none may be written.
@@ -72,7 +72,7 @@ def _is_own(folder: Path) -> bool:
 
 
 def _is_safe(folder: Path) -> bool:
-    """Whether other users than root can neither change what lies in it nor exchange the folder."""
+    """Whether only this user and root can change or replace the folder."""
     found, above = folder.lstat(), folder.parent.stat()
     return (
         stat.S_ISDIR(found.st_mode)
@@ -83,7 +83,7 @@ def _is_safe(folder: Path) -> bool:
 
 
 def _copy_first(sources: list[Path], folder: Path) -> None:
-    """Copy the first of these folders that may be read; without any, code is compiled anew."""
+    """Copy the first of these folders that may be read; without any, code is compiled again."""
     for source in sources:
         try:
             if not (source.is_dir() and _is_safe(source)):

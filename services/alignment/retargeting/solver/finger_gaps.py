@@ -72,7 +72,7 @@ def push(hand, work, finger, phalanx, along, distance_m):
 @compiled
 @no_type_check
 def push_apart(hand, work, status):
-    """Move the targets of neighbouring fingers that touch apart by what is missing; whether any."""
+    """Move the targets of neighbouring fingers that overlap apart; whether any."""
     touched = False
     push_m = work.push_m
     for a in range(hand.num_fingers - 1):

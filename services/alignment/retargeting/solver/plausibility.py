@@ -39,7 +39,8 @@ def check_finger(hand, person, tuning, work, finger, memory):
     """Which points of a finger to use; SOLVED, PARTIAL, IMPLAUSIBLE or MISSING. Bones get a scale.
 
     Bones of a length or a bend that no finger has, and knuckles far from where they belong, are
-    errors of the tracker; the whole finger is left out, since the odd point cannot be told.
+    errors of the tracker; the whole finger is rejected, because the wrong point cannot be
+    identified.
     """
     measured, usable = work.measured[finger], work.usable[finger]
     count, expected = 0, 0
@@ -89,7 +90,7 @@ def check_finger(hand, person, tuning, work, finger, memory):
 @compiled
 @no_type_check
 def knuckle_error_m(hand, person, tuning, work, finger, memory):
-    """How far a measured knuckle is from where it was, less what it may have travelled since."""
+    """Distance of a measured knuckle from its previous position, less possible travel since."""
     travel = person.travel[finger]
     base = hand.point_joints[finger, 0]
     origin = work.origin[finger]

@@ -118,7 +118,7 @@ def solve_alone(hand, person, tuning, work, memory, output):
 def solve_pinches(hand, person, tuning, work, memory, num_near, output):
     """The thumb and the fingers near it together, close to what each does alone.
 
-    The others as they are; no joint leaves the box around what came out before. That box grows with
+    The others as they are; no joint leaves the box around the previous result. That box grows with
     the time a finger was lost, but live, where the time of one output is all that motors have.
     """
     status, errors_m = output
