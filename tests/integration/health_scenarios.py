@@ -310,22 +310,22 @@ SCENARIOS: dict[str, Scenario] = {
     "bit errors": Scenario(GLOVE, "damage", {"bit_error_rate": 1e-5}),
     "bytes lost": Scenario(GLOVE, "damage", {"byte_loss_rate": 1e-4}),
     "half packets": Scenario(GLOVE, "damage", {"half_packet_probability": 0.05}),
-    "packets twice": Scenario(GLOVE, "repeated", {"duplicate_probability": 0.05}),
-    "packets overtake": Scenario(GLOVE, "reordered", {"reorder_probability": 0.05}),
+    "duplicate packets": Scenario(GLOVE, "repeated", {"duplicate_probability": 0.05}),
+    "packets out of order": Scenario(GLOVE, "reordered", {"reorder_probability": 0.05}),
     "silence of 0.4 s": Scenario(GLOVE, "silent", {"stalls_s": ((AT_S, AT_S + 0.4),)}, limit_s=0.3),
     "pause of 0.15 s": Scenario(WRIST, "gap", {"stalls_s": SHORT}),
     "bursts": Scenario(FINGERS, "jitter", {"burst_ms": 100.0}),
     "85 % of the rate": Scenario(WRIST, "rate", edit=slower),
-    "60 ms in the host": Scenario(WRIST, "latency", disturb=stamp_early),
-    "delay varies by 10 ms": Scenario(GLOVE, "clock_residual", {"jitter_ms": 10.0}),
+    "60 ms of host latency": Scenario(WRIST, "latency", disturb=stamp_early),
+    "latency jitter of 10 ms": Scenario(GLOVE, "clock_residual", {"jitter_ms": 10.0}),
     "clock steps forward": Scenario(
         GLOVE, "clock_step", {"clock_step_at_s": AT_S, "clock_step_s": 0.2}
     ),
-    "clock steps back": Scenario(
+    "clock steps backward": Scenario(
         GLOVE, "clock_step", {"clock_step_at_s": AT_S, "clock_step_s": -0.03}
     ),
     "clock off by 3000 ppm": Scenario(GLOVE, "clock_skew", {"skew_ppm": 3000.0}),
-    "stamps missing": Scenario(GLOVE, "clock_stamps", disturb=lose_stamps, is_timed=True),
+    "timestamps missing": Scenario(GLOVE, "clock_stamps", disturb=lose_stamps, is_timed=True),
     "device restarts": Scenario(GLOVE, "restart", disturb=reboot, is_timed=True),
     "other hand": Scenario(GLOVE, "wrong_side rejected", {"wrong_side_from_s": AT_S}),
     "other tracker": Scenario(WRIST, "wrong_side rejected", {"wrong_side_from_s": AT_S}),
@@ -348,12 +348,12 @@ SCENARIOS: dict[str, Scenario] = {
     "cell becomes NaN (Wuji)": Scenario(GLOVE, "nan", {"nan_probability": 0.05}, links=WUJI),
     "NaN (justfloat)": Scenario(GLOVE, "suspect", {"nan_probability": 0.05}, links=BARE),
     "NaN (pose)": Scenario(WRIST, "refused", {"nan_probability": 0.05}),
-    "tracker not seen": Scenario(WRIST, "tracking", {"occluded_s": SHORT}),
+    "tracker occluded": Scenario(WRIST, "tracking", {"occluded_s": SHORT}),
     "tracker not running": Scenario(WRIST, "tracking", {"not_running_s": SHORT}),
-    "thumb not seen": Scenario(FINGERS, "tracking", {"occluded_s": PAUSE}),
-    "pose jumps away": Scenario(WRIST, "jump", {"jumped_s": SHORT}),
-    "pose leaps about": Scenario(WRIST, "jump", {"position_noise_m": 0.2}),
-    "pose trembles": Scenario(WRIST, "pose_jitter", {"position_noise_m": 3e-3}, edit=at_rest),
+    "thumb occluded": Scenario(FINGERS, "tracking", {"occluded_s": PAUSE}),
+    "pose jumps": Scenario(WRIST, "jump", {"jumped_s": SHORT}),
+    "pose noise of 0.2 m": Scenario(WRIST, "jump", {"position_noise_m": 0.2}),
+    "pose noise of 3 mm": Scenario(WRIST, "pose_jitter", {"position_noise_m": 3e-3}, edit=at_rest),
     "image frozen": Scenario(
         CAMERA, "image_frozen", edit=changed_images(lambda images: images[:1]), is_timed=True
     ),
@@ -364,7 +364,7 @@ SCENARIOS: dict[str, Scenario] = {
         is_timed=True,
     ),
     "image clipped": Scenario(CAMERA, "image_clipped", edit=changed_images(covered), is_timed=True),
-    "images left out": Scenario(CAMERA, "image_gap", edit=without_some, is_timed=True),
+    "images skipped": Scenario(CAMERA, "image_gap", edit=without_some, is_timed=True),
     "images not encoded": Scenario(
         CAMERA, "queue", links=OWN_CAMERA, edit=seen_by_a_sensor, disturb=drop_images, is_timed=True
     ),
