@@ -258,9 +258,10 @@ class HostWatch:
     def problems(self) -> tuple[str, ...]:
         """What happened, in words."""
         texts = {
-            "host_suspended": "the host slept for {s:.1f} s during the take: a gap in all streams",
-            "wall_clock_set": "the wall clock was set by {s:.1f} s during the take: stamps are not "
-            "touched, but started_at may not fit",
+            "host_suspended": "the host was suspended for {s:.1f} s during the take: "
+            "a gap in all streams",
+            "wall_clock_set": "the wall clock was set by {s:.1f} s during the take: timestamps "
+            "are not affected, but started_at may be wrong",
         }
         return tuple(
             texts[name].format(s=event.total_ns / 1e9)

@@ -160,7 +160,7 @@ def _problems(fact: StreamFacts, span: TakeSpan) -> list[TakeProblem]:
         found.append(_problem(fact, "rate", "ERROR" if off > RATE_ERROR else "WARN", text))
     loss = fact.decoder.lost / max(1, fact.decoder.lost + fact.decoder.packets)
     if loss > LOSS_WARN:
-        text = f"{fact.decoder.lost} packets lost ({loss:.1%}), {fact.decoder.crc_errors} bad sums"
+        text = f"{fact.decoder.lost} packets lost ({loss:.1%}), {fact.decoder.crc_errors} corrupt"
         found.append(_problem(fact, "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text))
     for event, count in _taxel_events(fact).items():
         if count:

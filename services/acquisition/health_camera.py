@@ -68,9 +68,9 @@ class CameraJudge:
         clipped = quality.clipped_ratio
         too_much = f"{clipped:.0%} of the image black or white"
         flags: dict[Code, tuple[bool, str]] = {
-            "image_frozen": (quality.frozen, "the same image again and again"),
+            "image_frozen": (quality.frozen, "the same image repeatedly"),
             "image_blurred": (quality.blurred, "much less sharp than usual"),
-            "image_gap": (quality.gap, "its own stamps leave out images"),
+            "image_gap": (quality.gap, "images are missing according to its timestamps"),
             "image_clipped": (clipped > CLIPPED_LIMIT, too_much),
         }
         findings = []

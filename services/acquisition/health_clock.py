@@ -75,7 +75,7 @@ class ClockJudge:
         kept_s = self._residuals.add(block.t_host_ns, residuals_ns * 1e-9, now_ns)
         skew_ppm = self._skew_ppm(int(block.t_host_ns[-1]))
         figures = {**self._figures(), "clock_skew_ratio": skew_ppm * 1e-6}
-        text = f"its clock is off by {skew_ppm:+.0f} ppm"
+        text = f"its clock is skewed by {skew_ppm:+.0f} ppm"
         findings = above("clock_skew", abs(skew_ppm), SKEW_LIMITS_PPM, text)
         if len(kept_s) >= MIN_RESIDUALS:
             scatter_s = _scatter_s(kept_s)

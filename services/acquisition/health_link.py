@@ -26,7 +26,7 @@ SILENT_NS = 200_000_000
 
 
 def queue_dropped(driver: Driver) -> int:
-    """What fell out of a queue of the driver's own since the start: images not encoded."""
+    """Images dropped from the full queue of the driver's encoder since the start."""
     return driver.quality.num_dropped if isinstance(driver, ChecksImages) else 0
 
 
@@ -131,16 +131,23 @@ class LinkJudge:
         findings = (
             *above("loss", lost, LOSS_LIMITS, f"{lost:.1%} of packets lost"),
             *above("damage", damaged / packets, LOSS_LIMITS, f"{damaged} packets damaged"),
-            *above("refused", refused / packets, LOSS_LIMITS, f"{refused} samples are no samples"),
+            *above(
+                "refused", refused / packets, LOSS_LIMITS, f"{refused} packets without a sample"
+            ),
             *above("suspect", suspects / packets, LOSS_LIMITS, f"{suspects} packets held back"),
-            *above("queue", dropped / packets, LOSS_LIMITS, f"{dropped} fell out of a queue"),
-            *_events("repeated", last.repeated - first.repeated, "packets came twice"),
-            *_events("reordered", late, "packets came behind later ones and were left out"),
+            *above(
+                "queue",
+                dropped / packets,
+                LOSS_LIMITS,
+                f"{dropped} images dropped from a full queue",
+            ),
+            *_events("repeated", last.repeated - first.repeated, "duplicate packets"),
+            *_events("reordered", late, "late packets dropped"),
             *_events("restart", last.restarts - first.restarts, "restarts of the device"),
             *self._judge_connection(first, last),
         )
         if resync and not damaged:
-            findings += _events("damage", resync, "bytes between packets skipped")
+            findings += _events("damage", resync, "bytes skipped between packets")
         return findings, {
             "drop_ratio": lost,
             "damaged_ratio": damaged / packets,
@@ -149,7 +156,7 @@ class LinkJudge:
         }
 
     def _judge_connection(self, first: _Counts, last: _Counts) -> tuple[HealthFinding, ...]:
-        reason = self._supervisor.counters.last_error or "the driver refuses what it sends"
+        reason = self._supervisor.counters.last_error or "the driver rejects its packets"
         reconnects = last.reconnects - first.reconnects
         code: Code
         stream = self._supervisor.counters.streams[self._descriptor.name]
@@ -174,7 +181,7 @@ class LinkJudge:
         missing = int(np.count_nonzero(block.t_device_ns < 0))
         if not self._descriptor.capabilities.device_time or not missing:
             return ()
-        text = f"{missing} of {len(block)} samples come without the device's time"
+        text = f"{missing} of {len(block)} samples have no device timestamp"
         return (HealthFinding(code="clock_stamps", level="ERROR", message=text),)
 
     def _judge_arrivals(self, block: Block, now_ns: int) -> Verdict:
@@ -200,7 +207,7 @@ class LinkJudge:
             late_s = float(np.percentile(steps_s, 99))
             figures["interarrival_p99_seconds"] = late_s
             # A sequence with single losses has steps of exactly two periods.
-            text = f"1 % of samples come more than {late_s * 1e3:.0f} ms after the one before"
+            text = f"1 % of samples come more than {late_s * 1e3:.0f} ms after the previous one"
             findings += above("jitter", late_s * 0.99, limits, text)
             gap_s = float(steps_s.max())
             limits = (max(GAP_LIMITS_S[0], GAP_PERIODS / rate_hz), GAP_LIMITS_S[1])
@@ -209,7 +216,7 @@ class LinkJudge:
             latency_s = float(np.percentile(latencies_s, 99))
             figures["host_latency_p99_seconds"] = latency_s
             limits = (LATE_PERIODS[0] / rate_hz, LATE_PERIODS[1] / rate_hz)
-            text = f"1 % of samples wait {latency_s * 1e3:.0f} ms in this host"
+            text = f"1 % of samples are delayed by {latency_s * 1e3:.0f} ms in this host"
             findings += above("latency", latency_s, limits, text)
         return Verdict(findings, figures)
 

@@ -48,7 +48,7 @@ class PathJudge:
         if abs(measured.latency_ns - self._calibrated_ns) <= limit_ns:
             return Verdict((), figures)
         text = (
-            f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its answers and "
+            f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its replies and "
             f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, more than "
             f"{limit_ns * 1e-6:.1f} ms apart"
         )

@@ -57,7 +57,7 @@ class DiskJudge:
         try:
             free = self._free_bytes()
         except OSError as error:
-            text = f"the spool's disk does not answer: {error.strerror}"
+            text = f"the spool's disk cannot be read: {error.strerror}"
             return Verdict((HealthFinding(code="disk", level="ERROR", message=text),))
         rate = (total - counts[0][1]) / max(1e-9, elapsed_ns * 1e-9)
         figures = {"disk_free_bytes": float(free)}

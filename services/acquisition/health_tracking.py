@@ -59,7 +59,7 @@ class TrackingJudge:
         jumped = left_out.get("jumped", 0)
         findings = (
             *above("tracking", lost, LOST_LIMITS, f"not tracked for {lost:.0%} of 10 s"),
-            *above("jump", jumped / packets, JUMP_LIMITS, f"{jumped} jumps left out within 10 s"),
+            *above("jump", jumped / packets, JUMP_LIMITS, f"{jumped} jumps dropped within 10 s"),
         )
         return Verdict(findings, {"tracking_lost_ratio": lost})
 
@@ -96,7 +96,7 @@ class PoseJudge:
         jitter_m = self._jitter_m(times_ns, positions_m)
         if jitter_m is not None:
             figures["stationary_jitter_meters"] = jitter_m
-            text = f"trembles by {jitter_m * 1e3:.1f} mm at rest"
+            text = f"jitters by {jitter_m * 1e3:.1f} mm at rest"
             findings += above("pose_jitter", jitter_m, JITTER_LIMITS_M, text)
         return Verdict(findings, figures)
 

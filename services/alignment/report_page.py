@@ -41,14 +41,14 @@ def _doubts(report: AlignmentReport) -> list[str]:
     found = []
     for clock in report.clocks:
         whys = {
-            "skew": f"its clock is off by {_number(clock.skew_ppm, 0)} ppm",
-            "residual": "even the promptest samples come later than they should by more than a "
+            "skew": f"its clock is skewed by {_number(clock.skew_ppm, 0)} ppm",
+            "residual": "even the earliest samples arrive later than fitted by more than a "
             f"sample period ({_number(clock.residual_rms_ms, 1)} ms RMS of all)",
-            "stop": "device clock stood still or path got longer",
+            "stop": "the device clock stopped or the path delay increased",
         }
         if clock.warnings:
             reasons = " and ".join(whys[warning] for warning in clock.warnings)
-            found.append(f"{clock.stream}: times in doubt: {reasons}")
+            found.append(f"{clock.stream}: unreliable times: {reasons}")
     return found
 
 

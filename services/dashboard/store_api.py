@@ -42,7 +42,7 @@ async def clock_words(store: Upstream, episode_id: str) -> str:
     doubted = ", ".join(clock.stream for clock in clocks if clock.warnings)
     return (
         f"skew to {max(skews_ppm):.0f} ppm, residual to {max(residuals_ms):.2f} ms, "
-        f"{lost} samples lost{f'; times in doubt: {doubted}' if doubted else ''}"
+        f"{lost} samples lost{f'; unreliable times: {doubted}' if doubted else ''}"
     )
 
 

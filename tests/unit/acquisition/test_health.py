@@ -267,7 +267,7 @@ def test_bytes_skipped_after_an_opening_are_no_damage(bench):
     assert skip(300) == "WARN"
     assert bench.reasons()["tactile_left"] == ("1 reconnects",)
     assert skip(300) == "WARN"
-    assert "300 bytes between packets skipped" in bench.reasons()["tactile_left"]
+    assert "300 bytes skipped between packets" in bench.reasons()["tactile_left"]
 
 
 def test_a_stale_stream_tells_no_figures(bench):

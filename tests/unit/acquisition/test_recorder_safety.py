@@ -202,7 +202,7 @@ def test_a_sleeping_host_leaves_a_gap_that_is_named(make_recorder, clock):
     clock.suspend(12 * 10**9)
     play(recorder, clock, 100, first=100)
     status = recorder.stop()
-    assert "the host slept for 12.0 s" in status.problems[0]
+    assert "the host was suspended for 12.0 s" in status.problems[0]
     assert ("gap", "ERROR") in {(p.code, p.level) for p in status.check.problems}
     recorder.save(ANYWAY)
     spool = SpoolReader(recorder.spool_root / "take")

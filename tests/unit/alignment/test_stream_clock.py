@@ -142,8 +142,10 @@ def test_doubts_are_on_the_line_and_the_page_of_a_report():
     console = Console(width=300, record=True, file=io.StringIO())
     console.print(report_page(report))
     for text in (report_line(report), console.export_text()):
-        assert "glove_right: times in doubt: its clock is off by -4200 ppm and even" in text
-        assert "(71.2 ms RMS of all) and device clock stood still or path got longer" in text
+        assert "glove_right: unreliable times: its clock is skewed by -4200 ppm and even" in text
+        assert (
+            "(71.2 ms RMS of all) and the device clock stopped or the path delay increased" in text
+        )
         assert "glove_left: times" not in text
 
 
