@@ -216,7 +216,7 @@ class CellJudge:
             loaded = history.last > self._lowest + margin
             dead, stuck = np.zeros_like(exists), self._stuck(loaded)
         else:
-            # A cell that was out of order from the start tells nothing of its own rest.
+            # The rest level of a cell that was faulty from the start is unknown: use the median.
             rest = float(np.median(self._lowest[exists])) if exists.any() else 0.0
             loaded = history.last > rest + margin
             history.find_silent(self._moved_around(exists, self._grid))

@@ -22,7 +22,7 @@ RESIDUAL_LIMITS_S = (4e-3, 10e-3)
 STEP_NS = 4_000_000
 HOUR_NS = 3_600_000_000_000
 STEP_SHOWN_NS = 60_000_000_000
-# Two ways of seeing one step: what comes within this time of a known step is the same one.
+# A step is detected in two ways; detections within this time are the same step.
 SAME_STEP_NS = 2_500_000_000
 STEPS_ERROR = 3
 MIN_RESIDUALS = 30
@@ -37,7 +37,7 @@ RATE_SHARE = 0.02
 DEPARTURE_NS = 500_000
 BORNE_OUT_NS = 5_000_000_000
 BINS = 10
-# Counting bears delays up to most of a period; what comes near is told.
+# Counting tolerates delays of almost a period; warn before that.
 RESIDUAL_SHARES = (0.25, 0.5)
 
 

@@ -25,7 +25,7 @@ class EventLog:
     """
 
     def __init__(self) -> None:
-        # Filled, not zeroed: what is only zeroed takes no memory before it is written.
+        # Filled, not zeroed: zeroed pages take no memory before they are written.
         self._ring = np.full(MAX_EVENTS, 1, dtype=_EVENT)
         self._num_added = 0
         # Names of streams by the number that stands in the ring, and the other way round.

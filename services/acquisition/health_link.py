@@ -120,7 +120,7 @@ class LinkJudge:
     ) -> tuple[tuple[HealthFinding, ...], dict[str, float]]:
         expected = round(self._descriptor.nominal_rate_hz * WINDOW_NS * 1e-9)
         packets = max(expected, last.packets - first.packets + last.lost - first.lost)
-        # An overtaken packet is taken off what is lost when it comes.
+        # A late packet is no longer counted as lost once it arrives.
         lost = max(0, last.lost - first.lost) / packets
         damaged = last.damaged - first.damaged
         refused = last.refused - first.refused

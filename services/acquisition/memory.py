@@ -29,7 +29,7 @@ def keep_for_life() -> None:
     small.clear()
     gc.collect()
     gc.freeze()
-    # Python looks again when what is young has grown by a quarter of what it found here.
+    # The next full collection starts when young objects exceed a quarter of these.
     gc.collect()
 
 

@@ -28,7 +28,7 @@ PERIOD_NS = 1_000_000_000
 MAX_BACK_OFF = 5
 # Samples kept between two looks, some seconds of the fastest glove; what falls out is not needed.
 KEPT_SAMPLES = 2048
-# What a step of the device's clock leaves is not told before so much came after it.
+# After a step of the device's clock, no latency is reported before so many samples.
 MIN_EXCHANGES = 5
 MIN_SAMPLES = 120
 WINDOW_S = 60.0

@@ -18,7 +18,7 @@ PROTOCOL: Final = "dextouch-bridge"
 PROTOCOL_VERSION = 1
 MAX_HELLO_BYTES = 16384
 MAX_AGE_NS = 200_000_000
-# A clock that goes back further than this was set anew; less is a sample that is not new.
+# A larger decrease of the clock is a restart; a smaller one is an old sample.
 RESTART_NS = 1_000_000_000
 # How fast a source's clock may drift away from the host's before its data counts as old.
 MAX_DRIFT_PPM = 200

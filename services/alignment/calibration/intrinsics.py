@@ -23,7 +23,7 @@ MIN_VIEWS = 5
 # Views from one direction alone cannot tell focal length from distance.
 MIN_TILT_SPREAD_RAD = np.deg2rad(15.0)
 MAX_FOCAL_SIGMA = 0.05
-# What is advised, beyond what is required.
+# Recommended, more than required.
 GOOD_VIEWS = 15
 GOOD_FOCAL_SIGMA = 0.003
 PARTS = (

@@ -16,7 +16,7 @@ MAX_STEP = 1.0
 SMALLEST_STEP = 1e-3
 # The declared noise is trusted to a factor of four (one sigma): exp(1.4).
 PRIOR_LOG_SIGMA = 1.4
-# No variance is taken for smaller than this share of what was declared.
+# Lower bound of a variance, as a share of the declared one.
 MIN_SHARE = 1e-6
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float64
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side, select_taxels
 
-# One second of a 60 Hz glove: below that, slow noise cannot be told from the zero.
+# One second of a 60 Hz glove; with less, drift cannot be separated from the zero.
 MIN_SAMPLES = 60
 NUM_BLOCKS = 10
 # Readings further than this from the median (in robust standard deviations) are knocks.

@@ -104,7 +104,7 @@ class HandRetargeter:
         self._person = self._person_of(profile)
         self._memory = self._blank()
         self._was_sent = False
-        # Of `step`, which is called often: what need not be made anew.
+        # Buffers of `step`, which is called often.
         self._scratch = np.zeros(1, dtype=SCRATCH)
         self._elapsed_s = np.zeros(1)
 

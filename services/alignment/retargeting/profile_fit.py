@@ -34,12 +34,12 @@ NUM_SAMPLES = 240
 # Below this a tracker's noise makes no difference, and ratios of zeros would come up (metres).
 LEAST_SIGMA_M = 1e-4
 # A knuckle's spread is the difference of two variances, each known to some 8 % from 240 samples:
-# less than this share of the tracker's noise cannot be told from none.
+# less than this share of the tracker's noise is indistinguishable from none.
 LEAST_SIGMA_SHARE = 0.3
 # Standard deviations within which 95 of 100 points of a normal distribution in space lie.
 CHI_95 = 2.7955
 LEAST_KNUCKLE_SIGMA_M = 1e-5
-# A robot's knuckle that moved less than this (RMS, metres) tells nothing about its travel.
+# A robot's knuckle that moved less than this (RMS, metres) does not determine its travel.
 LEAST_TRAVEL_M = 1e-3
 UNKNOWN_FREEDOM = 1e6
 # Of a robot's finger; shorter is none.

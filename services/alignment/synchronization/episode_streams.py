@@ -102,7 +102,7 @@ def _image_blocks(
         first = max(0, first - int(kept[first]) % GOP_IMAGES)
         begins_group = int(kept[first]) % GOP_IMAGES == 0
         if not begins_group or int(kept[stop - 1] - kept[first]) != stop - 1 - first:
-            # Images without a time of their own lie between: what is left is no group any more.
+            # Images without a timestamp are in between: the rest is not a complete group.
             quality[f"{stream.name}_num_images_encoded_anew"] = float(stop - first)
             yield from stream.pieces(first, stop)
             return

@@ -80,7 +80,7 @@ def _retarget(
     t_s = (t_ns - t_ns[0]).astype(np.float64) / NS_PER_S
     result = retargeter.retarget(keypoints_m, t_s=t_s)
     near = GridPlacement(at.left - first, at.weight, at.valid)
-    # Beyond the first or last sample the line goes on, and could leave the limits.
+    # Extrapolation beyond the first or last sample could exceed the limits.
     hand = retargeter.hand
     joints_rad = np.clip(vectors_on_grid(result.joints_rad, near), hand.lower_rad, hand.upper_rad)
     return joints_rad, _quality(side, result, near)

@@ -186,7 +186,7 @@ def _whole_commit(stage: Path) -> CommitRecord | None:
     try:
         return decode_commit(data, what=stage.name)[0]
     except StorageError:
-        # Torn by the crash: what it said is found again in the logs. Or of an older version,
+        # Torn by the crash: its content is recovered from the logs. Or of an older version,
         # which a migration put aside.
         return None
 

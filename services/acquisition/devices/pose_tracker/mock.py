@@ -106,7 +106,7 @@ class TrackedPoses:
         self.t_ns = stream.t_ns
         self.poses = add_pose_noise(stream.values, faults, rng)
         self.states = np.full(len(self.t_ns), int(TrackingState.RUNNING_OK))
-        # The ledger of this source: what is wrong with each sample, "" where nothing is.
+        # The ledger of this source: the fault of each sample, "" if it has none.
         self.labels = np.full(len(self.t_ns), "", dtype="<U8")
         for fault in (*tracking_faults(faults), *tracking):
             during = (self.t_ns >= fault.start_s * 1e9) & (self.t_ns < fault.stop_s * 1e9)

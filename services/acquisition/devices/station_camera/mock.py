@@ -25,7 +25,7 @@ from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.link import Link
 from services.acquisition.mocks.replay import MockDevice, ReplayStream
 
-# V4L2 drivers fill the buffers they are given and lose what comes after.
+# V4L2 drivers fill their buffers and lose later images.
 NUM_BUFFERS = 4
 UNIT_HEADER = struct.Struct("<qHH")
 # With a virtual clock, time must not go on while an image is being encoded.

@@ -31,7 +31,7 @@ from services.acquisition.transports.base import Transport
 
 ANSWER_TIMEOUT_NS = 300_000_000
 NUM_ATTEMPTS = 3
-# A virtual clock stands still while a device is opened; silent reads then measure the waiting.
+# A virtual clock does not advance while a device is opened; count empty reads instead.
 MAX_SILENT_READS = 5
 
 
@@ -170,7 +170,7 @@ class TactileGlove(Driver):
                 self.transport.write(data)
             reply = self._await(number, timeout_ns)
         finally:
-            # Also what came when nobody waited any more: a station asks for months.
+            # Also replies that arrived too late: a station sends requests for months.
             with self._answered:
                 self._asked.discard(number)
                 self._replies.pop(number, None)
