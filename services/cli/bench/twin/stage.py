@@ -81,8 +81,8 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
 def selector_table(times_ms: Mapping[str, Figure]) -> ResultTable:
     """Milliseconds of a chunk, and how many times as fast as it is played."""
     return ResultTable(
-        "A chunk of 16 steps by what is asked to be seen",
-        ("asked", "ms", "times real time"),
+        "A chunk of 16 steps by requested observation",
+        ("requested", "ms", "times real time"),
         [
             (name, figure.text(), figure.inverse(CHUNK_MS).text())
             for name, figure in times_ms.items()

@@ -129,13 +129,13 @@ def _times(
 def _costs(
     world: "ModelWorld", episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
 ) -> dict[str, Figure]:
-    """Milliseconds a chunk of the world as served, by images asked and rollouts together."""
+    """Milliseconds per chunk of the world as served, by requested images and batch size."""
     subjects: dict[str, Callable[[int], Imagined]] = {
-        f"{asked}, {count} together": partial(_together, world, episodes[0], count, selector)
+        f"{asked}, batch of {count}": partial(_together, world, episodes[0], count, selector)
         for count in TOGETHER
         for asked, selector in SELECTORS.items()
     }
-    with bar("images and company", num_rounds * len(subjects)) as step:
+    with bar("requested images and batch sizes", num_rounds * len(subjects)) as step:
         found = interleaved(subjects, num_rounds, on_step=step)
     return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
 

@@ -44,10 +44,10 @@ def error_table(
 
 
 def cost_table(costs_ms: Mapping[str, Figure], served: str) -> ResultTable:
-    """Time of one rollout's chunk by what is asked for and how many step together."""
+    """Time of one rollout's chunk by requested images and batch size."""
     return ResultTable(
-        f"{served}: a chunk of one rollout, by images asked and rollouts in one batch",
-        ("asked", "ms"),
+        f"{served}: a chunk of one rollout, by requested images and batch size",
+        ("requested", "ms"),
         [(name, figure.text()) for name, figure in costs_ms.items()],
     )
 
