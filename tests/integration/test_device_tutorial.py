@@ -1,7 +1,6 @@
 """docs/tutorials/add_a_device.md followed literally: built, installed, recorded and judged."""
 
 import os
-import re
 import shlex
 import subprocess
 import sys
@@ -13,14 +12,9 @@ import pytest
 from dextouch.episodes.spool_reader import SpoolReader
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.calibration.tactile_baseline import TactileCalibration
+from tests.integration.tutorial_page import ROOT, TutorialPage
 
-ROOT = Path(__file__).parents[2]
-PAGE = (ROOT / "docs/tutorials/add_a_device.md").read_text(encoding="utf-8")
-FILES = re.findall(r"\*\*`([\w./-]+)`\*\*\n\n```\w+\n(.*?)```", PAGE, re.DOTALL)
-COMMANDS = [
-    line for text in re.findall(r"```sh\n(.*?)```", PAGE, re.DOTALL) for line in text.splitlines()
-]
-OUTPUT = re.search(r"```text\n(.*?)```", PAGE, re.DOTALL)[1]
+PAGE = TutorialPage.read("add_a_device")
 # Reads the flags of the page's stations as they do, and builds the drivers of the devices.
 STATIONS = """
 import sys
@@ -41,15 +35,11 @@ print(*(m for m in sys.modules if m == "t64_glove.mock" or ".mocks" in m))
 def lab(tmp_path_factory):
     """A folder with the page's files and its package installed below `installed`."""
     folder = tmp_path_factory.mktemp("lab")
-    for path, text in FILES:
-        (folder / path).parent.mkdir(parents=True, exist_ok=True)
-        (folder / path).write_text(text, encoding="utf-8")
-    install = [line for line in COMMANDS if line.startswith("pip install ")]
-    assert len(install) == 1
+    PAGE.write_files(folder)
     # Without a network: the build backend and what the package needs are here already.
     offline = ("--no-build-isolation", "--no-deps", "--no-index", "--no-compile", "--quiet")
     flags = (*offline, "--disable-pip-version-check", "--target", "installed")
-    run(folder, "-m", *shlex.split(install[0]), *flags)
+    run(folder, "-m", *PAGE.command("pip install "), *flags)
     return folder
 
 
@@ -68,7 +58,7 @@ def run(folder, *arguments):
 
 
 def test_the_page_names_every_file_of_a_package():
-    names = [Path(path).name for path, _ in FILES]
+    names = [Path(path).name for path, _ in PAGE.files]
     assert names == [
         *("pyproject.toml", "__init__.py", "settings.py", "packets.py", "kind.py", "mock.py"),
         "record_t64.py",
@@ -76,8 +66,8 @@ def test_the_page_names_every_file_of_a_package():
 
 
 def test_a_take_is_recorded_and_the_dead_cell_is_found(lab):
-    (command,) = (line for line in COMMANDS if line.startswith("python "))
-    assert run(lab, *shlex.split(command)[1:]) == OUTPUT
+    (shown,) = PAGE.outputs
+    assert run(lab, *PAGE.command("python ")[1:]) == shown
     (take,) = (lab / "takes").iterdir()
     spool = SpoolReader(take)
     descriptor = spool.streams["tactile_left"]
@@ -100,7 +90,9 @@ def test_a_take_is_recorded_and_the_dead_cell_is_found(lab):
 
 
 def test_stations_take_its_settings_and_import_no_mock(lab):
-    stations = [shlex.split(line)[2:] for line in COMMANDS if line.startswith("dextouch station ")]
+    stations = [
+        shlex.split(line)[2:] for line in PAGE.commands if line.startswith("dextouch station ")
+    ]
     assert len(stations) == 2
     output = run(lab, "-c", STATIONS.format(flags=stations)).splitlines()
     assert output == ["t64_glove", "tactile_glove glove_left (64,)", ""]
