@@ -17,7 +17,7 @@ from services.world_model.weights import (
     write_weights,
 )
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 METADATA_KEY = "dextouch_state_model"
 _DYNAMICS, _RENDERER = "dynamics.", "renderer."
 

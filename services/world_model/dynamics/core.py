@@ -74,8 +74,8 @@ class RecurrentCore(nn.Module):
         super().__init__()
         self.config = config
         width, channels = config.width, config.touch_channels
-        self.register_buffer("feature_mean", torch.zeros(NUM_FEATURES))
-        self.register_buffer("feature_std", torch.ones(NUM_FEATURES))
+        self.register_buffer("feature_mean", torch.zeros(len(config.tasks), NUM_FEATURES))
+        self.register_buffer("feature_std", torch.ones(len(config.tasks), NUM_FEATURES))
         static = _OBJECT_SIZE + NUM_PADS + len(config.tasks) + 1
         self.enter = nn.Sequential(
             nn.Linear(NUM_FEATURES + static, width),
@@ -118,12 +118,21 @@ class RecurrentCore(nn.Module):
             start: of the rollout, the same for all its chunks.
             state: from `first_state` or from the chunk before.
         """
-        scaled = (features - self.feature_mean) / self.feature_std
-        scaled = scaled.clamp(-MAX_DEVIATION, MAX_DEVIATION)
+        scaled = self.scaled(features, start.task).clamp(-MAX_DEVIATION, MAX_DEVIATION)
         static = self._static(start)[:, None].expand(-1, features.shape[1], -1)
         entered = self.dropout(self.enter(torch.cat([scaled, static], dim=-1)))
         hidden, state = self.memory(entered, state)
         return self._decoded(hidden, start), state
+
+    def scaled(
+        self, features: Float32[Tensor, "batch latents features"], task: Int64[Tensor, " batch"]
+    ) -> Float32[Tensor, "batch latents features"]:
+        """Features in standard deviations from the mean of their task.
+
+        Tasks hold their hands elsewhere: in units of all tasks together, the millimetres that
+        decide one of them would be too small to be learned from.
+        """
+        return (features - self.feature_mean[task][:, None]) / self.feature_std[task][:, None]
 
     def _static(self, start: SceneStart) -> Float32[Tensor, "batch static"]:
         objects = start.objects

@@ -207,7 +207,10 @@ class DynamicsModel(nn.Module):
         """Some latent steps during all of which the same entries are at rest."""
         features = [_features(commands, start.objects) for start in memory.start]
         distance = torch.stack(
-            [_distance(f, m.core) for f, m in zip(features, self._members(), strict=True)]
+            [
+                _distance(member.core.scaled(f, start.task))
+                for member, f, start in zip(self._members(), features, memory.start, strict=True)
+            ]
         ).mean(0)
         resting = _resting(memory, distance)
         if bool(at_rest.all()):
@@ -280,10 +283,9 @@ def _features(commands: Commands, objects: ObjectPoses) -> Float32[Tensor, "batc
     return command_features(commands.points_m, commands.axes, commands.joints_rad, objects)
 
 
-def _distance(features: Tensor, core: RecurrentCore) -> Float32[Tensor, "batch latents"]:
-    """Mean excess of features over the range that the core sees unclipped."""
-    scaled = ((features - core.feature_mean) / core.feature_std).abs()
-    return (scaled - MAX_DEVIATION).clamp_min(0.0).mean(2)
+def _distance(scaled: Float32[Tensor, "batch latents f"]) -> Float32[Tensor, "batch latents"]:
+    """Mean excess of scaled features over the range that the core sees unclipped."""
+    return (scaled.abs() - MAX_DEVIATION).clamp_min(0.0).mean(2)
 
 
 def _spread_m(poses: list[ObjectPoses]) -> Float32[Tensor, "*batch"]:

@@ -22,6 +22,8 @@ from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
 _FIT_EPISODES = 400
+# Added to the deviation of features, some of which hardly change within a task.
+_LEAST_DEVIATION = 0.05
 # How much more often hands are held still at later starts, of which fewer are free to be.
 _LATER_HELD = 2.5
 # Objects that moved less than this in the latent step before lie still.
@@ -102,16 +104,17 @@ def train_core(
 
 @torch.no_grad()
 def fit_features(core: RecurrentCore, table: SceneTable) -> None:
-    """Mean and deviation of command features over the training episodes."""
-    known = torch.nonzero(table.labelled)[:, 0]
-    rows = known[:: max(1, len(known) // _FIT_EPISODES)]
-    commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
-    objects = table.objects_at(rows, 0)
-    features = command_features(
-        commands.points_m, commands.axes, commands.joints_rad, objects
-    ).flatten(0, 1)
-    core.feature_mean.copy_(features.mean(0))
-    core.feature_std.copy_(features.std(0) + 0.05)
+    """Mean and deviation of command features over the training episodes of each task."""
+    for task in range(len(core.config.tasks)):
+        known = torch.nonzero(table.labelled & (table.task == task))[:, 0]
+        rows = known[:: max(1, len(known) // _FIT_EPISODES)]
+        commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
+        objects = table.objects_at(rows, 0)
+        features = command_features(
+            commands.points_m, commands.axes, commands.joints_rad, objects
+        ).flatten(0, 1)
+        core.feature_mean[task] = features.mean(0)
+        core.feature_std[task] = features.std(0) + _LEAST_DEVIATION
 
 
 def start_steps(table: SceneTable) -> list[int]:

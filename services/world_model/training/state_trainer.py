@@ -51,8 +51,8 @@ from services.world_model.training.scene_episodes import (
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
-# Goes up with every change of training that makes other weights of the same settings and data.
-TRAINING_VERSION = 3
+# Each goes up with a change of training that makes other weights of the same settings and data.
+READER_VERSION, CORE_VERSION, RENDERER_VERSION = 3, 4, 3
 # The renderer learns from this many episodes at most: it sees few of their images anyway.
 MAX_CLIPS = 1500
 _LOG_EVERY = 500
@@ -150,23 +150,25 @@ class _Work:
 
     def reader_file(self, member: int) -> Path:
         """Where a member's finished reader is kept; other settings or data have other names."""
-        return self.parts / f"reader-{self._key('reader')}-{member}.safetensors"
+        return self.parts / f"reader-{self._key(READER_VERSION, 'reader')}-{member}.safetensors"
 
     def core_file(self, member: int) -> Path:
         """Where a member's finished core is kept, which has learned with that member's reader."""
-        return self.parts / f"core-{self._key('width', 'reader', 'core')}-{member}.safetensors"
+        key = self._key(CORE_VERSION, "width", "reader", "core")
+        return self.parts / f"core-{key}-{member}.safetensors"
 
     @property
     def renderer_file(self) -> Path:
         """Where the finished renderer is kept."""
-        return self.parts / f"renderer-{self._key('renderer', 'drawing')}.safetensors"
+        key = self._key(RENDERER_VERSION, "renderer", "drawing")
+        return self.parts / f"renderer-{key}.safetensors"
 
-    def _key(self, *names: str) -> str:
+    def _key(self, version: int, *names: str) -> str:
         """A digest of the data and of those settings that make other weights."""
         chosen = self.settings.model_dump_json(
             include={"seed", "heldout_share", "labelled_share", *names}
         )
-        text = f"{TRAINING_VERSION} {chosen} {self.data_hash}"
+        text = f"{version} {chosen} {self.data_hash}"
         return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 

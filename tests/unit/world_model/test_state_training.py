@@ -15,6 +15,7 @@ from dextouch.geometry.transforms import apply, invert, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore
+from services.world_model.dynamics.features import command_features
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.dynamics.touch_codec import TouchCodec
@@ -30,6 +31,7 @@ from services.world_model.training.core_training import (
     _draw,
     _is_settled,
     core_loss,
+    fit_features,
     start_steps,
     touch_latents,
     train_core,
@@ -199,6 +201,33 @@ def test_cores_begin_anywhere_up_to_the_last_latent_step(config):
     latest = next(batch for batch in drawn if batch.start_step == 76)
     assert len(latest.commands) == 2
     assert torch.isfinite(core_loss(core, data, latest, settings))
+
+
+def test_each_task_has_features_in_units_of_its_own():
+    config = DynamicsConfig(tasks=("lift", "press"), num_objects=(1, 1), image_px=PX, width=32)
+    tasks = [("press", "lift")[seed % 2] for seed in range(8)]
+    episodes = [dataclasses.replace(episode(seed), task=task) for seed, task in enumerate(tasks)]
+    # Hands that stay where they are: hardly any feature changes within "lift".
+    still = [
+        dataclasses.replace(one, actions=np.repeat(one.actions[:1], len(one.actions), axis=0))
+        for one in episodes
+        if one.task == "lift"
+    ]
+    table = scene_table([one for one in episodes if one.task == "press"] + still, config)
+    core = RecurrentCore(config)
+    fit_features(core, table)
+    for task in (0, 1):
+        rows = torch.nonzero(table.task == task)[:, 0]
+        commands = table.commands(rows, 0, torch.zeros(len(rows), dtype=torch.bool))
+        features = command_features(
+            commands.points_m, commands.axes, commands.joints_rad, table.objects_at(rows, 0)
+        )
+        seen = features.numpy().reshape(-1, features.shape[-1])
+        np.testing.assert_allclose(core.feature_mean[task], seen.mean(0), atol=1e-5)
+        scaled = core.scaled(features, table.task[rows]).numpy().reshape(seen.shape)
+        wanted = (seen - seen.mean(0)) / (seen.std(0, ddof=1) + 0.05)
+        np.testing.assert_allclose(scaled, wanted, atol=1e-4)
+    assert core.feature_std[0].sum() < 0.9 * core.feature_std[1].sum()
 
 
 def test_hands_are_held_still_only_where_nothing_would_happen(config):
