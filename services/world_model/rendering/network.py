@@ -82,19 +82,16 @@ class RendererNetwork(nn.Module):
         Blocks are not moved side by side for it: the same sum is a convolution of the fine pixels
         with stride 2, whose kernel is the stem's with its channels laid out as pixels.
         """
-        dtype, rim = self.stem.weight.dtype, self.stem.weight.shape[-1] // 2
-        # In float32, because a sum of two parts that are rounded apart is not the rounded sum.
-        weight, bias = self.stem.weight.float(), self.stem.bias
-        fine, coarse = (planes.to(dtype).float() for planes in (inputs.fine, inputs.coarse))
+        weight, rim = self.stem.weight, self.stem.weight.shape[-1] // 2
+        fine, coarse = (
+            planes.to(weight.dtype, memory_format=torch.channels_last)
+            for planes in (inputs.fine, inputs.coarse)
+        )
         split = 4 * FINE_CHANNELS
         kernel = functional.pixel_shuffle(weight[:, :split], 2)
-        entered = functional.conv2d(
-            fine, kernel, None if bias is None else bias.float(), stride=2, padding=2 * rim
-        )
+        entered = functional.conv2d(fine, kernel, self.stem.bias, stride=2, padding=2 * rim)
         entered = entered.add_(functional.conv2d(coarse, weight[:, split:], padding=rim))
-        # Under autocast weights are float32 and sums narrower already.
-        narrowed = entered if dtype == torch.float32 else entered.to(dtype)
-        return narrowed.contiguous(memory_format=torch.channels_last)
+        return entered.contiguous(memory_format=torch.channels_last)
 
     def _unet(self, x: Tensor) -> Tensor:
         passed = []
