@@ -77,21 +77,12 @@ class RendererNetwork(nn.Module):
         return warped + inputs.change * mixed
 
     def _entered(self, inputs: DrawingInputs) -> Float[Tensor, "n width rows cols"]:
-        """The stem: a convolution of all channels, each 2×2 block of fine pixels side by side.
-
-        Blocks are not moved side by side for it: the same sum is a convolution of the fine pixels
-        with stride 2, whose kernel is the stem's with its channels laid out as pixels.
-        """
-        weight, rim = self.stem.weight, self.stem.weight.shape[-1] // 2
-        fine, coarse = (
-            planes.to(weight.dtype, memory_format=torch.channels_last)
-            for planes in (inputs.fine, inputs.coarse)
-        )
-        split = 4 * FINE_CHANNELS
-        kernel = functional.pixel_shuffle(weight[:, :split], 2)
-        entered = functional.conv2d(fine, kernel, self.stem.bias, stride=2, padding=2 * rim)
-        entered = entered.add_(functional.conv2d(coarse, weight[:, split:], padding=rim))
-        return entered.contiguous(memory_format=torch.channels_last)
+        """The stem: a convolution of all channels, each 2×2 block of fine pixels side by side."""
+        dtype = self.stem.weight.dtype
+        fine = functional.pixel_unshuffle(inputs.fine.to(dtype), 2)
+        planes = torch.cat([fine, inputs.coarse.to(dtype)], dim=1)
+        entered: Tensor = self.stem(planes.contiguous(memory_format=torch.channels_last))
+        return entered
 
     def _unet(self, x: Tensor) -> Tensor:
         passed = []
