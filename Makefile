@@ -74,10 +74,10 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state
 		--checkpoint $(MADE)/state.safetensors
 	$(BIN)/dextouch train probe --episodes $(MADE)/train --episodes $(MADE)/judge --episodes $(MADE)/imagined \
 		--development $(MADE)/development --development $(MADE)/imagined_development \
-		--output $(MADE)/success_probe.safetensors --training.num_training_steps 1500 --training.held_out_share 0.1
+		--output $(MADE)/success_probe.safetensors --training.num-training-steps 1500 --training.held-out-share 0.1
 	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8
-	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early_at 0.1 \
-		--training.num_training_steps 3600 --training.max_cpu_s 150 --output $(MADE)/cloned.safetensors
+	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early-at 0.1 \
+		--training.num-training-steps 3600 --training.max-cpu-s 150 --output $(MADE)/cloned.safetensors
 	$(BIN)/dextouch bench evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
 		--cloned cloned=$(MADE)/cloned.safetensors --cloned "cloned early=$(MADE)/cloned_early.safetensors" \
 		--first-seed 30020 --starts 40 --repeats docs/evaluator.json --keep $(MADE)/evaluator --out $(MADE)/bench

@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, field_validator
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 from services.acquisition.devices.registry import kind_names
 
@@ -30,11 +30,21 @@ class MockLinks(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    gloves: str = "tactile_glove"
-    trackers: Literal["hid", "usb", "bridge"] = "hid"
-    wrists: Literal["robot", "trackers"] = "robot"
-    cameras: Literal["bridge", "station"] = "bridge"
-    images: Literal["rgb8", "jpeg", "h264"] = "rgb8"
+    gloves: str = Field(
+        default="tactile_glove", description="kind of both gloves, ours or of another package"
+    )
+    trackers: Literal["hid", "usb", "bridge"] = Field(
+        default="hid", description="how finger and pose trackers are connected"
+    )
+    wrists: Literal["robot", "trackers"] = Field(
+        default="robot", description="what gives the poses of the wrists"
+    )
+    cameras: Literal["bridge", "station"] = Field(
+        default="bridge", description="images over a socket, or from a camera on the station's bus"
+    )
+    images: Literal["rgb8", "jpeg", "h264"] = Field(
+        default="rgb8", description="how images are encoded"
+    )
 
     @field_validator("gloves")
     @classmethod

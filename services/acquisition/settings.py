@@ -13,36 +13,63 @@ from services.acquisition.supervisor import SpoolSafety
 
 
 class AcquisitionSettings(ServiceSettings):
-    """One station.
+    """Record the gloves, trackers, robots and cameras of a station, and serve them over HTTP.
 
-    With `mock` the devices are simulated: they play the episode `mock_episode_id` of the local
-    store `mock_store` round and round, or a made-up pattern when no episode is named, connected
-    as `mock_links` says, without faults or, as in the demo, with those of an ordinary station
-    (`mock_faults=first_light`: its losses are findings of the health). Otherwise `devices` names
-    the real ones, and `calibration` a JSON file of named matrices.
+    Real devices are named by --devices. With --mock they are simulated: they play an episode of a
+    local store round and round, or a made-up pattern when none is named.
 
-    Takes are flushed to the disk every `flush_period_s`, the most that a power loss can lose. One
-    ends when less than `min_free_bytes` are left on the disk of the `spool`, and none begins then.
+    Example:
+      dextouch station serve --mock --port 8083 --spool data/spool
     """
 
-    model_config = service_config("acquisition")
+    model_config = service_config("acquisition", "dextouch station serve")
 
-    station: str = Field(default="station", min_length=1, max_length=128)
-    spool: Path = Field(default_factory=default_spool)
-    flush_period_s: float = Field(default=SpoolSafety.flush_period_s, gt=0, le=3600)
-    min_free_bytes: int = Field(default=SpoolSafety.min_free_bytes, ge=0)
-    mock: bool = False
-    mock_store: str | None = None
-    mock_episode_id: str | None = None
-    mock_faults: Literal["none", "first_light"] = "none"
+    station: str = Field(
+        default="station",
+        min_length=1,
+        max_length=128,
+        description="name of the station, as recordings carry it",
+    )
+    spool: Path = Field(default_factory=default_spool, description="folder of the takes")
+    flush_period_s: float = Field(
+        default=SpoolSafety.flush_period_s,
+        gt=0,
+        le=3600,
+        description="seconds between two flushes to the disk, the most that a power loss can lose",
+    )
+    min_free_bytes: int = Field(
+        default=SpoolSafety.min_free_bytes,
+        ge=0,
+        description="a take ends, and none begins, when less is left on the spool's disk",
+    )
+    mock: bool = Field(default=False, description="simulate the devices")
+    mock_store: str | None = Field(
+        default=None, description="local store of the episode that mock devices play"
+    )
+    mock_episode_id: str | None = Field(
+        default=None, description="episode that mock devices play (a made-up pattern)"
+    )
+    mock_faults: Literal["none", "first_light"] = Field(
+        default="none", description="first_light: losses, delays and drifts of an ordinary station"
+    )
     mock_links: MockLinks = MockLinks()
-    seed: int = Field(default=0, ge=0)
-    devices: tuple[ChosenDevice, ...] = ()
-    calibration: Path | None = None
-    episode_store_url: str | None = None
-    episode_store_key: SecretStr | None = None
-    upload_period_s: float = Field(default=2.0, gt=0, le=3600)
-    keep_uploaded: bool = True
+    seed: int = Field(default=0, ge=0, description="of everything random in mock devices")
+    devices: tuple[ChosenDevice, ...] = Field(
+        default=(), description="real devices, see docs/stations.md"
+    )
+    calibration: Path | None = Field(
+        default=None, description="JSON file of named matrices, see docs/calibration_guide.md"
+    )
+    episode_store_url: str | None = Field(default=None, description="where takes are uploaded to")
+    episode_store_key: SecretStr | None = Field(
+        default=None, description="bearer key of the episode store"
+    )
+    upload_period_s: float = Field(
+        default=2.0, gt=0, le=3600, description="seconds between two looks for takes to upload"
+    )
+    keep_uploaded: bool = Field(
+        default=True, description="keep takes in the spool when they are uploaded"
+    )
 
     @model_validator(mode="after")
     def _mock_or_devices(self) -> "AcquisitionSettings":

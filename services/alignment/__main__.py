@@ -1,7 +1,6 @@
 """Command line of `dextouch align`: align recordings, report on them, or serve over HTTP."""
 
 import argparse
-import json
 import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -12,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, TaskID, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.progress import Progress as Bars
 
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.hands.hand_files import load_hand
@@ -63,27 +63,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
-    layout = argparse.RawDescriptionHelpFormatter
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="dextouch align",
         description="Make synchronized, retargeted episodes of recordings, in the same store.",
         epilog=EPILOG,
-        formatter_class=layout,
     )
-    shared = argparse.ArgumentParser(add_help=False)
+    shared = CommandParser(add_help=False)
     shared.add_argument(
-        "--store", default=settings.store_url, help="URL or folder of the episode store"
+        "--store", default=settings.store_url, metavar="URL", help="the store (%(default)s)"
     )
-    shared.add_argument(
-        "--json", type=Path, metavar="PATH", help="also write the reports to this file"
-    )
+    add_json(shared)
     commands = parser.add_subparsers(
         dest="command", required=True, metavar="{run,report,retarget,serve}"
     )
     running = commands.add_parser(
-        "run", parents=[shared], help="align recordings", epilog=EPILOG, formatter_class=layout
+        "run",
+        parents=[shared],
+        help="align recordings",
+        description="Align recordings; those that have an episode are left as they are.",
+        epilog=EPILOG,
     )
-    running.add_argument("recordings", nargs="*", metavar="RECORDING_ID")
+    running.add_argument("recordings", nargs="*", metavar="ID", help="of a recording")
     running.add_argument("--all", action="store_true", help="all recordings without an episode")
     running.add_argument(
         "--workers",
@@ -92,7 +92,13 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
         metavar="N",
         help="recordings at once, each in a process of its own (default: one a processor)",
     )
-    report = commands.add_parser("report", parents=[shared], help="report on an aligned recording")
+    report = commands.add_parser(
+        "report",
+        parents=[shared],
+        help="report on an aligned recording",
+        description="Show clocks, retargeting and what was left out of an episode, and why.",
+        epilog="example:\n  dextouch align report take-7 --json report.json",
+    )
     report.add_argument("id", metavar="ID", help="of a recording or of its episode")
     other = commands.add_parser(
         "retarget",
@@ -103,7 +109,6 @@ def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
         epilog="example:\n  dextouch align retarget take-7 --model allegro_right.urdf \\\n"
         "    --mapping allegro_right.toml --to take-7_allegro.npz\n\n"
         "The mapping is described in docs/hands.md.",
-        formatter_class=layout,
     )
     other.add_argument("id", metavar="ID", help="of an episode, or of its recording")
     other.add_argument("--model", type=Path, required=True, metavar="FILE", help="URDF or MJCF")
@@ -133,7 +138,7 @@ def _serve(arguments: list[str]) -> int:
 
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     if parsed.all == bool(parsed.recordings):
-        raise InvalidInputError("run: expected either RECORDING_ID … or --all; see run --help")
+        raise InvalidInputError("run: expected either ID … or --all; see run --help")
     outcomes: list[Outcome] = []
     wanted = list(dict.fromkeys(parsed.recordings))
     if parsed.all:
@@ -153,7 +158,8 @@ def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
             _print_outcome(outcome, console)
     if not outcomes:
         console.print("nothing to do: every recording has its episode")
-    _write_json(parsed.json, [outcome.report for outcome in outcomes if outcome.report])
+    reports = [json_ready(outcome.report) for outcome in outcomes if outcome.report]
+    write_result(parsed.json, reports)
     return EXIT_REFUSED if any(outcome.error for outcome in outcomes) else 0
 
 
@@ -194,7 +200,7 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     report = find_report(EpisodeStore(parsed.store), parsed.id, settings.options)
     width = None if sys.stdout.isatty() else PAGE_WIDTH
     Console(highlight=False, width=width).print(report_page(report))
-    _write_json(parsed.json, [report])
+    write_result(parsed.json, [json_ready(report)])
     return 0
 
 
@@ -213,8 +219,7 @@ def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
         "tip_error_mm": tip_error_mm if math.isfinite(tip_error_mm) else None,
         "path": str(parsed.to),
     }
-    if parsed.json is not None:
-        parsed.json.write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    write_result(parsed.json, facts)
     print(
         f"{parsed.to}: {len(motion.joint_names)} joints of the {motion.side} hand in "
         f"{len(motion.t_ref_ns)} samples, {motion.share_solved:.1%} solved"
@@ -242,12 +247,6 @@ def find_episode(store: EpisodeStore, item_id: str, options: AlignmentOptions) -
     if store.exists(item_id):
         return store.open(item_id)
     return store.open(episode_id_of(store.recording(item_id), options))
-
-
-def _write_json(path: Path | None, reports: Sequence[AlignmentReport]) -> None:
-    if path is not None:
-        content = json.dumps([json_ready(report) for report in reports], indent=2)
-        path.write_text(content + "\n", encoding="utf-8")
 
 
 COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {

@@ -269,7 +269,7 @@ class JobDatabase:
         except BlockingIOError as error:
             raise ConflictError(
                 f"alignment jobs in {self._path.parent}: another alignment service uses them; stop "
-                "it, or give this one a --jobs_folder of its own"
+                "it, or give this one a --jobs-folder of its own"
             ) from error
 
     def _prepare(self, connection: sqlite3.Connection) -> None:

@@ -14,9 +14,16 @@ class AlignmentOptions(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    model_rate_hz: float = Field(default=15.0, gt=0, le=1000)
-    max_gap_ms: float = Field(default=50.0, gt=0, le=10_000)
-    min_num_steps: int = Field(default=17, ge=2)
+    model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="of the action grid")
+    max_gap_ms: float = Field(
+        default=50.0,
+        gt=0,
+        le=10_000,
+        description="samples further apart are not interpolated between",
+    )
+    min_num_steps: int = Field(
+        default=17, ge=2, description="shorter stretches without a gap become no episode"
+    )
 
     @property
     def max_gap_ns(self) -> int:

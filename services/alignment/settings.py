@@ -16,29 +16,50 @@ def usable_cores() -> int:
 
 
 class AlignmentSettings(ServiceSettings):
-    """Settings of the alignment service.
+    """Serve alignment over HTTP, and align recordings that arrive in a store.
 
-    `store_url` is the folder that the episode store writes to; `jobs_folder` holds the jobs,
-    `.alignments` in the store if not given; `options` are the defaults of a request; `num_workers`
-    alignments run at once, each in a separate process (by default one per processor), `max_waiting`
-    more may wait, `max_kept` are remembered; a job whose process died `max_attempts` times is
-    failed.
+    The options are the defaults of a request.
 
-    With `align_new`, recordings that arrive in the store are aligned by themselves, each once; the
-    store is listed every `look_period_s` (2 s for a folder, 30 s for a bucket if not given).
+    Example:
+      dextouch align serve --store-url data/store --port 8082
     """
 
-    model_config = service_config("alignment")
+    model_config = service_config("alignment", "dextouch align serve")
 
-    store_url: str = Field(default_factory=default_store, min_length=1)
-    jobs_folder: Path | None = None
+    store_url: str = Field(
+        default_factory=default_store,
+        min_length=1,
+        description="store that recordings arrive in: folder, file:///… or s3://…",
+    )
+    jobs_folder: Path | None = Field(
+        default=None, description="folder of the jobs (.alignments in the store)"
+    )
     options: AlignmentOptions = AlignmentOptions()
-    num_workers: int = Field(default_factory=usable_cores, ge=1, le=64)
-    max_waiting: int = Field(default=10_000, ge=1, le=100_000)
-    max_kept: int = Field(default=10_000, ge=1, le=100_000)
-    max_attempts: int = Field(default=3, ge=1, le=100)
-    align_new: bool = True
-    look_period_s: float | None = Field(default=None, gt=0, le=3600)
+    num_workers: int = Field(
+        default_factory=usable_cores,
+        ge=1,
+        le=64,
+        description="alignments at once, each in a process of its own (one a core)",
+    )
+    max_waiting: int = Field(default=10_000, ge=1, le=100_000, description="jobs that may wait")
+    max_kept: int = Field(
+        default=10_000, ge=1, le=100_000, description="finished jobs that are remembered"
+    )
+    max_attempts: int = Field(
+        default=3,
+        ge=1,
+        le=100,
+        description="starts of a job whose process died, until it is failed",
+    )
+    align_new: bool = Field(
+        default=True, description="align every recording that arrives in the store"
+    )
+    look_period_s: float | None = Field(
+        default=None,
+        gt=0,
+        le=3600,
+        description="seconds between two listings of the store (2 for a folder, 30 for a bucket)",
+    )
 
     @property
     def period_s(self) -> float:

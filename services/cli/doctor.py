@@ -1,9 +1,7 @@
 """Command `dextouch doctor`: checks what DexTouch can do on this machine."""
 
-import argparse
 import ctypes.util
 import importlib.util
-import json
 import os
 import platform
 import shutil
@@ -11,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from dextouch.command_line import CommandParser, add_json, write_result
 from services.cli.extras import install_hint
 
 
@@ -74,8 +73,13 @@ def _with_access(device: Path) -> str:
 
 def main(argv: Sequence[str]) -> int:
     """Print the findings; returns 1 if something required is missing."""
-    parser = argparse.ArgumentParser(prog="dextouch doctor", description=__doc__)
-    parser.add_argument("--json", type=Path, help="write the findings to this JSON file")
+    parser = CommandParser(
+        prog="dextouch doctor",
+        description="Check Python, packages, disk and devices of this machine, without changing "
+        "anything. Exits with status 1 if something required is missing.",
+        epilog="example:\n  dextouch doctor --json doctor.json",
+    )
+    add_json(parser)
     arguments = parser.parse_args(list(argv))
     findings = examine()
     width = max(len(finding.what) for finding in findings)
@@ -83,6 +87,5 @@ def main(argv: Sequence[str]) -> int:
         mark = "ok     " if finding.ok else "MISSING"
         hint = f"  → {finding.do}" if not finding.ok and finding.do else ""
         print(f"{mark}  {finding.what:<{width}}  {finding.found}{hint}")
-    if arguments.json:
-        arguments.json.write_text(json.dumps([asdict(f) for f in findings], indent=2))
+    write_result(arguments.json, [asdict(finding) for finding in findings])
     return 0 if all(finding.ok for finding in findings) else 1

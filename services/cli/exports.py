@@ -1,9 +1,7 @@
 """Commands `dextouch export` and `dextouch import` for formats of other tools."""
 
 import argparse
-import json
 import shutil
-import textwrap
 import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,6 +11,7 @@ from typing import NamedTuple
 from rich.console import Console
 from rich.progress import track
 
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
 from dextouch.errors import (
@@ -227,36 +226,37 @@ def main(argv: Sequence[str]) -> int:
     word, *rest = argv
     options = (_export_parser() if word == "export" else _import_parser()).parse_args(rest)
     report = _export(options) if word == "export" else _import(options)
-    if options.json is not None:
-        options.json.write_text(json.dumps(report, indent=2) + "\n", encoding="utf-8")
+    write_result(options.json, report)
     return 0
 
 
 def _parser(word: str, does: str, more: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog=f"dextouch {word}",
-        description=does,
-        epilog=textwrap.dedent(more),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = CommandParser(prog=f"dextouch {word}", description=does, epilog=more)
     parser.add_argument(
         "--store", metavar="URL", default=default_store(), help="the store (%(default)s)"
     )
-    parser.add_argument("--json", type=Path, metavar="PATH", help="write the result there as well")
+    add_json(parser)
     return parser
 
 
 def _export_parser() -> argparse.ArgumentParser:
     parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
     parser.add_argument("ids", nargs="*", metavar="ID", help="default: all that match the filters")
-    parser.add_argument("--format", required=True, choices=sorted([*_SINGLE, *_JOINT]))
+    parser.add_argument(
+        "--format", required=True, choices=sorted([*_SINGLE, *_JOINT]), help="of what is written"
+    )
     parser.add_argument(
         "--to", required=True, type=Path, metavar="PATH", help="file; mcap and rrd: or a folder"
     )
-    parser.add_argument("--kind", choices=("episode", "recording"), default="episode")
-    parser.add_argument("--task", help="only of this task")
+    parser.add_argument(
+        "--kind",
+        choices=("episode", "recording"),
+        default="episode",
+        help="what the ids name (%(default)s)",
+    )
+    parser.add_argument("--task", metavar="TASK", help="only of this task")
     parser.add_argument("--domain", choices=("human", "robot"), help="only of this domain")
-    parser.add_argument("--operator", help="only of this operator")
+    parser.add_argument("--operator", metavar="P", help="only of this operator")
     parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.add_argument(
         "--jpeg-quality",
@@ -264,7 +264,9 @@ def _export_parser() -> argparse.ArgumentParser:
         metavar="1…100",
         help="mcap: encode rgb8 images as JPEG (default: lossless)",
     )
-    parser.add_argument("--fps", type=int, help="lerobot: frames a second (the model rate)")
+    parser.add_argument(
+        "--fps", type=int, metavar="N", help="lerobot: frames a second (the model rate)"
+    )
     parser.add_argument(
         "--repo-id",
         default="dextouch/export",
@@ -276,9 +278,13 @@ def _export_parser() -> argparse.ArgumentParser:
 
 def _import_parser() -> argparse.ArgumentParser:
     parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
-    parser.add_argument("path", type=Path, help="file or folder to read")
-    parser.add_argument("--format", required=True, choices=("lerobot", "mcap", "umi"))
-    parser.add_argument("--id-prefix", default="", help="lerobot: prefix of every id")
+    parser.add_argument("path", type=Path, metavar="PATH", help="file or folder to read")
+    parser.add_argument(
+        "--format", required=True, choices=("lerobot", "mcap", "umi"), help="of what is read"
+    )
+    parser.add_argument(
+        "--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id"
+    )
     parser.add_argument(
         "--images",
         choices=("h264", "jpeg", "rgb8"),

@@ -1,4 +1,4 @@
-"""Robot episodes of a store as the world model imagines them: `dextouch train imagined`.
+"""Imagine the robot episodes of a store with the world model.
 
 Their outcome is that of the same actions in the twin. The success probe is trained on them beside
 true episodes, so that its probabilities hold for what is imagined, and measured on those of other
@@ -7,7 +7,6 @@ probe looks at.
 """
 
 import argparse
-import json
 import os
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -19,6 +18,7 @@ import torch
 from rich.progress import track
 
 from dextouch.clients.rollouts import RolloutClient
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
@@ -125,7 +125,11 @@ def positive(text: str) -> int:
 
 def main(argv: Sequence[str]) -> int:
     """`dextouch train imagined`."""
-    parser = argparse.ArgumentParser(prog="dextouch train imagined", description=__doc__)
+    parser = CommandParser(
+        prog="dextouch train imagined",
+        description=__doc__,
+        epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
+    )
     parser.add_argument("--episodes", required=True, help="folder of the store to imagine")
     parser.add_argument("--store", required=True, help="folder of the store for the result")
     parser.add_argument(
@@ -139,7 +143,7 @@ def main(argv: Sequence[str]) -> int:
     parser.add_argument(
         "--jobs", type=positive, default=os.cpu_count() or 1, help="processes (one a core)"
     )
-    parser.add_argument("--json", type=Path, help="write the counts here")
+    add_json(parser)
     arguments = parser.parse_args(list(argv))
     tasks = tuple(arguments.tasks.split(",")) if arguments.tasks else None
     counts = imagine_in_parts(
@@ -150,6 +154,5 @@ def main(argv: Sequence[str]) -> int:
         arguments.jobs,
     )
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(counts, indent=2), encoding="utf-8")
+    write_result(arguments.json, counts)
     return 0

@@ -29,7 +29,7 @@ COMMANDS = {
     "twin": Command(
         "services.twin.__main__", "record true episodes in the physics twin, or serve it"
     ),
-    "station": Command("services.acquisition.__main__", "record gloves, trackers and cameras"),
+    "station": Command("services.acquisition.__main__", "record and calibrate a station's devices"),
     "store": Command(
         "services.episode_store.__main__",
         "list, show, verify, repair, migrate, delete, restore, purge, serve",
@@ -42,18 +42,25 @@ COMMANDS = {
     ),
     "align": Command("services.alignment.__main__", "turn recordings into synchronized episodes"),
     "train": Command("services.cli.train", "train the world model, a policy or the success probe"),
+    "checkpoint": Command(
+        "services.world_model.__main__", "show where a world model comes from", ("show",)
+    ),
     "serve": Command(
         "services.world_model.__main__", "serve the world model's rollouts", ("serve",)
     ),
     "evaluate": Command(
         "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
     ),
+    "dashboard": Command("services.dashboard.__main__", "serve the operators' page"),
     "bench": Command("services.cli.bench", "time a stage against its error, beside its rivals"),
     "stress": Command("services.cli.stress.command", "check every stage against numerical hazards"),
 }
 
-# Subcommands that are implemented by another module.
+# Subcommands of a group whose module has none; without one, the group runs its module.
 INNER_COMMANDS = {
+    ("station", "serve"): Command(
+        "services.acquisition.__main__", "record gloves, trackers and cameras"
+    ),
     ("station", "calibrate"): Command(
         "services.cli.calibrate", "measure tare and gain, lenses and mounts"
     ),
@@ -70,14 +77,33 @@ def usage() -> str:
     return "\n".join(
         [
             "usage: dextouch COMMAND [options]",
+            "       dextouch GROUP COMMAND [options]",
             "",
             "Collect human and robot touch, learn a world model from it, judge policies inside it.",
             "",
             *rows,
             "",
             "Every command explains itself with --help; those that end write their result with",
-            "--json PATH. A service (station, serve, …) takes its flags as variables too.",
-            "Start with: dextouch demo",
+            "--json PATH, or --json - for standard output. A service (serve, station serve, …)",
+            "takes its flags as variables too. All commands: docs/command_line.md",
+            "",
+            "example:",
+            "  dextouch demo",
+        ]
+    )
+
+
+def group_usage(group: str) -> str:
+    """The help of a group of `INNER_COMMANDS`."""
+    inner = {word: entry for (name, word), entry in INNER_COMMANDS.items() if name == group}
+    rows = [f"  {word:<11}{command.does}" for word, command in inner.items()]
+    return "\n".join(
+        [
+            f"usage: dextouch {group} COMMAND [options]",
+            "",
+            *rows,
+            "",
+            f"Each explains itself, such as: dextouch {group} {next(iter(inner))} --help",
         ]
     )
 
@@ -101,8 +127,6 @@ def find_command(name: str, rest: Sequence[str]) -> tuple[str, Command, list[str
         return f"{name} {first}", inner[first], list(rest[1:])
     if inner and first and not first.startswith("-"):
         raise UnknownNameError("word", first, list(inner))
-    if inner and {"-h", "--help"} & set(rest):
-        print("\n".join(f"also: dextouch {name} {word} --help" for word in inner), end="\n\n")
     return name, COMMANDS[name], list(rest)
 
 
@@ -123,6 +147,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if name not in COMMANDS:
         print(f"dextouch: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
         return EXIT_USAGE
+    if rest in (["-h"], ["--help"]) and any(group == name for group, _ in INNER_COMMANDS):
+        print(group_usage(name))
+        return 0
     return _run(name, rest)
 
 

@@ -73,7 +73,7 @@ def bind(name: str, *, host: str, port: int) -> Place:
         listener.close()
         raise ConflictError(
             f"{name}: cannot listen on {host}:{port} ({error.strerror}); "
-            f"choose another port with --{name}_port, or 0 for any free one"
+            f"choose another port with --{name.replace('_', '-')}-port, or 0 for any free one"
         ) from error
     return Place(name, listener)
 

@@ -15,7 +15,7 @@ TRAINERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "direct-judge": ("services.evaluation.__main__", ("train-direct-judge",)),
 }
 
-USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe|direct-judge [options]
+USAGE = """usage: dextouch train COMMAND [options]
 
   data         record the mixed twin episodes that everything is trained on
   world-model  the joint visuo-tactile flow-matching model
@@ -26,7 +26,10 @@ USAGE = """usage: dextouch train data|world-model|state|imagined|policy|probe|di
   direct-judge its rival, which imagines nothing: for `dextouch bench evaluator --direct`
 
 Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`
-trains a small state model, a policy and a probe; docs/evaluation.md has the commands."""
+trains a small state model, a policy and a probe; docs/evaluation.md has the commands.
+
+example:
+  dextouch train data --store runs/episodes --count 20 --images 4"""
 
 
 def main(argv: Sequence[str]) -> int:

@@ -1,4 +1,4 @@
-"""Twin episodes to train and test networks on: `dextouch train data`.
+"""Record twin episodes that networks are trained and tested on.
 
 What decides success must be in the data: errors around the few millimetres that decide, misses,
 takes that stop or never begin, retreats, pushes, grasps that slip, hands that wander, and what is
@@ -17,9 +17,9 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from services.cli.data_mix import MIXES, Mix, options_of
@@ -217,7 +217,11 @@ def _keywords(text: str) -> dict[str, Any]:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="dextouch train data", description=__doc__)
+    parser = CommandParser(
+        prog="dextouch train data",
+        description=__doc__,
+        epilog="example:\n  dextouch train data --store runs/episodes --count 20 --images 4",
+    )
     parser.add_argument("--store", required=True, help="folder of the episode store")
     parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")
     parser.add_argument("--count", type=int, default=130, help="seeds a task (%(default)s)")
@@ -248,9 +252,11 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--images", type=int, default=1, metavar="N", help="of every N-th step (%(default)s)"
     )
-    parser.add_argument("--streams", choices=STREAM_CHOICES, default="training")
+    parser.add_argument(
+        "--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)"
+    )
     parser.add_argument("--jobs", type=int, help="processes (one a core)")
-    parser.add_argument("--json", type=Path, help="write the counts here")
+    add_json(parser)
     return parser
 
 
@@ -265,6 +271,5 @@ def main(argv: Sequence[str]) -> int:
         arguments.store, seeds, mix, num_jobs=arguments.jobs, scope=scope, policy=policy
     )
     print(", ".join(f"{count} {name}" for name, count in counts.items()))
-    if arguments.json:
-        arguments.json.write_text(json.dumps(counts, indent=2), encoding="utf-8")
+    write_result(arguments.json, counts)
     return 1 if counts["refused"] else 0

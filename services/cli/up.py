@@ -1,7 +1,6 @@
 """Command `dextouch up`: runs every service in one process and prints their addresses."""
 
 import asyncio
-import json
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -12,6 +11,7 @@ from fastapi import FastAPI
 from pydantic import AliasChoices, Field
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
+from dextouch.command_line import write_result
 from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, UnknownNameError
 from dextouch.serving.logs import configure_logging
@@ -20,16 +20,19 @@ from services.cli.extras import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 
 LOOPBACK = "127.0.0.1"
+PORT = "0 for any free one"
 # Settings and the addresses of all services in, one service out.
 Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
 
 
 class UpSettings(BaseSettings):
-    """Data folder and ports of the services; port 0 selects a free one.
+    """Run every service in one process, with a dashboard and mock devices.
 
     An explicit port must be free; a default port in use is replaced by a free one. All data is
-    stored below `data`. Mock devices replay episode `mock_episode_id` of this store, or a synthetic
-    pattern by default.
+    stored in one folder. Mock devices play an episode of its store, or a synthetic pattern.
+
+    Example:
+      dextouch up --data runs/station --without twin,world_model
     """
 
     model_config = SettingsConfigDict(
@@ -37,28 +40,34 @@ class UpSettings(BaseSettings):
         extra="forbid",
         env_prefix="DEXTOUCH_UP_",
         cli_prog_name="dextouch up",
-        cli_kebab_case=False,
     )
 
     data: Path = Field(
         default_factory=data_folder,
         description="folder of store and spool (DEXTOUCH_DATA, else data)",
     )
-    station: str = Field(default="mock station", min_length=1, max_length=64)
-    mock_episode_id: str | None = None
+    station: str = Field(
+        default="mock station", min_length=1, max_length=64, description="name of the station"
+    )
+    mock_episode_id: str | None = Field(
+        default=None, description="episode of the store that the mock devices play"
+    )
     align_new: bool = Field(default=True, description="align saved takes automatically")
     without: tuple[str, ...] = Field(default=(), description="services not to start")
-    dashboard_port: int = Field(default=8080, ge=0, le=65535)
-    episode_store_port: int = Field(default=8081, ge=0, le=65535)
-    alignment_port: int = Field(default=8082, ge=0, le=65535)
-    acquisition_port: int = Field(default=8083, ge=0, le=65535)
-    twin_port: int = Field(default=8084, ge=0, le=65535)
-    world_model_port: int = Field(default=8085, ge=0, le=65535)
-    log_level: Literal["debug", "info", "warning", "error"] = "warning"
+    dashboard_port: int = Field(default=8080, ge=0, le=65535, description=PORT)
+    episode_store_port: int = Field(default=8081, ge=0, le=65535, description=PORT)
+    alignment_port: int = Field(default=8082, ge=0, le=65535, description=PORT)
+    acquisition_port: int = Field(default=8083, ge=0, le=65535, description=PORT)
+    twin_port: int = Field(default=8084, ge=0, le=65535, description=PORT)
+    world_model_port: int = Field(default=8085, ge=0, le=65535, description=PORT)
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="warning", description="least level of log events"
+    )
     json_path: Path | None = Field(
         default=None,
         validation_alias=AliasChoices("json"),
-        description="write the addresses to this file once all services respond",
+        description="write the addresses as JSON to this file once all services respond; - for "
+        "standard output",
     )
 
     def port(self, name: str) -> int:
@@ -140,9 +149,7 @@ async def _announce(
         print(f"{name:<14}{place.url}")
     print(f"data          {settings.data.resolve()}")
     print(f"\nOpen {places['dashboard'].url} · stop with Ctrl-C", flush=True)
-    if settings.json_path is not None:
-        urls = {name: place.url for name, place in places.items()}
-        settings.json_path.write_text(json.dumps(urls, indent=2) + "\n", encoding="utf-8")
+    write_result(settings.json_path, {name: place.url for name, place in places.items()})
 
 
 # Services are imported lazily, to keep `dextouch --help` fast.

@@ -6,27 +6,49 @@ from dextouch.serving.settings import ServiceSettings, service_config
 
 
 class DashboardSettings(ServiceSettings):
-    """URLs of the services to show; a service without URL is omitted.
+    """Serve the operators' page, which shows the services whose URLs are given.
 
-    `upstream_key` is the bearer key of the other services. Browsers reach the page under loopback
-    names and those of `allowed_hosts`.
+    Browsers reach the page under loopback names and those of --allowed-hosts.
+
+    Example:
+      dextouch dashboard --port 8080 --acquisition-url http://127.0.0.1:8083
     """
 
-    model_config = service_config("dashboard")
+    model_config = service_config("dashboard", "dextouch dashboard")
 
-    station: str = Field(default="station", min_length=1, max_length=64)
-    tasks: tuple[str, ...] = Field(default=("stand_bottle", "stack_bowls"), min_length=1)
-    acquisition_url: str | None = None
-    episode_store_url: str | None = None
-    alignment_url: str | None = None
-    twin_url: str | None = None
-    world_model_url: str | None = None
-    upstream_key: SecretStr | None = None
-    upstream_timeout_s: float = Field(default=2.0, gt=0, le=30)
-    station_period_s: float = Field(default=0.2, ge=0.05, le=10)
-    taxel_period_s: float = Field(default=0.1, ge=0.02, le=10)
-    list_period_s: float = Field(default=2.0, ge=0.2, le=60)
-    session_hours: float = Field(default=12.0, gt=0, le=24 * 30)
+    station: str = Field(
+        default="station", min_length=1, max_length=64, description="name of the station"
+    )
+    tasks: tuple[str, ...] = Field(
+        default=("stand_bottle", "stack_bowls"),
+        min_length=1,
+        description="tasks that the operator may choose",
+    )
+    acquisition_url: str | None = Field(
+        default=None, description="of the station; a service without URL is not shown"
+    )
+    episode_store_url: str | None = Field(default=None, description="of the episode store")
+    alignment_url: str | None = Field(default=None, description="of the alignment service")
+    twin_url: str | None = Field(default=None, description="of the twin")
+    world_model_url: str | None = Field(default=None, description="of the world model")
+    upstream_key: SecretStr | None = Field(
+        default=None, description="bearer key of the other services"
+    )
+    upstream_timeout_s: float = Field(
+        default=2.0, gt=0, le=30, description="seconds until a silent service counts as away"
+    )
+    station_period_s: float = Field(
+        default=0.2, ge=0.05, le=10, description="seconds between two states of the station"
+    )
+    taxel_period_s: float = Field(
+        default=0.1, ge=0.02, le=10, description="seconds between two taxel maps"
+    )
+    list_period_s: float = Field(
+        default=2.0, ge=0.2, le=60, description="seconds between two listings of takes and episodes"
+    )
+    session_hours: float = Field(
+        default=12.0, gt=0, le=24 * 30, description="until an operator must sign in again"
+    )
 
     def upstream_urls(self) -> dict[str, str]:
         """Configured services by name, in the order of the data flow."""

@@ -1,11 +1,10 @@
 """Command line `dextouch store`: manage a store, or serve it over HTTP."""
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
+from dextouch.command_line import STANDARD_OUTPUT, CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.trash import TRASH_KINDS
 from dextouch.errors import DexTouchError
@@ -36,16 +35,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         configure_logging(service="episode_store", log_format="auto", level="warning")
         url = options.store or load_settings(EpisodeStoreSettings, []).store_url
         # With the result on stdout, messages go to stderr.
-        out = sys.stderr if options.json == "-" else sys.stdout
+        out = sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout
         context = Context(EpisodeStore(url), url, options, lambda line: print(line, file=out))
         result, status = _COMMANDS[options.command](context)
     except DexTouchError as error:
         print(f"dextouch store: {error.message}", file=sys.stderr)
         return EXIT_REFUSED
-    if options.json == "-":
-        print(json.dumps(result, indent=2))
-    elif options.json is not None:
-        Path(options.json).write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+    write_result(options.json, result)
     return status
 
 
@@ -71,58 +67,66 @@ _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="dextouch store",
         description="Inspect, repair or serve a store ('serve --help' lists the settings).",
+        epilog="example:\n  dextouch store list --store data/store",
     )
-    shared = argparse.ArgumentParser(add_help=False)
+    shared = CommandParser(add_help=False)
     shared.add_argument("--store", metavar="URL", help="local folder, file:///… or s3://…")
-    shared.add_argument(
-        "--json", metavar="PATH", help="also write the result as JSON to this file; - for stdout"
-    )
-    kind = argparse.ArgumentParser(add_help=False, parents=[shared])
+    add_json(shared)
+    kind = CommandParser(add_help=False, parents=[shared])
     kind.add_argument("--kind", choices=("episode", "recording"), help="default: both")
-    commands = parser.add_subparsers(dest="command", required=True)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     commands.add_parser("serve", help="serve the store over HTTP", add_help=False)
-    listing = commands.add_parser("list", parents=[kind], help="list episodes and recordings")
-    listing.add_argument("--task")
-    listing.add_argument("--domain", choices=("human", "robot"))
+    listing = _command(commands, kind, "list", "list episodes and recordings")
+    listing.add_argument("--task", metavar="TASK", help="only of this task")
+    listing.add_argument("--domain", choices=("human", "robot"), help="only of these hands")
     listing.add_argument("--origin", choices=("recorded", "twin", "imagined"), help="episodes only")
     listing.add_argument("--trash", action="store_true", help="list the trash instead")
-    show = commands.add_parser(
-        "show", parents=[kind], help="show attributes and streams of an item"
-    )
-    show.add_argument("id")
-    _add_ids(
-        commands.add_parser("verify", parents=[kind], help="verify all checksums and list damage")
-    )
-    repairing = commands.add_parser(
-        "repair", parents=[kind], help="complete interrupted items, repair or salvage damaged ones"
+    show = _command(commands, kind, "show", "show attributes and streams of an item", "take-7")
+    show.add_argument("id", metavar="ID", help="of an episode or recording")
+    _add_ids(_command(commands, kind, "verify", "verify all checksums and list damage"))
+    repairing = _command(
+        commands,
+        kind,
+        "repair",
+        "complete interrupted items, repair or salvage damaged ones",
+        "take-7 --from /mnt/copy",
     )
     _add_ids(repairing)
     repairing.add_argument(
         "--from", dest="source", metavar="URL", help="intact copy of the store to repair from"
     )
-    _add_ids(
-        commands.add_parser(
-            "migrate", parents=[kind], help="upgrade items of older format versions"
-        )
-    )
-    _add_delete(
-        commands.add_parser(
-            "delete", parents=[kind], help="move items to the trash, or delete them permanently"
-        )
-    )
-    restore = commands.add_parser("restore", parents=[shared], help="restore items from the trash")
+    _add_ids(_command(commands, kind, "migrate", "upgrade items of older format versions"))
+    does = "move items to the trash, or delete them permanently"
+    _add_delete(_command(commands, kind, "delete", does, "take-7 take-8"))
+    restore = _command(commands, shared, "restore", "restore items from the trash", "take-7")
     restore.add_argument("--kind", choices=TRASH_KINDS, help="required if an id has several kinds")
-    restore.add_argument("ids", nargs="+")
-    purge = commands.add_parser(
-        "purge", parents=[shared], help="permanently delete items in the trash"
-    )
+    restore.add_argument("ids", nargs="+", metavar="ID", help="of what is restored")
+    does = "permanently delete items in the trash"
+    purge = _command(commands, shared, "purge", does, "--older-than 30d")
     purge.add_argument(
         "--older-than", type=_age, default=0.0, metavar="AGE", help="such as 30d or 12h"
     )
     return parser
+
+
+def _command(
+    commands: "argparse._SubParsersAction[CommandParser]",
+    shared: CommandParser,
+    name: str,
+    does: str,
+    usual: str = "",
+) -> argparse.ArgumentParser:
+    """Add a command; `usual` are the arguments of its example."""
+    return commands.add_parser(
+        name,
+        parents=[shared],
+        help=does,
+        description=f"{does[0].upper()}{does[1:]}.",
+        epilog=f"example:\n  dextouch store {name} {usual}".rstrip(),
+    )
 
 
 def _age(text: str) -> float:
@@ -133,11 +137,11 @@ def _age(text: str) -> float:
 
 
 def _add_ids(command: argparse.ArgumentParser) -> None:
-    command.add_argument("ids", nargs="*", help="default: all")
+    command.add_argument("ids", nargs="*", metavar="ID", help="default: all")
 
 
 def _add_delete(command: argparse.ArgumentParser) -> None:
-    command.add_argument("ids", nargs="*")
+    command.add_argument("ids", nargs="*", metavar="ID", help="of what is deleted")
     command.add_argument(
         "--for-good", action="store_true", help="delete permanently, without trash"
     )

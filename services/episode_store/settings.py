@@ -7,27 +7,54 @@ from dextouch.serving.settings import ServiceSettings, service_config
 
 
 class EpisodeStoreSettings(ServiceSettings):
-    """Location of the store, and limits per request, in flight and per station.
+    """Serve a store over HTTP, with limits per request, in flight and per station.
 
-    `store_url` is a local folder or file:///…; unfinished uploads are kept below it.
-    `max_body_bytes` must hold one batch of the wire format. `max_open_uploads` unfinished uploads
-    keep their files open, two each: choose at least the number of concurrently uploading stations,
-    since reopening one reads its whole log. Batches beyond `max_batches_in_flight` or
-    `max_bytes_in_flight` are refused with 429; those that leave less than `min_free_bytes` on the
-    disk, or exceed a station's quota (unfinished and finished), with 507. `commit_in_process`
-    commits finished recordings in a child process.
+    Unfinished uploads are kept below the store. The largest body must hold one batch of the wire
+    format. An upload that is not kept open reads its whole log when it goes on.
+
+    Example:
+      dextouch store serve --store-url data/store --port 8081
     """
 
-    model_config = service_config("episode_store")
+    model_config = service_config("episode_store", "dextouch store serve")
 
-    store_url: str = Field(default_factory=default_store, min_length=1)
-    sync_uploads: bool = True
-    max_open_uploads: int = Field(default=128, ge=1, le=1024)
-    max_batches_in_flight: int = Field(default=32, ge=1, le=1024)
-    max_bytes_in_flight: int = Field(default=128 * 2**20, ge=1024)
-    min_free_bytes: int = Field(default=512 * 2**20, ge=0)
-    quota_bytes_per_station: int | None = Field(default=None, ge=1)
-    commit_in_process: bool = True
-    max_page: int = Field(default=1000, ge=1, le=100_000)
-    max_window_steps: int = Field(default=321, ge=1, le=10_000)
-    max_answer_bytes: int = Field(default=64 * 2**20, ge=1024)
+    store_url: str = Field(
+        default_factory=default_store, min_length=1, description="folder, file:///… or s3://…"
+    )
+    sync_uploads: bool = Field(
+        default=True, description="wait for the disk before a batch is confirmed"
+    )
+    max_open_uploads: int = Field(
+        default=128,
+        ge=1,
+        le=1024,
+        description="unfinished uploads whose files stay open; at least one a station",
+    )
+    max_batches_in_flight: int = Field(
+        default=32, ge=1, le=1024, description="batches at once; more are refused with 429"
+    )
+    max_bytes_in_flight: int = Field(
+        default=128 * 2**20,
+        ge=1024,
+        description="bytes of batches at once; more are refused with 429",
+    )
+    min_free_bytes: int = Field(
+        default=512 * 2**20,
+        ge=0,
+        description="bytes that stay free on the disk; less is refused with 507",
+    )
+    quota_bytes_per_station: int | None = Field(
+        default=None,
+        ge=1,
+        description="bytes of one station, unfinished and finished; more are refused with 507",
+    )
+    commit_in_process: bool = Field(
+        default=True, description="commit finished recordings in a child process"
+    )
+    max_page: int = Field(
+        default=1000, ge=1, le=100_000, description="items of one page of a listing"
+    )
+    max_window_steps: int = Field(
+        default=321, ge=1, le=10_000, description="steps of one window of an episode"
+    )
+    max_answer_bytes: int = Field(default=64 * 2**20, ge=1024, description="of one answer")

@@ -1,19 +1,18 @@
 """Command line `dextouch twin`: record true episodes to a store, or serve the twin over HTTP."""
 
 import argparse
-import json
 import multiprocessing
 import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 from rich.progress import track
 
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
@@ -28,6 +27,7 @@ from services.twin.tasks import TASK_NAMES
 
 EXIT_REFUSED = 3
 _MISS_DRAW = 5
+EXAMPLE = "example:\n  dextouch twin record --task stand_bottle --seeds 0:8 --store data/store"
 
 
 @dataclass(frozen=True)
@@ -74,40 +74,59 @@ def _seed_range(text: str) -> range:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="dextouch twin", description=__doc__)
-    commands = parser.add_subparsers(dest="command", required=True)
-    make = commands.add_parser(
-        "record", help="record episodes of a scripted demonstrator with true values"
+    parser = CommandParser(
+        prog="dextouch twin",
+        description="Record true episodes in the physics twin, or serve it as a world.",
+        epilog="example:\n  dextouch twin serve --port 8084",
     )
-    make.add_argument("--task", required=True, choices=TASK_NAMES)
-    make.add_argument("--seeds", required=True, type=_seed_range, help="range A:B, B excluded")
-    make.add_argument("--domain", default="robot", choices=DOMAINS)
+    commands = parser.add_subparsers(dest="command", required=True, metavar="{record,serve}")
+    does = "record episodes of a scripted demonstrator with true values"
+    make = commands.add_parser("record", help=does, description=does.capitalize(), epilog=EXAMPLE)
+    make.add_argument("--task", required=True, choices=TASK_NAMES, help="what is demonstrated")
+    make.add_argument("--seeds", required=True, type=_seed_range, metavar="A:B", help="without B")
+    make.add_argument("--domain", default="robot", choices=DOMAINS, help="hands (%(default)s)")
     make.add_argument(
         "--noise",
         default=0.0,
         type=float,
+        metavar="M",
         help="standard deviation of the demonstrator's error (m)",
     )
     make.add_argument(
-        "--miss-fraction", default=0.0, type=float, help="share of takes that miss the objects"
+        "--miss-fraction",
+        default=0.0,
+        type=float,
+        metavar="SHARE",
+        help="of takes that miss the objects (%(default)s)",
     )
-    make.add_argument("--freeze-from", type=int, help="freeze the commands from this step (0 … 80)")
-    make.add_argument("--motion", choices=MOTION_KINDS, help="replace the script by this motion")
-    make.add_argument("--motion-from", type=int, default=0, help="at this step (%(default)s)")
-    make.add_argument("--actions-of", type=int, help="play the actions of this seed instead")
-    make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS)
     make.add_argument(
-        "--image-every", type=int, help="record images of every n-th step instead of at 30 Hz"
+        "--freeze-from", type=int, metavar="STEP", help="freeze commands from there (0 … 80)"
     )
-    make.add_argument("--streams", default="all", choices=STREAM_CHOICES, help="(%(default)s)")
+    make.add_argument("--motion", choices=MOTION_KINDS, help="replace the script by this motion")
+    make.add_argument(
+        "--motion-from", type=int, default=0, metavar="STEP", help="of the motion (%(default)s)"
+    )
+    make.add_argument(
+        "--actions-of", type=int, metavar="SEED", help="play the actions of this seed instead"
+    )
+    make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS, help="(all)")
+    make.add_argument(
+        "--image-every",
+        type=int,
+        metavar="N",
+        help="record images of every n-th step instead of at 30 Hz",
+    )
+    make.add_argument(
+        "--streams", default="all", choices=STREAM_CHOICES, help="which (%(default)s)"
+    )
     make.add_argument(
         "--store",
         default=default_store(),
         help="store for the episodes (%(default)s)",
         metavar="URL",
     )
-    make.add_argument("--jobs", default=1, type=int, help="processes")
-    make.add_argument("--json", type=Path, help="write a JSON summary to this file")
+    make.add_argument("--jobs", default=1, type=int, metavar="N", help="processes (%(default)s)")
+    add_json(make)
     commands.add_parser("serve", help="serve the twin as a world; flags: serve --help")
     return parser
 
@@ -195,9 +214,7 @@ def _record(arguments: argparse.Namespace) -> int:
     orders = _orders(arguments)
     reports = _shown(_work(orders, arguments.jobs), len(orders), Console(stderr=True))
     summary = _summary(arguments, reports, time.monotonic() - start_s)
-    if arguments.json is not None:
-        content = json.dumps(summary, indent=2) + "\n"
-        arguments.json.write_text(content, encoding="utf-8")
+    write_result(arguments.json, summary)
     succeeded = sum(report.success for report in reports)
     print(
         f"{len(reports)} episodes of {arguments.task} ({arguments.domain}) in {arguments.store}: "

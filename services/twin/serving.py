@@ -2,6 +2,8 @@
 
 from typing import Any
 
+from pydantic import Field
+
 from dextouch.serving.settings import load_settings, service_config
 from dextouch.worlds.baseline import CopyFirstWorld
 from dextouch.worlds.serve import WorldServiceSettings, serve_worlds
@@ -11,11 +13,15 @@ from services.twin.world import TwinWorld
 
 
 class TwinServiceSettings(WorldServiceSettings):
-    """Settings of the twin's rollout service."""
+    """Serve the rollouts of the physics twin, and of a baseline that copies the first step.
 
-    model_config = service_config("twin")
+    Example:
+      dextouch twin serve --port 8084
+    """
 
-    scene: TwinSettings = TwinSettings()
+    model_config = service_config("twin", "dextouch twin serve")
+
+    scene: TwinSettings = Field(default=TwinSettings(), description="cameras and objects")
 
 
 def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:

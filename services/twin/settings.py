@@ -11,7 +11,12 @@ class TwinSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cameras: tuple[str, ...] = ("camera_head", "camera_wrist_left", "camera_wrist_right")
-    image_height_px: int = Field(default=64, ge=16, le=512)
-    image_width_px: int = Field(default=64, ge=16, le=512)
-    settle_s: float = Field(default=0.2, ge=0.0, le=2.0)
+    cameras: tuple[str, ...] = Field(
+        default=("camera_head", "camera_wrist_left", "camera_wrist_right"),
+        description="rendered ones; each takes half as long as the physics",
+    )
+    image_height_px: int = Field(default=64, ge=16, le=512, description="of every camera")
+    image_width_px: int = Field(default=64, ge=16, le=512, description="of every camera")
+    settle_s: float = Field(
+        default=0.2, ge=0.0, le=2.0, description="seconds that objects settle before a take"
+    )

@@ -204,7 +204,7 @@ class WorldModelSettings(WorldServiceSettings):
     sampling_steps: int | None = Field(
         default=None, ge=1, le=64, description="Euler steps of the paper's form"
     )
-    num_threads: int = Field(default=1, ge=1)
+    num_threads: int = Field(default=1, ge=1, description="threads of torch")
 
 
 def command_line(settings: TrainSettings) -> str:

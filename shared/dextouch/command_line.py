@@ -94,9 +94,15 @@ def write_result(path: Path | None, result: object, *, allow_nan: bool = True) -
     Raises:
         ValueError: a number is not finite and `allow_nan` is False.
     """
+    if path is not None:
+        text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=allow_nan)
+        write_json_text(path, text)
+
+
+def write_json_text(path: Path | None, text: str) -> None:
+    """Write JSON that is text already, as `write_result` does."""
     if path is None:
         return
-    text = json.dumps(result, indent=2, ensure_ascii=False, allow_nan=allow_nan)
     if path == STANDARD_OUTPUT:
         print(text, file=_result_stream.get() or sys.stdout, flush=True)
         return

@@ -91,7 +91,7 @@ def test_a_take_is_recorded_and_the_dead_cell_is_found(lab):
 
 def test_stations_take_its_settings_and_import_no_mock(lab):
     stations = [
-        shlex.split(line)[2:] for line in PAGE.commands if line.startswith("dextouch station ")
+        shlex.split(line)[3:] for line in PAGE.commands if line.startswith("dextouch station serve")
     ]
     assert len(stations) == 2
     output = run(lab, "-c", STATIONS.format(flags=stations)).splitlines()

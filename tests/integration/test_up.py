@@ -109,7 +109,7 @@ async def test_a_taken_port_is_a_clear_refusal(tmp_path):
     place = bind("other", host="127.0.0.1", port=0)
     port = place.socket.getsockname()[1]
     settings = up.UpSettings(data=tmp_path, dashboard_port=port)
-    with pytest.raises(ConflictError, match="--dashboard_port"):
+    with pytest.raises(ConflictError, match="--dashboard-port"):
         await up.run(settings, asyncio.Event())
     place.socket.close()
 
@@ -156,7 +156,7 @@ def test_ports_are_those_of_the_compose_file():
 
 def test_wrong_flags_are_named():
     with pytest.raises(InvalidInputError, match="twin_port"):
-        up.main(["--twin_port", "70000"])
+        up.main(["--twin-port", "70000"])
 
 
 async def test_what_cannot_be_left_out_is_named(tmp_path):

@@ -10,6 +10,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
+from dextouch.command_line import CommandParser, add_json
 from dextouch.errors import UnknownNameError
 from services.cli.bench.chart import draw
 from services.cli.bench.machine import refuse_shape_checks
@@ -60,7 +61,9 @@ def usage() -> str:
             *rows,
             "",
             "`dextouch bench STAGE --help` says what a stage measures and takes.",
-            "Start with: dextouch bench store --quick",
+            "",
+            "example:",
+            "  dextouch bench store --quick",
         ]
     )
 
@@ -68,10 +71,12 @@ def usage() -> str:
 def stage_parser(name: str) -> argparse.ArgumentParser:
     """Parser with the options common to all stages."""
     entry = STAGES[name]
-    parser = argparse.ArgumentParser(prog=f"dextouch bench {name}", description=entry.teaches)
-    parser.add_argument(
-        "--json", type=Path, metavar="PATH", help="write all figures to this JSON file"
+    parser = CommandParser(
+        prog=f"dextouch bench {name}",
+        description=entry.teaches,
+        epilog=f"example:\n  dextouch bench {name} --quick --json figures.json",
     )
+    add_json(parser)
     parser.add_argument(
         "--out",
         type=Path,

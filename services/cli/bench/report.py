@@ -9,6 +9,7 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from dextouch.command_line import write_json_text
 from services.cli.bench.chart import Panel
 from services.cli.bench.figures import Requirement
 
@@ -97,8 +98,7 @@ def _acceptance(report: StageReport) -> ResultTable:
 
 def write_json(report: StageReport, path: Path) -> None:
     """Write the report to the path of `--json`, creating its folder."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(report.to_json() + "\n", encoding="utf-8")
+    write_json_text(path, report.to_json())
 
 
 def _table(title: str, columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Table:

@@ -5,14 +5,13 @@ import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from dextouch.command_line import CommandParser, add_json, write_json_text
 from dextouch.data_folder import default_spool
 from dextouch.errors import InvalidInputError
 from services.cli.calibrate.boards import BOARD_HELP, parse_board
 
 Report = dict[str, object]
 EXIT_LEVEL = 1
-STANDARD_OUTPUT = Path("-")
-JSON_HELP = "also write the result as JSON to this file; - prints it last"
 
 _ABOUT = """\
 Measure what a station must know of its devices. Everything goes into one folder:
@@ -50,13 +49,21 @@ measure of accuracy (it is as small for 8 photos as for 40): check the sigma (±
   --photos FOLDER            calibrate with the photos of a folder
   --photos FOLDER --watch    watch for new photos, report what is missing, then calibrate
   --photos FOLDER --url URL  take still views from a running station into the folder, likewise
-  --check                    only report the coverage of the photos and advice"""
+  --check                    only report the coverage of the photos and advice
+
+example:
+  dextouch station calibrate camera --camera head --photos photos/head \\
+    --board charuco:5x7:30mm:22mm --to calibration"""
 
 _HAND_EYE = """\
 The board is fixed; hold the tracker with its camera still at every photo. Rotate it by 30 degrees
 or more about at least two of its axes, better three. The camera must be calibrated first
 (--intrinsics names its folder, if it is another one). With poses of the board in the file no
-photos are needed. If poses are refused as inverted, --invert inverts that side."""
+photos are needed. If poses are refused as inverted, --invert inverts that side.
+
+example:
+  dextouch station calibrate hand-eye --camera head --photos photos/mount \\
+    --poses photos/mount/poses.csv --board charuco:5x7:30mm:22mm --to calibration"""
 
 _GLOVE = """\
   --url URL                  a running station records all takes: this command guides you (rest,
@@ -70,7 +77,10 @@ columns are sigma_kpa, pads (thumb+index, palm, all), start_s, stop_s (seconds i
   take,pressure_kpa,sigma_kpa,pads
   spool/bladder-10,10,0.1,all
   spool/bladder-30,30,0.3,all
-Without presses only the tare is measured, for example daily; the gain is kept."""
+Without presses only the tare is measured, for example daily; the gain is kept.
+
+example:
+  dextouch station calibrate glove --side left --url http://127.0.0.1:8083 --to calibration"""
 
 _WRIST = """\
 Record one second or more of the flat hand, fingers straight; once for each person and glove.
@@ -95,6 +105,10 @@ series are poses of the same frame.
 example:
   dextouch station calibrate robot-base --poses pairs.json --to calibration"""
 
+_SHOW = """\
+example:
+  dextouch station calibrate show calibration"""
+
 _LATENCY = """\
 Two pose streams: hold both trackers together and turn them briskly and irregularly for ten
 seconds. A pose stream and a glove: tap a hard table with the flat hand, ten times, half a second
@@ -115,11 +129,7 @@ def main(argv: Sequence[str]) -> int:
     """
     options = _parser().parse_args(list(argv))
     report = _WORDS[options.word](options)
-    if options.json == STANDARD_OUTPUT:
-        print(_as_text(report))
-    elif options.json is not None:
-        options.json.parent.mkdir(parents=True, exist_ok=True)
-        options.json.write_text(_as_text(report) + "\n", encoding="utf-8")
+    write_json_text(options.json, _as_text(report))
     return EXIT_LEVEL if report.get("level") == "ERROR" else 0
 
 
@@ -193,11 +203,7 @@ _WORDS: dict[str, Callable[[argparse.Namespace], Report]] = {
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="dextouch station calibrate",
-        description=_ABOUT,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = CommandParser(prog="dextouch station calibrate", description=_ABOUT)
     words = parser.add_subparsers(dest="word", required=True, metavar="WORD")
     _add_camera(_word(words, "camera", "photos of a board → K and distortion of a camera", _CAMERA))
     _add_hand_eye(_word(words, "hand-eye", "photos and poses → camera on its tracker", _HAND_EYE))
@@ -208,22 +214,18 @@ def _parser() -> argparse.ArgumentParser:
         _word(words, "robot-base", "pairs of poses → the robot's base in the world", _ROBOT_BASE)
     )
     _add_latency(_word(words, "latency", "common motion or taps → path delay", _LATENCY))
-    shown = _word(words, "show", "contents, age and accuracy of a calibration", "")
-    shown.add_argument("folder", type=Path, help="calibration folder or file, or a spooled take")
+    shown = _word(words, "show", "contents, age and accuracy of a calibration", _SHOW)
+    shown.add_argument(
+        "folder", type=Path, metavar="PATH", help="calibration folder or file, or a spooled take"
+    )
     return parser
 
 
 def _word(
-    words: "argparse._SubParsersAction[argparse.ArgumentParser]", name: str, does: str, more: str
+    words: "argparse._SubParsersAction[CommandParser]", name: str, does: str, more: str
 ) -> argparse.ArgumentParser:
-    parser = words.add_parser(
-        name,
-        help=does,
-        description=does,
-        epilog=more,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--json", type=Path, metavar="PATH", help=JSON_HELP)
+    parser = words.add_parser(name, help=does, description=does, epilog=more)
+    add_json(parser)
     return parser
 
 
@@ -234,7 +236,9 @@ def _add_common(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_cameras(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--camera", required=True, choices=("head", "wrist_left", "wrist_right"))
+    parser.add_argument(
+        "--camera", required=True, choices=("head", "wrist_left", "wrist_right"), help="which one"
+    )
     parser.add_argument("--check", action="store_true", help="only report what is missing")
 
 
@@ -262,7 +266,7 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
 
 def _add_glove(parser: argparse.ArgumentParser) -> None:
     _add_common(parser)
-    parser.add_argument("--side", required=True, choices=("left", "right"))
+    parser.add_argument("--side", required=True, choices=("left", "right"), help="hand")
     parser.add_argument("--url", metavar="URL", help="this running station records the takes now")
     parser.add_argument("--key", metavar="KEY", help="API key of the station")
     parser.add_argument(
@@ -301,7 +305,7 @@ def _add_take(parser: argparse.ArgumentParser) -> None:
 
 def _add_hand(parser: argparse.ArgumentParser) -> None:
     _add_take(parser)
-    parser.add_argument("--side", required=True, choices=("left", "right"))
+    parser.add_argument("--side", required=True, choices=("left", "right"), help="hand")
 
 
 def _add_robot_base(parser: argparse.ArgumentParser) -> None:

@@ -1,6 +1,5 @@
 """Command line `dextouch demo`: runs all stages and writes report.json and report.html."""
 
-import json
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -10,6 +9,7 @@ from typing import Any
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from dextouch import __version__
+from dextouch.command_line import write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
 from dextouch.schemas.rollouts import WorldDescription
@@ -50,10 +50,8 @@ def main(argv: Sequence[str]) -> int:
     plan.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
         report = Demo(plan, Path(folder)).run()
-    text = json.dumps(report, indent=2, allow_nan=False)
     for path in (plan.output / "report.json", plan.json):
-        if path is not None:
-            path.write_text(text, encoding="utf-8")
+        write_result(path, report, allow_nan=False)
     show(report)
     print(f"\nreport: {plan.output / 'report.html'}")
     robot = report["takes"]["robot"]["episode_id"]

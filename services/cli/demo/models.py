@@ -29,8 +29,8 @@ ENDINGS = (
 UNSEEN_ENDINGS = ("--ladder", "--first", "30000", "--count", "180")
 # A small state model: one ensemble member, few steps.
 SMALL_STATE_MODEL = (
-    "--num_members=1", "--jobs=1", "--reader.num_steps=2500", "--core.num_steps=1500",
-    "--drawing.cpu_budget_s=300",
+    "--num-members=1", "--jobs=1", "--reader.num-steps=2500", "--core.num-steps=1500",
+    "--drawing.cpu-budget-s=300",
 )  # fmt: skip
 
 
@@ -107,7 +107,7 @@ def train_models(folder: Path) -> Models:
     of_world = ["--checkpoint", str(world_model)]
     train.main(["imagined", "--episodes", endings, "--store", imagined, *of_world])
     true_and_imagined = ["--episodes", endings, "--episodes", imagined]
-    train.main(["probe", *true_and_imagined, "--held_out", unseen, "--output", str(probe)])
+    train.main(["probe", *true_and_imagined, "--held-out", unseen, "--output", str(probe)])
     return _load(world_model, policy, probe)
 
 

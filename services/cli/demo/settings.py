@@ -1,10 +1,10 @@
 """Command line options of the demo, and the plan derived from them."""
 
-import argparse
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from dextouch.command_line import CommandParser, add_json
 from dextouch.data_folder import default_store
 
 TASKS = ("stand_bottle", "stack_bowls")
@@ -38,8 +38,9 @@ class DemoPlan:
 
 def parse(argv: Sequence[str]) -> DemoPlan:
     """Parse the command line; `--help` prints the usage and exits."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="dextouch demo",
+        epilog="example:\n  dextouch demo --output runs/demo --seeds 2",
         description="Record a human and a robot take through mock devices, align them, compare "
         "with the twin's truth, predict with the world model, and score policies in the twin and "
         "in the world model. Ends with a table, report.json and report.html; both takes stay in "
@@ -47,9 +48,13 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         "another data folder).",
     )
     parser.add_argument(
-        "--output", type=Path, default=Path("demo"), help="folder of the results (%(default)s)"
+        "--output",
+        type=Path,
+        default=Path("demo"),
+        metavar="FOLDER",
+        help="of the results (%(default)s)",
     )
-    parser.add_argument("--json", type=Path, help="also write the report to this file")
+    add_json(parser)
     parser.add_argument(
         "--train",
         action="store_true",
@@ -59,6 +64,7 @@ def parse(argv: Sequence[str]) -> DemoPlan:
     parser.add_argument(
         "--seeds",
         type=int,
+        metavar="N",
         default=6,
         help="held-out scenes per task for scoring policies (%(default)s)",
     )

@@ -7,6 +7,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
+from dextouch.command_line import CommandParser, add_json, write_json_text
 from dextouch.errors import UnknownNameError
 from services.cli.stress.cells import HAZARDS, Cell, Exemption, Finding, not_run, run_cell
 from services.cli.stress.report import summary, to_json, to_markdown, to_table
@@ -42,10 +43,10 @@ def main(argv: Sequence[str]) -> int:
     findings = _run(cells, console, quick=options.quick)
     console.print(to_table(findings))
     console.print(summary(findings), highlight=False)
-    for path, write in ((options.json, to_json), (options.markdown, to_markdown)):
-        if path is not None:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(write(findings) + "\n", encoding="utf-8")
+    write_json_text(options.json, to_json(findings))
+    if options.markdown is not None:
+        options.markdown.parent.mkdir(parents=True, exist_ok=True)
+        options.markdown.write_text(to_markdown(findings) + "\n", encoding="utf-8")
     return EXIT_FAILED if any(one.verdict == "failed" for one in findings) else 0
 
 
@@ -56,10 +57,10 @@ def _console() -> Console:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="dextouch stress",
         description=DESCRIPTION,
-        epilog=f"Stages: {', '.join(STAGES)}. Start with: dextouch stress --quick",
+        epilog=f"Stages: {', '.join(STAGES)}.\n\nexample:\n  dextouch stress clocks --quick",
     )
     parser.add_argument("stage", nargs="*", metavar="STAGE", help="only these (default: all)")
     parser.add_argument(
@@ -67,9 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--quick", action="store_true", help="skip slow cells")
     parser.add_argument("--list", action="store_true", help="list the cells without running them")
-    parser.add_argument(
-        "--json", type=Path, metavar="PATH", help="write all results to this JSON file"
-    )
+    add_json(parser)
     parser.add_argument(
         "--markdown", type=Path, metavar="PATH", help="write the matrix as Markdown to this file"
     )

@@ -100,10 +100,19 @@ class ServiceSettings(BaseSettings):
         frozen=True, extra="forbid", env_nested_delimiter="__", env_prefix="DEXTOUCH_"
     )
 
-    host: str = "127.0.0.1"
-    port: int = Field(default=0, ge=0, le=65535)
-    api_keys: tuple[ApiKey, ...] = ()
-    max_body_bytes: int = Field(default=16 * 2**20, ge=1024)
+    host: str = Field(
+        default="127.0.0.1",
+        description="address to listen on; anything but loopback needs api keys",
+    )
+    port: int = Field(
+        default=0, ge=0, le=65535, description="port to listen on; 0 for any free one"
+    )
+    api_keys: tuple[ApiKey, ...] = Field(
+        default=(), description="keys and their scopes, see docs/access.md"
+    )
+    max_body_bytes: int = Field(
+        default=16 * 2**20, ge=1024, description="largest body of a request"
+    )
     allowed_hosts: tuple[HostName, ...] = Field(
         default=(),
         description="host names besides loopback that are accepted without a key",
@@ -112,9 +121,15 @@ class ServiceSettings(BaseSettings):
         default=(),
         description="origins of the service behind a TLS proxy, such as https://lab.example",
     )
-    log_format: Literal["auto", "json", "console"] = "auto"
-    log_level: Literal["debug", "info", "warning", "error"] = "info"
-    shutdown_grace_s: int = Field(default=10, ge=0, le=600)
+    log_format: Literal["auto", "json", "console"] = Field(
+        default="auto", description="of log events; auto: console at a terminal, JSON otherwise"
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="least level of log events"
+    )
+    shutdown_grace_s: int = Field(
+        default=10, ge=0, le=600, description="seconds that requests in flight get to end"
+    )
 
     @model_validator(mode="after")
     def _needs_keys_off_loopback(self) -> "ServiceSettings":

@@ -46,9 +46,13 @@ class RolloutLimits(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    max_rollouts: int = Field(default=64, ge=1)
-    max_chunks: int = Field(default=1000, ge=1)
-    ttl_s: float = Field(default=600.0, gt=0)
+    max_rollouts: int = Field(default=64, ge=1, description="open at the same time")
+    max_chunks: int = Field(default=1000, ge=1, description="of one rollout")
+    ttl_s: float = Field(
+        default=600.0,
+        gt=0,
+        description="seconds until an unused rollout is dropped; every chunk renews them",
+    )
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 
 from fastapi import FastAPI
+from pydantic import Field
 
 from dextouch.serving.app import create_service_app
 from dextouch.serving.logs import configure_logging
@@ -18,7 +19,10 @@ from dextouch.worlds.world import World
 class WorldServiceSettings(ServiceSettings):
     """Settings of a service of worlds; subclass to add those of a world."""
 
-    state_url: str = "memory://"
+    state_url: str = Field(
+        default="memory://",
+        description="where rollouts are kept: memory:// or redis://HOST:PORT/DB",
+    )
     limits: RolloutLimits = RolloutLimits()
 
 

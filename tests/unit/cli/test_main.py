@@ -25,13 +25,25 @@ def test_unknown_command_names_the_valid_ones(capsys):
 
 def test_a_misspelt_inner_command_names_the_valid_ones(capsys):
     assert main.main(["station", "calibrat"]) == main.EXIT_REFUSED
-    assert "dextouch station: unknown word 'calibrat'; valid: calibrate" in capsys.readouterr().err
+    assert (
+        "dextouch station: unknown word 'calibrat'; valid: calibrate, serve"
+        in capsys.readouterr().err
+    )
 
 
-def test_help_of_a_command_tells_of_its_inner_ones(capsys):
-    with pytest.raises(SystemExit):
-        main.main(["station", "--help"])
-    assert capsys.readouterr().out.startswith("also: dextouch station calibrate --help\n")
+def test_help_of_a_group_lists_its_commands(capsys):
+    assert main.main(["station", "--help"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("usage: dextouch station COMMAND")
+    assert "\n  serve " in text
+    assert "\n  calibrate " in text
+
+
+def test_a_result_on_standard_output_stands_alone(capsys):
+    main.main(["doctor", "--json", "-"])
+    told = capsys.readouterr()
+    assert {"what", "found", "ok", "do"} == set(json.loads(told.out)[0])
+    assert "Python" in told.err
 
 
 @pytest.mark.parametrize("name", sorted(main.COMMANDS))

@@ -1,0 +1,148 @@
+"""Every command of `dextouch`: its name, help, example, flags and --json."""
+
+import argparse
+import contextlib
+import re
+import shlex
+from functools import cache
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from services.cli import main, train
+from services.cli.bench.stages import STAGES
+
+COMMANDS = """
+align report, align retarget, align run, align serve,
+bench acquisition, bench calibration, bench clocks, bench closure, bench evaluator, bench loader,
+bench retargeting, bench store, bench twin, bench world-model,
+checkpoint, dashboard, demo, doctor, evaluate, export, import, serve,
+station calibrate camera, station calibrate glove, station calibrate hand-eye,
+station calibrate latency, station calibrate profile, station calibrate robot-base,
+station calibrate show, station calibrate wrist, station serve,
+store delete, store list, store migrate, store purge, store repair, store restore, store serve,
+store show, store verify,
+stress,
+train data, train direct-judge, train imagined, train policy, train probe, train state,
+train world-model,
+twin record, twin serve, up
+"""
+NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
+# Services run until they are stopped and answer over HTTP: they have no result to write.
+WITHOUT_JSON = {"align serve", "dashboard", "serve", "station serve", "store serve", "twin serve"}
+# Flags that only have a name and a default: constants of training, which the networks' own
+# documents explain.
+TERSE = {
+    "checkpoint",
+    "evaluate",
+    "train direct-judge",
+    "train policy",
+    "train probe",
+    "train state",
+    "train world-model",
+}
+GROUPS = {
+    "": tuple(main.COMMANDS),
+    "bench": tuple(STAGES),
+    "train": tuple(train.TRAINERS),
+    "station": tuple(word for group, word in main.INNER_COMMANDS if group == "station"),
+}
+EXAMPLE = re.compile(r"^examples?:\n((?:  .*(?:\n|$))+)", re.MULTILINE | re.IGNORECASE)
+DOCUMENT = Path(__file__).parents[3] / "docs" / "command_line.md"
+
+
+class Help(NamedTuple):
+    """What `--help` printed, and the parser that printed it; None where a table did."""
+
+    text: str
+    parser: argparse.ArgumentParser | None
+
+
+@cache
+def help_of(name: str) -> Help:
+    """Run a command with --help."""
+    printed: list[tuple[argparse.ArgumentParser, str]] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "100")
+        patch.setattr(
+            argparse.ArgumentParser,
+            "print_help",
+            lambda parser, file=None: printed.append((parser, parser.format_help())),
+        )
+        try:
+            status = main.main([*name.split(), "--help"])
+        except SystemExit as end:
+            status = end.code
+    assert status in {0, None}
+    return Help(printed[0][1], printed[0][0]) if printed else Help("", None)
+
+
+def commands_below(name: str) -> list[str]:
+    """The commands of a group; the command itself if it is none."""
+    words = GROUPS.get(name)
+    if words is None:
+        parser = help_of(name).parser
+        assert parser is not None, name
+        inner = [a for a in parser._actions if isinstance(a, argparse._SubParsersAction)]
+        words = tuple(inner[0].choices) if inner else ()
+    if not words:
+        return [name]
+    return [leaf for word in words for leaf in commands_below(f"{name} {word}".strip())]
+
+
+def flags_of(parser: argparse.ArgumentParser) -> list[argparse.Action]:
+    """Arguments that help shows."""
+    return [action for action in parser._actions if action.help != argparse.SUPPRESS]
+
+
+def test_the_list_of_commands_is_complete():
+    assert sorted(commands_below("")) == sorted(NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_help_is_of_this_command_and_shows_how_to_call_it(name):
+    text, parser = help_of(name)
+    assert text.startswith(f"usage: dextouch {name} ")
+    assert not re.search(r"(tuple|dict|list)\[|\bnull\b|default factory|==SUPPRESS==", text)
+    examples = re.sub(r"\\\n\s*", " ", "".join(EXAMPLE.findall(text)))
+    # A remark may follow an example after some space.
+    lines = [re.split(r"\s{4,}", line.strip())[0] for line in examples.splitlines()]
+    own = [line for line in lines if f"{line} ".startswith(f"dextouch {name} ")]
+    assert own, f"no example of `dextouch {name}` in its help"
+    for line in own:
+        parser.parse_args(shlex.split(line)[1 + len(name.split()) :])
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_flags_have_dashes_and_say_what_they_are(name):
+    for action in flags_of(help_of(name).parser):
+        assert not any("_" in flag for flag in action.option_strings)
+        words = re.sub(r"\((default|required).*\)", "", action.help or "")
+        assert name in TERSE or words, f"{name}: {action.dest} has no help"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_results_are_written_as_json(name):
+    flags = {
+        flag: action for action in flags_of(help_of(name).parser) for flag in action.option_strings
+    }
+    assert ("--json" in flags) == (name not in WITHOUT_JSON)
+    if name not in WITHOUT_JSON:
+        assert flags["--json"].metavar == "PATH"
+        assert "- for standard output" in " ".join(flags["--json"].help.split())
+
+
+@pytest.mark.parametrize("group", [name for name in GROUPS if name])
+def test_groups_list_their_commands(group, capsys):
+    with contextlib.suppress(SystemExit):
+        main.main([group, "--help"])
+    text = capsys.readouterr().out
+    assert text.startswith(f"usage: dextouch {group} ")
+    listed = {line.split()[0] for line in text.splitlines() if re.match(r"  [a-z]", line)}
+    assert set(GROUPS[group]) <= listed
+
+
+def test_the_document_has_every_command():
+    text = DOCUMENT.read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^\| `dextouch ([a-z -]+)` \|", text, re.MULTILINE)) == sorted(NAMES)
