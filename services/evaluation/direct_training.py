@@ -46,18 +46,30 @@ class DirectSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = 0
-    max_cpu_s: float = Field(default=600.0, gt=0)
-    finder_share: float = Field(default=0.6, gt=0, lt=1)
-    num_finder_steps: int = Field(default=6000, ge=1)
-    num_judge_steps: int = Field(default=6000, ge=1)
-    batch_size: int = Field(default=64, ge=2)
-    learning_rate: float = Field(default=2e-3, gt=0)
-    weight_decay: float = Field(default=2e-2, ge=0)
+    seed: int = Field(default=0, description="of weights and of everything that is drawn")
+    max_cpu_s: float = Field(
+        default=600.0, gt=0, description="CPU seconds after which training ends"
+    )
+    finder_share: float = Field(
+        default=0.6, gt=0, lt=1, description="of the time, for finding objects in images"
+    )
+    num_finder_steps: int = Field(
+        default=6000, ge=1, description="steps of finding objects, if time lasts"
+    )
+    num_judge_steps: int = Field(default=6000, ge=1, description="steps of judging, if time lasts")
+    batch_size: int = Field(default=64, ge=2, description="examples per training step")
+    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
+    weight_decay: float = Field(default=2e-2, ge=0, description="of AdamW")
     bfloat16: bool = Field(default=False, description="convolve in bfloat16: twice as fast on AMX")
-    image_noise: float = Field(default=0.01, ge=0)
-    brightness: float = Field(default=0.03, ge=0)
-    development_share: float = Field(default=0.1, gt=0, lt=1)
+    image_noise: float = Field(
+        default=0.01, ge=0, description="deviation of the noise on training images, of 1"
+    )
+    brightness: float = Field(
+        default=0.03, ge=0, description="deviation of training images' brightness, of 1"
+    )
+    development_share: float = Field(
+        default=0.1, gt=0, lt=1, description="of seeds, to calibrate on"
+    )
 
 
 @dataclass(frozen=True)

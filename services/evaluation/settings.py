@@ -31,8 +31,11 @@ class TrainPolicySettings(BaseSettings):
     model_config = service_config("evaluation_train_policy", "dextouch train policy")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
-    output: Path = Path("runs/evaluation/behaviour_cloning.safetensors")
-    tasks: tuple[str, ...] = ()
+    output: Path = Field(
+        default=Path("runs/evaluation/behaviour_cloning.safetensors"),
+        description="checkpoint to write",
+    )
+    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
     early_at: float | None = Field(
         default=None,
         gt=0,
@@ -40,7 +43,7 @@ class TrainPolicySettings(BaseSettings):
         description="share of training after which a policy that is not finished is kept too, "
         "beside the output as …_early.safetensors",
     )
-    training: CloningSettings = CloningSettings()
+    training: CloningSettings = Field(default=CloningSettings(), description="how it is trained")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
     def early_output(self) -> Path:
@@ -64,9 +67,11 @@ class TrainProbeSettings(BaseSettings):
     held_out: tuple[str, ...] = Field(
         default=(), description="stores to measure on (a fifth of the seeds of `episodes`)"
     )
-    output: Path = Path("runs/evaluation/success_probe.safetensors")
-    tasks: tuple[str, ...] = ()
-    training: ProbeSettings = ProbeSettings()
+    output: Path = Field(
+        default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"
+    )
+    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
+    training: ProbeSettings = Field(default=ProbeSettings(), description="how it is trained")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
@@ -80,9 +85,11 @@ class TrainDirectSettings(BaseSettings):
     model_config = service_config("evaluation_train_direct_judge", "dextouch train direct-judge")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
-    output: Path = Path("runs/evaluation/direct_judge.safetensors")
-    tasks: tuple[str, ...] = ()
-    training: DirectSettings = DirectSettings()
+    output: Path = Field(
+        default=Path("runs/evaluation/direct_judge.safetensors"), description="checkpoint to write"
+    )
+    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
+    training: DirectSettings = Field(default=DirectSettings(), description="how it is trained")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
@@ -91,9 +98,9 @@ class ServedWorld(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    url: str
-    world: str
-    api_key: str | None = None
+    url: str = Field(description="of the service")
+    world: str = Field(description="its name there")
+    api_key: str | None = Field(default=None, description="for it, if it asks for one")
 
 
 class RunSettings(BaseSettings):

@@ -39,32 +39,72 @@ class ProbeSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = 0
+    seed: int = Field(default=0, description="of weights and of everything that is drawn")
     # Of each task.
-    num_training_steps: int = Field(default=2000, ge=1)
-    max_cpu_s: float = Field(default=200.0, gt=0)
-    batch_size: int = Field(default=48, ge=2)
-    learning_rate: float = Field(default=1.5e-3, gt=0)
-    weight_decay: float = Field(default=5e-2, ge=0)
-    image_noise: float = Field(default=0.02, ge=0)
-    brightness: float = Field(default=0.05, ge=0)
+    num_training_steps: int = Field(default=2000, ge=1, description="training steps")
+    max_cpu_s: float = Field(
+        default=200.0, gt=0, description="CPU seconds after which training ends"
+    )
+    batch_size: int = Field(default=48, ge=2, description="examples per training step")
+    learning_rate: float = Field(
+        default=1.5e-3, gt=0, description="largest; it falls along a cosine"
+    )
+    weight_decay: float = Field(default=5e-2, ge=0, description="of AdamW")
+    image_noise: float = Field(
+        default=0.02, ge=0, description="deviation of the noise on training images, of 1"
+    )
+    brightness: float = Field(
+        default=0.05, ge=0, description="deviation of training images' brightness, of 1"
+    )
     # At 64 pixels one is about 10 mm on the table, which is what decides success.
-    shift_px: int = Field(default=1, ge=0)
+    shift_px: int = Field(default=1, ge=0, description="training images are shifted by up to this")
     # Of true endings with both, how many are learned from without poses, without images: what is
     # really seen comes without poses, and with them nobody would look at the image.
-    true_without_poses: float = Field(default=0.85, ge=0, le=1)
-    true_without_images: float = Field(default=0.1, ge=0, le=1)
+    true_without_poses: float = Field(
+        default=0.85,
+        ge=0,
+        le=1,
+        description="of true endings with both, learned from without object poses",
+    )
+    true_without_images: float = Field(
+        default=0.1,
+        ge=0,
+        le=1,
+        description="of true endings with both, learned from without images",
+    )
     # The same of imagined endings: worlds that imagine poses do so always, images when asked.
-    imagined_without_poses: float = Field(default=0.3, ge=0, le=1)
-    imagined_without_images: float = Field(default=0.3, ge=0, le=1)
+    imagined_without_poses: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="of imagined endings with both, learned from without object poses",
+    )
+    imagined_without_images: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="of imagined endings with both, learned from without images",
+    )
     # In standard deviations of each feature of the poses.
-    pose_noise: float = Field(default=0.03, ge=0)
-    imagined_share: float = Field(default=0.4, gt=0, lt=1)
-    milestone_weight: float = Field(default=0.3, ge=0)
-    development_share: float = Field(default=0.15, gt=0, lt=1)
-    held_out_share: float = Field(default=0.2, gt=0, lt=1)
+    pose_noise: float = Field(
+        default=0.03,
+        ge=0,
+        description="noise on object poses, in each feature's standard deviations",
+    )
+    imagined_share: float = Field(
+        default=0.4, gt=0, lt=1, description="weight of imagined endings beside true ones"
+    )
+    milestone_weight: float = Field(
+        default=0.3, ge=0, description="of milestones in the loss, beside success"
+    )
+    development_share: float = Field(
+        default=0.15, gt=0, lt=1, description="of seeds, to calibrate on"
+    )
+    held_out_share: float = Field(default=0.2, gt=0, lt=1, description="of seeds, to measure on")
     # Errors that are allowed among the endings that the judge decides.
-    risk: float = Field(default=0.05, gt=0, lt=1)
+    risk: float = Field(
+        default=0.05, gt=0, lt=1, description="errors allowed among the endings that are decided"
+    )
 
 
 @dataclass(frozen=True)

@@ -20,12 +20,18 @@ class OptimizerSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    batch: int = Field(default=8, ge=1)
-    learning_rate: float = Field(default=2e-3, gt=0)
-    warmup_steps: int = Field(default=100, ge=1)
-    weight_decay: float = Field(default=0.02, ge=0)
-    max_gradient_norm: float = Field(default=1.0, gt=0)
-    ema_decay: float = Field(default=0.995, ge=0, lt=1)
+    batch: int = Field(default=8, ge=1, description="examples per training step")
+    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
+    warmup_steps: int = Field(
+        default=100, ge=1, description="steps until the learning rate is reached"
+    )
+    weight_decay: float = Field(default=0.02, ge=0, description="of AdamW")
+    max_gradient_norm: float = Field(
+        default=1.0, gt=0, description="longer gradients are shortened to this"
+    )
+    ema_decay: float = Field(
+        default=0.995, ge=0, lt=1, description="of the running average of the weights that is kept"
+    )
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac of equation 5")
 
 
@@ -34,8 +40,15 @@ class WindowSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    commanded_fraction: float = Field(default=0.5, ge=0, le=1)
-    chained_fraction: float = Field(default=0.3, ge=0, le=1)
+    commanded_fraction: float = Field(
+        default=0.5,
+        ge=0,
+        le=1,
+        description="of windows with commanded actions, where there are some",
+    )
+    chained_fraction: float = Field(
+        default=0.3, ge=0, le=1, description="of windows that begin with the model's own prediction"
+    )
     short_fraction: float = Field(default=0.25, ge=0, le=1, description="of 5, 9, 13 … steps")
     context_noise: float = Field(default=0.05, ge=0, le=1, description="on the first latents")
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
@@ -50,14 +63,29 @@ class TrainSettings(BaseModel):
     heldout: str | None = Field(
         default=None, description="store to be judged on; without it a tenth of `episodes`, by hash"
     )
-    output: Path = Path("runs/world_model/tiny.safetensors")
-    name: str = "tiny"
-    seed: int = Field(default=0, ge=0)
-    cpu_budget_s: float = Field(default=1000.0, gt=0)
-    max_steps: int | None = Field(default=None, ge=1)
-    num_threads: int = Field(default=1, ge=1)
-    heldout_percent: int = Field(default=10, ge=1, le=50)
-    evaluation_stride: int = Field(default=8, ge=1)
+    output: Path = Field(
+        default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="tiny", description="of the model, in the checkpoint")
+    seed: int = Field(default=0, ge=0, description="of weights and of everything that is drawn")
+    cpu_budget_s: float = Field(
+        default=1000.0, gt=0, description="CPU seconds after which training ends"
+    )
+    max_steps: int | None = Field(
+        default=None,
+        ge=1,
+        description="steps after which training ends, if it is not out of time before",
+    )
+    num_threads: int = Field(default=1, ge=1, description="threads of torch")
+    heldout_percent: int = Field(
+        default=10,
+        ge=1,
+        le=50,
+        description="of episodes, to measure on, where no --heldout is given",
+    )
+    evaluation_stride: int = Field(
+        default=8, ge=1, description="measure on every n-th window of the held-out episodes"
+    )
     streaming: CliImplicitFlag[bool] = Field(
         default=False, description="leave episodes on the disk: for more of them than memory holds"
     )
@@ -75,9 +103,13 @@ class TrainSettings(BaseModel):
     state_every_cpu_s: float = Field(
         default=60.0, ge=0, description="CPU seconds between states kept for --resume"
     )
-    network: NetworkConfig = NetworkConfig()
-    optimizer: OptimizerSettings = OptimizerSettings()
-    windows: WindowSettings = WindowSettings()
+    network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
+    optimizer: OptimizerSettings = Field(
+        default=OptimizerSettings(), description="how weights are moved"
+    )
+    windows: WindowSettings = Field(
+        default=WindowSettings(), description="which windows are trained on"
+    )
 
 
 class ReaderSettings(BaseModel):
@@ -85,10 +117,12 @@ class ReaderSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    num_steps: int = Field(default=4000, ge=1)
-    batch: int = Field(default=32, ge=1)
-    learning_rate: float = Field(default=2e-3, gt=0)
-    ema_decay: float = Field(default=0.995, ge=0, lt=1)
+    num_steps: int = Field(default=4000, ge=1, description="training steps")
+    batch: int = Field(default=32, ge=1, description="examples per training step")
+    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
+    ema_decay: float = Field(
+        default=0.995, ge=0, lt=1, description="of the running average of the weights that is kept"
+    )
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="of first steps")
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="convolve in bfloat16")
 
@@ -98,11 +132,11 @@ class CoreLossWeights(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    objects: float = Field(default=1.0, ge=0)
-    touch: float = Field(default=6.0, ge=0)
-    contact: float = Field(default=0.5, ge=0)
-    taxels: float = Field(default=2.0, ge=0)
-    success: float = Field(default=1.0, ge=0)
+    objects: float = Field(default=1.0, ge=0, description="of the positions and axes of objects")
+    touch: float = Field(default=6.0, ge=0, description="of the latents of all pressures")
+    contact: float = Field(default=0.5, ge=0, description="of which pads touch something")
+    taxels: float = Field(default=2.0, ge=0, description="of which taxels touch something")
+    success: float = Field(default=1.0, ge=0, description="of whether the task is done at the end")
 
 
 class CoreSettings(BaseModel):
@@ -110,16 +144,20 @@ class CoreSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    num_steps: int = Field(default=6500, ge=1)
-    batch: int = Field(default=64, ge=1)
-    learning_rate: float = Field(default=2e-3, gt=0)
-    weight_decay: float = Field(default=0.05, ge=0)
-    ema_decay: float = Field(default=0.99, ge=0, lt=1)
+    num_steps: int = Field(default=6500, ge=1, description="training steps")
+    batch: int = Field(default=64, ge=1, description="examples per training step")
+    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
+    weight_decay: float = Field(default=0.05, ge=0, description="of AdamW")
+    ema_decay: float = Field(
+        default=0.99, ge=0, lt=1, description="of the running average of the weights that is kept"
+    )
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="of whole episodes")
     measured_fraction: float = Field(default=0.15, ge=0, le=1, description="of measured actions")
     held_fraction: float = Field(default=0.04, ge=0, le=1, description="of hands held still")
     pose_noise_m: float = Field(default=0.0025, ge=0, description="of the true start poses")
-    weights: CoreLossWeights = CoreLossWeights()
+    weights: CoreLossWeights = Field(
+        default=CoreLossWeights(), description="weights of the targets"
+    )
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="train in bfloat16")
 
 
@@ -130,9 +168,11 @@ class StateTrainSettings(BaseModel):
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
     tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
-    output: Path = Path("runs/world_model/state.safetensors")
-    name: str = "state"
-    seed: int = Field(default=0, ge=0)
+    output: Path = Field(
+        default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
+    )
+    name: str = Field(default="state", description="of the model, in the checkpoint")
+    seed: int = Field(default=0, ge=0, description="of weights and of everything that is drawn")
     num_members: int = Field(default=2, ge=1, le=16, description="of the ensemble")
     heldout_share: float = Field(default=0.08, gt=0, lt=1, description="of scenes, to measure on")
     jobs: int = Field(default=2, ge=1, le=64, description="members trained at the same time")
@@ -143,10 +183,16 @@ class StateTrainSettings(BaseModel):
         description="of scenes whose object poses are learned from; touch and success: from all",
     )
     width: int = Field(default=192, ge=8, le=1024, description="of the recurrent cores")
-    reader: ReaderSettings = ReaderSettings()
-    core: CoreSettings = CoreSettings()
-    renderer: RendererConfig = RendererConfig()
-    drawing: RendererTraining = RendererTraining(cpu_budget_s=1400.0)
+    reader: ReaderSettings = Field(
+        default=ReaderSettings(), description="how start readers are trained"
+    )
+    core: CoreSettings = Field(
+        default=CoreSettings(), description="how recurrent cores are trained"
+    )
+    renderer: RendererConfig = Field(default=RendererConfig(), description="shape of the renderer")
+    drawing: RendererTraining = Field(
+        default=RendererTraining(cpu_budget_s=1400.0), description="how the renderer is trained"
+    )
 
 
 class TrainStateCommand(BaseSettings, StateTrainSettings):
@@ -182,7 +228,7 @@ class ShowCommand(BaseSettings):
 
     model_config = service_config("world_model_show", "dextouch checkpoint")
 
-    checkpoint: Path = PRETRAINED
+    checkpoint: Path = Field(default=PRETRAINED, description="file, or folder of files")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 

@@ -46,16 +46,24 @@ class CloningSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = 0
-    num_training_steps: int = Field(default=3000, ge=1)
-    max_cpu_s: float = Field(default=240.0, gt=0)
-    batch_size: int = Field(default=72, ge=1)
-    learning_rate: float = Field(default=1.5e-3, gt=0)
-    weight_decay: float = Field(default=1e-3, ge=0)
-    image_noise: float = Field(default=0.02, ge=0)
-    brightness: float = Field(default=0.06, ge=0)
+    seed: int = Field(default=0, description="of weights and of everything that is drawn")
+    num_training_steps: int = Field(default=3000, ge=1, description="training steps")
+    max_cpu_s: float = Field(
+        default=240.0, gt=0, description="CPU seconds after which training ends"
+    )
+    batch_size: int = Field(default=72, ge=1, description="examples per training step")
+    learning_rate: float = Field(
+        default=1.5e-3, gt=0, description="largest; it falls along a cosine"
+    )
+    weight_decay: float = Field(default=1e-3, ge=0, description="of AdamW")
+    image_noise: float = Field(
+        default=0.02, ge=0, description="deviation of the noise on training images, of 1"
+    )
+    brightness: float = Field(
+        default=0.06, ge=0, description="deviation of training images' brightness, of 1"
+    )
     pose_noise: float = Field(default=0.2, ge=0, description="of the spread of each number")
-    held_out_share: float = Field(default=0.12, gt=0, lt=1)
+    held_out_share: float = Field(default=0.12, gt=0, lt=1, description="of seeds, to measure on")
 
 
 @dataclass(frozen=True)

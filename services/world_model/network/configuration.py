@@ -13,19 +13,27 @@ class NetworkConfig(BaseModel):
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
     codec_channels: int = Field(default=48, ge=1, le=768, description="latents of a visual patch")
     palm_channels: int = Field(default=48, ge=1, le=240, description="latents of a palm pad")
-    video_width: int = Field(default=96, ge=8)
-    tactile_width: int = Field(default=96, ge=8)
-    num_layers: int = Field(default=3, ge=1)
-    num_heads: int = Field(default=3, ge=1)
-    head_width: int = Field(default=32, ge=4)
-    ffn_ratio: int = Field(default=3, ge=1)
-    num_word_buckets: int = Field(default=64, ge=2)
-    word_width: int = Field(default=16, ge=1)
-    use_pose_raster: bool = True
-    training_time_shift: float = Field(default=5.0, ge=1.0)
-    sampling_time_shift: float = Field(default=3.0, ge=1.0)
-    sampling_steps: int = Field(default=2, ge=1, le=64)
-    model_rate_hz: float = Field(default=15.0, gt=0)
+    video_width: int = Field(default=96, ge=8, description="of the visual expert")
+    tactile_width: int = Field(default=96, ge=8, description="of the tactile expert")
+    num_layers: int = Field(default=3, ge=1, description="layers of each expert")
+    num_heads: int = Field(default=3, ge=1, description="attention heads")
+    head_width: int = Field(default=32, ge=4, description="of each attention head")
+    ffn_ratio: int = Field(
+        default=3, ge=1, description="width of feed-forward layers over the width of the expert"
+    )
+    num_word_buckets: int = Field(default=64, ge=2, description="hashed words of an instruction")
+    word_width: int = Field(default=16, ge=1, description="of the embedding of a word")
+    use_pose_raster: bool = Field(
+        default=True, description="give a raster of the projected hands beside the actions"
+    )
+    training_time_shift: float = Field(
+        default=5.0, ge=1.0, description="shift of flow-matching times in training"
+    )
+    sampling_time_shift: float = Field(
+        default=3.0, ge=1.0, description="shift of flow-matching times in sampling"
+    )
+    sampling_steps: int = Field(default=2, ge=1, le=64, description="Euler steps a chunk")
+    model_rate_hz: float = Field(default=15.0, gt=0, description="steps a second")
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":

@@ -32,14 +32,26 @@ class RendererTraining(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cpu_budget_s: float = Field(default=540.0, gt=0)
-    max_steps: int | None = Field(default=None, ge=1)
-    batch: int = Field(default=24, ge=1)
-    learning_rate: float = Field(default=2e-3, gt=0)
-    warmup_steps: int = Field(default=50, ge=1)
-    weight_decay: float = Field(default=0.01, ge=0)
-    ema_decay: float = Field(default=0.995, ge=0, lt=1)
-    max_gradient_norm: float = Field(default=1.0, gt=0)
+    cpu_budget_s: float = Field(
+        default=540.0, gt=0, description="CPU seconds after which training ends"
+    )
+    max_steps: int | None = Field(
+        default=None,
+        ge=1,
+        description="steps after which training ends, if it is not out of time before",
+    )
+    batch: int = Field(default=24, ge=1, description="examples per training step")
+    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
+    warmup_steps: int = Field(
+        default=50, ge=1, description="steps until the learning rate is reached"
+    )
+    weight_decay: float = Field(default=0.01, ge=0, description="of AdamW")
+    ema_decay: float = Field(
+        default=0.995, ge=0, lt=1, description="of the running average of the weights that is kept"
+    )
+    max_gradient_norm: float = Field(
+        default=1.0, gt=0, description="longer gradients are shortened to this"
+    )
     gradient_weight: float = Field(default=0.5, ge=0, description="of neighbours' differences")
     sharpness_weight: float = Field(
         default=0.3, ge=0, description="of the strength of edges in windows of 7 pixels"

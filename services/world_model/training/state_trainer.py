@@ -207,7 +207,7 @@ def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> lis
     without = {episode.task for episode in episodes} - known
     if without:
         raise InvalidInputError(
-            f"--labelled_share {settings.labelled_share:g}: leaves no scene of "
+            f"--labelled-share {settings.labelled_share:g}: leaves no scene of "
             f"{', '.join(sorted(without))} whose object poses are learned from; give a larger one"
         )
     return labelled
