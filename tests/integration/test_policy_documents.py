@@ -66,8 +66,9 @@ def folder(tmp_path, monkeypatch):
     (tmp_path / "my_policy.py").write_text(block(POLICIES, "class ReachForward"))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [str(tmp_path), *sys.path])
-    monkeypatch.delitem(sys.modules, "my_policy", raising=False)
-    return tmp_path
+    sys.modules.pop("my_policy", None)
+    yield tmp_path
+    sys.modules.pop("my_policy", None)
 
 
 def here(text, services):

@@ -34,6 +34,7 @@ def lab(tmp_path_factory):
         patch.delenv("DEXTOUCH_DATA", raising=False)
         patch.chdir(folder)
         patch.setattr(sys, "path", [str(folder), *sys.path])
+        sys.modules.pop("my_policy", None)
         yield folder
         sys.modules.pop("my_policy", None)
 

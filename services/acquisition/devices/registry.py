@@ -126,5 +126,5 @@ def _where(point: EntryPoint) -> str:
 
 def _wrong(point: EntryPoint, got: str, expected: str) -> InvalidInputError:
     return InvalidInputError(
-        f"{_where(point)}: got {got}, expected {expected}; mend package {package_of(point)}"
+        f"{_where(point)}: got {got}, expected {expected}; fix package {package_of(point)}"
     )

@@ -218,7 +218,7 @@ def _checked_tactile(request: PredictionRequest) -> np.ndarray:
     if tactile.shape != (2, NUM_TAXELS):
         raise ShapeError(f"first touch: got shape {tactile.shape}, expected [2, {NUM_TAXELS}]")
     if not np.isfinite(tactile).all():
-        raise NonFiniteError("first touch: holds NaN or infinity; mend or mask the sensor first")
+        raise NonFiniteError("first touch: holds NaN or infinity; repair or mask the sensor first")
     if tactile.max() > MAX_PRESSURE_KPA:
         raise InvalidInputError(
             f"first touch: got {tactile.max():.3g} kPa, expected at most {MAX_PRESSURE_KPA:.0e}"

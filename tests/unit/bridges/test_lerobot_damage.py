@@ -209,7 +209,7 @@ DAMAGE = {
     "column of another type": (
         _feature("action", dtype="float64"),
         CorruptDataError,
-        "promises float64",
+        "declares float64",
     ),
     "column of ours with another shape": (
         _feature("dextouch.tactile_valid", shape=[1]),

@@ -2,9 +2,9 @@
 
 import pytest
 
+from dextouch.serving.settings import load_settings
 from services.cli import train
 from services.cli.demo import models
-from services.world_model.__main__ import _parse
 from services.world_model.settings import TrainStateCommand
 
 
@@ -25,7 +25,7 @@ def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, 
     world_model, _, probe = caught.value.args
     words = [word for word, *_ in called]
     assert words == ["data"] * 4 + ["state", "policy", "imagined", "probe"]
-    settings = _parse(TrainStateCommand, called[words.index("state")][1:])
+    settings = load_settings(TrainStateCommand, called[words.index("state")][1:])
     assert settings.output == world_model
     assert settings.tasks == ("stand_bottle", "stack_bowls")
     assert settings.episodes == (str(tmp_path / "episodes"), str(tmp_path / "endings"))

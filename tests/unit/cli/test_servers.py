@@ -85,6 +85,6 @@ def test_a_taken_port_is_named():
     place = bind("store", host="127.0.0.1", port=0)
     place.socket.listen()
     port = place.socket.getsockname()[1]
-    with pytest.raises(ConflictError, match=rf"cannot listen on 127.0.0.1:{port}.*--page_port"):
+    with pytest.raises(ConflictError, match=rf"cannot listen on 127.0.0.1:{port}.*--page-port"):
         bind("page", host="127.0.0.1", port=port)
     place.socket.close()

@@ -14,7 +14,7 @@ from services.cli.stress.cells import HAZARDS, Cell, Check, Exemption, StageCell
 from services.cli.stress.stages import STAGES, load_stage
 
 ROWS = {name: load_stage(name).row() for name in STAGES}
-# Cells that fail on the present code, each with the defect that is not mended yet (docs/stress.md).
+# Cells that fail on the present code, each with the defect that is not fixed yet (docs/stress.md).
 KNOWN_FAILURES = {("world-model", "long_run")}
 # Cells in which numbers are not of the kind that annotations say: the command runs them, without
 # the shape checks of tests.

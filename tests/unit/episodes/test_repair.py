@@ -1,4 +1,4 @@
-"""Damage is named by storage chunk, mended from a copy, or left out; never filled in."""
+"""Damage is named by storage chunk, repaired from a copy, or left out; never filled in."""
 
 import shutil
 
