@@ -60,6 +60,7 @@ def services_up(words, folder):
         loop.close()
 
 
+@pytest.mark.slow
 def test_a_take_is_recorded_and_aligned(lab, monkeypatch, capsys):
     page = TutorialPage.read("record_and_align")
     page.write_files(lab)
@@ -120,6 +121,7 @@ def test_an_episode_is_plotted(notebook, lab, monkeypatch):
     assert (lab / "episode.png").read_bytes().startswith(b"\x89PNG")
 
 
+@pytest.mark.slow
 def test_a_policy_is_scored(lab, capsys):
     page = TutorialPage.read("score_a_policy")
     page.write_files(lab)
@@ -135,6 +137,7 @@ def test_a_policy_is_scored(lab, capsys):
     assert {row["task"] for row in report["policies"]} == {"stand_bottle"}
 
 
+@pytest.mark.slow
 def test_the_tiny_model_is_trained_and_imagines(lab, capsys):
     page = TutorialPage.read("train_the_tiny_model")
     *dextouch, listed = [words for words in map(shlex.split, page.commands) if words[0] != "python"]

@@ -179,7 +179,7 @@ def test_all_takes_of_a_scene_are_labelled_or_none():
     chosen = {e.seed for e, one in zip(training, known, strict=True) if one}
     assert sum(known) == 2 * len(chosen)
     assert 0.15 < len(chosen) / len({e.seed for e in training}) < 0.45
-    with pytest.raises(InvalidInputError, match="labelled_share"):
+    with pytest.raises(InvalidInputError, match="--labelled-share"):
         _labelled(training, settings.model_copy(update={"labelled_share": 1e-6}))
 
 
