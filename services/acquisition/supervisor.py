@@ -352,18 +352,19 @@ class SpoolFlusher:
 
     def _run(self, on_tick: Callable[[], None], on_failure: Callable[[StorageError], None]) -> None:
         period_ns = round(self._safety.flush_period_s * 1e9)
-        try:
-            with closing(self._waiter) as waiter:
+        # A simulated clock stands still until the failure is reported: the waiter closes after it.
+        with closing(self._waiter) as waiter:
+            try:
                 due_ns = self._clock.now_ns() + period_ns
                 while waiter.wait_until(due_ns):
                     on_tick()
                     self._flush()
                     # After a long stop of the process one flush is enough.
                     due_ns = max(due_ns, self._clock.now_ns()) + period_ns
-        except StorageError as error:
-            on_failure(error)
-        finally:
-            os.close(self._log)
+            except StorageError as error:
+                on_failure(error)
+            finally:
+                os.close(self._log)
 
     def _flush(self) -> None:
         check_free_space(self._path, self._safety)
