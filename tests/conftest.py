@@ -9,7 +9,8 @@ from hypothesis import settings
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # On the emulated processor of `make vm` these checks would take minutes.
-if "DEXTOUCH_VM_GUEST" not in os.environ:
+CHECKS_SHAPES = "DEXTOUCH_VM_GUEST" not in os.environ
+if CHECKS_SHAPES:
     from tests import shape_checks
 
     shape_checks.install(["dextouch", "services"])
@@ -20,6 +21,17 @@ settings.register_profile("steady", derandomize=True, deadline=None)
 settings.load_profile("steady")
 
 ROOT = Path(__file__).parents[1]
+
+
+def pytest_xdist_auto_num_workers() -> int:
+    """One more worker than cores: many tests wait for processes, sockets and clocks."""
+    return len(os.sched_getaffinity(0)) + 1
+
+
+def pytest_runtest_setup() -> None:
+    """Each test checks the shapes of its own first calls."""
+    if CHECKS_SHAPES:
+        shape_checks.begin_test()
 
 
 def pytest_collection_finish() -> None:

@@ -3,7 +3,8 @@
 jaxtyping binds and checks the arguments of every function twice, also where no array is among
 them, and prepares the checks of every function that is imported. Here beartype checks them once,
 from the first call on; only functions whose annotations name array shapes get a scope of their
-own, in which an axis has one length in all arguments and the result.
+own, in which an axis has one length in all arguments and the result. A function that a test calls
+thousands of times, as training does, is checked in its first `CHECKED_CALLS` calls of that test.
 """
 
 import dataclasses
@@ -17,6 +18,7 @@ import jaxtyping
 from beartype import BeartypeConf, beartype
 
 BY_JAXTYPING = jaxtyping.jaxtyped
+CHECKED_CALLS = 16
 _CHECKED = "__has_shape_checks__"
 # What does not fit is a TypeError, as Python itself says it of wrong arguments.
 _beartype = beartype(conf=BeartypeConf(violation_type=jaxtyping.TypeCheckError))
@@ -27,6 +29,17 @@ def install(packages: list[str]) -> None:
     # The hook of jaxtyping writes this decorator by its name into the code that it imports.
     jaxtyping.jaxtyped = decorated
     jaxtyping.install_import_hook(packages, "beartype.beartype")
+
+
+class _Epoch:
+    """Counts the tests, so that each begins with checks of its own."""
+
+    number = 0
+
+
+def begin_test() -> None:
+    """Check the first calls of every function again."""
+    _Epoch.number += 1
 
 
 def decorated(item: Any = None, **_: Any) -> Any:
@@ -46,11 +59,17 @@ def checked(function: Callable) -> Callable:
     """The function behind checks of its arguments and its result, made at its first call."""
     inside = None
     is_scope = False
+    epoch = num_calls = 0
 
     @functools.wraps(function)
     def with_checks(*args, **kwargs):
         __tracebackhide__ = True
-        nonlocal inside, is_scope
+        nonlocal inside, is_scope, epoch, num_calls
+        if epoch != _Epoch.number:
+            epoch, num_calls = _Epoch.number, 0
+        num_calls += 1
+        if num_calls > CHECKED_CALLS:
+            return function(*args, **kwargs)
         if inside is None:
             inside, is_scope = _made(function)
         if not is_scope:

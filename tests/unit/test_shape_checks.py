@@ -11,7 +11,7 @@ from jaxtyping import Float64, TypeCheckError
 from dextouch.clients.policy import PolicyStart
 from dextouch.geometry.cameras import pinhole_matrix
 from dextouch.hands.actions import AnchorPoses
-from tests.shape_checks import decorated
+from tests.shape_checks import CHECKED_CALLS, begin_test, decorated
 
 if TYPE_CHECKING:
     from services.twin.stage import Stage
@@ -120,3 +120,17 @@ def test_names_that_only_type_checkers_know_are_not_checked():
     assert played(None, 3) == 3
     with pytest.raises(TypeCheckError):
         played(None, "3")
+
+
+def test_the_first_calls_of_each_test_are_checked():
+    @decorated
+    def half(count: int) -> int:
+        return count // 2
+
+    for _ in range(CHECKED_CALLS):
+        with pytest.raises(TypeCheckError):
+            half(3.0)
+    assert half(3.0) == 1.0
+    begin_test()
+    with pytest.raises(TypeCheckError):
+        half(3.0)

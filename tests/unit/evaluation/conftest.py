@@ -1,4 +1,4 @@
-"""Networks trained once on toy demonstrations, for all tests of this folder."""
+"""Networks of toy demonstrations: trained ones, and unfinished ones where only the form counts."""
 
 import pytest
 import torch
@@ -27,13 +27,26 @@ def trained_policies(demonstrations):
 
 
 @pytest.fixture(scope="session")
-def policy_checkpoint(trained_policies):
-    return trained_policies.finished
+def policy_checkpoint(demonstrations):
+    settings = CloningSettings(num_training_steps=3, batch_size=32)
+    episodes = [toy.cloning_episode(item) for item in demonstrations]
+    return train_cloned_policy(episodes, settings, command="a test", early_at=0.5).finished
+
+
+def _probe(demonstrations, num_steps):
+    settings = ProbeSettings(
+        num_training_steps=num_steps, batch_size=32, shift_px=1, learning_rate=3e-3
+    )
+    return train_success_probe(
+        [EndingEpisode.of(d) for d in demonstrations], settings, command="a test"
+    )
+
+
+@pytest.fixture(scope="session")
+def trained_probe(demonstrations):
+    return _probe(demonstrations, 350)
 
 
 @pytest.fixture(scope="session")
 def probe_checkpoint(demonstrations):
-    settings = ProbeSettings(num_training_steps=350, batch_size=32, shift_px=1, learning_rate=3e-3)
-    return train_success_probe(
-        [EndingEpisode.of(d) for d in demonstrations], settings, command="a test"
-    )
+    return _probe(demonstrations, 3)

@@ -49,6 +49,11 @@ def roll(policy: Policy, task: str, seed: int, *, num_chunks: int = 5) -> np.nda
     return np.linalg.norm(observation.action_reached[-1, :2] - state.target)
 
 
+@pytest.fixture(scope="module")
+def policy_checkpoint(trained_policies):
+    return trained_policies.finished
+
+
 def test_held_out_error_is_well_below_the_mean_chunk(policy_checkpoint):
     metrics = policy_checkpoint.metadata.metrics
     assert metrics["wrist_error_mm"] < 0.7 * metrics["wrist_error_mm_of_mean_chunk"]

@@ -49,18 +49,18 @@ def client():
 
 
 @pytest.fixture(scope="module")
-def probe(probe_checkpoint):
-    return SuccessProbe(probe_checkpoint)
+def probe(trained_probe):
+    return SuccessProbe(trained_probe)
 
 
 @pytest.fixture(scope="module")
-def policies(policy_checkpoint):
+def policies(trained_policies):
     good = [toy.demonstration(t, s) for t in toy.TASKS for s in SEEDS]
     poor = [toy.demonstration(t, s, noise_m=0.08) for t in toy.TASKS for s in SEEDS]
     return {
         "script": ReplayPolicy.of(good),
         "clumsy script": ReplayPolicy.of(poor),
-        "cloned": BehaviourCloningPolicy(policy_checkpoint),
+        "cloned": BehaviourCloningPolicy(trained_policies.finished),
         "hold": HoldPolicy(),
     }
 

@@ -19,15 +19,15 @@ def _episodes(demonstrations):
     return [EndingEpisode.of(d) for d in demonstrations]
 
 
-def test_held_out_accuracy_is_kept_in_the_checkpoint(probe_checkpoint):
-    metrics = probe_checkpoint.metadata.metrics
+def test_held_out_accuracy_is_kept_in_the_checkpoint(trained_probe):
+    metrics = trained_probe.metadata.metrics
     for task in toy.TASKS:
         assert metrics[f"held_out_balanced_accuracy_{task}"] >= 0.8
         assert metrics[f"num_held_out_failures_{task}"] > 0
 
 
-def test_it_tells_new_successes_from_failures(probe_checkpoint):
-    probe = SuccessProbe(probe_checkpoint)
+def test_it_tells_new_successes_from_failures(trained_probe):
+    probe = SuccessProbe(trained_probe)
     fresh = [toy.demonstration(t, s, noise_m=n) for t in toy.TASKS for s in range(500, 510)
              for n in (0.0, 0.06)]  # fmt: skip
     told = probe.probabilities([final_ending(d, d.num_steps - 1) for d in fresh]) > 0.5
