@@ -48,12 +48,12 @@ mutants: $(VENV)/.dev    ## plant known bugs one by one and count those that a t
 check: $(VENV)/.dev      ## format, lint, types, import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
-	$(BIN)/mypy -p dextouch -p services
+	$(BIN)/mypy -p dextouch -p services -p benchmarks
 	PYTHONPATH=.:shared $(BIN)/lint-imports
 
 bench: $(VENV)/.dev      ## time the stages against their errors, one after another; STAGE=clocks ARGS="--quick" for one
 	@missed=; for stage in $(STAGE); do echo "== $$stage"; \
-	$(BIN)/dextouch bench $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
+	$(BIN)/python -m benchmarks $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
 	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
 
 # Every step goes on where it was broken off. The last one says which bounds are met, and which figures are those of docs/evaluator.json.
@@ -78,7 +78,7 @@ reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state
 	$(BIN)/dextouch train data --store $(MADE)/exact --mix exact --first 700 --count 50 --images 8
 	$(BIN)/dextouch train policy --episodes $(MADE)/train --episodes $(MADE)/exact --early-at 0.1 \
 		--training.num-training-steps 3600 --training.max-cpu-s 150 --output $(MADE)/cloned.safetensors
-	$(BIN)/dextouch bench evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
+	$(BIN)/python -m benchmarks evaluator --world $(MADE)/state.safetensors --probe $(MADE)/success_probe.safetensors \
 		--cloned cloned=$(MADE)/cloned.safetensors --cloned "cloned early=$(MADE)/cloned_early.safetensors" \
 		--first-seed 30020 --starts 40 --repeats docs/evaluator.json --keep $(MADE)/evaluator --out $(MADE)/bench
 

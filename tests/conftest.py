@@ -13,7 +13,7 @@ CHECKS_SHAPES = "DEXTOUCH_VM_GUEST" not in os.environ
 if CHECKS_SHAPES:
     from tests import shape_checks
 
-    shape_checks.install(["dextouch", "services"])
+    shape_checks.install(["dextouch", "services", "benchmarks"])
 
 # The same examples in every run: a change is red because of the change, not because of the day.
 # No deadline: machines that are busy with other things are slow, not wrong.

@@ -52,7 +52,6 @@ COMMANDS = {
         "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
     ),
     "dashboard": Command("services.dashboard.__main__", "serve the operators' page"),
-    "bench": Command("services.cli.bench", "time a stage against its error, beside its rivals"),
     "stress": Command("services.cli.stress.command", "check every stage against numerical hazards"),
 }
 

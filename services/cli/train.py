@@ -23,7 +23,7 @@ USAGE = """usage: dextouch train COMMAND [options]
   imagined     those episodes as the world model imagines them
   policy       a closed-loop policy that imitates the demonstrations
   probe        the judge of imagined success, from true and imagined episodes
-  direct-judge its rival, which imagines nothing: for `dextouch bench evaluator --direct`
+  direct-judge its rival, which imagines nothing: for `python -m benchmarks evaluator --direct`
 
 Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`
 trains a small state model, a policy and a probe; docs/evaluation.md has the commands.

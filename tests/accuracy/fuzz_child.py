@@ -6,10 +6,10 @@ import time
 
 import numpy as np
 
+from benchmarks.retargeting.pinches import people, pinch_motion
 from services.alignment.retargeting import HandRetargeter, RetargetStatus, warm_up
-from services.cli.bench.retargeting.fuzz import FAULTS, fuzzed
-from services.cli.bench.retargeting.pinches import people, pinch_motion
-from services.cli.bench.retargeting.sequences import Motion, robot_motion
+from services.cli.simulated.hand_motions import Motion, robot_motion
+from services.cli.simulated.tracking_faults import FAULTS, fuzzed
 
 # Of the robot, swaps of neighbours go untold for up to 8 samples; at the velocity limit as many
 # bring the joints back, and then the pull of the samples before has to fade.

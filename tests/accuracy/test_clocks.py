@@ -8,9 +8,8 @@ import sys
 import numpy as np
 import pytest
 
-from dextouch.clocks import date_by_counting, fit_clock
-from services.cli.bench.clocks.rivals import arrivals, ours_offline, ours_online
-from services.cli.bench.clocks.scenes import (
+from benchmarks.clocks.rivals import arrivals, ours_offline, ours_online
+from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,
     SCENES,
@@ -18,7 +17,8 @@ from services.cli.bench.clocks.scenes import (
     Scene,
     simulate,
 )
-from services.cli.bench.clocks.scores import score
+from benchmarks.clocks.scores import score
+from dextouch.clocks import date_by_counting, fit_clock
 
 SECONDS = 120.0
 SEEDS = (0,)

@@ -19,8 +19,8 @@ from services.alignment.calibration.hand_eye import (
     solve_hand_eye,
 )
 from services.alignment.calibration.twists import move, twist
-from services.cli.bench.calibration import scenes
-from services.cli.bench.calibration.scenes import Motion
+from services.cli.simulated import board_scenes as scenes
+from services.cli.simulated.board_scenes import Motion
 
 RECORDED_POSES = Path(__file__).parents[3] / "shared/data/hand_eye/pose_samples.json"
 NUM_SEEDS = 20

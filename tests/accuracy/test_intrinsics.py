@@ -26,7 +26,7 @@ from services.alignment.calibration.intrinsics import (
     leave_one_out_rms_px,
     unseen_parts,
 )
-from services.cli.bench.calibration import scenes
+from services.cli.simulated import board_scenes as scenes
 
 PHOTOS = Path(__file__).parents[3] / "shared/data/camera_chessboard"
 CHARUCO_PHOTO = PHOTOS.parent / "hand_eye/charuco.jpg"

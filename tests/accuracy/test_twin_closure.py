@@ -5,12 +5,12 @@ from statistics import mean
 
 import pytest
 
+from benchmarks.closure.contact_times import contact_times, timing_errors
+from benchmarks.closure.methods import METHODS, OURS, retarget_take
+from benchmarks.closure.pictures import write_sheet
+from benchmarks.closure.replay import TASKS, close_take
 from dextouch.errors import InvalidInputError
 from dextouch.images.jpeg import jpeg_size
-from services.cli.bench.closure.contact_times import contact_times, timing_errors
-from services.cli.bench.closure.methods import METHODS, OURS, retarget_take
-from services.cli.bench.closure.pictures import write_sheet
-from services.cli.bench.closure.replay import TASKS, close_take
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

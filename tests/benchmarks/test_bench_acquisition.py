@@ -1,4 +1,4 @@
-"""`dextouch bench acquisition`: one short run as users start it, and its tables and verdicts.
+"""`python -m benchmarks acquisition`: one short run as users start it, and its tables and verdicts.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -10,21 +10,21 @@ import sys
 import numpy as np
 import pytest
 
-from dextouch.errors import InvalidInputError
-from services.cli.bench.acquisition import stage
-from services.cli.bench.acquisition.acceptance import requirements
-from services.cli.bench.acquisition.drivers import DriverSpeed, decode_all, make_talks
-from services.cli.bench.acquisition.families import make_families
-from services.cli.bench.acquisition.noise import (
+from benchmarks.acquisition import benchmark
+from benchmarks.acquisition.acceptance import requirements
+from benchmarks.acquisition.drivers import DriverSpeed, decode_all, make_talks
+from benchmarks.acquisition.families import make_families
+from benchmarks.acquisition.noise import (
     Judgement,
     Line,
     count_split_differences,
     disturb,
     judge,
 )
-from services.cli.bench.command import stage_parser, usage
-from services.cli.bench.figures import Figure
-from services.cli.bench.stages import STAGES
+from benchmarks.command import stage_parser, usage
+from benchmarks.figures import Figure
+from benchmarks.stages import STAGES
+from dextouch.errors import InvalidInputError
 
 FAMILIES = {family.name: family for family in make_families()}
 BAD_LINE = Line(bit_error_rate=1e-4, byte_loss_rate=1e-5)
@@ -34,7 +34,7 @@ BAD_LINE = Line(bit_error_rate=1e-4, byte_loss_rate=1e-5)
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "acquisition", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "acquisition", "--quick"]
     options = ["--packets", "600", "--seconds", "0.3", "--json", str(folder / "figures.json")]
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -110,10 +110,10 @@ def test_verdicts_say_what_was_not_measured():
 @pytest.mark.parametrize("words", [["--packets", "4"], ["--rounds", "0"], ["--seconds", "0"]])
 def test_options_that_mean_nothing_are_refused(words, tmp_path):
     parser = stage_parser("acquisition")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     options = parser.parse_args(words)
     with pytest.raises(InvalidInputError, match=words[0]):
-        stage.measure(options, tmp_path, pytest.fail)
+        benchmark.measure(options, tmp_path, pytest.fail)
 
 
 @pytest.mark.parametrize("talk", make_talks(seed=1), ids=lambda talk: talk.name)

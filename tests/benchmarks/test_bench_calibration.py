@@ -1,4 +1,4 @@
-"""`dextouch bench calibration`: one short run as users start it, and its parts that can be wrong.
+"""`python -m benchmarks calibration`: one short run, and its parts that can be wrong.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -12,16 +12,16 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from benchmarks.calibration import benchmark
+from benchmarks.calibration.acceptance import requirements
+from benchmarks.calibration.cameras import CameraResult
+from benchmarks.calibration.compare import MethodResult, not_worse_share, score
+from benchmarks.calibration.refusals import SceneResult, scene_makers
+from benchmarks.calibration.rivals import METHODS, OURS, OURS_POSES, PARK
+from benchmarks.command import stage_parser
+from benchmarks.figures import Figure
 from dextouch.errors import DegenerateRotationError, InvalidInputError, LimitExceededError
-from services.cli.bench.calibration import stage
-from services.cli.bench.calibration.acceptance import requirements
-from services.cli.bench.calibration.cameras import CameraResult
-from services.cli.bench.calibration.compare import MethodResult, not_worse_share, score
-from services.cli.bench.calibration.refusals import SceneResult, scene_makers
-from services.cli.bench.calibration.rivals import METHODS, OURS, OURS_POSES, PARK
-from services.cli.bench.calibration.scenes import Motion, board_points, make_scene
-from services.cli.bench.command import stage_parser
-from services.cli.bench.figures import Figure
+from services.cli.simulated.board_scenes import Motion, board_points, make_scene
 
 NAMES = [method.name for method in METHODS]
 BY_NAME = {method.name: method for method in METHODS}
@@ -32,7 +32,7 @@ EXACT = Motion(pixel_px=0.0, tracker_rotation_deg=0.0, tracker_translation_m=0.0
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "calibration", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "calibration", "--quick"]
     outputs = ["--json", str(folder / "figures.json"), "--out", str(folder / "out")]
     done = subprocess.run([*command, *outputs], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -44,7 +44,7 @@ def test_every_method_is_measured_on_every_seed(run):
     assert list(figures["hand_eye"]) == NAMES
     for result in figures["hand_eye"].values():
         for key in ("ms", "error_deg", "error_mm"):
-            assert len(result[key]["values"]) == stage.QUICK["seeds"]
+            assert len(result[key]["values"]) == benchmark.QUICK["seeds"]
             assert min(result[key]["values"]) > 0
 
 
@@ -98,7 +98,7 @@ def test_a_seed_makes_one_scene_with_the_noise_it_should_have():
 
 
 def test_scenes_that_cannot_be_seen_are_refused(monkeypatch):
-    monkeypatch.setattr("services.cli.bench.calibration.scenes.MAX_TRIES", 50)
+    monkeypatch.setattr("services.cli.simulated.board_scenes.MAX_TRIES", 50)
     with pytest.raises(LimitExceededError):
         make_scene(0, Motion(distance_m=(0.14, 0.15), tilt_deg=1.0))
 
@@ -161,6 +161,6 @@ def no_bar(what, num_steps):
 
 def test_runs_that_measure_nothing_are_refused(tmp_path):
     parser = stage_parser("calibration")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     with pytest.raises(InvalidInputError, match="--seeds"):
-        stage.measure(parser.parse_args(["--seeds", "0"]), tmp_path, no_bar)
+        benchmark.measure(parser.parse_args(["--seeds", "0"]), tmp_path, no_bar)

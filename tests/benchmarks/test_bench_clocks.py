@@ -1,4 +1,4 @@
-"""`dextouch bench clocks`: one short run as users start it; scores; options that mean nothing.
+"""`python -m benchmarks clocks`: one short run, scores, and options that mean nothing.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -10,10 +10,9 @@ import sys
 import numpy as np
 import pytest
 
-from dextouch.errors import InvalidInputError, UnknownNameError
-from services.cli.bench.clocks import stage
-from services.cli.bench.clocks.rivals import OFFLINE, ONLINE
-from services.cli.bench.clocks.scenes import (
+from benchmarks.clocks import benchmark
+from benchmarks.clocks.rivals import OFFLINE, ONLINE
+from benchmarks.clocks.scenes import (
     BASE_DELAY_NS,
     MORE_SCENES,
     SCENES,
@@ -23,15 +22,16 @@ from services.cli.bench.clocks.scenes import (
     find_scene,
     simulate,
 )
-from services.cli.bench.clocks.scores import score
-from services.cli.bench.command import stage_parser
+from benchmarks.clocks.scores import score
+from benchmarks.command import stage_parser
+from dextouch.errors import InvalidInputError, UnknownNameError
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "clocks", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "clocks", "--quick"]
     options = ["--scenes", "base,step -30 ms,stop 500 ms", "--seconds", "30", "--out", str(folder)]
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -96,11 +96,11 @@ def test_stops_late_paths_and_wrong_stamps_are_what_they_say():
 @pytest.mark.parametrize("words", [["--seconds", "5"], ["--rounds", "0"]])
 def test_options_that_mean_nothing_are_refused(words, tmp_path):
     parser = stage_parser("clocks")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     with pytest.raises(InvalidInputError, match=words[0]):
-        stage.measure(parser.parse_args(words), tmp_path, pytest.fail)
+        benchmark.measure(parser.parse_args(words), tmp_path, pytest.fail)
     with pytest.raises(UnknownNameError, match="wander"):
-        stage.measure(parser.parse_args(["--scenes", "storm"]), tmp_path, pytest.fail)
+        benchmark.measure(parser.parse_args(["--scenes", "storm"]), tmp_path, pytest.fail)
 
 
 def test_every_scene_can_be_named_in_a_list():

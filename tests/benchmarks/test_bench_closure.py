@@ -1,17 +1,17 @@
-"""`dextouch bench closure --quick`: one take; a copied wrist holds nothing, our method does."""
+"""`python -m benchmarks closure`: one take; a copied wrist holds nothing, our method does."""
 
 from contextlib import contextmanager
 
 import pytest
 
+from benchmarks.closure import benchmark
+from benchmarks.command import stage_parser
 from dextouch.errors import InvalidInputError
-from services.cli.bench.closure import stage
-from services.cli.bench.command import stage_parser
 
 
 def options(*arguments):
     parser = stage_parser("closure")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     return parser.parse_args(list(arguments))
 
 
@@ -23,7 +23,7 @@ def test_a_quick_run_replays_one_take(tmp_path):
         steps.append(total)
         yield steps.append
 
-    report = stage.measure(options("--quick", "--tasks", "stand_bottle"), tmp_path, bar)
+    report = benchmark.measure(options("--quick", "--tasks", "stand_bottle"), tmp_path, bar)
     assert steps[0] == 2 == len(steps) - 1
     assert list(report.data["succeeded"].values()) == [[False], [True]]
     assert report.is_met
@@ -33,4 +33,4 @@ def test_a_quick_run_replays_one_take(tmp_path):
 
 def test_no_take_is_refused(tmp_path):
     with pytest.raises(InvalidInputError, match="at least 1"):
-        stage.measure(options("--takes", "0"), tmp_path, lambda *_: None)
+        benchmark.measure(options("--takes", "0"), tmp_path, lambda *_: None)

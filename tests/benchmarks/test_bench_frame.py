@@ -1,20 +1,22 @@
-"""The frame of `dextouch bench`: rounds, figures, the chart, options and exit status."""
+"""The frame of `python -m benchmarks`: rounds, figures, the chart, options and exit status."""
 
 import json
+import re
 import sys
 import types
 import xml.etree.ElementTree as ET
 
 import pytest
 
+from benchmarks import __main__ as entry_point
+from benchmarks import command
+from benchmarks.chart import Panel, Point, draw, linear_ticks, log_ticks
+from benchmarks.figures import Figure, Requirement
+from benchmarks.machine import NOT_INSTALLED, describe_machine
+from benchmarks.report import ResultTable, StageReport
+from benchmarks.rounds import interleaved
+from benchmarks.stages import STAGES, StageEntry
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
-from services.cli.bench import command
-from services.cli.bench.chart import Panel, Point, draw, linear_ticks, log_ticks
-from services.cli.bench.figures import Figure, Requirement
-from services.cli.bench.machine import NOT_INSTALLED, describe_machine
-from services.cli.bench.report import ResultTable, StageReport
-from services.cli.bench.rounds import interleaved
-from services.cli.bench.stages import STAGES, StageEntry
 
 
 def test_rounds_are_taken_in_turns():
@@ -138,6 +140,41 @@ def test_every_stage_teaches(name, capsys):
     assert all(word in text for word in ("--json", "--out", "--check", "--quick"))
     # argparse breaks lines, also after a hyphen.
     assert "".join(STAGES[name].teaches.split()) in "".join(text.split())
+
+
+@pytest.mark.parametrize("name", sorted(STAGES))
+def test_flags_have_dashes_and_the_example_is_taken(name):
+    parser = command.stage_parser(name)
+    command.load_stage(name).add_options(parser)
+    text = parser.format_help()
+    assert text.startswith(f"usage: python -m benchmarks {name} ")
+    example = text.partition("example:\n")[2].split()
+    assert example[:4] == ["python", "-m", "benchmarks", name]
+    parser.parse_args(example[4:])
+    for action in parser._actions:
+        assert not any("_" in flag for flag in action.option_strings)
+        assert re.sub(r"\((default|required).*\)", "", action.help or ""), action.dest
+
+
+def test_refusals_are_one_line_without_a_traceback(monkeypatch, capsys):
+    assert entry_point.main(["espresso"]) == 3
+    told = capsys.readouterr().err
+    assert told.startswith("benchmarks: unknown stage 'espresso'; valid: ")
+    assert len(told.splitlines()) == 1
+
+    def without_mujoco(argv):
+        raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
+
+    monkeypatch.setattr(command, "main", without_mujoco)
+    assert entry_point.main(["twin"]) == 3
+    assert "dextouch-wm[twin]" in capsys.readouterr().err
+
+
+def test_a_result_on_standard_output_stands_alone(fake_stage, capsys):
+    assert entry_point.main(["fake", "--figure", "1", "--json", "-"]) == 0
+    told = capsys.readouterr()
+    assert json.loads(told.out)["designs"] == {"ours": [1.0]}
+    assert "rival is left out" in told.err
 
 
 @pytest.fixture

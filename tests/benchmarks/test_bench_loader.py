@@ -1,4 +1,4 @@
-"""`dextouch bench loader`: one short run as users start it, and its table and verdict.
+"""`python -m benchmarks loader`: one short run as users start it, and its table and verdict.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -9,17 +9,17 @@ import sys
 
 import pytest
 
+from benchmarks import loader
+from benchmarks.command import stage_parser
+from benchmarks.figures import Figure
 from dextouch.errors import InvalidInputError
-from services.cli.bench import loader
-from services.cli.bench.command import stage_parser
-from services.cli.bench.figures import Figure
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "loader", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "loader", "--quick"]
     options = ["--episodes", "2", "--workers", "0,1", "--json", str(folder / "figures.json")]
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr

@@ -1,4 +1,4 @@
-"""`dextouch bench retargeting`: a quick run, its rivals and its verdicts."""
+"""`python -m benchmarks retargeting`: a quick run, its rivals and its verdicts."""
 
 import json
 import signal
@@ -10,18 +10,11 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from dextouch.errors import (
-    InvalidInputError,
-    LimitExceededError,
-    UnavailableError,
-    UnknownNameError,
-)
-from dextouch.hands.robot_hand import RobotHand
-from services.cli.bench.command import stage_parser
-from services.cli.bench.figures import Figure
-from services.cli.bench.retargeting import compare, rival_process, rivals, stage
-from services.cli.bench.retargeting.acceptance import requirements, velocity_limit_deg, worst_ratio
-from services.cli.bench.retargeting.compare import (
+from benchmarks.command import stage_parser
+from benchmarks.figures import Figure
+from benchmarks.retargeting import benchmark, compare, rival_process, rivals
+from benchmarks.retargeting.acceptance import requirements, velocity_limit_deg, worst_ratio
+from benchmarks.retargeting.compare import (
     PINCH_INPUT,
     ROBOT_INPUT,
     Effort,
@@ -30,15 +23,22 @@ from services.cli.bench.retargeting.compare import (
     compare_speed,
     scale_of,
 )
-from services.cli.bench.retargeting.hand_urdf import hand_urdf, roll_pitch_yaw
-from services.cli.bench.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
-from services.cli.bench.retargeting.pinches import people, pinch_motion
-from services.cli.bench.retargeting.rival_process import RivalProcess
-from services.cli.bench.retargeting.rivals import RIVALS
-from services.cli.bench.retargeting.robustness import faulty_motions, try_faults
-from services.cli.bench.retargeting.scores import PinchScore, RobotScore, score_robot
-from services.cli.bench.retargeting.sequences import cold_postures, robot_motion
-from services.cli.bench.retargeting.tables import tables
+from benchmarks.retargeting.hand_urdf import hand_urdf, roll_pitch_yaw
+from benchmarks.retargeting.ours import OURS, OURS_EXACT, OURS_LIVE, ColdStart
+from benchmarks.retargeting.pinches import people, pinch_motion
+from benchmarks.retargeting.rival_process import RivalProcess
+from benchmarks.retargeting.rivals import RIVALS
+from benchmarks.retargeting.robustness import faulty_motions, try_faults
+from benchmarks.retargeting.scores import PinchScore, RobotScore, score_robot
+from benchmarks.retargeting.tables import tables
+from dextouch.errors import (
+    InvalidInputError,
+    LimitExceededError,
+    UnavailableError,
+    UnknownNameError,
+)
+from dextouch.hands.robot_hand import RobotHand
+from services.cli.simulated.hand_motions import cold_postures, robot_motion
 
 SIDES = ("left", "right")
 DEX = RIVALS["dex vector15"]
@@ -48,7 +48,7 @@ DEX = RIVALS["dex vector15"]
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "retargeting", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "retargeting", "--quick"]
     outputs = ["--rivals", "none", "--out", str(folder)]
     done = subprocess.run([*command, *outputs], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -174,7 +174,7 @@ def test_the_alarm_counts_processor_time_and_is_not_left_behind():
 
 CHILD = """
 import sys, time
-from services.cli.bench.retargeting import rival_process, rivals
+from benchmarks.retargeting import rival_process, rivals
 def solve(reference):
     if reference[0, 0] == 1.0:
         raise ValueError("ones are not for me")
@@ -273,15 +273,15 @@ def test_references_are_what_each_objective_follows():
 
 def test_rivals_that_are_not_installed_are_named_with_the_way_to_get_them(monkeypatch, tmp_path):
     monkeypatch.setattr(rivals, "find_spec", lambda name: None if name == "nlopt" else object())
-    chosen, left_out = stage.choose_rivals(None)
+    chosen, left_out = benchmark.choose_rivals(None)
     assert [one.library for one in chosen] == ["dexi"] * 3
     assert [one.library for one in left_out] == ["dex"] * 3
-    text = stage.notes(chosen, left_out)[-1]
+    text = benchmark.notes(chosen, left_out)[-1]
     assert "dex dexpilot not measured: nlopt not installed; pip install" in text
-    assert stage.choose_rivals("none") == ([], [])
-    assert [one.name for one in stage.choose_rivals("dexi vector15")[0]] == ["dexi vector15"]
+    assert benchmark.choose_rivals("none") == ([], [])
+    assert [one.name for one in benchmark.choose_rivals("dexi vector15")[0]] == ["dexi vector15"]
     with pytest.raises(UnknownNameError, match="dexi vector15"):
-        stage.choose_rivals("mink")
+        benchmark.choose_rivals("mink")
     with pytest.raises(UnavailableError, match="nlopt"):
         rivals.set_up(DEX, np.zeros((1, 25, 3)), "left", scale=1.0, folder=tmp_path)
 
@@ -352,6 +352,6 @@ def test_requirements_say_what_failed():
 @pytest.mark.parametrize("words", [["--rounds", "0"], ["--samples", "5"], ["--seed", "-1"]])
 def test_runs_that_measure_nothing_are_refused(words, tmp_path):
     parser = stage_parser("retargeting")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     with pytest.raises(InvalidInputError, match=words[0]):
-        stage.measure(parser.parse_args(words), tmp_path, no_bar)
+        benchmark.measure(parser.parse_args(words), tmp_path, no_bar)

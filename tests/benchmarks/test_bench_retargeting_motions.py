@@ -1,14 +1,9 @@
-"""Motions of `dextouch bench retargeting`: free of contact, as fast as they say, scored rightly."""
+"""Motions of the retargeting benchmark: free of contact, as fast as stated, scored rightly."""
 
 import numpy as np
 import pytest
 
-from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteError
-from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import NODE_INDEX
-from services.cli.bench.retargeting import sequences
-from services.cli.bench.retargeting.collisions import segment_distance_m, touching
-from services.cli.bench.retargeting.pinches import (
+from benchmarks.retargeting.pinches import (
     BONE_SPREAD,
     PINCHED_M,
     SIZES,
@@ -16,8 +11,13 @@ from services.cli.bench.retargeting.pinches import (
     people,
     pinch_motion,
 )
-from services.cli.bench.retargeting.scores import score_pinches, score_robot
-from services.cli.bench.retargeting.sequences import (
+from benchmarks.retargeting.scores import score_pinches, score_robot
+from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteError
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import NODE_INDEX
+from services.cli.simulated import hand_motions as sequences
+from services.cli.simulated.finger_contact import segment_distance_m, touching
+from services.cli.simulated.hand_motions import (
     MAX_SPEED_RAD_S,
     RATE_HZ,
     cold_postures,

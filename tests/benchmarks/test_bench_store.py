@@ -1,4 +1,4 @@
-"""`dextouch bench store`: one short run as users start it, and its parts that can be wrong.
+"""`python -m benchmarks store`: one short run as users start it, and its parts that can be wrong.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -14,24 +14,24 @@ import numpy as np
 import pytest
 import simplejpeg
 
-from dextouch.errors import CorruptDataError, InvalidInputError, UnknownNameError
-from services.cli.bench.command import stage_parser
-from services.cli.bench.figures import Figure
-from services.cli.bench.store import stage
-from services.cli.bench.store.acceptance import requirements
-from services.cli.bench.store.compare import DesignResult, expected_window, image_psnr
-from services.cli.bench.store.designs import OpenStore
-from services.cli.bench.store.live import LiveResult
-from services.cli.bench.store.scene import NOISE_SIGMA_LEVELS, make_scene
-from services.cli.bench.store.tables import panels, rms_levels
-from services.cli.bench.store.take import make_take
-from services.cli.bench.store.workload import (
+from benchmarks.command import stage_parser
+from benchmarks.figures import Figure
+from benchmarks.store import benchmark
+from benchmarks.store.acceptance import requirements
+from benchmarks.store.compare import DesignResult, expected_window, image_psnr
+from benchmarks.store.designs import OpenStore
+from benchmarks.store.live import LiveResult
+from benchmarks.store.scene import NOISE_SIGMA_LEVELS, make_scene
+from benchmarks.store.tables import panels, rms_levels
+from benchmarks.store.take import make_take
+from benchmarks.store.workload import (
     CAMERAS,
     IMAGE_SHAPE,
     NUMERIC_RATES_HZ,
     TimedStream,
     Workload,
 )
+from dextouch.errors import CorruptDataError, InvalidInputError, UnknownNameError
 
 DESIGNS = ["ours-h264", "zarr-jpeg"]
 
@@ -40,7 +40,7 @@ DESIGNS = ["ours-h264", "zarr-jpeg"]
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "store", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "store", "--quick"]
     options = ["--seconds", "1", "--designs", ",".join(DESIGNS)]
     outputs = ["--json", str(folder / "figures.json"), "--out", str(folder / "out")]
     done = subprocess.run(
@@ -156,7 +156,7 @@ def block_take():
     return Workload(20 / 30, {camera: stream(images) for camera in CAMERAS}, numbers)
 
 
-@pytest.mark.parametrize("design", stage.DESIGNS, ids=lambda design: design.name)
+@pytest.mark.parametrize("design", benchmark.DESIGNS, ids=lambda design: design.name)
 def test_every_design_gives_back_what_it_was_given(design, block_take, tmp_path):
     """Numbers exactly, images as well as the codec can."""
     assert design.missing() is None
@@ -267,16 +267,16 @@ def no_bar(what, num_steps):
 
 def options(*words):
     parser = stage_parser("store")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     return parser.parse_args(list(words))
 
 
 @pytest.mark.parametrize("words", [("--seconds", "0.4"), ("--rounds", "0"), ("--windows", "-1")])
 def test_runs_that_measure_nothing_are_refused(words, tmp_path):
     with pytest.raises(InvalidInputError, match=words[0]):
-        stage.measure(options(*words), tmp_path, no_bar)
+        benchmark.measure(options(*words), tmp_path, no_bar)
 
 
 def test_unknown_designs_name_the_known_ones(tmp_path):
     with pytest.raises(UnknownNameError, match=r"'parquet'.*ours-h264"):
-        stage.measure(options("--designs", "zarr-jpeg,parquet"), tmp_path, no_bar)
+        benchmark.measure(options("--designs", "zarr-jpeg,parquet"), tmp_path, no_bar)

@@ -1,4 +1,4 @@
-"""`dextouch bench twin`: one short run as users start it, and errors by hand.
+"""`python -m benchmarks twin`: one short run as users start it, and errors by hand.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -10,19 +10,19 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.command import stage_parser
+from benchmarks.figures import Figure
+from benchmarks.twin import benchmark
+from benchmarks.twin.chunks import HEAD, HEAD_LAST, SELECTORS
+from benchmarks.twin.physics import AS_SERVED, SOLVERS, Played, contact_error
 from dextouch.errors import InvalidInputError
-from services.cli.bench.command import stage_parser
-from services.cli.bench.figures import Figure
-from services.cli.bench.twin import stage
-from services.cli.bench.twin.chunks import HEAD, HEAD_LAST, SELECTORS
-from services.cli.bench.twin.physics import AS_SERVED, SOLVERS, Played, contact_error
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "twin", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "twin", "--quick"]
     options = ["--rounds", "1", "--out", str(folder)]
     done = subprocess.run([*command, *options], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
@@ -69,14 +69,14 @@ def test_contact_errors_by_hand():
 
 def test_verdicts_are_of_the_rounds_ratios():
     times_ms = {HEAD: Figure.of([100.0, 200.0]), HEAD_LAST: Figure.of([70.0, 140.0])}
-    saved, share, equal = stage.requirements(times_ms, states_are_equal=True)
+    saved, share, equal = benchmark.requirements(times_ms, states_are_equal=True)
     assert (saved.figure, equal.figure) == (pytest.approx(0.7), 1.0)
     assert share.figure == pytest.approx(150 / 1066.667, rel=1e-4)
-    assert stage.requirements(times_ms, states_are_equal=False)[2].is_met is False
+    assert benchmark.requirements(times_ms, states_are_equal=False)[2].is_met is False
 
 
 def test_no_round_is_refused(tmp_path):
     parser = stage_parser("twin")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     with pytest.raises(InvalidInputError, match="--rounds"):
-        stage.measure(parser.parse_args(["--rounds", "0"]), tmp_path, pytest.fail)
+        benchmark.measure(parser.parse_args(["--rounds", "0"]), tmp_path, pytest.fail)

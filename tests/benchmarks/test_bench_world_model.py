@@ -1,4 +1,4 @@
-"""`dextouch bench world-model`: one short run as users start it, and errors by hand.
+"""`python -m benchmarks world-model`: one short run as users start it, and errors by hand.
 
 What a run says of speed is not judged here: that is for a quiet machine.
 """
@@ -10,26 +10,26 @@ import sys
 import numpy as np
 import pytest
 
-from dextouch.errors import InvalidInputError
-from dextouch.schemas.rollouts import ReturnSelector
-from dextouch.worlds.baseline import CopyFirstWorld
-from services.cli.bench.command import stage_parser
-from services.cli.bench.figures import Figure
-from services.cli.bench.world_model import stage, tables
-from services.cli.bench.world_model.held_out import CAMERA, held_out
-from services.cli.bench.world_model.rollouts import (
+from benchmarks.command import stage_parser
+from benchmarks.figures import Figure
+from benchmarks.world_model import benchmark, tables
+from benchmarks.world_model.held_out import CAMERA, held_out
+from benchmarks.world_model.rollouts import (
     Imagined,
     RolloutError,
     imagine,
     rollout_error,
 )
+from dextouch.errors import InvalidInputError
+from dextouch.schemas.rollouts import ReturnSelector
+from dextouch.worlds.baseline import CopyFirstWorld
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """A quick run in a process of its own, as shape checks must not be timed."""
     folder = tmp_path_factory.mktemp("bench")
-    command = [sys.executable, "-m", "services.cli.main", "bench", "world-model", "--quick"]
+    command = [sys.executable, "-m", "benchmarks", "world-model", "--quick"]
     done = subprocess.run(
         [*command, "--out", str(folder)], capture_output=True, text=True, check=False
     )
@@ -40,9 +40,9 @@ def run(tmp_path_factory):
 
 def test_a_quick_run_measures_everything(run):
     folder, figures = run
-    names = {tables.variant_name(n, p) for n in stage.EULER_STEPS for p in stage.PRECISIONS}
+    names = {tables.variant_name(n, p) for n in benchmark.EULER_STEPS for p in benchmark.PRECISIONS}
     assert set(figures["chunk_ms"]) == set(figures["errors"]) == names | {tables.COPY_FIRST}
-    assert len(figures["asked_ms"]) == len(stage.SELECTORS) * len(stage.TOGETHER)
+    assert len(figures["asked_ms"]) == len(benchmark.SELECTORS) * len(benchmark.TOGETHER)
     assert figures["options"]["served"] in names
     assert "as served" in (folder / "bench_world-model.md").read_text()
     assert "Imagined touch" in (folder / "bench_world-model.svg").read_text()
@@ -58,7 +58,7 @@ def test_the_model_is_nearer_to_the_twin_than_standing_still(run):
 def test_half_precision_is_near_full_precision_and_not_the_same(run):
     # Shape checks know float32 only, so half precision is tried without them.
     errors = run[1]["errors"]
-    for steps in stage.EULER_STEPS:
+    for steps in benchmark.EULER_STEPS:
         full = errors[tables.variant_name(steps, "float32")]
         half = errors[tables.variant_name(steps, "bfloat16")]
         assert half != full
@@ -120,6 +120,6 @@ def test_verdicts():
 @pytest.mark.parametrize("words", [["--rounds", "0"], ["--seeds", "0"]])
 def test_options_that_mean_nothing_are_refused(words, tmp_path):
     parser = stage_parser("world-model")
-    stage.add_options(parser)
+    benchmark.add_options(parser)
     with pytest.raises(InvalidInputError, match=words[0]):
-        stage.measure(parser.parse_args(words), tmp_path, pytest.fail)
+        benchmark.measure(parser.parse_args(words), tmp_path, pytest.fail)

@@ -6,17 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.stages import STAGES
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.settings import AcquisitionSettings
 from services.cli import main
-from services.cli.bench.stages import STAGES
 
 ROOT = Path(__file__).parents[2]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md")])
 LINK = re.compile(r"(?<!!)\[[^\]]*\]\((?!https?:)([^)\s]+)\)")
 CODE = re.compile(r"```\w*\n(.*?)```|`([^`\n]+)`", re.DOTALL)
-COMMAND = re.compile(r"\bdextouch ([a-z]+)(?: ([a-z-]+))?")
+COMMAND = re.compile(r"\bdextouch ([a-z]+)")
+BENCHMARK = re.compile(r"\bpython -m benchmarks\s+([a-z-]+)")
 
 
 def page_id(path):
@@ -51,10 +52,10 @@ def test_links_lead_to_a_file_and_a_heading(page):
 def test_commands_in_code_exist(page):
     text = page.read_text(encoding="utf-8")
     code = "\n".join(fenced or inline for fenced, inline in CODE.findall(text))
-    for name, word in COMMAND.findall(code):
+    for name in COMMAND.findall(code):
         assert name in main.COMMANDS, f"dextouch {name}"
-        if name == "bench" and word:
-            assert word in STAGES, f"dextouch bench {word}"
+    for name in BENCHMARK.findall(code):
+        assert name in STAGES, f"python -m benchmarks {name}"
 
 
 def test_station_settings_of_the_guide_are_taken(monkeypatch):
@@ -86,3 +87,6 @@ def test_make_bench_runs_every_stage():
     listed = re.search(r"^STAGE \?= (.+)$", text, re.MULTILINE)
     assert sorted(listed.group(1).split()) == sorted(STAGES)
     assert "|".join(listed.group(1).split()) in (ROOT / "README.md").read_text(encoding="utf-8")
+    table = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `python -m benchmarks ([a-z-]+)` \|", table, re.MULTILINE)
+    assert sorted(rows) == sorted(STAGES)

@@ -11,7 +11,7 @@ from services.alignment.retargeting.solver.arrays import TUNING
 
 @dataclass(frozen=True)
 class RetargetOptions:
-    """Options of the solver; the defaults are what `dextouch bench retargeting` measures.
+    """Options of the solver; the defaults are what `python -m benchmarks retargeting` measures.
 
     Args:
         temporal_weight_m2: pull towards the sample before, m²/rad² at 60 Hz beside points of unit

@@ -6,12 +6,11 @@ from typing import Any
 from dextouch.clients.policy import Policy
 from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import DexTouchError
-from services.cli.bench.evaluator.plan import ELSEWHERE, HOLD, RETREAT, script_name
-from services.cli.bench.evaluator.playing import scripted_actions
 from services.cli.demo.models import Models
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
 from services.evaluation.policies.replay import ReplayPolicy
+from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name, scripted_actions
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.tasks import get_task

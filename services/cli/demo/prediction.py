@@ -18,8 +18,8 @@ from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas.rollouts import Observation
 from dextouch.worlds.world import ReturnSelector, RolloutStart, World
-from services.cli.bench.evaluator.measuring import warp_over_table
 from services.cli.demo.models import TrainedOn
+from services.evaluation.camera_warp import warp_over_table
 from services.evaluation.reporting import PredictionPicture
 from services.world_model.training.episodes import read_episode
 from services.world_model.training.evaluation import refuse_trained

@@ -8,7 +8,7 @@ from dextouch.command_line import CommandParser, add_json
 from dextouch.data_folder import default_store
 
 TASKS = ("stand_bottle", "stack_bowls")
-# Nothing is trained or tuned on seeds from 30000 on; `dextouch bench evaluator` takes the first.
+# Nothing is trained or tuned on seeds from 30000 on; the evaluator's benchmark takes the first.
 FIRST_HELD_OUT_SEED = 31_000
 
 

@@ -14,9 +14,13 @@ from services.alignment.calibration.hand_eye import (
     solve_hand_eye,
 )
 from services.alignment.calibration.intrinsics import calibrate_found
-from services.cli.bench.calibration.cameras import simulated_boards
-from services.cli.bench.calibration.refusals import TURN_AXES
-from services.cli.bench.calibration.scenes import Motion, Scene, make_scene
+from services.cli.simulated.board_scenes import (
+    TURN_AXES,
+    Motion,
+    Scene,
+    make_scene,
+    simulated_boards,
+)
 from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("hand-eye")

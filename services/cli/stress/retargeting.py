@@ -4,12 +4,10 @@ from functools import cache, partial
 
 import numpy as np
 
-from dextouch.errors import InvalidInputError
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetStatus
-from services.cli.bench.closure.touch_anchor import touch_shares
-from services.cli.bench.retargeting.fuzz import fuzzed
-from services.cli.bench.retargeting.sequences import Motion, motion_of, robot_motion
+from services.cli.simulated.hand_motions import Motion, motion_of, robot_motion
+from services.cli.simulated.tracking_faults import fuzzed
 from services.cli.stress.cells import Check, StageCells
 from services.twin.hands import twin_hand
 
@@ -77,21 +75,6 @@ def _non_finite(check: Check) -> None:
     check.refused("NaN joints at reset", lambda: retargeter.reset(np.full(20, np.nan)))
 
 
-@STAGE.cell("touch", "fingertip forces of 0, 5e-324 N and 1e300 N, NaN and below zero")
-def _touch(check: Check) -> None:
-    times = np.arange(50) / 60.0
-    forces = np.zeros((50, 6))
-    check.true("no force, no share", not touch_shares(forces, times).any())
-    for force in (5e-324, 1.0, 1e300):
-        forces[25] = force
-        shares = touch_shares(forces, times)
-        inside = np.isfinite(shares).all() and (shares >= 0).all() and (shares <= 1).all()
-        check.true(f"{force:g} N: shares in 0 … 1", inside)
-    for bad in (np.nan, -1.0, np.inf):
-        forces[25] = bad
-        check.refused(f"{bad:g} N", lambda: touch_shares(forces, times), InvalidInputError)
-
-
 @STAGE.cell("precision", "keypoints rounded to float32 and float16 (0.1 mm)")
 def _precision(check: Check) -> None:
     motion = _motion()
@@ -128,6 +111,7 @@ def _batch(check: Check) -> None:
 
 STAGE.does_not_apply(
     one_axis="bones are measured, no mount: a hand that never moves is enough",
+    touch="only keypoints come in; touch transfer is tested with the benchmark that has it",
     ends="no interval: times have no end that is special",
     device="numba on the host's memory",
 )

@@ -31,7 +31,7 @@ class Policy(Protocol):
 
     A policy with an attribute `looks` that is False gets no images after the first step, so that
     worlds need not render them. With `looks = "last"` it may get nothing but the last step of each
-    chunk. `tasks` names those it supports; `dextouch bench evaluator` skips all others.
+    chunk. `tasks` names those it supports; `python -m benchmarks evaluator` skips all others.
     """
 
     def reset(self, start: PolicyStart) -> None:

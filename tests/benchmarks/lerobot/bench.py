@@ -5,14 +5,14 @@
 
 import sys
 
-from services.cli.bench.command import main
-from services.cli.bench.stages import STAGES, StageEntry
+from benchmarks.command import main
+from benchmarks.stages import STAGES, StageEntry
 
 STAGES["lerobot"] = StageEntry(
     "lerobot_stage",
     "write and read a take: ours, LeRobotDataset v3",
-    "Writes the take of `dextouch bench store` with our store and with LeRobotDataset v3 (its "
-    "streaming writer, the same tuned for speed, and its default writer) in turns, and reads "
+    "Writes the take of `python -m benchmarks store` with our store and with LeRobotDataset v3 "
+    "(its streaming writer, the same tuned for speed, and its default writer) in turns, and reads "
     "random windows of 17 images of one camera with touch and actions: through LeRobot's own "
     "items, and through its video decoder and table directly.",
 )

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from services.cli.bench.store.designs import OpenStore, StoreWindow
-from services.cli.bench.store.workload import (
+from benchmarks.store.designs import OpenStore, StoreWindow
+from benchmarks.store.workload import (
     CAMERAS,
     IMAGE_RATE_HZ,
     IMAGE_SHAPE,

@@ -8,17 +8,17 @@ from pathlib import Path
 from environment import enter
 from lerobot_designs import DIRECT, STREAMING, lerobot_designs
 
+from benchmarks.figures import Requirement
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.stages import Bar
+from benchmarks.store.compare import DesignResult, Effort, compare
+from benchmarks.store.designs import Design
+from benchmarks.store.our_design import OurDesign
+from benchmarks.store.tables import panels, read_table, write_table
+from benchmarks.store.take import make_take
+from benchmarks.store.workload import CAMERAS
 from dextouch.errors import UnknownNameError
-from services.cli.bench.figures import Requirement
-from services.cli.bench.machine import describe_machine
-from services.cli.bench.report import StageReport
-from services.cli.bench.stages import Bar
-from services.cli.bench.store.compare import DesignResult, Effort, compare
-from services.cli.bench.store.designs import Design
-from services.cli.bench.store.our_design import OurDesign
-from services.cli.bench.store.tables import panels, read_table, write_table
-from services.cli.bench.store.take import make_take
-from services.cli.bench.store.workload import CAMERAS
 
 OURS = "ours-h264"
 PACKAGES = ("lerobot", "torch", "torchcodec", "datasets", "pyarrow", "av", "numpy")

@@ -23,7 +23,7 @@ from services.alignment.calibration.twists import (
     right_jacobian_inverse,
     twist,
 )
-from services.cli.bench.calibration.scenes import DISTORTION, K, Motion, board_points, make_scene
+from services.cli.simulated.board_scenes import DISTORTION, K, Motion, board_points, make_scene
 
 
 def some_poses(num, seed=0):

@@ -11,12 +11,9 @@ from typing import NamedTuple
 import pytest
 
 from services.cli import main, train
-from services.cli.bench.stages import STAGES
 
 COMMANDS = """
 align report, align retarget, align run, align serve,
-bench acquisition, bench calibration, bench clocks, bench closure, bench evaluator, bench loader,
-bench retargeting, bench store, bench twin, bench world-model,
 checkpoint, dashboard, demo, doctor, evaluate, export, import, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
@@ -33,7 +30,6 @@ NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
 WITHOUT_JSON = {"align serve", "dashboard", "serve", "station serve", "store serve", "twin serve"}
 GROUPS = {
     "": tuple(main.COMMANDS),
-    "bench": tuple(STAGES),
     "train": tuple(train.TRAINERS),
     "station": tuple(word for group, word in main.INNER_COMMANDS if group == "station"),
 }

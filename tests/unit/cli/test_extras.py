@@ -62,9 +62,6 @@ COMMANDS = (
     "train probe --help",
     "serve --help",
     "evaluate --help",
-    "bench --help",
-    "bench store --help",
-    "bench acquisition --help",
 )
 HELP = "\n".join(("--help", "train --help", *COMMANDS))
 
@@ -89,7 +86,7 @@ def run_without(folder, packages, lines):
     ("installed", "refused"),
     [
         ((), set(COMMANDS)),
-        (("store",), set(COMMANDS) - {"bench clocks --help"}),
+        (("store",), set(COMMANDS)),
         (
             ("store", "station", "serve"),
             {
@@ -107,7 +104,6 @@ def run_without(folder, packages, lines):
                 "train probe --help",
                 "serve --help",
                 "evaluate --help",
-                "bench store --help",
             },
         ),
         (

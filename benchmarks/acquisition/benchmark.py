@@ -1,0 +1,121 @@
+"""Entry point of the benchmark stage `acquisition`."""
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks.acquisition.acceptance import requirements
+from benchmarks.acquisition.drivers import make_talks, measure_drivers
+from benchmarks.acquisition.families import make_families
+from benchmarks.acquisition.noise import Line, count_split_differences, judge
+from benchmarks.acquisition.ptys import NUM_STREAMS, run_ptys
+from benchmarks.acquisition.speed import measure_speed
+from benchmarks.acquisition.tables import panels, tables
+from benchmarks.figures import Figure
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+
+LINE = Line(bit_error_rate=1e-5, byte_loss_rate=1e-5)
+PACKAGES = ("numpy", "pyserial")
+_QUICK = {"packets": 2000, "rounds": 1, "seconds": 1.0, "splits": 5}
+_USUAL = {"packets": 100_000, "rounds": 7, "seconds": 5.0, "splits": 60}
+_NUM_PTY_ROUNDS = 3
+_BLOCKS = 500
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument(
+        "--packets", type=int, help=f"a family over the bad line ({_USUAL['packets']}; quick 2000)"
+    )
+    parser.add_argument("--rounds", type=int, help=f"of timing ({_USUAL['rounds']}; quick 1)")
+    parser.add_argument(
+        "--seconds", type=float, help=f"of eight gloves, thrice ({_USUAL['seconds']:g}; quick 1)"
+    )
+    parser.add_argument("--splits", type=int, help=f"of a stream ({_USUAL['splits']}; quick 5)")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (%(default)s)")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Decode from a noisy line, time every decoder and driver, read eight gloves.
+
+    Raises:
+        InvalidInputError: an invalid number.
+    """
+    del folder
+    plan = _plan(options)
+    seed = options.seed
+    families = make_families()
+    with bar("bad line", len(families) * -(-plan["packets"] // _BLOCKS)) as step:
+        judgements = [
+            found
+            for family in families
+            for found in judge(
+                family, list(family.ways), LINE, plan["packets"], seed=seed, on_block=step
+            )
+        ]
+    splits = {
+        family.name: count_split_differences(family, LINE, plan["splits"], seed=seed)
+        for family in families
+    }
+    num_subjects = plan["rounds"] * 3 * sum(len(family.ways) for family in families)
+    with bar("timing", num_subjects) as step:
+        speeds = measure_speed(families, plan["rounds"], seed=seed, on_step=step)
+    talks = make_talks(seed=seed)
+    with bar("every driver", plan["rounds"] * len(talks)) as step:
+        drivers = measure_drivers(talks, plan["rounds"], on_step=step)
+    runs = []
+    num_pty_rounds = 1 if options.quick else _NUM_PTY_ROUNDS
+    with bar("eight gloves", num_pty_rounds) as step:
+        for index in range(num_pty_rounds):
+            step(f"run {index + 1}")
+            runs.append(run_ptys(plan["seconds"]))
+    share = Figure.of([100 * run["cpu_s"] / run["seconds"] / NUM_STREAMS for run in runs])
+    return StageReport(
+        stage="acquisition",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "seed": seed},
+        tables=tables(judgements, speeds, drivers, line=LINE, core_share=share),
+        panels=panels(judgements, speeds),
+        requirements=requirements(judgements, drivers, splits, share),
+        data={
+            "line": asdict(LINE),
+            "judgements": [asdict(found) for found in judgements],
+            "split_differences": splits,
+            "us_a_packet": [
+                {"family": family, "way": way, "read_bytes": size, "rounds": list(figure.values)}
+                for (family, way, size), figure in speeds.items()
+            ],
+            "drivers": [
+                {
+                    "driver": driver.name,
+                    "packet_bytes": driver.packet_bytes,
+                    "packet_reads": driver.packet_reads,
+                    "us_a_packet": list(driver.time_us.values),
+                }
+                for driver in drivers
+            ],
+            "eight_gloves": runs,
+        },
+        notes=[
+            "justfloat has no checksum: errors that leave a possible reading are delivered by any "
+            "decoder; its stream says so in its capabilities",
+            "cameras: raw images are checked and JPEG images looked at too, one of 10 decoded",
+        ],
+    )
+
+
+def _plan(options: argparse.Namespace) -> dict[str, Any]:
+    """Values of the options, otherwise the usual or the quick defaults."""
+    plan: dict[str, Any] = {}
+    for name, default in (_QUICK if options.quick else _USUAL).items():
+        given = getattr(options, name)
+        plan[name] = default if given is None else given
+        if plan[name] <= 0:
+            raise InvalidInputError(f"--{name}: got {plan[name]}, expected more than 0")
+    if plan["packets"] <= 4:
+        raise InvalidInputError(f"--packets: got {plan['packets']}, expected at least 5")
+    return plan

@@ -1,0 +1,225 @@
+"""Processor time per packet of every driver, fed with the reads of its transport."""
+
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from benchmarks.acquisition.families import FULL_SCALE, NUM_VALUES, make_families
+from benchmarks.figures import Figure
+from benchmarks.rounds import interleaved
+from dextouch.hands.skeleton import NUM_KEYPOINTS
+from dextouch.streams.descriptors import StreamDescriptor
+from services.acquisition.devices.camera.driver import (
+    CameraDecoder,
+    ImageEncoding,
+    camera_descriptor,
+)
+from services.acquisition.devices.camera.mock import CameraSource
+from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import (
+    FingerTrackerDecoder,
+    keypoints_descriptor,
+)
+from services.acquisition.devices.finger_tracker.mock import (
+    BridgeFingerTrackerSource,
+    FingerTrackerSource,
+)
+from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
+from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
+from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
+from services.acquisition.devices.robot_state.mock import RobotStateSource
+from services.acquisition.devices.robot_state.packets import (
+    STREAM_SIZES,
+    RobotStateDecoder,
+    robot_descriptor,
+)
+from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
+from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
+from services.acquisition.drivers.base import Decoder
+from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
+from services.acquisition.drivers.tracking import pose_descriptor
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.replay import PacketSource, ReplayStream
+from services.acquisition.transports.socket import READ_BYTES
+
+NUM_PACKETS = 300
+NUM_IMAGES = 24
+IMAGE_SIZE_PX = (480, 640)
+PERIOD_NS = 10_000_000
+NO_FAULTS = DeviceFaults()
+
+
+@dataclass(frozen=True)
+class DeviceTalk:
+    """Recorded byte stream of one device.
+
+    `greeting` and each of `packets` are lists of reads of its transport; `decoder` creates the
+    decoder.
+    """
+
+    name: str
+    decoder: Callable[[], Decoder]
+    packets: Sequence[Sequence[bytes]]
+    greeting: Sequence[bytes] = ()
+
+    @property
+    def packet_bytes(self) -> float:
+        """Mean size of a packet on the wire."""
+        return sum(len(read) for packet in self.packets for read in packet) / len(self.packets)
+
+    @property
+    def packet_reads(self) -> float:
+        """Mean number of reads of a packet."""
+        return sum(map(len, self.packets)) / len(self.packets)
+
+
+@dataclass(frozen=True)
+class DriverSpeed:
+    """Processor time of one driver."""
+
+    name: str
+    packet_bytes: float
+    packet_reads: float
+    time_us: Figure
+
+
+def make_talks(*, seed: int) -> list[DeviceTalk]:
+    """One device of each kind, without faults."""
+    rng = np.random.default_rng(seed)
+    return [*_gloves(rng), *_trackers(rng), _robot(rng), *_cameras()]
+
+
+def measure_drivers(
+    talks: Iterable[DeviceTalk], num_rounds: int, *, on_step: Callable[[str], None]
+) -> list[DriverSpeed]:
+    """µs a packet of processor time of each driver's decoder, in turns."""
+    named = {talk.name: talk for talk in talks}
+    subjects = {name: partial(_once, talk) for name, talk in named.items()}
+    found: Mapping[str, list[float]] = interleaved(subjects, num_rounds, on_step=on_step)
+    return [
+        DriverSpeed(talk.name, talk.packet_bytes, talk.packet_reads, Figure.of(found[talk.name]))
+        for talk in named.values()
+    ]
+
+
+def decode_all(talk: DeviceTalk, decoder: Decoder) -> int:
+    """Feed all packets to a decoder and return the number of samples of all streams."""
+    num_samples = 0
+    for index, packet in enumerate(talk.packets, start=1):
+        for read in packet:
+            for samples in decoder.decode(read, index * PERIOD_NS).values():
+                num_samples += len(samples)
+    return num_samples
+
+
+def _once(talk: DeviceTalk, round_index: int) -> float:
+    del round_index
+    decoder = talk.decoder()
+    for read in talk.greeting:
+        decoder.decode(read, 0)
+    start_s = time.thread_time()
+    decode_all(talk, decoder)
+    return (time.thread_time() - start_s) / len(talk.packets) * 1e6
+
+
+def _gloves(rng: np.random.Generator) -> list[DeviceTalk]:
+    makers: dict[str, Callable[[], Decoder]] = {
+        "dextouch": partial(TactileGloveDecoder, "left"),
+        "wuji": partial(WujiGloveDecoder, "left"),
+        "justfloat": partial(
+            JustFloatGloveDecoder,
+            "left",
+            num_values=NUM_VALUES,
+            full_scale=FULL_SCALE,
+            rate_hz=60.0,
+        ),
+    }
+    return [
+        DeviceTalk(
+            f"glove {family.name}",
+            makers[family.name],
+            [[family.make(index, rng)] for index in range(NUM_PACKETS)],
+        )
+        for family in make_families()
+    ]
+
+
+def _trackers(rng: np.random.Generator) -> list[DeviceTalk]:
+    hand = _stream(keypoints_descriptor("left"), rng.uniform(-0.1, 0.1, (NUM_KEYPOINTS, 3)))
+    wrist = _stream(pose_descriptor("wrist_left"), np.array([0.1, 0.2, 1.0, 0.8, 0.0, 0.6, 0.0]))
+    fingers = FingerTrackerSource(hand, side="left", noise_m=1e-4, rng=rng)
+    poses = PoseTrackerSource(wrist, faults=NO_FAULTS, rng=rng)
+    bridged_fingers = BridgeFingerTrackerSource(hand, side="left", rng=rng)
+    bridged_poses = BridgePoseSource(wrist, faults=NO_FAULTS, rng=rng)
+    asking = bytes([DESCRIPTOR_REPORT])
+    return [
+        DeviceTalk(
+            "finger tracker, HID",
+            partial(FingerTrackerDecoder, "left"),
+            _packets(fingers),
+            fingers.answer(asking),
+        ),
+        DeviceTalk("pose tracker, HID", partial(PoseTrackerDecoder, "wrist_left"), _packets(poses)),
+        DeviceTalk(
+            "finger tracker, bridge",
+            partial(BridgeFingerTrackerDecoder, "left"),
+            _packets(bridged_fingers),
+            [bridged_fingers.hello()],
+        ),
+        DeviceTalk(
+            "pose tracker, bridge",
+            partial(BridgePoseTrackerDecoder, "wrist_left"),
+            _packets(bridged_poses),
+            [bridged_poses.hello()],
+        ),
+    ]
+
+
+def _robot(rng: np.random.Generator) -> DeviceTalk:
+    streams = {
+        name: _stream(robot_descriptor(name), rng.uniform(-1.0, 1.0, size))
+        for name, size in STREAM_SIZES.items()
+    }
+    return DeviceTalk("robot state", RobotStateDecoder, _packets(RobotStateSource(streams)))
+
+
+def _cameras() -> list[DeviceTalk]:
+    height_px, width_px = IMAGE_SIZE_PX
+    rows, columns = np.mgrid[:height_px, :width_px]
+    # Moving stripes: sharp enough not to count as blurred, and small once encoded.
+    shifts = np.arange(NUM_IMAGES)[:, None, None, None]
+    stripes = (8 * ((rows + columns) // 16))[None, :, :, None] + shifts
+    images = np.broadcast_to(stripes % 256, (NUM_IMAGES, *IMAGE_SIZE_PX, 3)).astype(np.uint8)
+    encodings: tuple[ImageEncoding, ...] = ("rgb8", "jpeg", "h264")
+    talks = []
+    for encoding in encodings:
+        size = {"height_px": height_px, "width_px": width_px}
+        descriptor = camera_descriptor("camera_head", **size, encoding="rgb8")
+        source = CameraSource(_stream(descriptor, images), encoding=encoding)
+        decoder = partial(CameraDecoder, "camera_head", **size, encoding=encoding)
+        talks.append(DeviceTalk(f"camera, {encoding}", decoder, _packets(source)))
+    return talks
+
+
+def _stream(descriptor: StreamDescriptor, values: np.ndarray) -> ReplayStream:
+    """A stream of many samples with the values of one."""
+    if values.ndim == len(descriptor.shape):
+        values = np.broadcast_to(values, (NUM_PACKETS, *values.shape))
+    t_ns = PERIOD_NS * np.arange(len(values), dtype=np.int64)
+    return ReplayStream(descriptor, t_ns, values)
+
+
+def _packets(source: PacketSource) -> list[list[bytes]]:
+    """Packets of a source, split into reads."""
+    return [
+        [
+            unit[at : at + READ_BYTES]
+            for unit in source.units(index, index, int(t_ns) + PERIOD_NS)
+            for at in range(0, len(unit), READ_BYTES)
+        ]
+        for index, t_ns in enumerate(source.t_ns)
+    ]

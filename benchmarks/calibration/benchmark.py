@@ -1,0 +1,68 @@
+"""Entry point of the benchmark stage `calibration`."""
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks.calibration.acceptance import notes, requirements
+from benchmarks.calibration.cameras import measure_cameras
+from benchmarks.calibration.compare import compare
+from benchmarks.calibration.refusals import try_scenes
+from benchmarks.calibration.tables import panels, tables
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+from services.cli.simulated.board_scenes import Motion, make_scene
+
+PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
+USUAL = {"seeds": 100, "camera_seeds": 20, "scenes": 20, "healthy": 50}
+QUICK = {"seeds": 4, "camera_seeds": 2, "scenes": 2, "healthy": 2}
+USUAL_COUNTS, QUICK_COUNTS = (8, 15, 25, 40), (8, 25)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument(
+        "--seeds", type=int, help=f"hand-eye scenes ({USUAL['seeds']}; quick {QUICK['seeds']})"
+    )
+    parser.add_argument("--views", type=int, default=20, help="of a hand-eye scene (%(default)s)")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Solve scenes of known mounts and cameras with every method, then degenerate scenes.
+
+    Raises:
+        InvalidInputError: no seed.
+    """
+    del folder
+    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
+    if options.seeds is not None:
+        plan["seeds"] = options.seeds
+    if plan["seeds"] < 1:
+        raise InvalidInputError(f"--seeds: got {plan['seeds']}, expected at least 1")
+    motion = Motion(num_views=options.views)
+    with bar("making scenes", plan["seeds"]) as step:
+        scenes = []
+        for seed in range(plan["seeds"]):
+            step(f"seed {seed}")
+            scenes.append(make_scene(seed, motion))
+    results = compare(scenes, bar)
+    counts = QUICK_COUNTS if options.quick else USUAL_COUNTS
+    cameras = measure_cameras(counts, plan["camera_seeds"], bar)
+    refusals = try_scenes(plan["scenes"], plan["healthy"], bar)
+    return StageReport(
+        stage="calibration",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "motion": asdict(motion)},
+        tables=tables(results, cameras, refusals),
+        panels=panels(results),
+        requirements=requirements(results, cameras, refusals),
+        data={
+            "hand_eye": {name: asdict(result) for name, result in results.items()},
+            "cameras": [asdict(camera) for camera in cameras],
+            "refusals": [asdict(scene) for scene in refusals],
+        },
+        notes=notes(results),
+    )

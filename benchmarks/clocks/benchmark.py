@@ -1,0 +1,75 @@
+"""Entry point of the benchmark stage `clocks`."""
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from benchmarks.clocks.compare import compare, compare_stampless
+from benchmarks.clocks.scenes import MORE_SCENES, SCENES, STOP_SCENES, find_scene
+from benchmarks.clocks.scores import WARM_UP_S
+from benchmarks.clocks.tables import panels, requirements, tables
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+
+PACKAGES = ("numpy",)
+_QUICK = {"seconds": 60.0, "rounds": 1}
+_USUAL = {"seconds": 600.0, "rounds": 5}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument(
+        "--seconds", type=float, help=f"length of a take ({_USUAL['seconds']:g}; quick 60)"
+    )
+    parser.add_argument("--rounds", type=int, help=f"takes a scene ({_USUAL['rounds']}; quick 1)")
+    parser.add_argument("--seed", type=int, default=0, help="of the first round (%(default)s)")
+    names = ", ".join([*SCENES, *MORE_SCENES, *STOP_SCENES]).replace("%", "%%")
+    parser.add_argument("--scenes", metavar="A,B", help=f"only these, by comma (all: {names})")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Run every method on every scene.
+
+    Raises:
+        UnknownNameError: an unknown scene.
+        InvalidInputError: takes that are too short, or no round.
+    """
+    plan = _plan(options)
+    names = list(SCENES | MORE_SCENES | STOP_SCENES)
+    if options.scenes is not None:
+        names = [name.strip() for name in options.scenes.split(",")]
+    scenes = {name: find_scene(name) for name in names}
+    effort = {"seconds": plan["seconds"], "num_rounds": plan["rounds"], "seed": options.seed}
+    results = compare(scenes, **effort, bar=bar)
+    stampless = compare_stampless(**effort, bar=bar)
+    return StageReport(
+        stage="clocks",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "seed": options.seed, "scenes": names},
+        tables=tables(results, stampless),
+        panels=panels(results),
+        requirements=requirements(results, stampless),
+        data={"results": [result.to_data() for result in (*results, *stampless)]},
+        notes=[
+            f"online errors count after {WARM_UP_S:g} s and, in scenes with a step, not within "
+            "1.2 s of it; a round is a take with a seed of its own"
+        ],
+    )
+
+
+def _plan(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say, else the usual or the quick numbers."""
+    defaults: Mapping[str, float] = _QUICK if options.quick else _USUAL
+    given = {name: getattr(options, name) for name in defaults}
+    plan = {name: given[name] if given[name] is not None else defaults[name] for name in defaults}
+    if plan["seconds"] < 2 * WARM_UP_S + 2:
+        raise InvalidInputError(
+            f"--seconds: got {plan['seconds']:g}, expected at least {2 * WARM_UP_S + 2:g}: online "
+            f"errors count after {WARM_UP_S:g} s, and a step comes in the middle"
+        )
+    if plan["rounds"] < 1:
+        raise InvalidInputError(f"--rounds: got {plan['rounds']}, expected at least 1")
+    return plan

@@ -1,0 +1,105 @@
+"""The benchmark stage `closure`: human takes of the twin, played again by its robot hand."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from statistics import mean
+
+from benchmarks.closure.contact_times import timing_errors
+from benchmarks.closure.methods import METHODS, OURS, Method
+from benchmarks.closure.replay import TASKS, ClosureTake, close_take
+from benchmarks.figures import Requirement
+from benchmarks.machine import describe_machine
+from benchmarks.report import ResultTable, StageReport
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+
+PACKAGES = ("numpy", "mujoco", "numba")
+FIRST_SEED = 100
+NUM_TAKES = 20
+MIN_SUCCESS = 0.8
+QUICK_METHODS = (METHODS[0], OURS)
+COLUMNS = ("", "success", "hand first", "hand last", "pad first", "pad last", "missing", "extra")
+
+Played = Mapping[tuple[str, Method], Sequence[ClosureTake]]
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this stage."""
+    parser.add_argument(
+        "--takes", type=int, metavar="N", help=f"human takes a task ({NUM_TAKES}; quick 1)"
+    )
+    parser.add_argument(
+        "--tasks", default=",".join(TASKS), metavar="A,B", help="of the twin (%(default)s)"
+    )
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Record human takes and replay each of them by every method.
+
+    Raises:
+        InvalidInputError: no take.
+        UnknownNameError: no such task.
+    """
+    del folder
+    num_takes = options.takes if options.takes is not None else 1 if options.quick else NUM_TAKES
+    if num_takes < 1:
+        raise InvalidInputError(f"--takes: got {num_takes}, expected at least 1")
+    tasks = options.tasks.split(",")
+    methods = QUICK_METHODS if options.quick else METHODS
+    played: dict[tuple[str, Method], list[ClosureTake]] = {
+        (task, method): [] for task in tasks for method in methods
+    }
+    with bar("replaying", len(played) * num_takes) as step:
+        for task in tasks:
+            for seed in range(FIRST_SEED, FIRST_SEED + num_takes):
+                for take in close_take(task, seed, methods, step):
+                    played[task, take.method].append(take)
+    return StageReport(
+        stage="closure",
+        machine=describe_machine(PACKAGES),
+        options={"takes": num_takes, "tasks": tasks},
+        tables=[_table(played, num_takes)],
+        panels=[],
+        requirements=[_requirement(played, task) for task in tasks],
+        data={
+            "succeeded": {
+                f"{task}: {method.name}": [take.succeeded for take in takes]
+                for (task, method), takes in played.items()
+            }
+        },
+    )
+
+
+def _table(played: Played, num_takes: int) -> ResultTable:
+    rows = []
+    for (task, method), takes in played.items():
+        errors = timing_errors([(take.human_contact, take.contact) for take in takes])
+        times_ms = (
+            errors.hand_first_ms,
+            errors.hand_last_ms,
+            errors.pad_first_ms,
+            errors.pad_last_ms,
+        )
+        counts = (str(errors.num_missing), str(errors.num_extra))
+        figures = (f"{_rate(takes):.2f}", *(_mean_ms(values) for values in times_ms), *counts)
+        rows.append((f"{task}: {method.name}", *figures))
+    return ResultTable(
+        f"Replays of {num_takes} human takes a task; contact times against the human's in ms",
+        COLUMNS,
+        rows,
+    )
+
+
+def _requirement(played: Played, task: str) -> Requirement:
+    return Requirement(
+        f"{task}: success of {OURS.name}", _rate(played[task, OURS]), "at least", MIN_SUCCESS
+    )
+
+
+def _rate(takes: Sequence[ClosureTake]) -> float:
+    return mean(float(take.succeeded) for take in takes)
+
+
+def _mean_ms(values: Sequence[float]) -> str:
+    return f"{mean(abs(value) for value in values):.0f}" if values else "-"

@@ -1,0 +1,256 @@
+"""The stage `evaluator`: policies in the twin and in imagination, and how far the two agree."""
+
+import argparse
+import json
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import asdict
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+from benchmarks.evaluator.drawn import Line, Rolled
+from benchmarks.evaluator.keeping import KeptRows, Row
+from benchmarks.evaluator.lines import TaskFigures
+from benchmarks.evaluator.page import cell, write_page
+from benchmarks.evaluator.plan import (
+    FIRST_SEED,
+    LEVELS_MM,
+    ClonedPolicy,
+    OutsidePolicy,
+    StudyPlan,
+    trained_seeds,
+)
+from benchmarks.evaluator.repetition import read_lines, repetition
+from benchmarks.evaluator.work import NEEDED, Missing, Study, open_study, unit_rows
+from benchmarks.machine import describe_machine
+from benchmarks.report import ResultTable, StageReport
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE, EARLY_POLICY
+from services.twin.tasks import TASK_NAMES
+
+PACKAGES = ("numpy", "torch", "mujoco")
+_SERVO = "colour servo=services.evaluation.policies.colour_servo:ColourServo"
+_USUAL_STARTS, _QUICK_STARTS = 20, 2
+_QUICK_LEVELS_MM = (0.0, 10.0, 30.0)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """The options of this stage."""
+    parser.add_argument(
+        "--world",
+        action="append",
+        type=Path,
+        help="checkpoint of the world model (committed one); repeated for other training seeds",
+    )
+    parser.add_argument(
+        "--probe",
+        action="append",
+        type=Path,
+        help="checkpoint of the judge (committed one); once for all worlds, or once for each",
+    )
+    parser.add_argument(
+        "--direct",
+        action="append",
+        type=Path,
+        help="checkpoint of the direct judge, which imagines nothing, as a rival (none); once for "
+        "all worlds, or once for each",
+    )
+    parser.add_argument(
+        "--without-touch",
+        action="append",
+        type=Path,
+        help="checkpoint of a world model that learned nothing of touch, as a rival (none); once "
+        "for all worlds, or once for each",
+    )
+    parser.add_argument("--tasks", nargs="+", default=list(TASK_NAMES), help="(all of the twin)")
+    parser.add_argument(
+        "--starts", type=int, help=f"starts a task ({_USUAL_STARTS}; quick {_QUICK_STARTS})"
+    )
+    parser.add_argument("--first-seed", type=int, default=FIRST_SEED, help="%(default)s")
+    parser.add_argument(
+        "--cloned",
+        action="append",
+        metavar="NAME=PATH",
+        help="cloned policy to roll out in closed loop; may be repeated (the committed two)",
+    )
+    parser.add_argument(
+        "--policy",
+        action="append",
+        metavar="[NAME=]MODULE:FACTORY",
+        help="policy of your own in closed loop; may be repeated (the colour servo)",
+    )
+    parser.add_argument(
+        "--keep",
+        type=Path,
+        default=Path("runs/evaluator"),
+        help="folder of results; what is there is not computed again (%(default)s)",
+    )
+    parser.add_argument(
+        "--repeats",
+        type=Path,
+        metavar="FILE",
+        help="evaluator.json of an earlier run: also say which figures are apart from it",
+    )
+    parser.add_argument("--jobs", type=int, default=min(2, os.cpu_count() or 1), help="%(default)s")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Roll out what is not kept yet, and make the table of everything.
+
+    Raises:
+        InvalidInputError: options that do not fit.
+    """
+    del folder
+    earlier = read_lines(options.repeats) if options.repeats else {}
+    plan = _plan(options)
+    study, kept = open_study(plan), KeptRows(plan.keep / "rollouts.jsonl")
+    units = [
+        (task, seed, missing)
+        for seed in plan.seeds
+        for task in study.tasks
+        if (missing := study.missing(kept, task, seed))
+    ]
+    with bar("rolling out", len(units)) as step:
+        for rows, name in _results(plan, units, options.jobs):
+            kept.add(rows)
+            step(name)
+    figures, failed = figures_of_tasks(study, kept)
+    lines = [line for each in figures for line in each.lines()]
+    policies = [row for each in figures for row in each.policy_rows()]
+    chunks = [row for each in figures for row in each.chunk_rows()]
+    rivals = [row for each in figures for row in each.rival_rows()]
+    notes = [f"{task} is unknown to the world or the judge" for task in plan.tasks
+             if task not in study.tasks]  # fmt: skip
+    if failed:
+        notes.append(f"{failed} rollouts failed and are missing; see {kept.path}")
+    write_page(plan.keep / "evaluator.html", study.about, lines, (policies, rivals, chunks), notes)
+    content = {
+        "about": study.about,
+        "lines": [asdict(line) for line in lines],
+        "policies": policies,
+        "rivals": rivals,
+        "chunks": chunks,
+        "notes": notes,
+    }
+    text = json.dumps(content, indent=1, allow_nan=False)
+    (plan.keep / "evaluator.json").write_text(text + "\n", encoding="utf-8")
+    return StageReport(
+        stage="evaluator",
+        machine=describe_machine(PACKAGES),
+        options={"tasks": study.tasks, "starts": len(plan.seeds), "policies": plan.policies},
+        tables=[
+            interval_table(lines),
+            row_table("Success rates", policies),
+            row_table("AUC of single rollouts, by who judges what", rivals),
+            row_table("Chunks of scripts, each figure beside its rival", chunks),
+        ],
+        panels=[],
+        requirements=[
+            *(line.requirement() for line in lines),
+            *(repetition(lines, earlier) if options.repeats else ()),
+        ],
+        data={name: content[name] for name in ("about", "lines", "policies", "rivals", "chunks")},
+        notes=[*notes, f"rollouts, JSON and page: {plan.keep}"],
+    )
+
+
+def figures_of_tasks(study: Study, kept: KeptRows) -> tuple[list[TaskFigures], int]:
+    """Figures of every task from what is kept, and how many rollouts failed or are missing."""
+    figures: list[TaskFigures] = []
+    failed = 0
+    for task in study.tasks:
+        by_seed: list[list[Rolled]] = [[] for _ in study.members]
+        for seed in study.plan.seeds:
+            for policy in study.policies(task):
+                rolled = _rolled(study, kept, (task, seed, policy))
+                failed += not rolled
+                for mine, one in zip(by_seed, rolled, strict=False):
+                    mine.append(one)
+        if by_seed[0]:
+            figures.append(TaskFigures(task, by_seed, study.plan.scripts))
+    return figures, failed
+
+
+def _rolled(study: Study, kept: KeptRows, about: tuple[str, int, str]) -> list[Rolled]:
+    """One rollout in the world of every training seed; nothing if it failed in one of them."""
+    rows: list[dict[str, Row]] = [{} for _ in study.members]
+    for (kind, number), key in study.keys(*about).items():
+        row = kept.get(**key)
+        if row is not None and "error" not in row:
+            rows[number][kind] = row
+    if any(kind not in each for each in rows for kind in NEEDED):
+        return []
+    _, seed, policy = about
+    return [Rolled(policy, seed, bool(each["real"]["success"]), each) for each in rows]
+
+
+def interval_table(lines: Sequence[Line]) -> ResultTable:
+    """Figures with their intervals, and with those of every training seed if there are several."""
+    several = max((len(line.by_seed) for line in lines), default=1) > 1
+    rows = [
+        (
+            f"{line.task}: {line.what}",
+            _number(line.value),
+            "" if line.interval is None else f"{line.interval[0]:.3f} to {line.interval[1]:.3f}",
+            str(line.num),
+            *([", ".join(map(_number, line.by_seed))] if several else []),
+        )
+        for line in lines
+    ]
+    columns = ["", "figure", "95 % over starts", "rollouts or policies"]
+    columns += ["training seeds"] * several
+    return ResultTable("Imagined and real", tuple(columns), rows)
+
+
+def _number(value: float | None) -> str:
+    return "undefined" if value is None else f"{value:.3f}"
+
+
+def row_table(title: str, rows: Sequence[Mapping[str, Any]]) -> ResultTable:
+    """Rows of one kind as a table."""
+    columns = tuple(dict.fromkeys(name for row in rows for name in row))
+    return ResultTable(title, columns, [tuple(cell(row.get(n)) for n in columns) for row in rows])
+
+
+def _results(
+    plan: StudyPlan, units: Sequence[tuple[str, int, Missing]], num_jobs: int
+) -> Iterator[tuple[list[Row], str]]:
+    """Rows of every unit, as soon as it is done."""
+    if num_jobs == 1 or len(units) < 2:
+        for task, seed, missing in units:
+            yield unit_rows(plan, task, seed, missing), f"{task} {seed}"
+        return
+    # A fresh interpreter: a forked one would share the threads of torch.
+    with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
+        running = {pool.submit(unit_rows, plan, *unit): unit for unit in units}
+        for done in as_completed(running):
+            task, seed, _ = running[done]
+            yield done.result(), f"{task} {seed}"
+
+
+def _plan(options: argparse.Namespace) -> StudyPlan:
+    default = _QUICK_STARTS if options.quick else _USUAL_STARTS
+    num_starts = default if options.starts is None else options.starts
+    if num_starts < 1 or options.jobs < 1:
+        raise InvalidInputError(
+            f"evaluator: got {num_starts} starts and {options.jobs} jobs, expected at least one"
+        )
+    cloned = options.cloned or [f"cloned={DEFAULT_POLICY}", f"cloned early={EARLY_POLICY}"]
+    return StudyPlan(
+        keep=options.keep,
+        trained=trained_seeds(
+            options.world or [None],
+            options.probe or [DEFAULT_PROBE],
+            options.direct or [],
+            options.without_touch or [],
+        ),
+        tasks=tuple(options.tasks),
+        seeds=tuple(range(options.first_seed, options.first_seed + num_starts)),
+        levels_mm=_QUICK_LEVELS_MM if options.quick else LEVELS_MM,
+        cloned=tuple(ClonedPolicy.parse(text) for text in cloned),
+        outside=tuple(OutsidePolicy.parse(text) for text in options.policy or [_SERVO]),
+        num_still_starts=1 if options.quick else 3,
+    )

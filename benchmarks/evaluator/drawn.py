@@ -1,0 +1,214 @@
+"""Figures of one task with their bootstrap draws, and their mean over training seeds as lines."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.figures import Requirement, Sense
+from services.evaluation.calibration import expected_calibration_error
+from services.evaluation.resampling import (
+    area_under_roc_of_draws,
+    balanced_accuracy_of_draws,
+    mean_of_draws,
+    start_counts,
+)
+from services.evaluation.statistics import interval_of_draws
+
+NUM_DRAWS: Final = 1000
+_NUM_CALIBRATION_DRAWS: Final = 200
+Bound = tuple[Sense, float]
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of the table; `value` is None where it is not defined, or nothing was rolled out.
+
+    `value` is the mean over the training seeds, `by_seed` the figure of each; `interval` is the
+    95 % bootstrap interval of the mean over the starts.
+    """
+
+    task: str
+    what: str
+    value: float | None
+    interval: tuple[float, float] | None
+    num: int
+    sense: Sense
+    bound: float
+    unit: str = ""
+    by_seed: tuple[float | None, ...] = ()
+
+    def requirement(self) -> Requirement:
+        """The line as a promise that is kept or not."""
+        what = f"{self.task}: {self.what}"
+        return Requirement(what, self.value, self.sense, self.bound, self.unit)
+
+
+@dataclass(frozen=True)
+class Rolled:
+    """One policy from one start, with the kept rows of the rollout by their kind."""
+
+    policy: str
+    seed: int
+    success: bool
+    rows: Mapping[str, Mapping[str, Any]]
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A figure of one training seed, and the same figure in every draw of starts.
+
+    `worst` is the bound of the worst of several training seeds, where there is one.
+    """
+
+    what: str
+    value: float
+    draws: np.ndarray
+    num: int
+    bound: Bound
+    unit: str = ""
+    worst: float | None = None
+
+    def less(self, other: "Drawn", what: str, bound: float) -> "Drawn":
+        """How much greater it is than another figure, in the same draws."""
+        return Drawn(
+            what, self.value - other.value, self.draws - other.draws, self.num, ("at least", bound)
+        )
+
+
+class Sampling:
+    """Draws of the starts of a task, the same for every figure.
+
+    Args:
+        rollouts: whose starts are drawn.
+    """
+
+    def __init__(self, rollouts: Iterable[Rolled]) -> None:
+        self.seeds = sorted({one.seed for one in rollouts})
+        generator = np.random.default_rng(0)
+        self.counts = start_counts(max(1, len(self.seeds)), generator, num_draws=NUM_DRAWS)
+        self._own = np.ones((1, max(1, len(self.seeds))))
+
+    def starts(self, rollouts: Iterable[Rolled]) -> np.ndarray:
+        """Index of the start of every rollout."""
+        return np.array([self.seeds.index(one.seed) for one in rollouts], dtype=int)
+
+    def area(
+        self, what: str, kind: str, rollouts: Sequence[Rolled], bound: float, worst: float | None
+    ) -> Drawn:
+        """Area under the ROC curve of the probabilities in one kind of row."""
+        mine, success = having(kind, rollouts)
+        if success.all() or not success.any():
+            return undefined(what, ("at least", bound))
+        told, starts = probabilities(mine, kind), self.starts(mine)
+        value, draws = (
+            area_under_roc_of_draws(told, success, starts, counts)
+            for counts in (self._own, self.counts)
+        )
+        return Drawn(what, float(value[0]), draws, len(mine), ("at least", bound), worst=worst)
+
+    def balanced(self, what: str, kind: str, rollouts: Sequence[Rolled], bound: float) -> Drawn:
+        """Balanced accuracy of the likelier outcomes in one kind of row."""
+        mine, success = having(kind, rollouts)
+        if success.all() or not success.any():
+            return undefined(what, ("at least", bound))
+        likely = np.array([one.rows[kind]["likely_success"] for one in mine], dtype=bool)
+        starts = self.starts(mine)
+        value, draws = (
+            balanced_accuracy_of_draws(likely, success, starts, counts)
+            for counts in (self._own, self.counts)
+        )
+        return Drawn(what, float(value[0]), draws, len(mine), ("at least", bound))
+
+    def calibration(self, what: str, kind: str, rollouts: Sequence[Rolled], bound: float) -> Drawn:
+        """Expected calibration error of the probabilities in one kind of row."""
+        mine, success = having(kind, rollouts)
+        if not mine:
+            return undefined(what, ("at most", bound))
+        told, starts = probabilities(mine, kind), self.starts(mine)
+        draws = []
+        for row in self.counts[:_NUM_CALIBRATION_DRAWS]:
+            chosen = np.repeat(np.arange(len(told)), row[starts].astype(int))
+            some = len(chosen) > 0
+            draws.append(
+                expected_calibration_error(told[chosen], success[chosen]) if some else math.nan
+            )
+        value = expected_calibration_error(told, success)
+        return Drawn(what, value, np.array(draws), len(told), ("at most", bound))
+
+    def mean(
+        self, what: str, values: np.ndarray, rollouts: Sequence[Rolled], bound: Bound
+    ) -> Drawn:
+        """Mean of one value for each rollout."""
+        if len(values) == 0:
+            return undefined(what, bound)
+        draws = mean_of_draws(values, self.starts(rollouts), self.counts)
+        return Drawn(what, float(np.mean(values)), draws, len(values), bound)
+
+    def sums(self, values: np.ndarray, rollouts: Sequence[Rolled]) -> tuple[np.ndarray, np.ndarray]:
+        """Sums of values [rollouts, ...] over the rollouts, [...] and [draws, ...]."""
+        drawn = np.tensordot(self.counts[:, self.starts(rollouts)], values, axes=1)
+        return values.sum(axis=0), drawn
+
+
+def undefined(what: str, bound: Bound) -> Drawn:
+    """A figure that nothing was rolled out for."""
+    return Drawn(what, math.nan, np.array([math.nan]), 0, bound)
+
+
+def having(kind: str, rollouts: Iterable[Rolled]) -> tuple[list[Rolled], np.ndarray]:
+    """The rollouts that have a kind of row, and their outcomes."""
+    mine = [one for one in rollouts if kind in one.rows]
+    return mine, np.array([one.success for one in mine], dtype=bool)
+
+
+def probabilities(rollouts: Iterable[Rolled], kind: str) -> np.ndarray:
+    """Probabilities of success in one kind of row."""
+    return np.array([one.rows[kind]["probability"] for one in rollouts], dtype=float)
+
+
+def lines_over_seeds(task: str, by_seed: Sequence[Sequence[Drawn]]) -> list[Line]:
+    """The mean of every figure over the training seeds, and the worst seed where it has a bound.
+
+    Args:
+        task: its name.
+        by_seed: the same figures of every training seed, in the same order.
+    """
+    lines = []
+    for same in zip(*by_seed, strict=True):
+        values = [one.value for one in same]
+        shown = tuple(value if math.isfinite(value) else None for value in values)
+        draws = np.stack(np.broadcast_arrays(*(one.draws for one in same))).mean(axis=0)
+        lines.append(_line(task, same[0], (float(np.mean(values)), draws), shown))
+        if same[0].worst is not None and len(same) > 1 and np.isfinite(values).all():
+            least = same[0].bound[0] == "at least"
+            one = same[int(np.argmin(values) if least else np.argmax(values))]
+            worst = Drawn(
+                f"{one.what}, worst training seed", one.value, one.draws, one.num,
+                (one.bound[0], same[0].worst), one.unit,
+            )  # fmt: skip
+            lines.append(_line(task, worst, (worst.value, worst.draws), shown))
+    return lines
+
+
+def _line(
+    task: str,
+    about: Drawn,
+    figure: tuple[float, np.ndarray],
+    by_seed: tuple[float | None, ...],
+) -> Line:
+    value, draws = figure
+    found = interval_of_draws(draws).interval if about.num and math.isfinite(value) else None
+    interval = None if found is None else (found.low, found.high)
+    return Line(
+        task,
+        about.what,
+        value if math.isfinite(value) else None,
+        interval,
+        about.num,
+        *about.bound,
+        about.unit,
+        by_seed,
+    )

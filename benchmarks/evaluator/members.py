@@ -1,0 +1,86 @@
+"""The networks of each training seed, opened once in a process."""
+
+import hashlib
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from benchmarks.evaluator.plan import Trained
+from dextouch.errors import InvalidInputError
+from dextouch.worlds.world import BatchWorld
+from services.evaluation.direct_judge import DirectJudge
+from services.evaluation.success_probe import SuccessProbe
+from services.world_model.world import open_world
+
+
+@dataclass(frozen=True, eq=False)
+class Member:
+    """A world model, its judge, and its rivals where there are any.
+
+    `direct` judges without imagining; `untouched` is a world that learned nothing of touch.
+    `about` are the digests that results are known by.
+    """
+
+    about: dict[str, str]
+    world: BatchWorld[Any]
+    probe: SuccessProbe
+    direct: DirectJudge | None = None
+    untouched: BatchWorld[Any] | None = None
+
+    @property
+    def tasks(self) -> set[str]:
+        """The tasks that all its networks know."""
+        return set(self.world.description.tasks) & set(self.probe.metadata.tasks)
+
+    @property
+    def judges(self) -> list[SuccessProbe | DirectJudge]:
+        """All that were trained on starts of their own."""
+        return [self.probe, *([] if self.direct is None else [self.direct])]
+
+
+def open_members(trained: tuple[Trained, ...]) -> tuple[Member, ...]:
+    """The networks of every training seed; a file that several share is opened once."""
+    worlds, probes, directs = cache(open_world), cache(SuccessProbe.load), cache(DirectJudge.load)
+    found = []
+    for one in trained:
+        world: BatchWorld[Any] = worlds(one.world)
+        about = {"world": world.description.digest, "judge": file_digest(one.probe)}
+        if one.direct is not None:
+            about["direct judge"] = file_digest(one.direct)
+        direct = None if one.direct is None else directs(one.direct)
+        untouched: BatchWorld[Any] | None = None if one.untouched is None else worlds(one.untouched)
+        if untouched is not None:
+            about["world without touch"] = untouched.description.digest
+        found.append(Member(about, world, probes(one.probe), direct, untouched))
+    return tuple(found)
+
+
+def file_digest(path: Path) -> str:
+    """sha256 of a file."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def refuse_unequal_rivals(members: Sequence[Member]) -> None:
+    """Refuse rivals of the training seeds that do not know the same tasks.
+
+    Raises:
+        InvalidInputError: direct judges, or worlds without touch, of different tasks.
+    """
+    refuse_unequal_tasks("--direct", [m.direct.shape.tasks for m in members if m.direct])
+    worlds = [m.untouched.description.tasks for m in members if m.untouched]
+    refuse_unequal_tasks("--without-touch", worlds)
+
+
+def refuse_unequal_tasks(flag: str, known: Sequence[Collection[str]]) -> None:
+    """Refuse networks that are compared over training seeds and know different tasks.
+
+    Raises:
+        InvalidInputError: different tasks.
+    """
+    if any(set(tasks) != set(known[0]) for tasks in known):
+        raise InvalidInputError(
+            f"evaluator: {flag}: got networks of {[sorted(tasks) for tasks in known]}, "
+            "expected the same tasks of all; train them on the same ones"
+        )

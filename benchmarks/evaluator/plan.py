@@ -1,0 +1,156 @@
+"""What the stage `evaluator` rolls out: tasks, starts, and policies by name."""
+
+import hashlib
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from dextouch.errors import InvalidInputError
+from services.evaluation.policies.outside import PolicySource
+from services.twin.scripted_actions import ELSEWHERE, HOLD, RETREAT, script_name
+
+CAMERA: Final = "camera_head"
+# 5 1/3 s at 15 steps a second, in chunks as policies send them.
+NUM_STEPS: Final = 80
+CHUNK_STEPS: Final = 16
+# A still hand is watched for 63 chunks, 1008 steps, and looked at after every 9th.
+STILL_CHUNKS: Final = 63
+STILL_SHOWN_EVERY: Final = 9
+FIRST_SEED: Final = 30_000
+LEVELS_MM: Final = (0.0, 2.5, 5.0, 7.5, 10.0, 15.0, 20.0, 30.0)
+# What cannot succeed, and what a judge that looks at motion would call a success.
+IDLE: Final = (HOLD, RETREAT, ELSEWHERE)
+
+
+@dataclass(frozen=True)
+class ClonedPolicy:
+    """A checkpoint of a cloned policy, known by its name and its content."""
+
+    name: str
+    path: Path
+
+    @classmethod
+    def parse(cls, text: str) -> "ClonedPolicy":
+        """A policy from NAME=PATH.
+
+        Raises:
+            InvalidInputError: other text, or no such file.
+        """
+        name, _, path = text.partition("=")
+        if not name or not Path(path).is_file():
+            raise InvalidInputError(f"--cloned: got {text!r}, expected NAME=PATH of a checkpoint")
+        return cls(name, Path(path))
+
+    @property
+    def key(self) -> str:
+        """Its name in results; another checkpoint of the same name has another one."""
+        return f"{self.name}@{hashlib.sha256(self.path.read_bytes()).hexdigest()[:8]}"
+
+
+@dataclass(frozen=True)
+class OutsidePolicy:
+    """A policy of somebody's own, known by its name and the content of its module's file."""
+
+    source: PolicySource
+    digest: str
+
+    @classmethod
+    def parse(cls, text: str) -> "OutsidePolicy":
+        """A policy from [NAME=]MODULE:FACTORY.
+
+        Raises:
+            InvalidInputError, NotFoundError, UnknownNameError: it does not load.
+        """
+        source = PolicySource.parse(text)
+        source.load({})
+        path = sys.modules[source.module].__file__
+        content = source.module.encode() if path is None else Path(path).read_bytes()
+        return cls(source, hashlib.sha256(content).hexdigest()[:8])
+
+    @property
+    def key(self) -> str:
+        """Its name in results; another file of the same name has another one."""
+        return f"{self.source.name}@{self.digest}"
+
+
+@dataclass(frozen=True)
+class Trained:
+    """The checkpoints of one training seed.
+
+    Args:
+        world: of the world model; None is the one that comes with the package.
+        probe: of the judge of imagined endings.
+        direct: of the direct judge, its rival without a world model; None for none.
+        untouched: of a world model that learned nothing of touch; None for none.
+    """
+
+    world: Path | None
+    probe: Path
+    direct: Path | None = None
+    untouched: Path | None = None
+
+
+def trained_seeds(
+    worlds: Sequence[Path | None],
+    probes: Sequence[Path],
+    directs: Sequence[Path] = (),
+    untouched: Sequence[Path] = (),
+) -> tuple[Trained, ...]:
+    """One entry for each world, with the others of the same place or the only ones there are.
+
+    Raises:
+        InvalidInputError: several judges, but not one for each world; or no world or judge.
+    """
+    asked = (("--probe", probes, 1), ("--direct", directs, 0), ("--without-touch", untouched, 0))
+    for what, paths, least in asked:
+        if not worlds or not (least <= len(paths) <= 1 or len(paths) == len(worlds)):
+            raise InvalidInputError(
+                f"evaluator: got {len(paths)} {what} for {len(worlds)} --world, expected one for "
+                "all or one for each, in the same order"
+            )
+    count = len(worlds)
+    judges = list(probes) * (count if len(probes) == 1 else 1)
+    rivals = [_one_each(paths, count) for paths in (directs, untouched)]
+    return tuple(map(Trained, worlds, judges, *rivals))
+
+
+def _one_each(paths: Sequence[Path], count: int) -> list[Path | None]:
+    return [*paths] * (count if len(paths) == 1 else 1) or [None] * count
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """Everything that one run of the stage is about.
+
+    `trained` are the checkpoints of every training seed; `keep` is the folder of results and
+    arrays; the first `num_still_starts` starts of a task are also held still for 1000 steps.
+    """
+
+    keep: Path
+    trained: tuple[Trained, ...]
+    tasks: tuple[str, ...]
+    seeds: tuple[int, ...]
+    levels_mm: tuple[float, ...] = LEVELS_MM
+    cloned: tuple[ClonedPolicy, ...] = ()
+    outside: tuple[OutsidePolicy, ...] = ()
+    num_still_starts: int = 3
+
+    def __post_init__(self) -> None:
+        if not self.tasks or not self.seeds or not self.levels_mm:
+            raise InvalidInputError(
+                f"evaluator: got {len(self.tasks)} tasks, {len(self.seeds)} starts and "
+                f"{len(self.levels_mm)} levels, expected at least one of each"
+            )
+
+    @property
+    def scripts(self) -> tuple[str, ...]:
+        """Names of the scripted policies, from exact to far off."""
+        return tuple(script_name(level_mm) for level_mm in self.levels_mm)
+
+    @property
+    def policies(self) -> tuple[str, ...]:
+        """Names of all policies."""
+        closed_loop: tuple[ClonedPolicy | OutsidePolicy, ...] = (*self.cloned, *self.outside)
+        return (*self.scripts, *IDLE, *(policy.key for policy in closed_loop))

@@ -1,0 +1,159 @@
+"""One policy in the twin, and in an imagined world from the same first observation."""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+
+from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS, NUM_STEPS
+from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.worlds.world import (
+    Observation,
+    ReturnSelector,
+    RolloutStart,
+    StartedRollout,
+    State,
+    World,
+)
+from services.evaluation.endings import NUM_SEEN_STEPS
+from services.evaluation.policies.asking import action_chunk, ask
+from services.twin.scripted_actions import Actions
+from services.twin.world import TwinState, TwinWorld
+
+_NO_IMAGES = ReturnSelector(cameras=())
+_LAST_IMAGE = ReturnSelector(steps="last")
+
+
+@dataclass(frozen=True)
+class TrueRollout:
+    """What the twin made of a policy.
+
+    Chunk ends are steps 16, 32 … 80. `actions` are what was sent, relative to step 0;
+    `object_poses` T_world_object at step 0 and the chunk ends.
+    """
+
+    success: bool
+    actions: Actions
+    tactile_kpa: Float32[np.ndarray, "81 2 320"]
+    images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
+    last_images: UInt8[np.ndarray, "3 h w 3"]
+    object_poses: Float64[np.ndarray, "ends objects 7"]
+
+
+@dataclass(frozen=True)
+class ImaginedRollout:
+    """What a world imagined of the same policy; `doubted` is why it does not trust itself."""
+
+    tactile_kpa: Float32[np.ndarray, "81 2 320"]
+    images_of_chunks: UInt8[np.ndarray, "chunks h w 3"]
+    last_images: UInt8[np.ndarray, "3 h w 3"]
+    object_poses: Float32[np.ndarray, "3 objects 7"] | None
+    doubted: str | None
+
+
+def play_in_twin(
+    twin: TwinWorld,
+    started: StartedRollout[TwinState],
+    policy: Policy | Actions,
+    start: PolicyStart,
+) -> TrueRollout:
+    """Let a policy act in the twin from its start."""
+    stage, state = twin.stage(start.task), started.state
+    touch, sent = [started.observation.tactile_kpa], []
+    poses, images = [stage_poses(twin, state)], []
+    seen = started.observation
+    looks = _begin(policy, start)
+    for first in range(0, NUM_STEPS, CHUNK_STEPS):
+        chunk = _chunk(policy, seen, first, twin)
+        shows_end = looks == "last" or first + CHUNK_STEPS == NUM_STEPS
+        head = CHUNK_STEPS - 4 if shows_end else CHUNK_STEPS
+        # Images are slow, so only those that somebody looks at are made.
+        selector = ReturnSelector() if looks == "all" else _NO_IMAGES
+        step = twin.step(state, chunk[:head], seed=start.seed, selector=selector)
+        parts = [step]
+        if shows_end:
+            parts.append(twin.step(step.state, chunk[head:], seed=start.seed))
+        touch.extend(part.observation.tactile_kpa for part in parts)
+        state, seen = parts[-1].state, parts[-1].observation
+        images.append(stage.rig.image(stage.simulation, CAMERA))
+        poses.append(stage.simulation.object_poses())
+        sent.append(chunk)
+    return TrueRollout(
+        bool(seen.success),
+        np.concatenate(sent),
+        np.concatenate(touch),
+        np.stack(images),
+        seen.images[CAMERA][-NUM_SEEN_STEPS:],
+        np.stack(poses),
+    )
+
+
+def stage_poses(twin: TwinWorld, state: TwinState) -> Float64[np.ndarray, "objects 7"]:
+    """Where the objects of a state are."""
+    simulation = twin.stage(state.task).simulation
+    simulation.set_state(state.physics, step_index=0)
+    return simulation.object_poses()
+
+
+def play_in_imagination(
+    world: World[State], first: RolloutStart, policy: Policy | Actions, start: PolicyStart
+) -> ImaginedRollout:
+    """Let a policy act in an imagined world; a policy that looks sees what is imagined."""
+    started = world.reset(first)
+    state, seen = started.state, started.observation
+    touch, images = [seen.tactile_kpa], []
+    looks = _begin(policy, start)
+    doubted: str | None = None
+    for at in range(0, NUM_STEPS, CHUNK_STEPS):
+        chunk = _chunk(policy, seen, at, world)
+        if looks == "all" or at + CHUNK_STEPS == NUM_STEPS:
+            step = last = world.step(state, chunk, seed=start.seed + at)
+        else:
+            # A world is a function: asking twice gives touch of all steps and the last image.
+            step = world.step(state, chunk, seed=start.seed + at, selector=_NO_IMAGES)
+            last = world.step(state, chunk, seed=start.seed + at, selector=_LAST_IMAGE)
+        images.append(last.observation.images[CAMERA][-1])
+        state, seen = step.state, last.observation
+        touch.append(step.observation.tactile_kpa)
+        if seen.doubt is not None and seen.doubt.outside:
+            doubted = doubted or seen.doubt.reason
+    poses = seen.object_poses
+    return ImaginedRollout(
+        np.concatenate(touch),
+        np.stack(images),
+        seen.images[CAMERA][-NUM_SEEN_STEPS:],
+        None if poses is None else poses[-NUM_SEEN_STEPS:],
+        doubted,
+    )
+
+
+def _begin(policy: Policy | Actions, start: PolicyStart) -> Literal["no", "last", "all"]:
+    """Tell a policy that looks where it begins; which steps of a chunk it looks at."""
+    if isinstance(policy, np.ndarray):
+        return "no"
+    ask(policy.reset, start, where="policy: reset")
+    looks = getattr(policy, "looks", True)
+    return "last" if looks == "last" else "all" if looks else "no"
+
+
+def _chunk(
+    policy: Policy | Actions, seen: Observation, first: int, world: World[State]
+) -> Float64[np.ndarray, "16 67"]:
+    if isinstance(policy, np.ndarray):
+        return policy[first : first + CHUNK_STEPS]
+    where = f"policy, step {first}: act"
+    answer = ask(policy.act, seen, where=where)
+    return action_chunk(answer, world.description, where=where)[:CHUNK_STEPS]
+
+
+def start_in_twin(
+    twin: TwinWorld, task: str, seed: int, instruction: str
+) -> tuple[StartedRollout[TwinState], RolloutStart, PolicyStart]:
+    """How the twin begins, and the same start for an imagined world and for a policy."""
+    asked = RolloutStart(task=task, seed=seed, instruction=instruction)
+    started = twin.reset(asked)
+    imagined = replace(
+        asked, observation=started.observation, anchor=started.anchor, K_head=started.K_head
+    )
+    return started, imagined, PolicyStart(task, instruction, seed, started.anchor, started.K_head)

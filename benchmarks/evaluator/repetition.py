@@ -1,0 +1,78 @@
+"""Whether a run of the evaluator repeats an earlier one: each figure within a stated tolerance."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from benchmarks.evaluator.drawn import Line
+from benchmarks.figures import Requirement
+from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
+
+# Of areas under the curve, correlations, success rates and the like, and of decibels. Figures in
+# other units scatter too much to be compared.
+TOLERANCES: Final = {"": 0.08, "dB": 1.0}
+
+
+class _EarlierLine(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    task: str
+    what: str
+    value: float | None
+    unit: str = ""
+
+
+class _Run(BaseModel):
+    model_config = ConfigDict(extra="ignore")
+
+    lines: tuple[_EarlierLine, ...]
+
+
+Earlier = Mapping[tuple[str, str], _EarlierLine]
+
+
+def read_lines(path: Path) -> Earlier:
+    """The lines of the `evaluator.json` of an earlier run, by task and what they are about.
+
+    Raises:
+        NotFoundError: no such file.
+        CorruptDataError: no such report.
+    """
+    if not path.is_file():
+        raise NotFoundError(f"evaluator: no file {path} to compare with; see --repeats")
+    try:
+        run = _Run.model_validate(json.loads(path.read_text(encoding="utf-8")))
+    except (ValidationError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise CorruptDataError(
+            f"evaluator: {path} is no evaluator.json of an earlier run ({error})"
+        ) from error
+    return {(line.task, line.what): line for line in run.lines}
+
+
+def repetition(lines: Sequence[Line], earlier: Earlier) -> list[Requirement]:
+    """For each figure that both runs have, how far they are apart, and how far they may be.
+
+    Args:
+        lines: of this run.
+        earlier: from `read_lines`.
+
+    Raises:
+        InvalidInputError: not one line in common.
+    """
+    if not any((line.task, line.what) in earlier for line in lines):
+        raise InvalidInputError(
+            f"evaluator: none of {len(lines)} lines is among the {len(earlier)} of the earlier "
+            "run; compare runs of the same tasks"
+        )
+    found: list[Requirement] = []
+    for line in lines:
+        other = earlier.get((line.task, line.what))
+        if other is None or other.value is None or other.unit not in TOLERANCES:
+            continue
+        apart = None if line.value is None else abs(line.value - other.value)
+        what = f"{line.task}: {line.what}, apart from {other.value:.3f} before"
+        found.append(Requirement(what, apart, "at most", TOLERANCES[other.unit], line.unit))
+    return found

@@ -1,0 +1,111 @@
+"""Touch that a world imagines of one chunk when it starts anew from what was really there."""
+
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float64
+
+from benchmarks.evaluator.measuring import contact_counts
+from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS
+from benchmarks.evaluator.playing import TrueRollout
+from dextouch.geometry.rotations import rotation_angle
+from dextouch.hands.actions import (
+    HandTrajectory,
+    poses_from_actions,
+    reanchor,
+)
+from dextouch.worlds.world import (
+    Observation,
+    ReturnSelector,
+    RolloutStart,
+    StartedRollout,
+    State,
+    World,
+)
+from services.twin.world import TwinState, TwinWorld
+
+_NO_IMAGES = ReturnSelector(cameras=())
+_REACHED = ReturnSelector(cameras=(), steps="last")
+# What moves less than this within a chunk stands still.
+_STILL_M, _STILL_RAD = 1e-3, 0.02
+
+
+def contact_with_true_context(
+    twin: TwinWorld,
+    world: World[State],
+    started: StartedRollout[TwinState],
+    first: RolloutStart,
+    real: TrueRollout,
+) -> list[list[float]]:
+    """Contact counts of every chunk, each imagined from the true observation at its start.
+
+    The twin replays the commands to tell where hands and camera really were; image and touch are
+    those of the kept rollout, and the commands stay what they were.
+    """
+    found = []
+    reached = _reached_rows(twin, started, real)
+    for index in range(len(real.images_of_chunks)):
+        start, chunk = first, real.actions[index * CHUNK_STEPS : (index + 1) * CHUNK_STEPS]
+        if index:
+            start = _restart(first, real, index, reached[index - 1])
+            chunk = reanchor(chunk, 0, anchor_action=reached[index - 1])
+        state = world.reset(start).state
+        imagined = world.step(state, chunk, seed=first.seed, selector=_NO_IMAGES)
+        after = slice(1 + index * CHUNK_STEPS, 1 + (index + 1) * CHUNK_STEPS)
+        found.append(contact_counts(imagined.observation.tactile_kpa, real.tactile_kpa[after]))
+    return found
+
+
+def _reached_rows(
+    twin: TwinWorld, started: StartedRollout[TwinState], real: TrueRollout
+) -> list[Float64[np.ndarray, "67"]]:
+    """Where hands and camera were at the end of every chunk, relative to step 0."""
+    rows, state = [], started.state
+    for chunk in np.split(real.actions, len(real.images_of_chunks)):
+        step = twin.step(state, chunk, seed=0, selector=_REACHED)
+        rows.append(step.observation.action_reached[-1])
+        state = step.state
+    return rows
+
+
+def _restart(
+    first: RolloutStart, real: TrueRollout, index: int, reached: Float64[np.ndarray, "67"]
+) -> RolloutStart:
+    """The true step before chunk `index` as a start of its own."""
+    if first.anchor is None:
+        raise ValueError("the twin gives an anchor with every start")
+    observation = Observation(
+        first_step=0,
+        images={CAMERA: real.images_of_chunks[index - 1][None]},
+        tactile_kpa=real.tactile_kpa[index * CHUNK_STEPS][None],
+        action_reached=reanchor(reached[None], 0),
+        reached_is_measured=True,
+    )
+    anchor = poses_from_actions(reached[None], first.anchor).anchor(0)
+    return replace(first, observation=observation, anchor=anchor)
+
+
+def chunks_that_move(
+    commands: HandTrajectory, object_poses: Float64[np.ndarray, "ends objects 7"]
+) -> Bool[np.ndarray, " chunks"]:
+    """Whether a wrist, a finger or an object moves within each chunk.
+
+    Args:
+        commands: of steps 1 … 80.
+        object_poses: T_world_object at step 0 and at the chunk ends.
+    """
+    moves = []
+    for index in range(len(object_poses) - 1):
+        rows = slice(index * CHUNK_STEPS, (index + 1) * CHUNK_STEPS)
+        wrists = (commands.Ts_world_wrist_left[rows], commands.Ts_world_wrist_right[rows])
+        fingers = (commands.joints_left_rad[rows], commands.joints_right_rad[rows])
+        before, after = object_poses[index], object_poses[index + 1]
+        turned = 2 * np.arccos(np.clip(np.abs(np.sum(before[:, 3:] * after[:, 3:], axis=1)), 0, 1))
+        moves.append(
+            any(np.ptp(T[:, :3, 3], axis=0).max() > _STILL_M for T in wrists)
+            or any(rotation_angle(T[0, :3, :3].T @ T[:, :3, :3]).max() > _STILL_RAD for T in wrists)
+            or any(np.ptp(angles, axis=0).max() > _STILL_RAD for angles in fingers)
+            or bool(np.linalg.norm(after[:, :3] - before[:, :3], axis=1).max() > _STILL_M)
+            or bool(turned.max() > _STILL_RAD)
+        )
+    return np.array(moves, dtype=bool)

@@ -1,0 +1,63 @@
+"""Hands that hold still for over a thousand steps, in the twin and in imagination."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float64, UInt8
+
+from benchmarks.evaluator.measuring import psnr_within
+from benchmarks.evaluator.plan import (
+    CAMERA,
+    CHUNK_STEPS,
+    STILL_CHUNKS,
+    STILL_SHOWN_EVERY,
+)
+from dextouch.worlds.world import ReturnSelector, RolloutStart, State, World
+
+_NO_IMAGES = ReturnSelector(cameras=())
+_LAST_IMAGE = ReturnSelector(cameras=(CAMERA,), steps="last")
+
+
+@dataclass(frozen=True)
+class StillRollout:
+    """What a world shows of hands that stand: the greatest pressure of all, and some images."""
+
+    greatest_kpa: float
+    images: UInt8[np.ndarray, "shown h w 3"]
+
+
+def hold_still(
+    world: World[State], first: RolloutStart, row: Float64[np.ndarray, "67"]
+) -> StillRollout:
+    """One command, sent 1008 times; images of every 144th step."""
+    started = world.reset(first)
+    state, greatest, images = started.state, 0.0, []
+    chunk = np.repeat(row[None], CHUNK_STEPS, axis=0)
+    for index in range(1, STILL_CHUNKS + 1):
+        if index % STILL_SHOWN_EVERY == 0:
+            shown = world.step(state, chunk, seed=index, selector=_LAST_IMAGE)
+            images.append(shown.observation.images[CAMERA][-1])
+        step = world.step(state, chunk, seed=index, selector=_NO_IMAGES)
+        greatest = max(greatest, float(step.observation.tactile_kpa.max()))
+        state = step.state
+    return StillRollout(greatest, np.stack(images))
+
+
+def still_figures(
+    imagined: StillRollout, true_images: np.ndarray, first_image: np.ndarray
+) -> dict[str, object]:
+    """The greatest imagined pressure, and PSNR [imagined, copy of the first image] of each image.
+
+    Args:
+        imagined: by a world.
+        true_images: [shown, h, w, 3] of the same steps.
+        first_image: [h, w, 3] of step 0.
+    """
+    everywhere = np.ones(first_image.shape[:2], dtype=bool)
+    return {
+        "greatest_kpa": imagined.greatest_kpa,
+        "psnr": [
+            [psnr_within(one, true, everywhere) for one in (image, first_image)]
+            for image, true in zip(imagined.images, true_images, strict=True)
+        ],
+    }

@@ -1,0 +1,111 @@
+"""Report of a benchmark stage: tables, charts and requirements, as text, Markdown and JSON."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from benchmarks.chart import Panel
+from benchmarks.figures import Requirement
+from dextouch.command_line import write_json_text
+
+
+@dataclass(frozen=True)
+class ResultTable:
+    """Rows of text under a title; the first column names them."""
+
+    title: str
+    columns: tuple[str, ...]
+    rows: Sequence[tuple[str, ...]]
+
+
+@dataclass(frozen=True)
+class StageReport:
+    """Results of one run of a stage.
+
+    `data` holds the raw measurements for JSON: every round of every figure.
+    """
+
+    stage: str
+    machine: dict[str, str]
+    options: dict[str, Any]
+    tables: Sequence[ResultTable]
+    panels: Sequence[Panel]
+    requirements: Sequence[Requirement]
+    data: dict[str, Any]
+    notes: Sequence[str] = field(default=())
+
+    @property
+    def is_met(self) -> bool:
+        """Whether every requirement was measured and is met."""
+        return all(requirement.is_met for requirement in self.requirements)
+
+    def to_json(self) -> str:
+        """The report as JSON text."""
+        requirements = [
+            {**asdict(requirement), "verdict": requirement.verdict()}
+            for requirement in self.requirements
+        ]
+        content = {
+            "stage": self.stage,
+            "machine": self.machine,
+            "options": self.options,
+            "requirements": requirements,
+            "notes": list(self.notes),
+            **self.data,
+        }
+        return json.dumps(content, indent=2, allow_nan=False)
+
+
+def show(report: StageReport, console: Console) -> None:
+    """Print the machine, the tables and the requirements."""
+    console.print(_table("Machine", ("", ""), list(report.machine.items())))
+    for table in report.tables:
+        console.print(_table(table.title, table.columns, table.rows))
+    for note in report.notes:
+        console.print(f"Note: {note}", markup=False, highlight=False)
+    verdicts = _acceptance(report)
+    console.print(_table(verdicts.title, verdicts.columns, verdicts.rows))
+
+
+def to_markdown(report: StageReport) -> str:
+    """The report as Markdown for the documentation: machine, versions and tables."""
+    about = ", ".join(f"{name} {value}" for name, value in report.machine.items())
+    parts = [f"Machine: {about}.\n"]
+    for table in (*report.tables, _acceptance(report)):
+        lines = [table.columns, ("---",) * len(table.columns), *table.rows]
+        parts.append(f"**{table.title}**\n")
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines) + "\n")
+    return "\n".join(parts)
+
+
+def _acceptance(report: StageReport) -> ResultTable:
+    rows = [
+        (
+            requirement.what,
+            "" if requirement.figure is None else f"{requirement.figure:.3g}",
+            f"{requirement.sense} {requirement.bound:g} {requirement.unit}".strip(),
+            requirement.verdict(),
+        )
+        for requirement in report.requirements
+    ]
+    return ResultTable("Acceptance", ("requirement", "measured", "bound", "verdict"), rows)
+
+
+def write_json(report: StageReport, path: Path) -> None:
+    """Write the report to the path of `--json`, creating its folder."""
+    write_json_text(path, report.to_json())
+
+
+def _table(title: str, columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Table:
+    table = Table(title=title, title_justify="left", header_style="bold")
+    table.show_header = any(columns)
+    for index, column in enumerate(columns):
+        table.add_column(column, justify="left" if index == 0 else "right")
+    for row in rows:
+        table.add_row(*row)
+    return table

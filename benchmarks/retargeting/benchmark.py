@@ -1,0 +1,140 @@
+"""Entry point of the benchmark stage `retargeting`."""
+
+import argparse
+from contextlib import ExitStack
+from dataclasses import asdict, replace
+from pathlib import Path
+
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.retargeting.acceptance import requirements
+from benchmarks.retargeting.compare import (
+    Effort,
+    compare_pinches,
+    compare_robot,
+    compare_speed,
+    pinch_set,
+    robot_sets,
+    to_data,
+)
+from benchmarks.retargeting.ours import OURS_EXACT, cold_start
+from benchmarks.retargeting.rival_process import NUM_WARM_UP, RivalProcess
+from benchmarks.retargeting.rivals import (
+    INSTALL,
+    RIVALS,
+    Rival,
+    find_rival,
+    missing_modules,
+)
+from benchmarks.retargeting.robustness import try_faults
+from benchmarks.retargeting.tables import panels, tables
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+
+PACKAGES = ("numpy", "numba", "dex-retargeting", "nlopt", "pin", "torch", "dexi-rs")
+USUAL = Effort(2, 600, 5, 6, 5000, 0)
+QUICK = Effort(1, 120, 1, 1, 100, 0)
+_NONE = "none"
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument(
+        "--rounds", type=int, help=f"of the timing ({USUAL.num_rounds}; quick {QUICK.num_rounds})"
+    )
+    parser.add_argument(
+        "--samples", type=int, help=f"of a motion ({USUAL.num_samples}; quick {QUICK.num_samples})"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the first motion (%(default)s)")
+    parser.add_argument(
+        "--rivals",
+        metavar="A,B",
+        help=f"only these, by comma, or {_NONE} (all that are installed: {', '.join(RIVALS)})",
+    )
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Run every method on robot motions and on pinching people.
+
+    Raises:
+        UnknownNameError: a rival that there is not.
+        InvalidInputError: no round, or motions of fewer than 30 samples.
+    """
+    del folder
+    effort = _effort(options)
+    chosen, left_out = choose_rivals(options.rivals)
+    with ExitStack() as stack:
+        rivals = {one.name: stack.enter_context(RivalProcess(one)) for one in chosen}
+        speeds = compare_speed(effort, rivals, bar)
+        robot = compare_robot(robot_sets(effort), rivals, bar)
+        pinches = compare_pinches(pinch_set(effort), rivals, bar)
+        outcomes = try_faults(effort.seed, rivals, bar)
+    cold = cold_start(effort.num_postures, effort.seed)
+    return StageReport(
+        stage="retargeting",
+        machine=describe_machine(PACKAGES),
+        options={**asdict(effort), "rivals": list(rivals)},
+        tables=tables(speeds, robot, pinches, cold, outcomes, list(rivals)),
+        panels=panels(speeds, robot, pinches),
+        requirements=requirements(speeds, robot, pinches, cold),
+        data={
+            "speed": [asdict(speed) for speed in speeds],
+            "robot": to_data(robot),
+            "pinches": to_data(pinches),
+            "cold_start": cold._asdict(),
+            "faults": [asdict(outcome) for outcome in outcomes],
+        },
+        notes=notes(chosen, left_out),
+    )
+
+
+def choose_rivals(words: str | None) -> tuple[list[Rival], list[Rival]]:
+    """The rivals of `--rivals` that are installed, and those that are not.
+
+    Raises:
+        UnknownNameError: a rival that there is not.
+    """
+    wanted = list(RIVALS.values())
+    if words is not None:
+        names = [name.strip() for name in words.split(",")]
+        wanted = [] if names == [_NONE] else [find_rival(name) for name in names]
+    left_out = [rival for rival in wanted if missing_modules(rival)]
+    return [rival for rival in wanted if rival not in left_out], left_out
+
+
+def notes(chosen: list[Rival], left_out: list[Rival]) -> list[str]:
+    """Notes on how methods were run, and why some were skipped."""
+    told = [
+        f"{OURS_EXACT} is without its temporal term; times are with the person's profile known, "
+        "errors with a profile measured from the same samples"
+    ]
+    if chosen:
+        told.append(
+            "rivals run in processes of their own, sample by sample, without their low-pass "
+            f"filter and from a start that {NUM_WARM_UP} calls with the first sample have brought "
+            "near; their keypoints are scaled by the lengths of the fingers; ours starts from "
+            "nothing"
+        )
+    if left_out:
+        missing = sorted({module for rival in left_out for module in missing_modules(rival)})
+        told.append(
+            f"{', '.join(rival.name for rival in left_out)} not measured: "
+            f"{', '.join(missing)} not installed; {INSTALL}"
+        )
+    return told
+
+
+def _effort(options: argparse.Namespace) -> Effort:
+    """What the options say, else the usual or the quick numbers."""
+    effort = replace(QUICK if options.quick else USUAL, seed=options.seed)
+    if options.rounds is not None:
+        effort = replace(effort, num_rounds=options.rounds)
+    if options.samples is not None:
+        effort = replace(effort, num_samples=options.samples)
+    if effort.num_rounds < 1:
+        raise InvalidInputError(f"--rounds: got {effort.num_rounds}, expected at least 1")
+    if effort.num_samples < 30:
+        raise InvalidInputError(f"--samples: got {effort.num_samples}, expected at least 30")
+    if effort.seed < 0:
+        raise InvalidInputError(f"--seed: got {effort.seed}, expected at least 0")
+    return effort

@@ -1,0 +1,160 @@
+"""Rival retargeting libraries with their objectives, configured for our hand.
+
+dex-retargeting and its port dexi-rs know three objectives, here in the form that does best on a
+hand with five full fingers: vectors from the wrist to PIP, DIP and tip of every finger, the same
+points as positions, and DexPilot's ten vectors between the tips with the five from the wrist. They
+run without their low-pass filter, which costs more accuracy than their solvers.
+"""
+
+import importlib
+from collections.abc import Callable, Mapping
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float64
+
+from benchmarks.retargeting.hand_urdf import WRIST_LINK, hand_urdf, link_name, tip_name
+from dextouch.errors import UnavailableError, UnknownNameError
+from dextouch.hands.robot_hand import RobotHand
+from dextouch.hands.skeleton import CHAINS, solver_indices
+
+INSTALL: Final = "pip install -c constraints.txt '.[bench]'"
+DEX, DEXI = "dex", "dexi"
+VECTOR, POSITION, DEXPILOT = "vector15", "position15", "dexpilot"
+_WRIST_NODE: Final = 0
+_NODES: Final = [node for chain in CHAINS for node in solver_indices(chain)[1:]]
+_LINKS: Final = [
+    name for chain in CHAINS for name in (link_name(chain, 2), link_name(chain, 3), tip_name(chain))
+]
+_TIP_NODES: Final = [solver_indices(chain)[-1] for chain in CHAINS]
+# DexPilot's pairs (from, to) of the wrist, 0, and the tips, 1 … 5, in the order of both libraries.
+_PAIRS: Final = np.array(
+    [(b, a) for a in range(1, 5) for b in range(a + 1, 6)] + [(0, tip) for tip in range(1, 6)]
+)
+
+
+class Rival(NamedTuple):
+    """One library with one objective."""
+
+    library: str
+    objective: str
+
+    @property
+    def name(self) -> str:
+        """As the tables call it."""
+        return f"{self.library} {self.objective}"
+
+
+RIVALS: Final[Mapping[str, Rival]] = {
+    rival.name: rival
+    for rival in (
+        Rival(library, objective)
+        for library in (DEX, DEXI)
+        for objective in (VECTOR, POSITION, DEXPILOT)
+    )
+}
+_MODULES: Final = {DEX: ("dex_retargeting", "nlopt", "pinocchio", "torch"), DEXI: ("dexi_rs",)}
+# Joint angles of one reference, the library's own order.
+Solve = Callable[[Any], Any]
+
+
+class Setup(NamedTuple):
+    """A library at work: what it is given for keypoints, its call, its order of the joints."""
+
+    references: list[Any]
+    solve: Solve
+    joint_names: list[str]
+
+
+def find_rival(name: str) -> Rival:
+    """The rival of that name.
+
+    Raises:
+        UnknownNameError: there is none.
+    """
+    if name not in RIVALS:
+        raise UnknownNameError("rival", name, list(RIVALS))
+    return RIVALS[name]
+
+
+def missing_modules(rival: Rival) -> list[str]:
+    """Modules of a rival that are not installed, checked without importing."""
+    return [module for module in _MODULES[rival.library] if find_spec(module) is None]
+
+
+def references(
+    rival: Rival, keypoints_m: np.ndarray, scale: float
+) -> Float64[np.ndarray, "time 15 3"]:
+    """Reference vectors or positions for a rival from samples [T, 25, 3], metres.
+
+    Positions are scaled here; vectors by the libraries, as DexPilot's thresholds require.
+    """
+    keypoints = np.asarray(keypoints_m, dtype=np.float64)
+    wrist = keypoints[:, _WRIST_NODE, None]
+    if rival.objective == VECTOR:
+        return np.asarray(keypoints[:, _NODES] - wrist)
+    if rival.objective == POSITION:
+        return np.asarray(keypoints[:, _NODES] - wrist) * scale
+    points = np.concatenate([wrist, keypoints[:, _TIP_NODES]], axis=1)
+    return np.asarray(points[:, _PAIRS[:, 1]] - points[:, _PAIRS[:, 0]])
+
+
+def set_up(
+    rival: Rival, keypoints_m: np.ndarray, side: str, *, scale: float, folder: Path
+) -> Setup:
+    """Create a retargeter for the robot hand of one side, with its references.
+
+    Args:
+        rival: which.
+        keypoints_m: [T, 25, 3], wrist coordinates.
+        side: of the hand.
+        scale: size of the robot's hand relative to the tracked one.
+        folder: for the URDF.
+
+    Raises:
+        UnavailableError: its library is not installed.
+    """
+    missing = missing_modules(rival)
+    if missing:
+        raise UnavailableError(f"{rival.name}: {', '.join(missing)} not installed; {INSTALL}")
+    hand = RobotHand(side)
+    path = folder / f"{side}_hand.urdf"
+    path.write_text(hand_urdf(hand), encoding="utf-8")
+    config = {"urdf_path": str(path), **_config(rival.objective), "low_pass_alpha": -1.0}
+    config["target_joint_names"] = list(hand.joint_names)
+    config["scaling_factor"] = scale
+    wanted = references(rival, keypoints_m, scale)
+    if rival.library == DEX:
+        _library("torch").set_num_threads(1)
+        module = _library("dex_retargeting.retargeting_config")
+        built = module.RetargetingConfig.from_dict(config).build()
+        return Setup(list(wanted), built.retarget, list(built.joint_names))
+    built = _library("dexi_rs").load_config(config).build()
+    flat = wanted.reshape(len(wanted), -1).tolist()
+    return Setup(flat, built.retarget, list(built.joint_names))
+
+
+def _config(objective: str) -> dict[str, Any]:
+    if objective == VECTOR:
+        return {
+            "type": "vector",
+            "target_origin_link_names": [WRIST_LINK] * len(_LINKS),
+            "target_task_link_names": _LINKS,
+            "target_link_human_indices": [[_WRIST_NODE] * len(_NODES), _NODES],
+        }
+    if objective == POSITION:
+        return {
+            "type": "position",
+            "target_link_names": _LINKS,
+            "target_link_human_indices": _NODES,
+        }
+    tips = [tip_name(chain) for chain in CHAINS]
+    return {"type": "dexpilot", "wrist_link_name": WRIST_LINK, "finger_tip_link_names": tips}
+
+
+def _library(name: str) -> ModuleType:
+    """Import by name, since it is an optional dependency."""
+    return importlib.import_module(name)

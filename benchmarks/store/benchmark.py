@@ -1,0 +1,133 @@
+"""Entry point of the benchmark stage `store`."""
+
+import argparse
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.stages import Bar
+from benchmarks.store.acceptance import OURS, requirements
+from benchmarks.store.appends import measure_appends
+from benchmarks.store.compare import DesignResult, Effort, compare
+from benchmarks.store.designs import Design
+from benchmarks.store.live import LiveResult, write_live
+from benchmarks.store.mcap_design import McapDesign
+from benchmarks.store.our_design import OurDesign
+from benchmarks.store.tables import panels, tables
+from benchmarks.store.take import make_take
+from benchmarks.store.workload import CAMERAS, WINDOW_IMAGES, Workload
+from benchmarks.store.zarr_design import ZarrDesign
+from dextouch.errors import InvalidInputError, UnknownNameError
+
+DESIGNS: tuple[Design, ...] = (
+    OurDesign("h264"),
+    OurDesign("jpeg"),
+    ZarrDesign("jpeg"),
+    ZarrDesign("jpeg-pool"),
+    ZarrDesign("raw"),
+    McapDesign(),
+)
+PACKAGES = ("numpy", "simplejpeg", "av", "zarr", "zstandard", "mcap")
+_QUICK = {"seconds": 2.0, "rounds": 1, "windows": 4}
+_USUAL = {"seconds": 10.0, "rounds": 5, "windows": 40}
+_MIN_SECONDS = 1.0
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    names = ",".join(design.name for design in DESIGNS)
+    parser.add_argument(
+        "--seconds", type=float, help=f"length of the take ({_USUAL['seconds']:g}; quick 2)"
+    )
+    parser.add_argument("--rounds", type=int, help=f"rounds ({_USUAL['rounds']}; quick 1)")
+    parser.add_argument(
+        "--windows", type=int, help=f"random windows a round ({_USUAL['windows']}; quick 4)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of the scene (%(default)s)")
+    parser.add_argument(
+        "--designs", metavar="A,B", help=f"only these, by comma (all that can run: {names})"
+    )
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Write and read one take with every design, then appends and the live run.
+
+    Raises:
+        UnknownNameError: an unknown design.
+        InvalidInputError: a take too short for a window, or no round or window.
+    """
+    plan = _plan(options)
+    chosen = choose(options.designs)
+    notes = [f"{d.name} is left out: needs {d.missing()}" for d in chosen if d.missing()]
+    designs = [design for design in chosen if design.missing() is None]
+    with bar("making the scene", len(CAMERAS)) as step:
+        workload = make_take(plan["seconds"], options.seed, on_camera=step)
+    effort = Effort(plan["rounds"], plan["windows"], 1 if options.quick else 3, options.seed)
+    results = compare(designs, workload, folder, effort, bar)
+    share = 0.1 if options.quick else 1.0
+    appends = measure_appends(workload, folder, plan["rounds"], bar, share=share)
+    live = _live(results, workload, folder / "live", plan["rounds"], bar)
+    return StageReport(
+        stage="store",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "seed": options.seed, "designs": [design.name for design in designs]},
+        tables=tables(results, appends, live),
+        panels=panels(results),
+        requirements=requirements(results, appends, live),
+        data={
+            "designs": {name: asdict(result) for name, result in results.items()},
+            "appends": [asdict(append) for append in appends],
+            "live": [asdict(run) for run in live],
+        },
+        notes=notes,
+    )
+
+
+def choose(names: str | None) -> list[Design]:
+    """The designs of `--designs`; all of them when it is not given.
+
+    Raises:
+        UnknownNameError: a design that there is not.
+    """
+    known = {design.name: design for design in DESIGNS}
+    wanted = list(known) if names is None else [name.strip() for name in names.split(",")]
+    for name in wanted:
+        if name not in known:
+            raise UnknownNameError("design", name, list(known))
+    return [known[name] for name in wanted]
+
+
+def _plan(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say, else the usual or the quick numbers."""
+    defaults: Mapping[str, float] = _QUICK if options.quick else _USUAL
+    given = {name: getattr(options, name) for name in defaults}
+    plan = {name: given[name] if given[name] is not None else defaults[name] for name in defaults}
+    if plan["seconds"] < _MIN_SECONDS:
+        raise InvalidInputError(
+            f"--seconds: got {plan['seconds']:g}, expected at least {_MIN_SECONDS:g}: a window "
+            f"holds {WINDOW_IMAGES} images"
+        )
+    for name in ("rounds", "windows"):
+        if plan[name] < 1:
+            raise InvalidInputError(f"--{name}: got {plan[name]}, expected at least 1")
+    return plan
+
+
+def _live(
+    results: Mapping[str, DesignResult],
+    workload: Workload,
+    folder: Path,
+    num_rounds: int,
+    bar: Bar,
+) -> Sequence[LiveResult]:
+    if OURS not in results:
+        return []
+    runs = []
+    with bar("live", num_rounds) as step:
+        for index in range(num_rounds):
+            step(f"run {index + 1}")
+            runs.append(write_live(workload, folder, "h264"))
+    return runs

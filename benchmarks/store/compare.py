@@ -1,0 +1,250 @@
+"""Time, size and image error of each storage design on one take, measured in turns."""
+
+import gc
+import os
+import resource
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from benchmarks.figures import Figure
+from benchmarks.rounds import interleaved
+from benchmarks.stages import Bar
+from benchmarks.store.designs import Design, OpenStore, ReadsTouch, StoreWindow
+from benchmarks.store.workload import CAMERAS, WINDOW_IMAGES, WINDOW_TACTILE, Workload
+from dextouch.errors import CorruptDataError
+from dextouch.metrics.image import psnr
+
+# Just enough for one window.
+_WARM_SECONDS = 0.6
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Extent of the measurement: rounds, random windows per round, spans of compared images."""
+
+    num_rounds: int
+    num_windows: int
+    num_compared: int
+    seed: int
+
+
+@dataclass(frozen=True)
+class DesignResult:
+    """Cost and image quality of one design; figures hold one value per round."""
+
+    name: str
+    seconds: float
+    write_s: Figure
+    cpu_s: Figure
+    num_bytes: int
+    num_files: int
+    psnr_db: Mapping[str, float]
+    window_ms: Figure
+    three_cameras_ms: Figure
+    three_cameras_threaded_ms: Figure
+    touch_ms: Figure | None
+
+    @property
+    def mean_psnr_db(self) -> float:
+        """Mean over the cameras."""
+        return float(np.mean(list(self.psnr_db.values())))
+
+
+class WriteCost(NamedTuple):
+    """One write of the whole take."""
+
+    wall_s: float
+    cpu_s: float
+
+
+class ReadCost(NamedTuple):
+    """Milliseconds for one window, three cameras' windows in turn and in threads, and touch."""
+
+    window_ms: float
+    three_cameras_ms: float
+    three_cameras_threaded_ms: float
+    touch_ms: float | None
+
+
+def compare(
+    designs: Sequence[Design], workload: Workload, folder: Path, effort: Effort, bar: Bar
+) -> dict[str, DesignResult]:
+    """Write and read one take with every design in each round.
+
+    Args:
+        designs: available ones; one that reads another's files requires that other.
+        workload: the take.
+        folder: for the files, with a subfolder per design.
+        effort: extent of the measurement.
+        bar: opens a progress bar.
+
+    Raises:
+        CorruptDataError: a design returned other values than were written.
+    """
+    written = _write_rounds(designs, workload, folder, effort.num_rounds, bar)
+    readers = {d.name: d.open(folder / (d.reads or d.name)) for d in designs}
+    errors: dict[str, dict[str, float]] = {}
+    with bar("comparing with the original", len(readers)) as step:
+        for name, reader in readers.items():
+            step(name)
+            errors[name] = image_psnr(name, reader, workload, effort.num_compared)
+    starts = _random_starts(workload, effort)
+    with bar("reading windows", effort.num_rounds * len(readers)) as step:
+        read = interleaved(
+            {name: partial(_read_once, reader, starts) for name, reader in readers.items()},
+            effort.num_rounds,
+            on_step=step,
+        )
+    results = {}
+    for design in designs:
+        files = folder / (design.reads or design.name)
+        costs = written[design.reads or design.name]
+        results[design.name] = DesignResult(
+            name=design.name,
+            seconds=workload.seconds,
+            write_s=Figure.of([cost.wall_s for cost in costs]),
+            cpu_s=Figure.of([cost.cpu_s for cost in costs]),
+            num_bytes=sum(p.stat().st_size for p in files.rglob("*") if p.is_file()),
+            num_files=sum(p.is_file() for p in files.rglob("*")),
+            psnr_db=errors[design.name],
+            **_read_figures(read[design.name]),
+        )
+    return results
+
+
+def image_psnr(
+    name: str, reader: OpenStore, workload: Workload, num_spans: int
+) -> dict[str, float]:
+    """Mean PSNR of each camera over spans of the take; numeric values must be exact.
+
+    Raises:
+        CorruptDataError: other values, or images of another shape, than were written.
+    """
+    spans = np.linspace(0, workload.num_starts - 1, num_spans + 2).astype(int)[1:-1]
+    psnr_db = {}
+    for camera in CAMERAS:
+        found = []
+        for start in (int(span) for span in spans):
+            window = reader.window(camera, start)
+            true = expected_window(workload, camera, start)
+            _check_numbers(name, window, true, start)
+            found.append(psnr(predicted=np.asarray(window.images), true=true.images))
+        psnr_db[camera] = float(np.mean(found))
+    return psnr_db
+
+
+def expected_window(workload: Workload, camera: str, start: int) -> StoreWindow:
+    """The original window."""
+    touched = slice(2 * start, 2 * start + WINDOW_TACTILE)
+    seen = slice(start, start + WINDOW_IMAGES)
+    return StoreWindow(
+        images=workload.images[camera].values[seen],
+        tactile_left=workload.numbers["tactile_left"].values[touched],
+        tactile_right=workload.numbers["tactile_right"].values[touched],
+        actions=workload.numbers["action"].values[seen],
+    )
+
+
+def _check_numbers(name: str, window: StoreWindow, true: StoreWindow, start: int) -> None:
+    for part in ("tactile_left", "tactile_right", "actions"):
+        got, expected = getattr(window, part), getattr(true, part)
+        if not np.array_equal(got, expected):
+            raise CorruptDataError(
+                f"design {name!r}: {part} of the window at image {start} are {got.dtype} "
+                f"{got.shape} that differ from the {expected.dtype} {expected.shape} that were "
+                "written; its other figures would mean nothing"
+            )
+
+
+def _write_rounds(
+    designs: Sequence[Design], workload: Workload, folder: Path, num_rounds: int, bar: Bar
+) -> dict[str, list[WriteCost]]:
+    writers = [design for design in designs if design.reads is None]
+    with bar("warming up", len(writers)) as step:
+        for design in writers:
+            step(design.name)
+            warm = folder / f"warm-{design.name}"
+            design.write(workload.first(_WARM_SECONDS), warm)
+            design.open(warm).window(CAMERAS[0], 0)
+            shutil.rmtree(warm)
+    with bar("writing", num_rounds * len(writers)) as step:
+        return interleaved(
+            {d.name: partial(_write_once, d, workload, folder / d.name) for d in writers},
+            num_rounds,
+            on_step=step,
+        )
+
+
+def _write_once(design: Design, workload: Workload, folder: Path, _round_index: int) -> WriteCost:
+    shutil.rmtree(folder, ignore_errors=True)
+    # Pending writes of the previous design must not be charged to this one.
+    os.sync()
+    gc.collect()
+    cpu_s, wall_s = _cpu_s(), time.perf_counter()
+    design.write(workload, folder)
+    return WriteCost(wall_s=time.perf_counter() - wall_s, cpu_s=_cpu_s() - cpu_s)
+
+
+def _cpu_s() -> float:
+    """Processor time of this process with all threads, and of its finished children."""
+    used = [resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return sum(usage.ru_utime + usage.ru_stime for usage in used)
+
+
+Starts = list[list[tuple[str, int]]]
+
+
+def _random_starts(workload: Workload, effort: Effort) -> Starts:
+    """Cameras and starts, the same for all designs of a round."""
+    rng = np.random.default_rng(effort.seed)
+    return [
+        [
+            (CAMERAS[int(rng.integers(len(CAMERAS)))], int(rng.integers(workload.num_starts)))
+            for _ in range(effort.num_windows)
+        ]
+        for _ in range(effort.num_rounds)
+    ]
+
+
+def _read_once(reader: OpenStore, all_starts: Starts, round_index: int) -> ReadCost:
+    starts = all_starts[round_index]
+    few = [start for _, start in starts[: max(1, len(starts) // 4)]]
+    for camera in CAMERAS:
+        reader.window(camera, starts[0][1])
+    return ReadCost(
+        window_ms=_mean_ms([partial(reader.window, *place) for place in starts]),
+        three_cameras_ms=_mean_ms(
+            [partial(reader.windows, CAMERAS, start, threaded=False) for start in few]
+        ),
+        three_cameras_threaded_ms=_mean_ms(
+            [partial(reader.windows, CAMERAS, start, threaded=True) for start in few]
+        ),
+        touch_ms=_mean_ms([partial(reader.touch, start) for _, start in starts])
+        if isinstance(reader, ReadsTouch)
+        else None,
+    )
+
+
+def _mean_ms(calls: Sequence[Callable[[], object]]) -> float:
+    gc.collect()
+    begun_s = time.perf_counter()
+    for call in calls:
+        call()
+    return (time.perf_counter() - begun_s) * 1e3 / len(calls)
+
+
+def _read_figures(costs: Sequence[ReadCost]) -> dict[str, Any]:
+    touch_ms = [cost.touch_ms for cost in costs if cost.touch_ms is not None]
+    return {
+        "window_ms": Figure.of([cost.window_ms for cost in costs]),
+        "three_cameras_ms": Figure.of([cost.three_cameras_ms for cost in costs]),
+        "three_cameras_threaded_ms": Figure.of([c.three_cameras_threaded_ms for c in costs]),
+        "touch_ms": Figure.of(touch_ms) if touch_ms else None,
+    }

@@ -1,0 +1,121 @@
+"""Tables and charts of the store benchmark."""
+
+from collections.abc import Mapping, Sequence
+
+from benchmarks.chart import Panel, Point
+from benchmarks.figures import Figure
+from benchmarks.report import ResultTable
+from benchmarks.store.appends import AppendResult
+from benchmarks.store.compare import DesignResult
+from benchmarks.store.live import LiveResult
+
+_WRITE_COLUMNS = ("design", "speed", "CPU (s)", "MB/min", "files", "PSNR (dB)")
+_READ_COLUMNS = ("design", "1 camera", "3 cameras", "3, threads", "touch (ms)")
+
+
+def tables(
+    results: Mapping[str, DesignResult],
+    appends: Sequence[AppendResult],
+    live: Sequence[LiveResult],
+) -> list[ResultTable]:
+    """All tables of the stage; those without rows are left out."""
+    found = [
+        write_table(results),
+        read_table(results),
+        ResultTable(
+            "Appending one sample of a glove (ms)",
+            ("way", "p50", "p99", "appends a round"),
+            [(a.name, a.p50_ms.text(), a.p99_ms.text(), str(a.num_appends)) for a in appends],
+        ),
+        ResultTable(
+            "A whole station, live (late: handed over more than 0.1 s after it was due)",
+            ("speed", "rows", "late", "dropped", "worst lag (ms)", "closing (s)"),
+            [
+                (
+                    f"{run.speed:g}",
+                    str(run.num_rows),
+                    str(run.num_late),
+                    str(run.num_dropped),
+                    f"{run.worst_lag_ms:.3g}",
+                    f"{run.finish_s:.3g}",
+                )
+                for run in live
+            ],
+        ),
+    ]
+    return [table for table in found if table.rows]
+
+
+def write_table(results: Mapping[str, DesignResult]) -> ResultTable:
+    """Time, bytes and image error of writing: medians, with the spread of the rounds."""
+    rows = [
+        (
+            result.name,
+            result.write_s.inverse(result.seconds).text(),
+            result.cpu_s.scaled(1 / result.seconds).text(),
+            _megabytes(result),
+            str(result.num_files),
+            " ".join(f"{decibels:.1f}" for decibels in result.psnr_db.values()),
+        )
+        for result in results.values()
+    ]
+    return ResultTable(
+        "Writing (speed: 1 is real time; CPU: of a recorded second; PSNR: head, left, right)",
+        _WRITE_COLUMNS,
+        rows,
+    )
+
+
+def read_table(results: Mapping[str, DesignResult]) -> ResultTable:
+    """How many windows a second: medians, with the spread of the rounds."""
+    rows = [
+        (
+            result.name,
+            _rate(result.window_ms),
+            _rate(result.three_cameras_ms),
+            _rate(result.three_cameras_threaded_ms),
+            "" if result.touch_ms is None else result.touch_ms.text(),
+        )
+        for result in results.values()
+    ]
+    return ResultTable(
+        "Random windows of 17 images a second, and the touch of one", _READ_COLUMNS, rows
+    )
+
+
+def panels(results: Mapping[str, DesignResult]) -> list[Panel]:
+    """Time against image error: once of writing, once of reading."""
+    write = {name: result.write_s.scaled(1 / result.seconds) for name, result in results.items()}
+    read = {name: result.window_ms for name, result in results.items()}
+    error = "image error (RMS, levels of 255)"
+    return [
+        Panel("Writing", "seconds a recorded second", error, _points(results, write)),
+        Panel("Reading, one camera", "ms a window of 17 images", error, _points(results, read)),
+    ]
+
+
+def _points(results: Mapping[str, DesignResult], times: Mapping[str, Figure]) -> list[Point]:
+    return [
+        Point(
+            label=f"{name}, {_megabytes(result)} MB/min",
+            time=times[name].median,
+            time_low=times[name].low,
+            time_high=times[name].high,
+            error=rms_levels(result.mean_psnr_db),
+            is_ours=name.startswith("ours"),
+        )
+        for name, result in results.items()
+    ]
+
+
+def rms_levels(psnr_db: float) -> float:
+    """The root mean square error of 8-bit images that a PSNR stands for."""
+    return float(255.0 * 10.0 ** (-psnr_db / 20.0))
+
+
+def _megabytes(result: DesignResult) -> str:
+    return f"{result.num_bytes / 1e6 * 60 / result.seconds:.0f}"
+
+
+def _rate(milliseconds: Figure) -> str:
+    return milliseconds.inverse(1e3).text()

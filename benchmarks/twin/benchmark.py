@@ -1,0 +1,165 @@
+"""Entry point of the benchmark stage `twin`."""
+
+import argparse
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from benchmarks.chart import Panel, Point
+from benchmarks.figures import Figure, Requirement
+from benchmarks.machine import describe_machine
+from benchmarks.report import ResultTable, StageReport
+from benchmarks.rounds import interleaved
+from benchmarks.stages import Bar
+from benchmarks.twin.chunks import HEAD, HEAD_LAST, TimedChunk
+from benchmarks.twin.physics import (
+    AS_SERVED,
+    SOLVERS,
+    ContactChunks,
+    ContactError,
+    Played,
+    Solver,
+    contact_error,
+)
+from dextouch.errors import InvalidInputError
+from services.twin.tasks import TASK_NAMES
+
+PACKAGES: Final = ("numpy", "mujoco-core")
+# Of demonstrations that nothing is trained on.
+FIRST_SEED: Final = 30_000
+# 16 steps at 15 a second.
+CHUNK_MS: Final = 16 / 15 * 1e3
+USUAL: Final = {"rounds": 15, "seeds": 3, "solver_rounds": 5}
+QUICK: Final = {"rounds": 3, "seeds": 1, "solver_rounds": 1}
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument("--task", default="stand_bottle", choices=TASK_NAMES, help="(%(default)s)")
+    parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 3)")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Time a chunk with every selector in turns, then chunks with contact with every solver.
+
+    Raises:
+        InvalidInputError: no round.
+    """
+    del folder
+    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
+    plan["rounds"] = plan["rounds"] if options.rounds is None else options.rounds
+    if plan["rounds"] < 1:
+        raise InvalidInputError(f"--rounds: got {plan['rounds']}, expected at least 1")
+    chunk = TimedChunk(options.task, FIRST_SEED)
+    subjects = chunk.subjects()
+    with bar("selectors", plan["rounds"] * len(subjects)) as step:
+        found = interleaved(subjects, plan["rounds"], on_step=step)
+    times_ms = {name: Figure.of(values) for name, values in found.items()}
+    solver_ms, errors, num_chunks = _solvers(options.task, plan, bar)
+    return StageReport(
+        stage="twin",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "task": options.task, "chunks_with_contact": num_chunks},
+        tables=[selector_table(times_ms), solver_table(solver_ms, errors, num_chunks)],
+        panels=[panel(solver_ms, errors)],
+        requirements=requirements(times_ms, states_are_equal=chunk.states_are_equal()),
+        data={
+            "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
+            "solver_ms": {name: list(figure.values) for name, figure in solver_ms.items()},
+            "contact_error": {
+                name: {"force_n": error.force_n, "object_mm": error.object_mm}
+                for name, error in errors.items()
+            },
+        },
+        notes=["times are processor time of the whole process, with one thread"],
+    )
+
+
+def selector_table(times_ms: Mapping[str, Figure]) -> ResultTable:
+    """Milliseconds of a chunk, and how many times as fast as it is played."""
+    return ResultTable(
+        "A chunk of 16 steps by requested observation",
+        ("requested", "ms", "times real time"),
+        [
+            (name, figure.text(), figure.inverse(CHUNK_MS).text())
+            for name, figure in times_ms.items()
+        ],
+    )
+
+
+def solver_table(
+    times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError], num_chunks: int
+) -> ResultTable:
+    """What coarser solvers save and what they cost in contact."""
+    return ResultTable(
+        f"Solvers on {num_chunks} chunks with contact, no camera, errors after one chunk",
+        ("solver", "ms", "force error (N)", "true force (N)", "object error (mm)"),
+        [
+            (
+                name,
+                times_ms[name].text(),
+                f"{error.force_n:.2g}",
+                f"{error.force_rms_n:.2g}",
+                f"{error.object_mm:.2g}",
+            )
+            for name, error in errors.items()
+        ],
+    )
+
+
+def panel(times_ms: Mapping[str, Figure], errors: Mapping[str, ContactError]) -> Panel:
+    """Time of a chunk against its contact error; what is served is its own truth."""
+    points = [
+        Point(
+            label=name,
+            time=times_ms[name].median,
+            time_low=times_ms[name].low,
+            time_high=times_ms[name].high,
+            error=error.force_n,
+            is_ours=name == AS_SERVED,
+        )
+        for name, error in errors.items()
+    ]
+    label = "RMS error of pad forces after one chunk (N)"
+    return Panel("Physics of a chunk with contact", "processor ms a chunk", label, points)
+
+
+def requirements(times_ms: Mapping[str, Figure], *, states_are_equal: bool) -> list[Requirement]:
+    """What the twin promises of selectors."""
+    saved = times_ms[HEAD_LAST].over(times_ms[HEAD]).median
+    share = times_ms[HEAD].median / CHUNK_MS
+    return [
+        Requirement(f"{HEAD_LAST}, share of the time of {HEAD}", saved, "at most", 0.9),
+        Requirement(f"{HEAD}, share of real time", share, "at most", 0.5),
+        Requirement(
+            "selectors that leave the state after a chunk as it is, share",
+            float(states_are_equal),
+            "at least",
+            1.0,
+        ),
+    ]
+
+
+def _solvers(
+    task: str, plan: Mapping[str, int], bar: Bar
+) -> tuple[dict[str, Figure], dict[str, ContactError], int]:
+    """Milliseconds of the median chunk by round, and errors, of every solver."""
+    chunks = ContactChunks([task], range(FIRST_SEED, FIRST_SEED + plan["seeds"]))
+    subjects = {name: partial(_played, chunks, solver) for name, solver in SOLVERS.items()}
+    with bar("solvers", plan["solver_rounds"] * len(subjects)) as step:
+        found = interleaved(subjects, plan["solver_rounds"], on_step=step)
+    times_ms = {
+        name: Figure.of([float(np.median([one.ms for one in played])) for played in rounds])
+        for name, rounds in found.items()
+    }
+    truth = found[AS_SERVED][0]
+    errors = {name: contact_error(rounds[-1], truth) for name, rounds in found.items()}
+    return times_ms, errors, len(chunks)
+
+
+def _played(chunks: ContactChunks, solver: Solver, round_index: int) -> list[Played]:
+    del round_index
+    return chunks.play(solver)

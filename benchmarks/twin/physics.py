@@ -1,0 +1,136 @@
+"""Contact errors of the twin under coarser MuJoCo solvers, relative to the default solver."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import mujoco
+import numpy as np
+from jaxtyping import Float64
+
+from benchmarks.twin.chunks import CHUNK_STEPS
+from services.twin.settings import TwinSettings
+from services.twin.simulation import STEPS_PER_GRID, STEPS_PER_TACTILE, Simulation
+from services.twin.stage import Plan, Stage, command_row
+
+AS_SERVED: Final = "as served"
+_MM_PER_M: Final = 1e3
+
+
+@dataclass(frozen=True)
+class Solver:
+    """Options of MuJoCo's constraint solver; what is None stays as the twin has it."""
+
+    iterations: int | None = None
+    kind: int | None = None
+    cone: int | None = None
+
+
+SOLVERS: Final = {
+    AS_SERVED: Solver(),
+    "3 Newton steps": Solver(iterations=3),
+    "2 Newton steps": Solver(iterations=2),
+    "1 Newton step": Solver(iterations=1),
+    "pyramidal cones": Solver(cone=int(mujoco.mjtCone.mjCONE_PYRAMIDAL)),
+    "CG": Solver(kind=int(mujoco.mjtSolver.mjSOL_CG)),
+}
+
+
+@dataclass(frozen=True)
+class Played:
+    """What a chunk with contact led to: pad forces at 60 Hz and where the objects went."""
+
+    pad_forces_n: Float64[np.ndarray, "samples 2 6"]
+    object_positions_m: Float64[np.ndarray, "objects 3"]
+    ms: float
+
+
+@dataclass(frozen=True)
+class ContactError:
+    """Of chunks that begin in the same states, against the twin as served.
+
+    Attributes:
+        force_n: root mean square over pads and samples in which something is felt.
+        force_rms_n: of the true forces that are not zero.
+        object_mm: median over chunks and objects of how far objects end from where they should.
+    """
+
+    force_n: float
+    force_rms_n: float
+    object_mm: float
+
+
+class ContactChunks:
+    """Chunks of demonstrations, begun from the states that the twin as served reaches.
+
+    So errors are those of one chunk and do not grow from one to the next.
+
+    Args:
+        tasks: of the twin.
+        seeds: of the demonstrations of each task.
+    """
+
+    def __init__(self, tasks: Sequence[str], seeds: Sequence[int]) -> None:
+        self._stages = {task: Stage(task, "robot", TwinSettings()) for task in tasks}
+        self._begins: list[tuple[str, Plan, int, Float64[np.ndarray, " numbers"]]] = []
+        for task in tasks:
+            for seed in seeds:
+                self._add(task, self._stages[task].plan(seed))
+
+    def _add(self, task: str, plan: Plan) -> None:
+        stage = self._stages[task]
+        stage.start(plan)
+        for first in range(1, len(plan.commands.joints_left_rad), CHUNK_STEPS):
+            state = stage.simulation.state()
+            if _play(stage.simulation, plan, first).pad_forces_n.any():
+                self._begins.append((task, plan, first, state))
+
+    def __len__(self) -> int:
+        return len(self._begins)
+
+    def play(self, solver: Solver) -> list[Played]:
+        """Every chunk with one solver, which is taken back afterwards."""
+        played = []
+        for task, plan, first, state in self._begins:
+            simulation = self._stages[task].simulation
+            option = simulation.scene.model.opt
+            kept = option.iterations, option.solver, option.cone
+            simulation.set_state(state, step_index=(first - 1) * STEPS_PER_GRID)
+            option.iterations = kept[0] if solver.iterations is None else solver.iterations
+            option.solver = kept[1] if solver.kind is None else solver.kind
+            option.cone = kept[2] if solver.cone is None else solver.cone
+            try:
+                played.append(_play(simulation, plan, first))
+            finally:
+                option.iterations, option.solver, option.cone = kept
+        return played
+
+
+def contact_error(played: Sequence[Played], truth: Sequence[Played]) -> ContactError:
+    """How far chunks are from those of the twin as served."""
+    true_n = np.concatenate([one.pad_forces_n for one in truth])
+    off_n = np.concatenate([one.pad_forces_n for one in played]) - true_n
+    off_m = np.concatenate([one.object_positions_m for one in played]) - np.concatenate(
+        [one.object_positions_m for one in truth]
+    )
+    felt = (true_n > 0) | (off_n != 0)
+    return ContactError(
+        force_n=float(np.sqrt(np.mean(off_n[felt] ** 2))) if felt.any() else 0.0,
+        force_rms_n=float(np.sqrt(np.mean(true_n[true_n > 0] ** 2))),
+        object_mm=_MM_PER_M * float(np.median(np.linalg.norm(off_m, axis=1))),
+    )
+
+
+def _play(simulation: Simulation, plan: Plan, first: int) -> Played:
+    last = min(first + CHUNK_STEPS, len(plan.commands.joints_left_rad))
+    forces_n: list[np.ndarray] = []
+    begin_s = time.process_time()
+    for row in range(first, last):
+        forces_n.extend(
+            simulation.pad_forces_n
+            for step_index in simulation.advance(command_row(plan.commands, row))
+            if step_index % STEPS_PER_TACTILE == 0
+        )
+    elapsed_s = time.process_time() - begin_s
+    return Played(np.stack(forces_n), simulation.object_poses()[:, :3], 1e3 * elapsed_s)

@@ -1,0 +1,179 @@
+"""Entry point of the benchmark stage `world-model`."""
+
+import argparse
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Final
+
+from benchmarks.figures import Figure
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.rounds import interleaved
+from benchmarks.stages import Bar
+from benchmarks.world_model.held_out import HeldOut, held_out
+from benchmarks.world_model.rollouts import (
+    Imagined,
+    RolloutError,
+    imagine,
+    imagine_together,
+    rollout_error,
+)
+from benchmarks.world_model.tables import (
+    COPY_FIRST,
+    cost_table,
+    error_table,
+    panels,
+    requirements,
+    variant_name,
+)
+from dextouch.errors import InvalidInputError
+from dextouch.worlds.baseline import CopyFirstWorld
+from dextouch.worlds.world import EVERYTHING, ReturnSelector, World
+from services.twin.tasks import TASK_NAMES
+
+if TYPE_CHECKING:
+    from services.world_model.network.model import Precision
+    from services.world_model.world import ModelWorld
+
+PACKAGES: Final = ("numpy", "torch", "mujoco-core")
+# Of demonstrations that nothing is trained on.
+FIRST_SEED: Final = 30_000
+USUAL: Final = {"rounds": 7, "seeds": 6}
+QUICK: Final = {"rounds": 1, "seeds": 1}
+EULER_STEPS: Final = (1, 2, 4)
+PRECISIONS: "Final[tuple[Precision, ...]]" = ("float32", "bfloat16")
+SELECTORS: Final = {
+    "all images": EVERYTHING,
+    "the last image": ReturnSelector(steps="last"),
+    "no image": ReturnSelector(cameras=()),
+}
+TOGETHER: Final = (1, 4, 8)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument(
+        "--checkpoint", type=Path, help="of the paper's form (default: the package's own)"
+    )
+    parser.add_argument("--rounds", type=int, help=f"rounds ({USUAL['rounds']}; quick 1)")
+    parser.add_argument(
+        "--seeds", type=int, help=f"episodes of each task ({USUAL['seeds']}; quick 1)"
+    )
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Let the model imagine held-out demonstrations in many ways, in turns.
+
+    Raises:
+        InvalidInputError: no round or seed, or a model that knows none of the twin's tasks.
+    """
+    from services.world_model.checkpoints import paper_form_checkpoint, read_checkpoint
+    from services.world_model.world import ModelWorld
+
+    del folder
+    plan = _plan(options)
+    checkpoint = read_checkpoint(options.checkpoint or paper_form_checkpoint())
+    network = checkpoint.metadata.network
+    variants = {
+        variant_name(steps, precision): ModelWorld(
+            checkpoint, sampling_steps=steps, precision=precision
+        )
+        for precision in PRECISIONS
+        for steps in EULER_STEPS
+    }
+    served = variant_name(network.sampling_steps, "float32")
+    world = variants.setdefault(served, ModelWorld(checkpoint))
+    tasks = [task for task in TASK_NAMES if task in world.description.tasks]
+    if not tasks:
+        raise InvalidInputError(
+            f"bench world-model: the model knows {world.description.tasks}, expected at least one "
+            f"task of the twin: {TASK_NAMES}"
+        )
+    with bar("demonstrations of the twin", 1) as step:
+        step("making")
+        seeds = range(FIRST_SEED, FIRST_SEED + plan["seeds"])
+        episodes = held_out(tasks, seeds, world.description.image_height_px)
+    worlds: dict[str, World[Any]] = {
+        COPY_FIRST: CopyFirstWorld.beside(world.description),
+        **variants,
+    }
+    errors = {name: rollout_error(imagine(one, episodes), episodes) for name, one in worlds.items()}
+    times_ms = _times(worlds, episodes, plan["rounds"], bar)
+    costs_ms = _costs(world, episodes, plan["rounds"], bar)
+    return StageReport(
+        stage="world-model",
+        machine=describe_machine(PACKAGES),
+        options={**plan, "tasks": tasks, "checkpoint": world.description.name, "served": served},
+        tables=[error_table(times_ms, errors, served, len(episodes)), cost_table(costs_ms, served)],
+        panels=panels(times_ms, errors, served),
+        requirements=requirements(times_ms, errors, served),
+        data=_data(times_ms, errors, costs_ms),
+        notes=[
+            "times are processor time of the whole process; OMP_NUM_THREADS=1 gives one thread",
+            "every chunk starts from what the one before it imagined",
+        ],
+    )
+
+
+def _times(
+    worlds: Mapping[str, World[Any]], episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
+) -> dict[str, Figure]:
+    subjects = {name: partial(_imagined, world, episodes) for name, world in worlds.items()}
+    with bar("steps and precision", num_rounds * len(subjects)) as step:
+        found = interleaved(subjects, num_rounds, on_step=step)
+    return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
+
+
+def _costs(
+    world: "ModelWorld", episodes: Sequence[HeldOut], num_rounds: int, bar: Bar
+) -> dict[str, Figure]:
+    """Milliseconds per chunk of the world as served, by requested images and batch size."""
+    subjects: dict[str, Callable[[int], Imagined]] = {
+        f"{asked}, batch of {count}": partial(_together, world, episodes[0], count, selector)
+        for count in TOGETHER
+        for asked, selector in SELECTORS.items()
+    }
+    with bar("requested images and batch sizes", num_rounds * len(subjects)) as step:
+        found = interleaved(subjects, num_rounds, on_step=step)
+    return {name: Figure.of([one.ms for one in rounds]) for name, rounds in found.items()}
+
+
+def _imagined(world: World[Any], episodes: Sequence[HeldOut], round_index: int) -> Imagined:
+    del round_index
+    return imagine(world, episodes)
+
+
+def _together(
+    world: "ModelWorld",
+    episode: HeldOut,
+    num_rollouts: int,
+    selector: ReturnSelector,
+    round_index: int,
+) -> Imagined:
+    del round_index
+    return imagine_together(world, episode, num_rollouts, selector)
+
+
+def _data(
+    times_ms: Mapping[str, Figure],
+    errors: Mapping[str, RolloutError],
+    costs_ms: Mapping[str, Figure],
+) -> dict[str, Any]:
+    return {
+        "chunk_ms": {name: list(figure.values) for name, figure in times_ms.items()},
+        "errors": {name: asdict(error) for name, error in errors.items()},
+        "asked_ms": {name: list(figure.values) for name, figure in costs_ms.items()},
+    }
+
+
+def _plan(options: argparse.Namespace) -> dict[str, Any]:
+    """What the options say, else the usual or the quick numbers."""
+    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
+    for name in ("rounds", "seeds"):
+        given = getattr(options, name)
+        plan[name] = plan[name] if given is None else given
+        if plan[name] < 1:
+            raise InvalidInputError(f"--{name}: got {plan[name]}, expected at least 1")
+    return plan

@@ -1,0 +1,83 @@
+"""Imagined rollouts of held-out demonstrations: processor time and errors."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.world_model.held_out import CAMERA, CHUNK_STEPS, HeldOut
+from dextouch.metrics.tactile import contact_f1
+from dextouch.worlds.world import EVERYTHING, BatchWorld, Observation, ReturnSelector, World
+
+
+@dataclass(frozen=True)
+class Imagined:
+    """All rollouts of one world: what was seen of each chunk, and milliseconds a chunk."""
+
+    seen: list[list[Observation]]
+    ms: float
+
+
+@dataclass(frozen=True)
+class RolloutError:
+    """Of whole rollouts against the twin: root mean squares, and contact of taxels."""
+
+    image_levels: float
+    touch_kpa: float
+    contact_f1: float
+
+
+def imagine(
+    world: World[Any], episodes: Sequence[HeldOut], selector: ReturnSelector = EVERYTHING
+) -> Imagined:
+    """Play every episode's actions, chunk after chunk, each from what the last one imagined."""
+    states = [world.reset(episode.start).state for episode in episodes]
+    seen: list[list[Observation]] = [[] for _ in episodes]
+    num_chunks = 0
+    begin_s = time.process_time()
+    for index, episode in enumerate(episodes):
+        for chunk, actions in enumerate(episode.chunks):
+            stepped = world.step(states[index], actions, seed=chunk, selector=selector)
+            states[index] = stepped.state
+            seen[index].append(stepped.observation)
+            num_chunks += 1
+    elapsed_s = time.process_time() - begin_s
+    return Imagined(seen, 1e3 * elapsed_s / num_chunks)
+
+
+def imagine_together(
+    world: BatchWorld[Any], episode: HeldOut, num_rollouts: int, selector: ReturnSelector
+) -> Imagined:
+    """Several rollouts of one episode in one batch; milliseconds a chunk of one rollout."""
+    states = [world.reset(episode.start).state] * num_rollouts
+    begin_s = time.process_time()
+    for actions in episode.chunks:
+        stepped = world.step_batch(
+            states,
+            np.repeat(actions[None], num_rollouts, axis=0),
+            seeds=range(num_rollouts),
+            selectors=[selector] * num_rollouts,
+        )
+        states = [one.state for one in stepped]
+    elapsed_s = time.process_time() - begin_s
+    return Imagined([], 1e3 * elapsed_s / (num_rollouts * len(episode.chunks)))
+
+
+def rollout_error(imagined: Imagined, episodes: Sequence[HeldOut]) -> RolloutError:
+    """How far rollouts that showed everything are from what the twin showed."""
+    all_seen = [one for seen in imagined.seen for one in seen]
+    pairs = list(zip(imagined.seen, episodes, strict=True))
+    true_images = [episode.images[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]
+    true_touches = [episode.tactile_kpa[: CHUNK_STEPS * len(seen)] for seen, episode in pairs]
+    images = np.concatenate([one.images[CAMERA] for one in all_seen])
+    off_levels = images.astype(np.float64) - np.concatenate(true_images)
+    touch = np.concatenate([one.tactile_kpa for one in all_seen])
+    true_touch = np.concatenate(true_touches)
+    off_kpa = touch.astype(np.float64) - true_touch
+    return RolloutError(
+        image_levels=float(np.sqrt(np.mean(off_levels**2))),
+        touch_kpa=float(np.sqrt(np.mean(off_kpa**2))),
+        contact_f1=contact_f1(predicted_kpa=touch, true_kpa=true_touch),
+    )

@@ -1,0 +1,1 @@
+"""Simulated inputs with known truth, shared by `dextouch stress` and the benchmarks."""

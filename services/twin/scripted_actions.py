@@ -1,0 +1,57 @@
+"""Open-loop policies of graded quality: the demonstrator with errors, and three that fail."""
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.geometry.transforms import transform
+from dextouch.hands.actions import (
+    AnchorPoses,
+    HandTrajectory,
+    actions_from_poses,
+    poses_from_actions,
+)
+from services.twin.demonstrators import NUM_GRID_STEPS
+from services.twin.stage import Stage
+
+# Names of the policies that should fail; scripts are named by `script_name`.
+HOLD, RETREAT, ELSEWHERE = "hold", "retreat", "another scene's actions"
+# Added to the seed for the actions of another scene: the same task, objects elsewhere.
+OTHER_SCENE: Final = 5_000
+_RETREAT_M = np.array([0.0, -0.10, 0.12])
+_RETREAT_STEPS: Final = 24
+Actions = Float64[np.ndarray, "80 67"]
+
+
+def script_name(level_mm: float) -> str:
+    """The name of the script that reads places wrongly by so much."""
+    return f"script {level_mm:g} mm"
+
+
+def scripted_actions(stage: Stage, seed: int, policy: str, levels_mm: tuple[float, ...]) -> Actions:
+    """Commands of a policy that does not look, steps 1 … 80, relative to the start's poses."""
+    noise_m = {script_name(level): level / 1000 for level in levels_mm}.get(policy, 0.0)
+    plan = stage.plan(seed + OTHER_SCENE * (policy == ELSEWHERE), noise_m=noise_m)
+    anchor = stage.start(plan)
+    actions = actions_from_poses(plan.commands, anchor)
+    if policy == HOLD:
+        actions[1:] = actions[0]
+    if policy == RETREAT:
+        actions = _retreat(actions[0], anchor)
+    return actions[1:]
+
+
+def _retreat(row: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "81 67"]:
+    """Both hands back and up, and still from then on."""
+    still = poses_from_actions(np.repeat(row[None], NUM_GRID_STEPS, axis=0), anchor)
+    way = np.minimum(np.arange(NUM_GRID_STEPS) / _RETREAT_STEPS, 1.0)
+    offset = transform(np.eye(3), (way * way * (3 - 2 * way))[:, None] * _RETREAT_M)
+    moved = HandTrajectory(
+        offset @ still.Ts_world_wrist_left,
+        offset @ still.Ts_world_wrist_right,
+        still.joints_left_rad,
+        still.joints_right_rad,
+        still.Ts_world_camera_head,
+    )
+    return actions_from_poses(moved, anchor)
