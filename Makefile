@@ -10,7 +10,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz mutants fix clean docs bench bench-lerobot check-lerobot-export \
+.PHONY: demo test check slow vm fuzz mutants fix clean docs bench bench-lerobot check-lerobot-export wheel-test \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -35,6 +35,9 @@ test: $(VENV)/.dev       ## the default test run (seven to nine minutes on two c
 
 slow: $(VENV)/.dev       ## the long tests
 	$(BIN)/python -m pytest -q -m slow
+
+wheel-test: $(VENV)/.dev   ## build the wheel, install it outside the checkout, run its demo and its services
+	$(BIN)/python -m pytest -q -m slow tests/system/test_wheel.py
 
 vm: $(VENV)/.dev         ## real drivers on a Debian kernel's devices; apt-get install qemu-system-x86 busybox-static cpio kmod
 	$(BIN)/python -m pytest -q -s -m vm tests/vm

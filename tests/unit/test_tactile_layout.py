@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 from dextouch.errors import ShapeError, UnknownNameError
+from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.tactile import contact, heatmap, layout
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
+from services.acquisition.mocks.replay import ReplayStream
 
 
 @pytest.mark.parametrize("side", layout.SIDES)
@@ -42,6 +45,56 @@ def test_each_pad_is_read_from_its_place_in_the_scan(side, pad, row, column, sca
     pads = {**dict(zip(layout.FINGERS, tips, strict=True)), "palm": palm}
     assert [name for name in pads if pads[name].any()] == [pad]
     assert np.argwhere(pads[pad]).tolist() == [[row, column]]
+
+
+def scan_cell(pad, row, column, *, side):
+    """Place in the 360 readings by the table "Scan of the tactile glove", one taxel at a time."""
+    if pad == "palm":
+        number = 16 * row + column
+        scan_row, scan_column = 4 + number // 20, number % 20
+    else:
+        first_column = {"thumb": 0, "index": 4, "middle": 8, "ring": 12, "little": 16}[pad]
+        scan_row, scan_column = row, first_column + column
+    return 20 * scan_row + (scan_column if side == "right" else 19 - scan_column)
+
+
+def all_taxels():
+    """Pad, row and column of the 320 taxels in anatomical order."""
+    for pad in ("thumb", "index", "middle", "ring", "little"):
+        yield from ((pad, row, column) for row in range(4) for column in range(4))
+    yield from (("palm", row, column) for row in range(15) for column in range(16))
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_every_taxel_is_read_from_the_documents_cell(side):
+    readings = 1000 + np.arange(360)
+    expected = [1000 + scan_cell(*taxel, side=side) for taxel in all_taxels()]
+    assert layout.select_taxels(readings, side=side).tolist() == expected
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_the_mock_glove_sends_every_taxel_in_the_documents_cell(side):
+    kpa = np.arange(1, 321, dtype=np.float32)
+    glove = GloveCalibration(np.zeros(360), np.full(360, 10.0))
+    sent = np.frombuffer(packet_of(kpa, glove, side)[22:-4], "<u2")
+    for taxel, pressure in zip(all_taxels(), kpa, strict=True):
+        assert sent[scan_cell(*taxel, side=side)] == 10 * pressure
+    assert np.count_nonzero(sent) == 320
+
+
+def packet_of(kpa, glove, side):
+    """The bytes that a mock glove sends of one sample."""
+    descriptor = StreamDescriptor(
+        name=f"tactile_{side}",
+        kind="tactile",
+        shape=(320,),
+        dtype="float32",
+        unit="kPa",
+        nominal_rate_hz=60,
+    )
+    stream = ReplayStream(descriptor, np.zeros(1, dtype=np.int64), kpa[None])
+    (packet,) = TactileGloveSource(stream, side=side, calibration=glove).units(0, 0, 0)
+    return packet
 
 
 def test_left_glove_is_wired_as_the_mirror_image():

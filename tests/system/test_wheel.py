@@ -1,0 +1,100 @@
+"""The wheel, installed outside the checkout, runs `dextouch demo` and `dextouch up` by itself."""
+
+import json
+import signal
+import time
+import zipfile
+
+import httpx
+import pytest
+
+from tests.system.wheel_environment import ROOT, build, own_packages
+
+pytestmark = [pytest.mark.slow, pytest.mark.system]
+
+SERVICES = {"episode_store", "alignment", "acquisition", "twin", "world_model", "dashboard"}
+# Of a machine that is busy with other things; the solver may be compiled first.
+READY_LIMIT_S = 900
+IMPORT_ALL = """
+import importlib, json, pkgutil
+import dextouch, services
+absent = []
+for package in (dextouch, services):
+    for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+        if not module.name.endswith("__main__"):
+            try:
+                importlib.import_module(module.name)
+            except ModuleNotFoundError as error:
+                absent.append([module.name, error.name])
+print(json.dumps(absent))
+"""
+
+
+@pytest.fixture(scope="module")
+def installed(tmp_path_factory):
+    """What `pip install 'dextouch-wm[all]'` would give."""
+    environment = build(tmp_path_factory.mktemp("wheel"), ("all",))
+    yield environment
+    assert environment.opened_in_the_checkout() == []
+
+
+def files_below(folder):
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder.parent)) for path in found if path.suffix != ".pyc"}
+
+
+def test_the_wheel_holds_every_file_of_both_packages(installed):
+    with zipfile.ZipFile(installed.wheel) as wheel:
+        names = {name for name in wheel.namelist() if ".dist-info/" not in name}
+    assert names == files_below(ROOT / "services") | files_below(ROOT / "shared/dextouch")
+    for path in own_packages(installed).values():
+        assert path.startswith(str(installed.site_packages))
+
+
+def test_the_extras_name_what_every_module_imports(installed):
+    absent = json.loads(installed.run("python", "-c", IMPORT_ALL, limit_s=600))
+    # The viewer has an extra of its own, which `all` leaves out.
+    assert absent == [["dextouch.bridges.rerun", "rerun"]]
+
+
+def test_the_machine_is_judged(installed):
+    done = json.loads(installed.run("dextouch", "doctor", "--json", "-"))
+    assert done
+
+
+def wait_until_ready(client, name, url):
+    """Alignment says 503 while its solver is compiled."""
+    last = time.monotonic() + READY_LIMIT_S
+    while not (answer := client.get(f"{url}/readyz")).is_success:
+        assert answer.status_code == 503, name
+        assert time.monotonic() < last, f"{name}: {answer.text}"
+        time.sleep(0.5)
+
+
+def test_all_services_answer_and_stop(installed):
+    urls_path = installed.folder / "urls.json"
+    running = installed.start("dextouch", "up", "--json", str(urls_path))
+    try:
+        while not urls_path.exists() or not urls_path.read_text().endswith("\n"):
+            assert running.poll() is None, running.communicate()[1][-4000:]
+            time.sleep(0.1)
+        urls = json.loads(urls_path.read_text())
+        with httpx.Client(trust_env=False, timeout=60) as client:
+            for name, url in urls.items():
+                wait_until_ready(client, name, url)
+            page = client.get(urls["dashboard"])
+            style = client.get(f"{urls['dashboard']}/static/style.css")
+    finally:
+        running.send_signal(signal.SIGINT)
+        _, errors = running.communicate(timeout=120)
+    assert running.returncode == 0, errors[-4000:]
+    assert set(urls) == SERVICES
+    assert page.is_success
+    assert style.is_success
+
+
+def test_the_demo_ends_well(installed):
+    installed.run("dextouch", "demo", "--seeds", "1", limit_s=1800)
+    report = json.loads((installed.folder / "demo/report.json").read_text())
+    assert report["errors"]["taxel_iou"] >= 0.98
+    assert (installed.folder / "demo/report.html").stat().st_size > 20_000
