@@ -25,17 +25,17 @@ from services.world_model.world import open_world
 
 USAGE = """usage: python -m services.world_model COMMAND [flags]
 
-  train         learn from the episodes of a store and write a measured checkpoint
-  train-state   the same for a state model: start readers and recurrent cores
+  train         train a model on the episodes of a store and write an evaluated checkpoint
+  train-state   train a state model: start readers and recurrent cores
   serve         serve a checkpoint's rollouts over HTTP
-  show          say where a checkpoint comes from and how good it is
+  show          print the provenance and accuracy of a checkpoint
 
-Each explains itself with --help."""
+Run a command with --help for its options."""
 EXIT_USAGE = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status, 2 for a word that is none."""
+    """Run one command and return its exit status (2 for an unknown command)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str]], int]] = {
         "train": run_train,
@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run_train(arguments: list[str]) -> int:
-    """Train with a progress bar; the report goes to the terminal and, if asked, to a file."""
+    """Train with a progress bar; print the report and optionally write it to a file."""
     settings = load_settings(TrainCommand, arguments)
     columns = (
         TextColumn("training"),
@@ -82,7 +82,7 @@ def run_train(arguments: list[str]) -> int:
 
 
 def run_train_state(arguments: list[str]) -> int:
-    """Train a state model; figures go to the terminal and, if asked, to a file."""
+    """Train a state model; print its evaluation and optionally write it to a file."""
     from services.world_model.training.state_trainer import train_state
 
     settings = load_settings(TrainStateCommand, arguments)
@@ -109,7 +109,7 @@ def run_serve(arguments: list[str]) -> int:
 
 
 def run_show(arguments: list[str]) -> int:
-    """Print the history of one checkpoint, or of every one in a folder."""
+    """Print the metadata of one checkpoint, or of every checkpoint in a folder."""
     settings = load_settings(ShowCommand, arguments)
     path = settings.checkpoint
     found = [_history(file) for file in (list_checkpoints(path) if path.is_dir() else [path])]
@@ -119,7 +119,7 @@ def run_show(arguments: list[str]) -> int:
 
 
 def _history(file: Path) -> dict[str, Any]:
-    """What a checkpoint of either form says about itself."""
+    """Metadata of a checkpoint of either kind."""
     if is_state_checkpoint(file):
         state = read_state_checkpoint(file)
         history = {"form": "state model", **state.metadata.model_dump(mode="json")}

@@ -1,4 +1,4 @@
-"""Checkpoints of the paper's form, and which checkpoint comes with the package."""
+"""Checkpoints of the joint flow-matching model, and the default checkpoint of the package."""
 
 import hashlib
 from dataclasses import dataclass
@@ -14,18 +14,18 @@ from services.world_model.weights import half_weights, load_strictly, read_weigh
 
 FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_world_model"
-# Statistics that files of older releases do not hold; the network's own defaults stand in.
+# Statistics missing from files of older releases; the network's defaults are used instead.
 LATER_STATISTICS = ("tokenizer.peak_kpa",)
 PRETRAINED = Path(__file__).parent / "pretrained"
 STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
 
 class CheckpointMetadata(BaseModel):
-    """Where a checkpoint comes from and how good it was measured to be, inside its file.
+    """Provenance and measured accuracy of a model, stored in its checkpoint.
 
-    `initialized_from` is the digest of the checkpoint whose weights training began with; what that
-    one was trained on counts as trained on here, too. Where it is None it is not written, so that
-    older releases read the file.
+    `initialized_from` is the digest of the checkpoint that the weights were initialized from; its
+    training episodes count as training episodes here, too. None is not written, so that older
+    releases can read the file.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -48,7 +48,7 @@ class CheckpointMetadata(BaseModel):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A loaded model, its history and the digest of its file."""
+    """A loaded model with its metadata and the digest of its file."""
 
     model: JointWorldModel
     metadata: CheckpointMetadata
@@ -56,16 +56,16 @@ class Checkpoint:
 
 
 def write_checkpoint(path: Path, model: JointWorldModel, metadata: CheckpointMetadata) -> str:
-    """Write the file in one move and return its digest."""
+    """Write the file atomically and return its digest."""
     return write_weights(path, half_weights(model), metadata, METADATA_KEY)
 
 
 def read_checkpoint(path: Path) -> Checkpoint:
-    """Load a checkpoint strictly, in float32, ready to predict.
+    """Load a checkpoint strictly, in float32 and evaluation mode.
 
     Raises:
         NotFoundError, LimitExceededError, CorruptDataError: as `read_weights`.
-        InvalidInputError: another format version; tensors missing, foreign or of other shapes.
+        InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
         NonFiniteError: weights that are NaN or infinite.
     """
     tensors, metadata, digest = read_weights(path, CheckpointMetadata, METADATA_KEY)
@@ -75,11 +75,11 @@ def read_checkpoint(path: Path) -> Checkpoint:
 
 
 def find_checkpoint(folder: Path, digest: str) -> Path:
-    """The file in `folder` whose SHA-256 is, or begins with, `digest` (eight digits at least).
+    """Path of the file in `folder` whose SHA-256 is, or begins with, `digest` (at least 8 digits).
 
     Raises:
-        UnknownNameError: none; the message lists those there are.
-        InvalidInputError: fewer than eight digits, or more than one file fits.
+        UnknownNameError: no file matches; the message lists the digests found.
+        InvalidInputError: fewer than eight digits, or the prefix is ambiguous.
     """
     if len(digest) < 8:
         raise InvalidInputError(f"digest: got {digest!r}, expected at least 8 hexadecimal digits")
@@ -101,11 +101,11 @@ def list_checkpoints(folder: Path) -> dict[Path, str]:
 
 
 def default_checkpoint() -> Path:
-    """The checkpoint that comes with the package: the state model, where it is there."""
+    """Default checkpoint of the package: the state model if it is installed."""
     state = PRETRAINED / STATE_MODEL
     return state if state.is_file() else paper_form_checkpoint()
 
 
 def paper_form_checkpoint() -> Path:
-    """The checkpoint of the paper's form that comes with the package."""
+    """Checkpoint of the joint flow-matching model that ships with the package."""
     return PRETRAINED / PAPER_FORM

@@ -1,4 +1,4 @@
-"""Settings of training and serving, from flags and environment variables."""
+"""Settings of world model training and serving, from flags and environment variables."""
 
 from pathlib import Path
 
@@ -16,27 +16,23 @@ from services.world_model.rendering.training import RendererTraining
 
 
 class OptimizerSettings(BaseModel):
-    """How weights are moved."""
+    """Settings of the optimizer."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     batch: int = Field(default=8, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
-    warmup_steps: int = Field(
-        default=100, ge=1, description="steps until the learning rate is reached"
-    )
-    weight_decay: float = Field(default=0.02, ge=0, description="of AdamW")
+    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
+    warmup_steps: int = Field(default=100, ge=1, description="warm-up steps of the learning rate")
+    weight_decay: float = Field(default=0.02, ge=0, description="AdamW weight decay")
     max_gradient_norm: float = Field(
-        default=1.0, gt=0, description="longer gradients are shortened to this"
+        default=1.0, gt=0, description="norm that gradients are clipped to"
     )
-    ema_decay: float = Field(
-        default=0.995, ge=0, lt=1, description="of the running average of the weights that is kept"
-    )
-    tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac of equation 5")
+    ema_decay: float = Field(default=0.995, ge=0, lt=1, description="decay of the averaged weights")
+    tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
 
 
 class WindowSettings(BaseModel):
-    """Which windows are trained on."""
+    """Sampling of training windows."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,13 +40,13 @@ class WindowSettings(BaseModel):
         default=0.5,
         ge=0,
         le=1,
-        description="of windows with commanded actions, where there are some",
+        description="share of windows with commanded actions, where available",
     )
     chained_fraction: float = Field(
-        default=0.3, ge=0, le=1, description="of windows that begin with the model's own prediction"
+        default=0.3, ge=0, le=1, description="share of commanded windows anchored like later chunks"
     )
-    short_fraction: float = Field(default=0.25, ge=0, le=1, description="of 5, 9, 13 … steps")
-    context_noise: float = Field(default=0.05, ge=0, le=1, description="on the first latents")
+    short_fraction: float = Field(default=0.25, ge=0, le=1, description="share of short windows")
+    context_noise: float = Field(default=0.05, ge=0, le=1, description="noise on the first latents")
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
@@ -61,102 +57,98 @@ class TrainSettings(BaseModel):
 
     episodes: str = Field(description="URL or folder of the episode store to train on")
     heldout: str | None = Field(
-        default=None, description="store to be judged on; without it a tenth of `episodes`, by hash"
+        default=None, description="store to evaluate on; default: a tenth of `episodes`, by hash"
     )
     output: Path = Field(
         default=Path("runs/world_model/tiny.safetensors"), description="checkpoint to write"
     )
-    name: str = Field(default="tiny", description="of the model, in the checkpoint")
-    seed: int = Field(default=0, ge=0, description="of weights and of everything that is drawn")
+    name: str = Field(default="tiny", description="model name in the checkpoint")
+    seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
     cpu_budget_s: float = Field(
         default=1000.0, gt=0, description="CPU seconds after which training ends"
     )
     max_steps: int | None = Field(
         default=None,
         ge=1,
-        description="steps after which training ends, if it is not out of time before",
+        description="steps after which training ends, unless the CPU budget ends it",
     )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
     heldout_percent: int = Field(
         default=10,
         ge=1,
         le=50,
-        description="of episodes, to measure on, where no --heldout is given",
+        description="percentage of episodes to evaluate on if no --heldout is given",
     )
     evaluation_stride: int = Field(
-        default=8, ge=1, description="measure on every n-th window of the held-out episodes"
+        default=8, ge=1, description="evaluate on every n-th window of held-out episodes"
     )
     streaming: CliImplicitFlag[bool] = Field(
-        default=False, description="leave episodes on the disk: for more of them than memory holds"
+        default=False, description="stream episodes from disk, for data larger than memory"
     )
     loader_workers: int = Field(
-        default=0, ge=0, le=64, description="processes that read for --streaming; 0: none besides"
+        default=0, ge=0, le=64, description="reader processes of --streaming; 0: this process"
     )
     init: Path | None = Field(
         default=None,
-        description="checkpoint whose weights and codecs to start from; same network settings",
+        description="checkpoint to initialize from; its network settings must be equal",
     )
     resume: CliImplicitFlag[bool] = Field(
         default=False,
-        description="go on with what a run of this output left when it was killed, if anything",
+        description="resume an interrupted run of this output, if there is one",
     )
     state_every_cpu_s: float = Field(
-        default=60.0, ge=0, description="CPU seconds between states kept for --resume"
+        default=60.0, ge=0, description="CPU seconds between states saved for --resume"
     )
     network: NetworkConfig = Field(default=NetworkConfig(), description="shape of the network")
     optimizer: OptimizerSettings = Field(
-        default=OptimizerSettings(), description="how weights are moved"
+        default=OptimizerSettings(), description="settings of the optimizer"
     )
     windows: WindowSettings = Field(
-        default=WindowSettings(), description="which windows are trained on"
+        default=WindowSettings(), description="sampling of training windows"
     )
 
 
 class ReaderSettings(BaseModel):
-    """How start readers are trained."""
+    """Training of start readers."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_steps: int = Field(default=4000, ge=1, description="training steps")
     batch: int = Field(default=32, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
-    ema_decay: float = Field(
-        default=0.995, ge=0, lt=1, description="of the running average of the weights that is kept"
-    )
-    first_fraction: float = Field(default=0.6, ge=0, le=1, description="of first steps")
+    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
+    ema_decay: float = Field(default=0.995, ge=0, lt=1, description="decay of the averaged weights")
+    first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of first steps")
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="convolve in bfloat16")
 
 
 class CoreLossWeights(BaseModel):
-    """Weights of a core's training targets; 0 leaves one out."""
+    """Weights of a core's training targets; 0 disables one."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    objects: float = Field(default=1.0, ge=0, description="of the positions and axes of objects")
-    touch: float = Field(default=6.0, ge=0, description="of the latents of all pressures")
-    contact: float = Field(default=0.5, ge=0, description="of which pads touch something")
-    taxels: float = Field(default=2.0, ge=0, description="of which taxels touch something")
-    success: float = Field(default=1.0, ge=0, description="of whether the task is done at the end")
+    objects: float = Field(default=1.0, ge=0, description="weight of object positions and axes")
+    touch: float = Field(default=6.0, ge=0, description="weight of touch latents")
+    contact: float = Field(default=0.5, ge=0, description="weight of pad contact")
+    taxels: float = Field(default=2.0, ge=0, description="weight of taxel contact")
+    success: float = Field(default=1.0, ge=0, description="weight of final task success")
 
 
 class CoreSettings(BaseModel):
-    """How recurrent cores are trained."""
+    """Training of recurrent cores."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_steps: int = Field(default=6500, ge=1, description="training steps")
     batch: int = Field(default=64, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
-    weight_decay: float = Field(default=0.05, ge=0, description="of AdamW")
-    ema_decay: float = Field(
-        default=0.99, ge=0, lt=1, description="of the running average of the weights that is kept"
-    )
-    first_fraction: float = Field(default=0.6, ge=0, le=1, description="of whole episodes")
-    measured_fraction: float = Field(default=0.15, ge=0, le=1, description="of measured actions")
-    held_fraction: float = Field(default=0.04, ge=0, le=1, description="of hands held still")
-    pose_noise_m: float = Field(default=0.0025, ge=0, description="of the true start poses")
+    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
+    weight_decay: float = Field(default=0.05, ge=0, description="AdamW weight decay")
+    ema_decay: float = Field(default=0.99, ge=0, lt=1, description="decay of the averaged weights")
+    first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of whole episodes")
+    measured_fraction: float = Field(default=0.15, ge=0, le=1, description="measured actions")
+    held_fraction: float = Field(default=0.04, ge=0, le=1, description="share of hands held still")
+    pose_noise_m: float = Field(default=0.0025, ge=0, description="noise on true start poses")
     weights: CoreLossWeights = Field(
-        default=CoreLossWeights(), description="weights of the targets"
+        default=CoreLossWeights(), description="weights of the training targets"
     )
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="train in bfloat16")
 
@@ -166,32 +158,30 @@ class StateTrainSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
-    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
+    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
     output: Path = Field(
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )
-    name: str = Field(default="state", description="of the model, in the checkpoint")
-    seed: int = Field(default=0, ge=0, description="of weights and of everything that is drawn")
-    num_members: int = Field(default=2, ge=1, le=16, description="of the ensemble")
-    heldout_share: float = Field(default=0.08, gt=0, lt=1, description="of scenes, to measure on")
-    jobs: int = Field(default=2, ge=1, le=64, description="members trained at the same time")
+    name: str = Field(default="state", description="model name in the checkpoint")
+    seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
+    num_members: int = Field(default=2, ge=1, le=16, description="members of the ensemble")
+    heldout_share: float = Field(default=0.08, gt=0, lt=1, description="share of held-out scenes")
+    jobs: int = Field(default=2, ge=1, le=64, description="members trained in parallel")
     labelled_share: float = Field(
         default=1.0,
         gt=0,
         le=1,
-        description="of scenes whose object poses are learned from; touch and success: from all",
+        description="share of scenes that train object poses; touch and success use all",
     )
-    width: int = Field(default=192, ge=8, le=1024, description="of the recurrent cores")
+    width: int = Field(default=192, ge=8, le=1024, description="width of the recurrent cores")
     reader: ReaderSettings = Field(
-        default=ReaderSettings(), description="how start readers are trained"
+        default=ReaderSettings(), description="training of start readers"
     )
-    core: CoreSettings = Field(
-        default=CoreSettings(), description="how recurrent cores are trained"
-    )
+    core: CoreSettings = Field(default=CoreSettings(), description="training of recurrent cores")
     renderer: RendererConfig = Field(default=RendererConfig(), description="shape of the renderer")
     drawing: RendererTraining = Field(
-        default=RendererTraining(cpu_budget_s=1400.0), description="how the renderer is trained"
+        default=RendererTraining(cpu_budget_s=1400.0), description="training of the renderer"
     )
 
 
@@ -220,7 +210,7 @@ class TrainCommand(BaseSettings, TrainSettings):
 
 
 class ShowCommand(BaseSettings):
-    """Show where a world model's checkpoint, or every one in a folder, comes from.
+    """Show the provenance and accuracy of a checkpoint, or of every checkpoint in a folder.
 
     Example:
       dextouch checkpoint --checkpoint runs/state.safetensors
@@ -228,7 +218,7 @@ class ShowCommand(BaseSettings):
 
     model_config = service_config("world_model_show", "dextouch checkpoint")
 
-    checkpoint: Path = Field(default=PRETRAINED, description="file, or folder of files")
+    checkpoint: Path = Field(default=PRETRAINED, description="checkpoint, or folder of checkpoints")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
@@ -242,21 +232,21 @@ class WorldModelSettings(WorldServiceSettings):
     model_config = service_config("world_model", "dextouch serve")
 
     checkpoint: Path = Field(
-        default_factory=default_checkpoint, description="of either form (default: the package's)"
+        default_factory=default_checkpoint, description="checkpoint (default: the package's)"
     )
     world_name: str = Field(
-        default="world_model", min_length=1, max_length=64, description="what clients call it"
+        default="world_model", min_length=1, max_length=64, description="name of the served world"
     )
     sampling_steps: int | None = Field(
-        default=None, ge=1, le=64, description="Euler steps of the paper's form"
+        default=None, ge=1, le=64, description="Euler steps of a flow-matching checkpoint"
     )
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
 
 
 def command_line(settings: TrainSettings) -> str:
-    """The command that repeats a run: every setting that is not the default.
+    """Command that repeats a run: every setting that differs from its default.
 
-    Stores go by their last name: checkpoints travel, folders do not.
+    Stores are given by their last path component, since folders differ between machines.
     """
     given = settings.model_dump(
         mode="json",

@@ -1,4 +1,4 @@
-"""Starts of rollouts as both forms of the world model take them: one observed step, checked."""
+"""Validated rollout starts, one observed step each, for both kinds of world model."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.worlds.world import Observation, RolloutStart
 
 CAMERA: Final = "camera_head"
-# Farther poses and larger cameras are mistakes of units or frames.
+# Larger values are mistakes of units or frames.
 MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 
 
@@ -20,8 +20,8 @@ MAX_ANCHOR_M, MAX_CAMERA_PX = 5.0, 1e5
 class ObservedStart:
     """The step that a rollout begins with; its arrays are copies.
 
-    Touch is not below zero; the pose parts of `reached` are the identity, since the poses of
-    step 0 are what actions are relative to.
+    Touch is clipped at zero; the pose parts of `reached` are the identity, since actions are
+    relative to the poses of step 0.
     """
 
     image: UInt8[np.ndarray, "h w 3"]
@@ -33,7 +33,7 @@ class ObservedStart:
     def observation(
         self, object_poses: Float32[np.ndarray, "1 objects 7"] | None = None
     ) -> Observation:
-        """The step as a world's first answer."""
+        """Observation of step 0, as returned to clients."""
         return Observation(
             first_step=0,
             images={CAMERA: self.image[None].copy()},
@@ -45,15 +45,15 @@ class ObservedStart:
 
 
 def observed_start(start: RolloutStart, *, tasks: Sequence[str]) -> ObservedStart:
-    """The observed step of a start.
+    """Validate the observed step of a start.
 
     Args:
-        start: of a rollout.
-        tasks: that the world knows.
+        start: start of a rollout.
+        tasks: tasks that the world knows.
 
     Raises:
-        InvalidInputError: no observation, anchor or K_head.
-        UnknownNameError: another task, or no image of the head camera.
+        InvalidInputError: missing observation, anchor or K_head.
+        UnknownNameError: unknown task, or no head camera image.
         ShapeError: more than one observed step.
         NonFiniteError: NaN or infinity in touch.
     """
@@ -84,11 +84,11 @@ def observed_start(start: RolloutStart, *, tasks: Sequence[str]) -> ObservedStar
 
 
 def check_geometry(anchor: AnchorPoses, K_head: Float64[np.ndarray, "3 3"]) -> None:
-    """Refuse poses far from the world's origin, and cameras that see nothing.
+    """Reject poses far from the world's origin and implausible intrinsics.
 
     Raises:
-        InvalidInputError: an anchor farther than 5 m, a focal length or principal point out of
-            all proportion.
+        InvalidInputError: an anchor farther than 5 m, or an implausible focal length or principal
+            point.
         NonFiniteError: NaN or infinity.
     """
     Ts = np.stack([np.asarray(T, dtype=np.float64) for T in anchor.as_tuple()])

@@ -1,4 +1,4 @@
-"""Checkpoints of state models: dynamics and renderer in one safetensors file with its history."""
+"""Checkpoints of state models: dynamics, renderer and metadata in one safetensors file."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,12 +23,12 @@ _DYNAMICS, _RENDERER = "dynamics.", "renderer."
 
 
 class StateBounds(BaseModel):
-    """Beyond these a rollout is doubted, or ends.
+    """Limits beyond which a rollout is flagged as uncertain.
 
-    `disagreement_m` and `distance` are figures of held-out episodes that almost none of them
-    passes; `horizon_latents` is the length of an episode that the cores were trained on. Bounds
-    `of_chunks` are of the worst latent step in 16 steps from anywhere in an episode; others, of
-    older checkpoints, are of whole episodes: the worst disagreement and the mean distance.
+    `disagreement_m` and `distance` are high quantiles over held-out episodes; `horizon_latents` is
+    the length of the episodes that the cores were trained on. Bounds `of_chunks` apply to the worst
+    latent step of any 16 steps of an episode; those of older checkpoints apply to whole episodes:
+    to the worst disagreement and the mean distance.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -40,16 +40,16 @@ class StateBounds(BaseModel):
 
     @property
     def latent_distance(self) -> float:
-        """The largest distance of a latent step that is not doubted.
+        """Largest distance at which a latent step is not flagged.
 
-        No step of an episode with a bounded mean is farther than that mean times the number of
+        If the bound is on the mean over an episode, no step exceeds that mean times the number of
         steps.
         """
         return self.distance * (1 if self.of_chunks else self.horizon_latents)
 
 
 class StateMetadata(BaseModel):
-    """Where a state model comes from and how good it was measured to be."""
+    """Provenance and measured accuracy of a state model, stored in its checkpoint."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -87,7 +87,7 @@ class StateMetadata(BaseModel):
 
 @dataclass(frozen=True)
 class StateCheckpoint:
-    """A loaded state model, its history and the digest of its file."""
+    """A loaded state model with its metadata and the digest of its file."""
 
     dynamics: DynamicsModel
     renderer: RendererNetwork
@@ -96,24 +96,24 @@ class StateCheckpoint:
 
 
 def is_state_checkpoint(path: Path) -> bool:
-    """Whether a safetensors file says that it holds a state model."""
+    """Whether the metadata of a safetensors file declares a state model."""
     return holds(path, METADATA_KEY)
 
 
 def write_state_checkpoint(
     path: Path, dynamics: DynamicsModel, renderer: RendererNetwork, metadata: StateMetadata
 ) -> str:
-    """Write the file in one move and return its digest."""
+    """Write the file atomically and return its digest."""
     tensors = half_weights(dynamics, prefix=_DYNAMICS) | half_weights(renderer, prefix=_RENDERER)
     return write_weights(path, tensors, metadata, METADATA_KEY)
 
 
 def read_state_checkpoint(path: Path) -> StateCheckpoint:
-    """Load a state model strictly, in float32, ready to predict.
+    """Load a state model strictly, in float32 and evaluation mode.
 
     Raises:
         NotFoundError, LimitExceededError, CorruptDataError: as `read_weights`.
-        InvalidInputError: another format version; tensors missing, foreign or of other shapes.
+        InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
         NonFiniteError: weights that are NaN or infinite.
     """
     tensors, metadata, digest = read_weights(path, StateMetadata, METADATA_KEY)

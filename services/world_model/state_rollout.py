@@ -1,4 +1,4 @@
-"""Where a rollout of a state model stands, and its snapshot."""
+"""Rollout state of a state model, and its snapshot."""
 
 from dataclasses import dataclass
 
@@ -20,7 +20,7 @@ MAX_SNAPSHOT_BYTES = 2**20
 
 @dataclass(frozen=True)
 class StateRollout:
-    """Where a rollout stands: its start, and the memory of its scene.
+    """State of a rollout: its start and the memory of its scene.
 
     `first_reached` and `reached` are relative to `anchor`, the poses of step 0; `num_moving` counts
     the latent steps in which hands moved.
@@ -38,7 +38,7 @@ class StateRollout:
 
 
 def rollout_bytes(state: StateRollout, digest: str) -> bytes:
-    """A snapshot: the state as bytes, with the digest of its world."""
+    """Serialize the state together with the digest of its world."""
     fields = {
         "digest": digest,
         "task": state.task,
@@ -56,10 +56,10 @@ def rollout_bytes(state: StateRollout, digest: str) -> bytes:
 
 
 def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> StateRollout:
-    """The state of a snapshot, for bytes from somewhere that is not trusted.
+    """Restore the state of a snapshot; validates untrusted bytes.
 
     Raises:
-        InvalidInputError: bytes that are no snapshot of this world.
+        InvalidInputError: not a snapshot of this world.
         NonFiniteError: NaN or infinity.
     """
     fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)

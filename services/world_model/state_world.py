@@ -1,4 +1,4 @@
-"""World of a state model: rollouts whose imagined scene lasts from the first chunk to the last."""
+"""World of a state model: rollouts with a scene memory that persists across chunks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -59,17 +59,17 @@ from services.world_model.state_checkpoints import StateCheckpoint
 from services.world_model.state_rollout import StateRollout, rollout_bytes, rollout_from_bytes
 
 MAX_CHUNK_STEPS = 64
-# An object believed absent is shown here, under the table, where no task leaves one.
+# Pose reported for objects believed absent: below the table, where no task places one.
 ABSENT_POSE = np.array([0.0, 0.0, -1.0, 1.0, 0.0, 0.0, 0.0], dtype=np.float32)
-# A rollout is doubted once its hands have moved half as long again as an episode of training, and
-# ends at four times that length: so far no state was ever trained.
+# A rollout is flagged once its hands have moved 1.5 times the length of a training episode and ends
+# at four times that length, since no longer ones were trained on.
 DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
 
 
 class StateWorld:
     """Implements `dextouch.worlds.world.BatchWorld` with a state model.
 
-    It is deterministic: seeds of chunks change nothing.
+    Deterministic: the seeds of chunks have no effect.
 
     Args:
         checkpoint: loaded, from `read_state_checkpoint`.
@@ -107,15 +107,15 @@ class StateWorld:
 
     @property
     def description(self) -> WorldDescription:
-        """What this world is and accepts."""
+        """Capabilities and limits of this world."""
         return self._description
 
     def reset(self, start: RolloutStart) -> StartedRollout[StateRollout]:
-        """Find the objects of one observed step, and remember them.
+        """Find the objects of one observed step and start a rollout.
 
         Raises:
             UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: no observation, anchor or K_head, or ones that do not fit.
+            InvalidInputError: missing or invalid observation, anchor or K_head.
         """
         first = observed_start(start, tasks=self._description.tasks)
         self._check_start(start, first)
@@ -146,7 +146,7 @@ class StateWorld:
         return StartedRollout(rollout, seen, first.anchor, first.K_head)
 
     def _check_start(self, start: RolloutStart, first: ObservedStart) -> None:
-        """The checks of every other model, and that hands and camera are within reach."""
+        """Run the checks shared by all world models; hands and camera must be within reach."""
         check_geometry(first.anchor, first.K_head)
         request = PredictionRequest(
             first_image=first.image,
@@ -167,11 +167,11 @@ class StateWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[StateRollout]:
-        """Imagine one action chunk of 4k ≤ 64 steps.
+        """Predict one action chunk of 4k ≤ 64 steps.
 
         Raises:
             ShapeError: a chunk of another length.
-            InvalidInputError: actions that no hand can follow.
+            InvalidInputError: physically impossible actions.
             EndedError: the hands have moved four times as long as any episode of training.
         """
         chunks = np.asarray(actions)[None]
@@ -185,7 +185,7 @@ class StateWorld:
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[StateRollout]]:
-        """`step` for each entry at once; answers differ from single ones by rounding only."""
+        """`step` for several rollouts; results differ from single calls by rounding only."""
         asked = [EVERYTHING] * len(states) if selectors is None else list(selectors)
         counts = (len(states), len(actions), len(seeds), len(asked))
         if len(set(counts)) != 1 or len(states) == 0:
@@ -268,7 +268,7 @@ class StateWorld:
         actions: Float64[np.ndarray, "n 67"],
         poses: Float32[np.ndarray, "n objects 7"],
     ) -> UInt8[np.ndarray, "n h w 3"]:
-        """Images of steps with hands and objects where they are said to be."""
+        """Images of steps with hands and objects at the given poses."""
         start_poses = self._poses(mean_start(state.memory), state.task)
         boxes_m = np.array(self._metadata.object_boxes_m[state.task])
         start = _scene_states(state.first_reached[None], state.anchor, start_poses)[0]
@@ -277,7 +277,7 @@ class StateWorld:
 
     def _doubt(self, state: StateRollout, steps: ImaginedSteps, index: int) -> Doubt:
         bounds = self._metadata.bounds
-        # Of the worst latent step, whatever the length of the chunk.
+        # Of the worst latent step, independent of the chunk length.
         disagreement_m = float(steps.disagreement_m[index].max())
         distance = float(steps.distance[index].max())
         count = len(self._metadata.object_names[state.task])
@@ -311,14 +311,14 @@ class StateWorld:
         return np.where(there[..., None], poses, ABSENT_POSE)
 
     def snapshot(self, state: StateRollout) -> bytes:
-        """The state as bytes that `restore` of the same checkpoint accepts."""
+        """Serialize the state for `restore` with the same checkpoint."""
         return rollout_bytes(state, self._digest)
 
     def restore(self, data: bytes) -> StateRollout:
-        """The state of a snapshot.
+        """Restore the state of a snapshot.
 
         Raises:
-            InvalidInputError: bytes that are no snapshot of this checkpoint.
+            InvalidInputError: not a snapshot of this checkpoint.
         """
         return rollout_from_bytes(data, self._metadata, self._digest)
 

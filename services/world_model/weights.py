@@ -1,4 +1,4 @@
-"""Safetensors files of weights with their history: written in one move, read back strictly."""
+"""Safetensors files of weights with metadata: written atomically, read strictly."""
 
 import hashlib
 import json
@@ -25,7 +25,7 @@ History = TypeVar("History", bound=BaseModel)
 
 
 def half_weights(model: nn.Module, *, prefix: str = "") -> dict[str, Tensor]:
-    """Learned weights as float16, statistics as float32, each name behind a prefix.
+    """Learned weights as float16 and statistics as float32, with prefixed names.
 
     Raises:
         NonFiniteError: weights that are NaN, infinite, or too large for float16.
@@ -40,13 +40,13 @@ def half_weights(model: nn.Module, *, prefix: str = "") -> dict[str, Tensor]:
 
 
 def write_weights(path: Path, tensors: Mapping[str, Tensor], history: BaseModel, key: str) -> str:
-    """Write a file in one move and return the SHA-256 of its bytes.
+    """Write a file atomically and return the SHA-256 of its bytes.
 
     Args:
-        path: of the file.
-        tensors: from `half_weights`, of one model or of several.
-        history: where the weights come from; kept as JSON.
-        key: of the history in the file's metadata: says what kind of model it is.
+        path: file to write.
+        tensors: from `half_weights`, of one or several models.
+        history: provenance of the weights; stored as JSON.
+        key: metadata key of the history, which identifies the kind of model.
     """
     data = save(dict(tensors), {key: history.model_dump_json()})
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -59,18 +59,18 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], history: BaseModel,
 def read_weights(
     path: Path, history: type[History], key: str
 ) -> tuple[dict[str, Tensor], History, str]:
-    """Tensors, history and SHA-256 of a file.
+    """Read tensors, history and SHA-256 of a file.
 
     Args:
-        path: of the file.
-        history: its class; it has a `format_version`.
-        key: that the history was written under.
+        path: file to read.
+        history: class of the history; it has a `format_version`.
+        key: metadata key of the history.
 
     Raises:
         NotFoundError: no such file.
         LimitExceededError: larger than 64 MiB.
-        CorruptDataError: no safetensors file, or without this history.
-        InvalidInputError: another format version.
+        CorruptDataError: not a safetensors file, or one without this history.
+        InvalidInputError: unsupported format version.
     """
     where = f"checkpoint {path.name}"
     if not path.is_file():
@@ -105,7 +105,7 @@ def _history(text: str | None, history: type[History], key: str, where: str) -> 
 
 
 def holds(path: Path, key: str) -> bool:
-    """Whether a file says that it holds this kind of model; False where it is no such file."""
+    """Whether a file declares this kind of model; False if it is not a safetensors file."""
     try:
         with safe_open(path, framework="pt") as file:
             return key in (file.metadata() or {})
@@ -120,16 +120,16 @@ def load_strictly(
     where: str,
     later: Collection[str] = (),
 ) -> None:
-    """Put tensors into models, all of them and nothing else, as float32.
+    """Load tensors into models as float32; the names must match exactly.
 
     Args:
-        models: by the prefix of their tensors' names.
-        tensors: of all models together.
-        where: for messages.
-        later: names that older files do not hold; the model's own values stand in.
+        models: keyed by the prefix of their tensor names.
+        tensors: tensors of all models.
+        where: context for error messages.
+        later: names that older files do not have; the model keeps its own values.
 
     Raises:
-        InvalidInputError: tensors missing, foreign or of other shapes.
+        InvalidInputError: missing or unexpected tensors, or wrong shapes.
         NonFiniteError: weights that are NaN or infinite.
     """
     expected = {
@@ -159,7 +159,7 @@ def load_strictly(
 
 
 def refuse_non_finite(tensors: Mapping[str, Tensor], where: str) -> None:
-    """Raise NonFiniteError where a tensor holds NaN or infinity."""
+    """Raise NonFiniteError if a tensor holds NaN or infinity."""
     bad = [name for name, tensor in tensors.items() if not torch.isfinite(tensor).all()]
     if bad:
         raise NonFiniteError(f"{where}: NaN or infinity in {bad[:3]} ({len(bad)} tensors)")

@@ -1,4 +1,4 @@
-"""World of a paper-form checkpoint: imagines observations chunk by chunk."""
+"""World of a flow-matching checkpoint: predicts observations chunk by chunk."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -44,7 +44,7 @@ _SNAPSHOT_ARRAYS = ("image", "tactile_kpa", "reached", "anchor", "K_head")
 
 @dataclass(frozen=True)
 class ModelState:
-    """What the next chunk starts from; `reached` is relative to `anchor`, the poses of step 0."""
+    """State of a rollout; `reached` is relative to `anchor`, the poses of step 0."""
 
     image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: Float32[np.ndarray, "2 320"]
@@ -61,7 +61,7 @@ class ModelWorld:
 
     Args:
         checkpoint: loaded, from `read_checkpoint`.
-        sampling_steps: Euler steps; None takes the checkpoint's.
+        sampling_steps: Euler steps; None uses the checkpoint's.
         precision: of the experts' matrix products; codecs are always float32.
     """
 
@@ -93,15 +93,15 @@ class ModelWorld:
 
     @property
     def description(self) -> WorldDescription:
-        """What this world is and accepts."""
+        """Capabilities and limits of this world."""
         return self._description
 
     def reset(self, start: RolloutStart) -> StartedRollout[ModelState]:
-        """Begin from one observed step.
+        """Start a rollout from one observed step.
 
         Raises:
             UnknownNameError: a task or action kind that the model was not trained on.
-            InvalidInputError: no observation, anchor or K_head, or ones that do not fit.
+            InvalidInputError: missing or invalid observation, anchor or K_head.
         """
         first = observed_start(start, tasks=self._description.tasks)
         state = ModelState(
@@ -114,7 +114,7 @@ class ModelWorld:
             action_kind=start.action_kind,
             step=0,
         )
-        # The same checks as of a chunk, now rather than at the first one.
+        # The checks of a chunk, so that they fail here rather than at the first one.
         standing = np.repeat(first.reached[None], self._description.chunk_multiple, axis=0)
         build_inputs([_request(state, standing)], self._model.config)
         return StartedRollout(state, first.observation(), first.anchor, first.K_head)
@@ -127,12 +127,12 @@ class ModelWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[ModelState]:
-        """Imagine one action chunk of 4k ≤ 16 steps.
+        """Predict one action chunk of 4k ≤ 16 steps.
 
         Raises:
             ShapeError: a chunk of another length.
-            InvalidInputError: actions that no hand can follow.
-            UnavailableError: the model gave numbers that are not finite.
+            InvalidInputError: physically impossible actions.
+            UnavailableError: the model returned NaN or infinity.
         """
         chunks = np.asarray(actions)[None]
         return self.step_batch([state], chunks, seeds=[seed], selectors=[selector])[0]
@@ -145,10 +145,10 @@ class ModelWorld:
         seeds: Sequence[int],
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[ModelState]]:
-        """`step` for each entry at once; answers differ from single ones by rounding only.
+        """`step` for several rollouts; results differ from single calls by rounding only.
 
         Images of the last latent are always decoded, since the next chunk starts from the last of
-        them; the others only if somebody asks.
+        them; the others only on request.
         """
         asked = [EVERYTHING] * len(states) if selectors is None else list(selectors)
         counts = (len(states), len(actions), len(seeds), len(asked))
@@ -181,7 +181,7 @@ class ModelWorld:
         ]
 
     def snapshot(self, state: ModelState) -> bytes:
-        """The state as bytes that `restore` of the same checkpoint accepts."""
+        """Serialize the state for `restore` with the same checkpoint."""
         fields = {
             "digest": self._digest,
             "instruction": state.instruction,
@@ -198,10 +198,10 @@ class ModelWorld:
         return pack(fields, arrays)
 
     def restore(self, data: bytes) -> ModelState:
-        """The state of a snapshot.
+        """Restore the state of a snapshot.
 
         Raises:
-            InvalidInputError: bytes that are no snapshot of this checkpoint.
+            InvalidInputError: not a snapshot of this checkpoint.
         """
         fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
         if fields.get("digest") != self._digest:
@@ -252,12 +252,12 @@ def open_world(
     sampling_steps: int | None = None,
     precision: Precision = "float32",
 ) -> ModelWorld | StateWorld:
-    """The world of a checkpoint file, of either form; without one, of the package's own.
+    """Open the world of a checkpoint file of either kind; default: the package's own.
 
     Args:
-        path: of a safetensors file; None for the one that comes with the package.
-        sampling_steps: Euler steps of the paper's form; a state model has none.
-        precision: of the paper's form.
+        path: safetensors file; None for the one that ships with the package.
+        sampling_steps: Euler steps of a flow-matching model; a state model has none.
+        precision: precision of a flow-matching model.
 
     Raises:
         InvalidInputError: sampling steps for a state model.
@@ -274,7 +274,7 @@ def open_world(
 
 
 def _request(state: ModelState, chunk: np.ndarray) -> PredictionRequest:
-    """The chunk re-anchored to where the rollout stands."""
+    """Request for a chunk, re-anchored to the rollout's current poses."""
     rows = np.concatenate([state.reached[None], chunk])
     return PredictionRequest(
         first_image=state.image,
@@ -293,9 +293,9 @@ def _advance(
     imagined: tuple[np.ndarray, np.ndarray],
     selector: ReturnSelector,
 ) -> SteppedRollout[ModelState]:
-    """The new state and what is asked for of what was imagined: images (maybe the last), touch.
+    """New state and requested outputs, from predicted images (maybe the last only) and touch.
 
-    The model senses no pose: the next chunk starts from the last action that was given.
+    The model predicts no poses: the next chunk starts from the last commanded action.
     """
     images, tactile_kpa = imagined
     first = 0 if selector.steps == "all" else len(chunk) - 1

@@ -1,1 +1,1 @@
-"""Lasting state of a scene: objects found at the start, then moved by a recurrent core."""
+"""Dynamics of a scene: readers find the objects at the start, recurrent cores move them."""

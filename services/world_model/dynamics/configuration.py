@@ -1,20 +1,20 @@
-"""Shape of the start reader and the recurrent core; stored in every checkpoint that has them."""
+"""Configuration of start readers and recurrent cores; stored in every checkpoint of them."""
 
 from typing import Final
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-# Objects a task may have; unused slots are masked.
+# Largest number of objects of a task; unused slots are masked.
 MAX_OBJECTS: Final = 3
-# The core runs once every four steps of the model grid, the clock of video latents.
+# The core runs once every four steps of the model grid, the rate of video latents.
 STEPS_PER_LATENT: Final = 4
 
 
 class DynamicsConfig(BaseModel):
-    """Everything that fixes the shape of a dynamics model.
+    """Architecture of a dynamics model.
 
-    `tasks` and the number of objects of each are the vocabulary: a task's index selects its
-    embedding, its objects fill the first slots in the order of the episode's `object_names`.
+    `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
+    objects fill the first slots in the order of the episode's `object_names`.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -1,8 +1,8 @@
-"""Recurrent core: what becomes of objects and touch when hands move as commanded.
+"""Recurrent core: predicts object motion and touch from commanded hand motion.
 
-A gated recurrent network (Cho et al. 2014) at 3.75 Hz. Its hidden state is the scene's memory: it
-is all that a rollout carries from one action chunk to the next, and it is bounded by construction
-(every unit stays within −1 … 1).
+A gated recurrent network (Cho et al. 2014) at 3.75 Hz. Its hidden state is the only memory that a
+rollout carries from one action chunk to the next, and it is bounded by construction (every unit
+stays within −1 … 1).
 """
 
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from services.world_model.dynamics.features import NUM_FEATURES, compressed
 from services.world_model.dynamics.objects import ObjectPoses
 
 NUM_PADS = 12
-# Which taxels of a hand touch something is a mixture of this many patterns.
+# The contact of a hand's taxels is modelled as a mixture of this many patterns.
 NUM_PATTERNS = 48
-# Positions are predicted as moves from the start in this unit.
+# Displacements from the start are predicted in this unit.
 MOVE_M = 0.05
 MAX_DEVIATION = 5.0
 _OBJECT_SIZE = MAX_OBJECTS * 10
@@ -31,10 +31,10 @@ _OBJECT_SIZE = MAX_OBJECTS * 10
 
 @dataclass(frozen=True)
 class SceneStart:
-    """What the core knows of the first step beside the commands.
+    """Inputs of the core at the first step, besides the commands.
 
-    `touch` are latents of both hands, `pads_kpa` mean pressures of the twelve pads (thumb …
-    little, palm; left, right), `commanded` is 1 where actions are commanded and 0 where measured.
+    `touch` holds the latents of both hands, `pads_kpa` the mean pressures of the twelve pads (thumb
+    … little, palm; left, right); `commanded` is 1 for commanded actions and 0 for measured ones.
     """
 
     objects: ObjectPoses
@@ -46,11 +46,12 @@ class SceneStart:
 
 @dataclass(frozen=True)
 class SceneFuture:
-    """What the core says of every latent step.
+    """Predictions of the core for every latent step.
 
-    `touch`, `pattern` (which `RecurrentCore.taxels` turns into log odds of each taxel) and
-    `contact` (log odds of each pad) are of the four steps that end at the latent; `success` are
-    log odds that the task is done at it. The last two are training targets only.
+    `touch`, `pattern` (mapped by `RecurrentCore.taxels` to contact log odds of each taxel) and
+    `contact` (contact log odds of each pad) cover the four steps that end at the latent; `success`
+    holds the log odds that the task is done at it. `contact` and `success` are training targets
+    only.
     """
 
     objects: ObjectPoses
@@ -61,10 +62,10 @@ class SceneFuture:
 
 
 class RecurrentCore(nn.Module):
-    """Command features and a start to object poses and touch.
+    """Predicts object poses and touch from command features and a start.
 
     Args:
-        config: of the dynamics model.
+        config: configuration of the dynamics model.
     """
 
     feature_mean: Tensor
@@ -111,12 +112,12 @@ class RecurrentCore(nn.Module):
         start: SceneStart,
         state: Float32[Tensor, "layers batch width"],
     ) -> tuple[SceneFuture, Float32[Tensor, "layers batch width"]]:
-        """What follows, and the hidden state after the last latent.
+        """Predictions for every latent, and the hidden state after the last one.
 
         Args:
             features: from `command_features`, relative to the objects of `start`.
-            start: of the rollout, the same for all its chunks.
-            state: from `first_state` or from the chunk before.
+            start: start of the rollout, the same for all its chunks.
+            state: from `first_state` or from the previous chunk.
         """
         scaled = self.scaled(features, start.task).clamp(-MAX_DEVIATION, MAX_DEVIATION)
         static = self._static(start)[:, None].expand(-1, features.shape[1], -1)
@@ -127,10 +128,10 @@ class RecurrentCore(nn.Module):
     def scaled(
         self, features: Float32[Tensor, "batch latents features"], task: Int64[Tensor, " batch"]
     ) -> Float32[Tensor, "batch latents features"]:
-        """Features in standard deviations from the mean of their task.
+        """Features standardized with the mean and deviation of their task.
 
-        Tasks hold their hands elsewhere: in units of all tasks together, the millimetres that
-        decide one of them would be too small to be learned from.
+        Tasks hold the hands in different regions: with statistics shared by all tasks, the
+        millimetres that decide success would be too small to learn from.
         """
         return (features - self.feature_mean[task][:, None]) / self.feature_std[task][:, None]
 

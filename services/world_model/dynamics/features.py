@@ -1,8 +1,8 @@
-"""Commands as the core sees them: palms and fingertips relative to the objects of the start.
+"""Command features of the core: palms and fingertips relative to the objects at the start.
 
 Success is decided within millimetres, which a wrist pose relative to its own start does not
-carry. Distances are compressed by asinh(d / 1 cm), so that a millimetre near an object and a
-decimetre far from it both move a feature by about a tenth.
+resolve. Distances are compressed by asinh(d / 1 cm), so that a millimetre near an object and a
+decimetre far from it both change a feature by about a tenth.
 """
 
 import torch
@@ -14,7 +14,7 @@ from services.world_model.dynamics.hand_motion import NUM_POINTS
 from services.world_model.dynamics.objects import ObjectPoses
 
 NEAR_M = 0.01
-# Of the four steps of a latent these two are looked at: the middle and the end.
+# Features are computed at these two of the four steps of a latent: the middle and the end.
 LOOKS = (2, 4)
 _HAND_SIZE = NUM_POINTS * MAX_OBJECTS * 6
 NUM_FEATURES = len(LOOKS) * (2 * _HAND_SIZE + 2 * NUM_POINTS) + 2 * 6 + 2 * 20
@@ -39,9 +39,9 @@ def command_features(
 
     Args:
         points_m: wrists and fingertips in the world at the `LOOKS` of each latent.
-        axes: of the wrists at each latent's end.
-        joints_rad: at each latent's end.
-        objects: of the start [batch, objects]; fixed over the sequence.
+        axes: wrist axes at each latent's end.
+        joints_rad: joint angles at each latent's end.
+        objects: poses at the start [batch, objects]; constant over the sequence.
     """
     position = objects.position_m[:, None, None, None, None]
     offset = points_m[..., None, :] - position

@@ -1,4 +1,4 @@
-"""Where palms and fingertips are in the world for given actions: what the core is fed with."""
+"""Hand and head camera motion in the world for given actions; the input of the core."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -32,7 +32,7 @@ class HandMotion:
         return len(self.points_m)
 
     def __getitem__(self, steps: slice | np.ndarray) -> "HandMotion":
-        """Some of the steps."""
+        """Select steps."""
         return HandMotion(
             self.points_m[steps],
             self.axes[steps],
@@ -47,14 +47,14 @@ def _hand(side: str) -> RobotHand:
 
 
 def hand_motion(actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses) -> HandMotion:
-    """Both hands where actions put them.
+    """Motion of both hands under the given actions.
 
     Args:
         actions: relative to `anchor`.
-        anchor: T_world poses that the actions refer to.
+        anchor: T_world poses that the actions are relative to.
 
     Raises:
-        DegenerateRotationError: actions that describe no rotation.
+        DegenerateRotationError: the actions hold a degenerate rotation.
     """
     poses = poses_from_actions(actions, anchor)
     Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)

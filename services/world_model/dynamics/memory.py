@@ -1,4 +1,4 @@
-"""Scene memories put together for a batch, taken apart again, and kept as named arrays."""
+"""Batching, unbatching and serialization of scene memories."""
 
 from collections.abc import Mapping, Sequence
 
@@ -14,12 +14,12 @@ from services.world_model.dynamics.hand_motion import NUM_POINTS
 from services.world_model.dynamics.model import SceneMemory
 from services.world_model.dynamics.objects import ObjectPoses
 
-# Of metres, kilopascals and latents: whatever is larger was never written by this world.
+# Bound on metres, kilopascals and latents; this world never writes larger values.
 _LARGEST = 1e6
 
 
 def stack_memories(memories: Sequence[SceneMemory]) -> SceneMemory:
-    """Memories of single rollouts as one of a batch."""
+    """Stack the memories of single rollouts into a batch."""
     members = range(len(memories[0].start))
     return SceneMemory(
         start=tuple(
@@ -42,8 +42,8 @@ def stack_memories(memories: Sequence[SceneMemory]) -> SceneMemory:
 
 
 def memory_of(memory: SceneMemory, index: int) -> SceneMemory:
-    """One rollout's memory out of a batch."""
-    # Copies: a slice would keep the whole batch in memory, and share it with other rollouts.
+    """Memory of one rollout of a batch."""
+    # Copies: a slice would keep the whole batch alive and share it with other rollouts.
     one = torch.tensor([index])
     return SceneMemory(
         start=tuple(
@@ -74,7 +74,7 @@ def _stack_poses(poses: list[ObjectPoses]) -> ObjectPoses:
 
 
 def memory_arrays(memory: SceneMemory) -> dict[str, np.ndarray]:
-    """A single rollout's memory as arrays, for a snapshot."""
+    """Arrays of a single rollout's memory, for a snapshot."""
     first = memory.start[0]
     tensors: dict[str, Tensor] = {
         "start_position_m": torch.cat([start.objects.position_m for start in memory.start]),
@@ -99,11 +99,11 @@ def memory_arrays(memory: SceneMemory) -> dict[str, np.ndarray]:
 def memory_from_arrays(
     arrays: Mapping[str, np.ndarray], config: DynamicsConfig, num_members: int
 ) -> SceneMemory:
-    """Inverse of `memory_arrays`, for bytes from somewhere that is not trusted.
+    """Inverse of `memory_arrays`; validates untrusted arrays.
 
     Raises:
-        InvalidInputError: arrays missing, of another shape or kind of number, or a task that the
-            model has not.
+        InvalidInputError: missing arrays, wrong shapes or dtypes, or a task that the model does
+            not have.
         NonFiniteError: NaN or infinity.
     """
     found = _checked(arrays, config, num_members)

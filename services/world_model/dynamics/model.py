@@ -1,7 +1,7 @@
-"""Dynamics model: an ensemble of start readers and recurrent cores with one touch codec.
+"""Dynamics model: an ensemble of start readers and recurrent cores that share a touch codec.
 
-`begin` reads where objects are from one observed step, `advance` imagines what the next commands
-do to them and how it feels. All that lasts between chunks is a `SceneMemory`.
+`begin` estimates object poses from one observed step; `advance` predicts object motion and touch
+for the next commands. The only state kept between chunks is a `SceneMemory`.
 """
 
 from dataclasses import dataclass, replace
@@ -28,10 +28,10 @@ from services.world_model.dynamics.start_reader import FirstStep, StartReader
 from services.world_model.dynamics.stillness import REST_LATENTS, stillness
 from services.world_model.dynamics.touch_codec import FREE_KPA, TouchCodec
 
-# An object whose probability of being there is below this is not there.
+# Objects with a lower presence probability count as absent.
 PRESENCE_THRESHOLD = 0.5
-# A taxel touches something from a probability of 0.35 on. Where nobody can know, that gives the
-# highest F1: the best threshold is half the F1 it leads to (Lipton et al. 2014).
+# Contact threshold of a taxel: probability 0.35. Where contact cannot be predicted with certainty,
+# the threshold with the best F1 is half of that F1 (Lipton et al. 2014).
 CONTACT_LOG_ODDS = -0.62
 
 
@@ -44,7 +44,7 @@ def pad_means_kpa(tactile_kpa: Float32[np.ndarray, "*batch 2 320"]) -> np.ndarra
 
 @dataclass(frozen=True)
 class Commands:
-    """Both hands at the looks of each latent step."""
+    """Motion of both hands at the sampled steps of each latent."""
 
     points_m: Float32[Tensor, "batch latents looks 2 6 3"]
     axes: Float32[Tensor, "batch latents 2 6"]
@@ -54,14 +54,14 @@ class Commands:
         return self.points_m.shape[1]
 
     def __getitem__(self, latents: slice) -> "Commands":
-        """Some of the latent steps."""
+        """Select latent steps."""
         return Commands(
             self.points_m[:, latents], self.axes[:, latents], self.joints_rad[:, latents]
         )
 
     @classmethod
     def of(cls, motions: list[HandMotion]) -> "Commands":
-        """Commands of a batch: for each entry the hands over the next 4k steps."""
+        """Commands of a batch: for each entry, the hand motion over the next 4k steps."""
         looks = np.arange(0, len(motions[0]), STEPS_PER_LATENT)[:, None] + np.array(LOOKS) - 1
         ends = looks[:, -1]
         return cls(
@@ -72,19 +72,19 @@ class Commands:
 
     @classmethod
     def standing(cls, motions: list[HandMotion]) -> "Commands":
-        """The one latent step that a rollout begins with: hands where they are (one step each)."""
+        """The single latent step, with resting hands, that starts a rollout (one step each)."""
         return cls.of([motion[np.zeros(STEPS_PER_LATENT, dtype=np.int64)] for motion in motions])
 
 
 @dataclass(frozen=True)
 class SceneMemory:
-    """All that a rollout's dynamics carry from one chunk to the next.
+    """State of the dynamics that a rollout carries from one chunk to the next.
 
-    `start` holds what was read and felt at the first step, member by member; `hidden` the cores'
-    states; `poses` where objects are believed now (mean of the members), `disagreement_m` how far
-    members differ about that; `points_m` where the hands stood when they last moved; `num_still`
-    for how many latent steps they have stood there (from the start on, at least `REST_LATENTS`
-    where they touch nothing).
+    `start` holds objects and touch at the first step for every member, `hidden` the hidden states
+    of the cores, `poses` the current object poses (mean over members), `disagreement_m` the
+    ensemble disagreement about them, `points_m` the hand points when they last moved, and
+    `num_still` the number of latent steps since then (at least `REST_LATENTS` from the start on
+    for hands that touch nothing).
     """
 
     start: tuple[SceneStart, ...]
@@ -98,11 +98,11 @@ class SceneMemory:
 
 @dataclass(frozen=True)
 class ImaginedSteps:
-    """What the ensemble says of the next 4k steps, and of the k latent steps that they are.
+    """Predictions of the ensemble for the next 4k steps and the k latent steps they form.
 
-    `disagreement_m` is the largest spread (standard deviation over members) of an object's
-    position; `distance` how far command features leave the range of training (0: inside); `moves`
-    says where hands moved and `at_rest` where nothing moves any more.
+    `disagreement_m` is the largest standard deviation over members of an object's position;
+    `distance` is how far command features lie outside the range of training (0: inside); `moves`
+    marks latents in which hands move, `at_rest` those in which nothing moves any more.
     """
 
     poses: ObjectPoses
@@ -114,7 +114,7 @@ class ImaginedSteps:
 
 
 class DynamicsMember(nn.Module):
-    """One reader with its core."""
+    """One start reader with its recurrent core."""
 
     def __init__(self, config: DynamicsConfig) -> None:
         super().__init__()
@@ -123,11 +123,11 @@ class DynamicsMember(nn.Module):
 
 
 class DynamicsModel(nn.Module):
-    """Members that were trained from different seeds, and the touch codec they share.
+    """Ensemble members trained from different seeds, with a shared touch codec.
 
     Args:
-        config: of every member.
-        num_members: of the ensemble, at least one.
+        config: configuration of every member.
+        num_members: size of the ensemble, at least one.
     """
 
     def __init__(self, config: DynamicsConfig, num_members: int = 1) -> None:
@@ -144,15 +144,15 @@ class DynamicsModel(nn.Module):
         standing: Commands,
         commanded: Float32[Tensor, " batch"],
     ) -> SceneMemory:
-        """Read the scene of an observed step.
+        """Estimate the scene at an observed step.
 
-        Hands that touch nothing leave the scene at rest until they move.
+        If the hands touch nothing, the scene is at rest until they move.
 
         Args:
-            first: the step as readers see it.
-            tactile_kpa: pressure of that step.
-            standing: from `Commands.standing` of the measured hands.
-            commanded: 1 where the rollout's actions are commanded, 0 where they are measured.
+            first: the step as input of the readers.
+            tactile_kpa: pressure at that step.
+            standing: the measured hands, from `Commands.standing`.
+            commanded: 1 if the rollout's actions are commanded, 0 if they are measured.
         """
         starts, states = [], []
         touch = self.codec.encode(tactile_kpa)
@@ -175,11 +175,10 @@ class DynamicsModel(nn.Module):
 
     @torch.no_grad()
     def advance(self, memory: SceneMemory, commands: Commands) -> tuple[SceneMemory, ImaginedSteps]:
-        """Imagine the steps of some commands.
+        """Predict the steps that follow from commands.
 
-        Entries whose hands have stood still for two seconds, and go on doing so, are at rest:
-        nothing moves any more, and touch stays as it is. Commands that are cut into several calls
-        give the same as those of one call.
+        Entries whose hands have stood still for two seconds, and still do, are at rest: poses and
+        touch stay constant. Splitting commands over several calls does not change the result.
         """
         still = stillness(memory.points_m, memory.num_still, commands.points_m)
         parts: list[_Run] = []
@@ -204,7 +203,7 @@ class DynamicsModel(nn.Module):
     def _advance_run(
         self, memory: SceneMemory, commands: Commands, at_rest: Bool[Tensor, " batch"]
     ) -> tuple[SceneMemory, "_Run"]:
-        """Some latent steps during all of which the same entries are at rest."""
+        """Advance by latent steps during which the same entries are at rest."""
         features = [_features(commands, start.objects) for start in memory.start]
         distance = torch.stack(
             [
@@ -261,9 +260,9 @@ class DynamicsModel(nn.Module):
         touch: Float32[Tensor, "*batch 2 channels"],
         taxels: Float32[Tensor, "*batch 2 320"],
     ) -> Float32[Tensor, "*batch 2 320"]:
-        """Pressures in kPa, of latents and of log odds that a taxel is in contact.
+        """Pressures in kPa from latents and from contact log odds of each taxel.
 
-        A taxel in contact feels at least the pressure that counts as contact, others feel nothing.
+        Taxels in contact have at least the contact threshold pressure, all others have none.
         """
         touches = taxels > CONTACT_LOG_ODDS
         return self.codec.decode(touch).clamp_min(CONTACT_THRESHOLD_KPA) * touches
@@ -271,7 +270,7 @@ class DynamicsModel(nn.Module):
 
 @dataclass(frozen=True)
 class _Run:
-    """What is imagined of some latent steps."""
+    """Predictions for a run of latent steps."""
 
     poses: ObjectPoses
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
@@ -289,14 +288,14 @@ def _distance(scaled: Float32[Tensor, "batch latents f"]) -> Float32[Tensor, "ba
 
 
 def _spread_m(poses: list[ObjectPoses]) -> Float32[Tensor, "*batch"]:
-    """Largest standard deviation over members of the position of an object that is there."""
+    """Largest standard deviation over members of the position of an object that is present."""
     used = torch.stack([each.present for each in poses]).mean(0) > PRESENCE_THRESHOLD
     positions = torch.stack([each.position_m for each in poses])
     return (positions.std(0, correction=0).norm(dim=-1) * used).amax(-1)
 
 
 def _mean(poses: list[ObjectPoses]) -> ObjectPoses:
-    """Mean over members; a member that sees no object has no say about where it is."""
+    """Mean over members; members that see no object do not contribute to its pose."""
     present = torch.stack([each.present for each in poses])
     share = present / present.sum(0).clamp_min(1e-6)
     return ObjectPoses(
@@ -307,12 +306,12 @@ def _mean(poses: list[ObjectPoses]) -> ObjectPoses:
 
 
 def mean_start(memory: SceneMemory) -> ObjectPoses:
-    """Where the members together saw the objects of the start."""
+    """Object poses at the start, averaged over members."""
     return _mean([start.objects for start in memory.start])
 
 
 def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
-    """Poses of every step of the model grid, linear between latent steps."""
+    """Poses at every step of the model grid, interpolated linearly between latent steps."""
     weight = torch.arange(1, STEPS_PER_LATENT + 1) / STEPS_PER_LATENT
 
     def filled(first: Tensor, later: Tensor) -> Tensor:
@@ -328,7 +327,7 @@ def _between(now: ObjectPoses, latents: ObjectPoses) -> ObjectPoses:
 
 
 def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) -> _Run:
-    """Latent steps in which everything stays as it is."""
+    """Latent steps in which everything stays constant."""
     num_latents = distance.shape[1]
 
     def held(now: Tensor, count: int) -> Tensor:
@@ -346,7 +345,7 @@ def _resting(memory: SceneMemory, distance: Float32[Tensor, "batch latents"]) ->
 
 
 def _chosen(at_rest: Bool[Tensor, " batch"], resting: _Run, moving: _Run) -> _Run:
-    """Entries at rest from one, all others from the other."""
+    """Predictions of `resting` for entries at rest and of `moving` for all others."""
 
     def chosen(held: Tensor, steps: Tensor) -> Tensor:
         return torch.where(at_rest.view(-1, *[1] * (steps.ndim - 1)), held, steps)

@@ -1,4 +1,4 @@
-"""Poses of a scene's objects as the networks hold them: position and two axes a slot."""
+"""Object poses of a scene as network tensors: a position and two axes per slot."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from dextouch.geometry.transforms import pose_from_transform, transform, transform_from_pose
 from services.world_model.dynamics.configuration import MAX_OBJECTS
 
-# An object farther than this from the world's origin counts as not there.
+# Objects farther than this from the world's origin count as absent.
 MAX_DISTANCE_M = 1.0
 
 
@@ -18,10 +18,10 @@ MAX_DISTANCE_M = 1.0
 class ObjectPoses:
     """Objects in the world frame.
 
-    `axes` are the images of the object's z and x axis. A network that cannot know an axis (the
-    yaw of a round bowl) predicts it shorter than one, so lengths carry certainty. `present` is 1
-    where there is an object, 0 in unused slots and for objects out of reach; between them it is a
-    probability.
+    `axes` are the directions of the object's z and x axis. An axis that cannot be observed (the yaw
+    of a round bowl) is predicted shorter than one, so that its length expresses certainty.
+    `present` is 1 for an object, 0 for unused slots and objects out of reach, and a probability in
+    between.
     """
 
     position_m: Float32[Tensor, "*batch objects 3"]
@@ -29,12 +29,12 @@ class ObjectPoses:
     present: Float32[Tensor, "*batch objects"]
 
     def __getitem__(self, index: Tensor | int | slice | tuple[slice, int]) -> "ObjectPoses":
-        """Some entries of the batch."""
+        """Index the batch."""
         return ObjectPoses(self.position_m[index], self.axes[index], self.present[index])
 
 
 def objects_from_poses(poses: Shaped[np.ndarray, "*batch objects 7"]) -> ObjectPoses:
-    """True poses (x y z in metres, qw qx qy qz) as filled slots; further slots are empty."""
+    """Fill slots with true poses (x y z in metres, qw qx qy qz); further slots stay empty."""
     T = transform_from_pose(np.asarray(poses, dtype=np.float64))
     batch, count = T.shape[:-3], T.shape[-3]
     position = np.zeros((*batch, MAX_OBJECTS, 3), dtype=np.float32)
@@ -53,7 +53,7 @@ def poses_from_objects(objects: ObjectPoses) -> Float64[np.ndarray, "*batch obje
     """Rigid poses nearest to predicted positions and axes.
 
     z keeps its direction; x is made perpendicular to it. Where x is unknown (near zero or along
-    z), any perpendicular direction is taken: the object is round about z as far as anybody knows.
+    z), any perpendicular direction is taken, as for an object that is symmetric about z.
     """
     axes = objects.axes.double().numpy()
     z = _unit(axes[..., 0, :], np.array([0.0, 0.0, 1.0]))

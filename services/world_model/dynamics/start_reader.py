@@ -1,8 +1,8 @@
-"""Start reader: where a task's objects are, from one head image, the touch and the hands.
+"""Start reader: object poses of a task from one head image, touch and hand poses.
 
-Feature points of a small convolutional network (spatial soft-argmax, Levine et al. 2016) give a
-pixel and a height for every object; the position is where the pixel's ray meets that height, so
-that the known camera pose is used exactly and not learned.
+A small convolutional network with feature points (spatial soft-argmax, Levine et al. 2016)
+predicts a pixel and a height for every object; the position is where the pixel's ray reaches that
+height, so that the known camera pose is used exactly instead of being learned.
 """
 
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from services.world_model.dynamics.objects import MAX_DISTANCE_M, ObjectPoses
 TASK_WIDTH = 16
 _POINT_SIZE = 2 * NUM_POINTS * 3
 _CAMERA_SIZE = 7
-# Rays flatter than this never meet the table within reach.
+# Rays flatter than this do not meet the table within reach.
 _FLATTEST = -0.15
 
 
@@ -37,10 +37,10 @@ class FirstStep:
 
 
 class StartReader(nn.Module):
-    """First step to object poses with a probability that each is there.
+    """Predicts object poses and presence probabilities from the first step.
 
     Args:
-        config: of the dynamics model.
+        config: configuration of the dynamics model.
     """
 
     height_mean: Tensor
@@ -68,7 +68,7 @@ class StartReader(nn.Module):
         )  # fmt: skip
 
     def forward(self, first: FirstStep) -> ObjectPoses:
-        """Objects of every entry; `present` are probabilities, 0 in slots the task has not."""
+        """Objects of every entry; `present` holds probabilities, 0 in slots unused by the task."""
         image = first.image.permute(0, 3, 1, 2).float() / 255 - 0.5
         return self.read(image, first)
 
@@ -79,7 +79,7 @@ class StartReader(nn.Module):
         *,
         bfloat16: bool = False,
     ) -> ObjectPoses:
-        """`forward` with an image in −0.5 … 0.5 in place of the bytes; convolved in bfloat16."""
+        """`forward` for an image in −0.5 … 0.5 instead of bytes; optionally in bfloat16."""
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
             maps = self.eye(image)
         told = self.head(self._known(maps.float(), first)).unflatten(1, (MAX_OBJECTS, 10))
@@ -123,9 +123,9 @@ def ray_at_height(
     K_head: Float32[Tensor, "batch 3 3"],
     T_world_camera: Float32[Tensor, "batch 4 4"],
 ) -> Float32[Tensor, "batch objects 3"]:
-    """World point (m) where a pixel's ray is at a height; each coordinate within `MAX_DISTANCE_M`.
+    """World point (m) where a pixel's ray reaches a height, within `MAX_DISTANCE_M` on each axis.
 
-    Rays that look up or almost along the horizon are bent down to meet the height far away.
+    Rays that look up or almost along the horizon are tilted to meet the height far away.
     """
     focal = torch.stack([K_head[:, 0, 0], K_head[:, 1, 1]], dim=-1)[:, None]
     centre = K_head[:, None, :2, 2]

@@ -1,6 +1,6 @@
-"""When hands stand still, and since when a scene is at rest: latent step by latent step.
+"""Detection of resting hands and resting scenes, per latent step.
 
-Counted by latent steps and never by chunks, so that it is the same however a client cuts its
+Counting latent steps instead of chunks makes the result independent of how a client splits its
 commands into chunks.
 """
 
@@ -11,18 +11,18 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor
 
-# Hands that move less than this between latent steps stand still.
+# Hands that move less than this between latent steps count as still.
 STILL_M = 1e-4
-# After this many latent steps of standing still (2 s) everything has come to rest.
+# After this many still latent steps (2 s) the scene counts as settled.
 REST_LATENTS = 8
 
 
 @dataclass(frozen=True)
 class Stillness:
-    """Which latent steps move hands, and which find a scene at rest.
+    """Latent steps in which the hands move, and in which the scene is at rest.
 
-    `points_m` are where hands stood when they last moved, `num_still` for how many latent steps
-    they have stood there, both after the last latent step.
+    `points_m` are the hand points when they last moved, `num_still` the number of latent steps
+    since then, both after the last latent step.
     """
 
     points_m: Float32[Tensor, "batch 2 6 3"]
@@ -31,7 +31,7 @@ class Stillness:
     at_rest: Bool[Tensor, "batch latents"]
 
     def runs(self) -> Iterator[tuple[slice, Bool[Tensor, " batch"]]]:
-        """Stretches of latent steps in which the same entries are at rest, and which these are."""
+        """Runs of latent steps in which the same entries are at rest, each with these entries."""
         first, num_latents = 0, self.at_rest.shape[1]
         for last in range(1, num_latents + 1):
             if last == num_latents or bool((self.at_rest[:, last] != self.at_rest[:, first]).any()):
@@ -44,10 +44,10 @@ def stillness(
     num_still: Int64[Tensor, " batch"],
     commanded_m: Float32[Tensor, "batch latents looks 2 6 3"],
 ) -> Stillness:
-    """Follow hands that stood at `points_m` for `num_still` latent steps.
+    """Track hands that have stood at `points_m` for `num_still` latent steps.
 
-    Hands move when they leave the place where they stood, however slowly. A scene is at rest in
-    latent steps that do not move hands and before which they had stood for `REST_LATENTS`.
+    Hands move when they leave that position, however slowly. A scene is at rest in latent steps
+    without hand motion that follow at least `REST_LATENTS` such steps.
     """
     moved, rested = [], []
     for looks_m in commanded_m.unbind(1):

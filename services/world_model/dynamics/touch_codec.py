@@ -1,4 +1,4 @@
-"""Linear codec of both hands' taxels for the core: principal axes of the root of pressure."""
+"""Linear codec of a hand's taxels for the core: principal axes of the root of pressure."""
 
 import torch
 from jaxtyping import Float32
@@ -8,16 +8,16 @@ from dextouch.tactile.layout import NUM_TAXELS
 from services.world_model.network.principal_axes import principal_axes
 from services.world_model.network.tactile_tokenizer import root_pressure
 
-# A pad at rest: below this peak pressure it counts as free when contact is learned.
+# Pads with a lower peak pressure count as free when contact is learned.
 FREE_KPA = 2.0
 
 
 class TouchCodec(nn.Module):
-    """Frozen encoder and decoder of one hand's taxels (left and right alike).
+    """Frozen encoder and decoder of one hand's taxels, the same for left and right.
 
-    Latents are in units of the strongest axis' amplitude, so that their squared error is that of
-    the roots of pressure up to one factor. Decoded pressure is bounded by `peak_kpa`, the highest
-    that was seen in training.
+    Latents are in units of the strongest axis' amplitude, so that their squared error is
+    proportional to that of the root of pressure. Decoded pressure is bounded by `peak_kpa`, the
+    highest pressure in training.
     """
 
     basis: Tensor
@@ -32,14 +32,14 @@ class TouchCodec(nn.Module):
 
     @torch.no_grad()
     def fit(self, tactile_kpa: Float32[Tensor, "n 320"], *, peak_kpa: float | None = None) -> None:
-        """Take axes, scale and peak from training touch of single hands.
+        """Fit axes, scale and peak to training touch of single hands.
 
         Args:
-            tactile_kpa: a sample of it.
-            peak_kpa: the highest pressure of all of it; None takes that of the sample.
+            tactile_kpa: sample of the training data.
+            peak_kpa: highest pressure of all training data; None uses that of the sample.
         """
         roots = root_pressure(tactile_kpa).double()
-        # Not centred: the mean of touch is no touch that ever happens.
+        # Not centred: the mean touch is not a touch that occurs.
         basis, rms = principal_axes(roots.T @ roots / len(roots), self.basis.shape[1])
         self.basis.copy_(basis)
         self.scale.copy_(rms[0].clamp_min(1e-3))
@@ -47,7 +47,7 @@ class TouchCodec(nn.Module):
         self.peak_kpa.fill_(max(peak, FREE_KPA))
 
     def encode(self, tactile_kpa: Float32[Tensor, "*b 320"]) -> Float32[Tensor, "*b channels"]:
-        """Latents; pressures below zero count as zero, those above the peak as the peak."""
+        """Latents; pressures are clipped to 0 … peak."""
         bounded = torch.minimum(tactile_kpa, self.peak_kpa)
         return (root_pressure(bounded) @ self.basis) / self.scale
 

@@ -4,6 +4,6 @@ from torch import Tensor
 
 
 def split_axis(tensor: Tensor, axis: int, sizes: tuple[int, ...]) -> Tensor:
-    """One axis as several; one size may be -1. `Tensor.unflatten` has no types."""
+    """Split one axis into several; one size may be -1. Typed, unlike `Tensor.unflatten`."""
     axis = axis % tensor.ndim
     return tensor.reshape(*tensor.shape[:axis], *sizes, *tensor.shape[axis + 1 :])

@@ -1,7 +1,7 @@
-"""Condition vectors of the experts: flow time, actions, instruction, kind of action and scene.
+"""Condition vectors of the experts: flow time, actions, instruction, action kind and scene.
 
-Dual rate (equation 4 of the paper): video latent j sees a[4j-3 … 4j], tactile step t sees a_t, and
-index 0 sees zeros.
+Dual rate (equation 4 of the paper): video latent j is conditioned on a[4j-3 … 4j], tactile step t
+on a_t, and index 0 on zeros.
 """
 
 import math
@@ -48,7 +48,7 @@ class ActionNormalizer(nn.Module):
         self.register_buffer("std", torch.ones(HAND_DIM))
 
     def fit(self, hands: Float32[Tensor, "n time 2 29"]) -> None:
-        """Mean and deviation over windows; one deviation for the three axes of translation."""
+        """Fit mean and deviation over windows; the three translation axes share one deviation."""
         flat = hands.reshape(-1, HAND_DIM).double()
         mean, std = flat.mean(dim=0), flat.std(dim=0)
         mean[:3] = 0.0
@@ -59,7 +59,7 @@ class ActionNormalizer(nn.Module):
         self.std.copy_(std.float())
 
     def forward(self, inputs: ModelInputs) -> ActionFeatures:
-        """Features bounded to ten deviations, so that no input can blow up the network."""
+        """Normalized features, clipped to ten deviations so that no input saturates the network."""
         own = _bounded((inputs.hands - self.mean) / self.std)
         device = inputs.camera.device
         camera = _bounded((inputs.camera - _NO_MOTION.to(device)) / _CAMERA_SCALE.to(device))
@@ -71,14 +71,14 @@ class ActionNormalizer(nn.Module):
 
 
 class TimeEmbedding(nn.Module):
-    """A flow time in 0 … 1 as a vector; float32 throughout."""
+    """Embedding of a flow time in 0 … 1; float32 throughout."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         self.project = two_layers(TIME_WIDTH, width, width)
 
     def forward(self, t: Float32[Tensor, "..."]) -> Float32[Tensor, "*batch width"]:
-        """Sines and cosines, then two layers."""
+        """Sines and cosines followed by two layers."""
         half = TIME_WIDTH // 2
         rates = torch.exp(
             -math.log(1e4) * torch.arange(half, dtype=torch.float32, device=t.device) / half
@@ -88,12 +88,12 @@ class TimeEmbedding(nn.Module):
 
 
 class VideoCondition(nn.Module):
-    """One condition a latent frame."""
+    """Condition vector of every latent frame."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
         width = config.video_width
-        # Both hands and the camera, once, for each of the four steps of a latent frame.
+        # Both hands and the camera for each of the four steps of a latent frame.
         self.actions = two_layers(FRAMES_PER_LATENT * ACTION_WIDTH, 2 * width, width)
         self.time = TimeEmbedding(width)
         self.static = StaticCondition(config, width)
@@ -104,7 +104,7 @@ class VideoCondition(nn.Module):
         features: ActionFeatures,
         t: Float32[Tensor, "batch latents"],
     ) -> Float32[Tensor, "batch latents width"]:
-        """T is zero where the latent is clean."""
+        """Condition vectors; t is zero where the latent is clean."""
         right_view = features.per_hand[:, 1:, 1]
         groups = split_axis(right_view, 1, (-1, FRAMES_PER_LATENT)).flatten(2)
         actions = after_first(self.actions(groups))
@@ -112,7 +112,7 @@ class VideoCondition(nn.Module):
 
 
 class TactileCondition(nn.Module):
-    """One condition a step and hand."""
+    """Condition vector of every step and hand."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -129,7 +129,7 @@ class TactileCondition(nn.Module):
         features: ActionFeatures,
         t: Float32[Tensor, "batch time"],
     ) -> Float32[Tensor, "batch time 2 width"]:
-        """T is zero where the step is clean."""
+        """Condition vectors; t is zero where the step is clean."""
         actions = after_first(self.actions(features.per_hand[:, 1:]))
         scene = self.scene(inputs) + self.layout(features.layout)
         return (
@@ -138,7 +138,7 @@ class TactileCondition(nn.Module):
 
 
 class StaticCondition(nn.Module):
-    """What holds for the whole window: the instruction and the kind of action."""
+    """Condition that is constant over the window: instruction and kind of action."""
 
     def __init__(self, config: NetworkConfig, width: int) -> None:
         super().__init__()
@@ -148,12 +148,12 @@ class StaticCondition(nn.Module):
         self.commanded = nn.Parameter(torch.zeros(width))
 
     def forward(self, inputs: ModelInputs) -> Float32[Tensor, "batch width"]:
-        """Words, and one vector more where actions are commanded."""
+        """Embedding of the instruction, plus a learned vector for commanded actions."""
         return self.instruction(inputs.words) + inputs.commanded[:, None] * self.commanded
 
 
 class SceneEncoder(nn.Module):
-    """The first image, with the own hand's raster at the first and last step, for each hand."""
+    """Encodes the first image, with a hand's raster at the first and last step, for each hand."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -172,7 +172,7 @@ class SceneEncoder(nn.Module):
         )
 
     def forward(self, inputs: ModelInputs) -> Float32[Tensor, "batch 2 width"]:
-        """One vector a hand; the left hand sees the mirror image."""
+        """One vector per hand; the left hand's image is mirrored."""
         image = inputs.first_image.permute(0, 3, 1, 2).float() / 127.5 - 1.0
         ends = inputs.raster[:, [0, -1]].transpose(1, 2)
         ends = nn.functional.interpolate(ends.flatten(0, 1), size=image.shape[-2:])
@@ -193,7 +193,7 @@ def two_layers(in_width: int, hidden_width: int, out_width: int) -> nn.Sequentia
 def after_first(
     condition: Float32[Tensor, "batch later ..."],
 ) -> Float32[Tensor, "batch time ..."]:
-    """The condition with zeros put before it: index 0 has no action (c_0 = 0)."""
+    """Prepend zeros for index 0, which has no action (c_0 = 0)."""
     return torch.cat([torch.zeros_like(condition[:, :1]), condition], dim=1)
 
 

@@ -1,4 +1,4 @@
-"""Every number that fixes the network's shape and sampling: in from settings or a checkpoint."""
+"""Network configuration: shape and sampling of the joint model, stored in its checkpoint."""
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -11,20 +11,20 @@ class NetworkConfig(BaseModel):
     image_px: int = Field(default=64, ge=16, le=256, description="side of the square head image")
     patch_px: int = Field(default=8, description="side of a visual patch")
     max_steps: int = Field(default=17, ge=5, description="longest window: 1 + 4k steps")
-    codec_channels: int = Field(default=48, ge=1, le=768, description="latents of a visual patch")
-    palm_channels: int = Field(default=48, ge=1, le=240, description="latents of a palm pad")
-    video_width: int = Field(default=96, ge=8, description="of the visual expert")
-    tactile_width: int = Field(default=96, ge=8, description="of the tactile expert")
+    codec_channels: int = Field(default=48, ge=1, le=768, description="latents per visual patch")
+    palm_channels: int = Field(default=48, ge=1, le=240, description="latents per palm pad")
+    video_width: int = Field(default=96, ge=8, description="width of the visual expert")
+    tactile_width: int = Field(default=96, ge=8, description="width of the tactile expert")
     num_layers: int = Field(default=3, ge=1, description="layers of each expert")
     num_heads: int = Field(default=3, ge=1, description="attention heads")
-    head_width: int = Field(default=32, ge=4, description="of each attention head")
+    head_width: int = Field(default=32, ge=4, description="width of an attention head")
     ffn_ratio: int = Field(
-        default=3, ge=1, description="width of feed-forward layers over the width of the expert"
+        default=3, ge=1, description="feed-forward width relative to the expert's width"
     )
-    num_word_buckets: int = Field(default=64, ge=2, description="hashed words of an instruction")
-    word_width: int = Field(default=16, ge=1, description="of the embedding of a word")
+    num_word_buckets: int = Field(default=64, ge=2, description="hash buckets for words")
+    word_width: int = Field(default=16, ge=1, description="width of a word embedding")
     use_pose_raster: bool = Field(
-        default=True, description="give a raster of the projected hands beside the actions"
+        default=True, description="condition on a raster of the projected hands, too"
     )
     training_time_shift: float = Field(
         default=5.0, ge=1.0, description="shift of flow-matching times in training"
@@ -32,8 +32,8 @@ class NetworkConfig(BaseModel):
     sampling_time_shift: float = Field(
         default=3.0, ge=1.0, description="shift of flow-matching times in sampling"
     )
-    sampling_steps: int = Field(default=2, ge=1, le=64, description="Euler steps a chunk")
-    model_rate_hz: float = Field(default=15.0, gt=0, description="steps a second")
+    sampling_steps: int = Field(default=2, ge=1, le=64, description="Euler steps per chunk")
+    model_rate_hz: float = Field(default=15.0, gt=0, description="steps per second")
 
     @model_validator(mode="after")
     def _sizes_fit(self) -> "NetworkConfig":
@@ -58,7 +58,7 @@ class NetworkConfig(BaseModel):
 
     @property
     def raster_cells(self) -> int:
-        """Cells along one side of the pose raster: four across a token."""
+        """Cells along one side of the pose raster: four per token."""
         return RASTER_CELLS_PER_TOKEN * self.tokens_across
 
     @property

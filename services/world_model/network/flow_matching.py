@@ -1,7 +1,7 @@
 """Flow matching (Lipman et al. 2023): noisy latents for training and Euler steps for sampling.
 
-Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0, so
-that the velocity is (x_t - x_0) / t and the last Euler step lands on its guess exactly.
+Straight paths: x_t = (1 - t) x_0 + t ε, t from 0 (data) to 1 (noise). The network predicts x_0; the
+velocity is (x_t - x_0) / t, so that the last Euler step returns its prediction exactly.
 """
 
 from collections.abc import Callable
@@ -12,20 +12,20 @@ from torch import Tensor
 
 from dextouch.errors import InvalidInputError
 
-# A training time is never below this: velocities divide by it.
+# Lower bound of training times: velocities divide by them.
 MIN_TIME = 1e-3
 Denoiser = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor]]
 
 
 def shift_time(t: Float32[Tensor, " n"], shift: float) -> Float32[Tensor, " n"]:
-    """Times moved towards noise: s t / (1 + (s - 1) t); keeps 0 and 1."""
+    """Shift times towards noise: s t / (1 + (s - 1) t); 0 and 1 stay fixed."""
     return shift * t / (1.0 + (shift - 1.0) * t)
 
 
 def training_times(
     batch: int, *, shift: float, generator: torch.Generator
 ) -> Float32[Tensor, " batch"]:
-    """Random times in (0, 1], mostly noisy ones, where actions decide."""
+    """Random times in (0, 1], biased towards noise, where the actions matter most."""
     return shift_time(torch.rand(batch, generator=generator), shift).clamp_min(MIN_TIME)
 
 
@@ -46,13 +46,13 @@ def sample(
     num_steps: int,
     shift: float,
 ) -> tuple[Float32[Tensor, "batch ..."], Float32[Tensor, "batch ..."]]:
-    """Euler's method from noise to data for both streams at once.
+    """Integrate from noise to data with Euler's method, for both streams at once.
 
     Args:
-        denoise: noisy video, noisy touch and times [batch] to guesses of the clean ones.
-        noise: what to start from.
-        num_steps: network calls, at least one; with one the sample is the first guess.
-        shift: of the time grid.
+        denoise: maps noisy video, noisy touch and times [batch] to predictions of the clean ones.
+        noise: initial noise of both streams.
+        num_steps: network calls, at least one; with one the sample is the first prediction.
+        shift: shift of the time grid.
     """
     if num_steps < 1:
         raise InvalidInputError(f"sampling: got {num_steps} steps, expected at least 1")

@@ -1,7 +1,7 @@
 """Input tensors of the joint model: image, touch, actions, instruction and geometry of a request.
 
-This is the only way into the network: the training loader and the world server both call
-`build_inputs`, so that a window means the same to both.
+The training loader and the world server both call `build_inputs`, the only way to build these
+tensors, so that training and serving treat a window identically.
 """
 
 from collections.abc import Sequence
@@ -39,18 +39,18 @@ from services.world_model.network.pose_raster import pose_raster
 MAX_TRANSLATION_M = 2.0
 MAX_JOINT_RAD = 2.0 * np.pi
 MAX_PRESSURE_KPA = 1e5
-# Poses and angles are rounded to a nanometre and a nanoradian: finer differences only tell how
-# often a pose was re-anchored on its way here.
+# Poses and angles are rounded to 1e-9 m and 1e-9 rad: finer differences only depend on how often a
+# pose was re-anchored.
 DECIMALS = 9
 ACTION_KINDS: tuple[ActionKind, ActionKind] = ("measured", "commanded")
 
 
 @dataclass(frozen=True)
 class PredictionRequest:
-    """One window to be predicted.
+    """One window to predict.
 
-    `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; row 0's own poses
-    are the anchor by definition and are not read.
+    `actions` [T, 67], T = 1 + 4k, are relative to `anchor`, the poses of row 0; the poses in row 0
+    are the anchor by definition and are ignored.
     """
 
     first_image: UInt8[np.ndarray, "h w 3"]
@@ -64,7 +64,7 @@ class PredictionRequest:
 
 @dataclass(frozen=True)
 class ModelInputs:
-    """Tensors of a batch of requests; physical units, normalized inside the network."""
+    """Batched tensors of requests in physical units; normalized inside the network."""
 
     first_image: UInt8[Tensor, "batch px px 3"]
     first_tactile_kpa: Float32[Tensor, "batch 2 320"]
@@ -77,26 +77,26 @@ class ModelInputs:
 
     @property
     def num_steps(self) -> int:
-        """Steps of the window, the first one included."""
+        """Steps of the window, including the first one."""
         return self.hands.shape[1]
 
     def __len__(self) -> int:
         return len(self.first_image)
 
     def to(self, device: torch.device) -> "ModelInputs":
-        """The same on a device."""
+        """Copy to a device."""
         return ModelInputs(**{name: tensor.to(device) for name, tensor in vars(self).items()})
 
 
 def build_inputs(requests: Sequence[PredictionRequest], config: NetworkConfig) -> ModelInputs:
-    """Check and stack requests of one length into the network's tensors.
+    """Validate requests of one length and stack them into network tensors.
 
     Raises:
-        ShapeError: arrays of another shape, or requests of different lengths.
+        ShapeError: wrong array shapes, or requests of different lengths.
         NonFiniteError: NaN or infinity.
-        DegenerateRotationError: actions that describe no rotation.
-        UnknownNameError: an action kind that does not exist.
-        InvalidInputError: poses or angles outside what a body can do, or no request.
+        DegenerateRotationError: the actions hold a degenerate rotation.
+        UnknownNameError: unknown action kind.
+        InvalidInputError: poses or angles out of physical range, or no request.
     """
     if not requests:
         raise InvalidInputError("model input: got no request, expected at least one")
@@ -153,7 +153,7 @@ def _checked_actions(request: PredictionRequest, config: NetworkConfig) -> np.nd
 
 
 def check_reach(actions: Float64[np.ndarray, "time 67"]) -> None:
-    """Refuse poses and angles outside what a body can do.
+    """Reject poses and angles out of physical range.
 
     Raises:
         InvalidInputError: more than 2 m from the anchor, or more than a full turn of a joint.

@@ -1,7 +1,7 @@
-"""Embedding of an instruction as one vector.
+"""Embedding of a text instruction as one vector.
 
-Words are hashed into a small table, so that no vocabulary has to be kept and any text is
-accepted. Entries start at zero: a word never trained on says nothing.
+Words are hashed into a small table, so that any text is accepted without a vocabulary. Entries
+start at zero: words that were not trained on have no effect.
 """
 
 import re
@@ -24,7 +24,7 @@ def hash_words(instruction: str, num_buckets: int) -> Int64[Tensor, " max_words"
 
 
 class InstructionEncoder(nn.Module):
-    """Mean of the words' entries, then a linear map; no word at all gives the bias."""
+    """Mean of the word embeddings and a linear map; an empty instruction gives the bias."""
 
     def __init__(self, *, num_buckets: int, word_width: int, width: int) -> None:
         super().__init__()
@@ -33,6 +33,6 @@ class InstructionEncoder(nn.Module):
         self.project = nn.Linear(word_width, width)
 
     def forward(self, words: Int64[Tensor, "batch max_words"]) -> Float32[Tensor, "batch width"]:
-        """One vector an instruction."""
+        """One vector per instruction."""
         count = (words != NO_WORD).sum(dim=1, keepdim=True).clamp_min(1)
         return self.project(self.table(words).sum(dim=1) / count)

@@ -18,7 +18,7 @@ NUM_MODULATIONS = 6
 
 @dataclass(frozen=True)
 class Stream:
-    """Tokens of one expert and the modulation of each: shift, scale and gate, twice."""
+    """Tokens of one expert with the modulation of each: shift, scale and gate, twice."""
 
     tokens: Float32[Tensor, "batch tokens width"]
     modulation: Float32[Tensor, "batch tokens 6 width"]
@@ -27,9 +27,9 @@ class Stream:
 def clean_mask(
     is_clean: Bool[Tensor, " tokens"],
 ) -> Bool[Tensor, "tokens tokens"]:
-    """Which key each query may see: clean queries only clean keys, noisy queries all.
+    """Attention mask: clean queries attend to clean keys only, noisy queries to all keys.
 
-    So clean context never depends on noise. Every query sees at least itself.
+    Clean context therefore never depends on noise. Every query attends at least to itself.
     """
     return ~is_clean[:, None] | is_clean[None, :]
 
@@ -43,7 +43,7 @@ class ExpertBlock(nn.Module):
         self.num_heads = num_heads
         self.to_qkv = nn.Linear(width, 3 * inner)
         self.to_out = nn.Linear(inner, width)
-        # Norms of queries and keys bound the logits whatever the tokens are.
+        # Normalized queries and keys bound the attention logits.
         self.query_norm = nn.RMSNorm(head_width, eps=1e-6)
         self.key_norm = nn.RMSNorm(head_width, eps=1e-6)
         self.ffn = nn.Sequential(
@@ -60,7 +60,7 @@ class ExpertBlock(nn.Module):
         Float32[Tensor, "batch heads tokens head_width"],
         Float32[Tensor, "batch heads tokens head_width"],
     ]:
-        """What the expert brings into the attention."""
+        """Queries, keys and values for the shared attention."""
         shift, scale, *_ = (stream.modulation + self.modulation).unbind(dim=2)
         normed = modulated_norm(stream.tokens, shift, scale)
         heads = split_axis(self.to_qkv(normed), -1, (3, self.num_heads, -1))
@@ -68,7 +68,7 @@ class ExpertBlock(nn.Module):
         return self.query_norm(query), self.key_norm(key), value
 
     def finish(self, stream: Stream, attended: Float32[Tensor, "batch tokens inner"]) -> Stream:
-        """Add the attention's answer, then the feed-forward network's."""
+        """Add the output of the attention, then that of the feed-forward network."""
         _, _, gate, ffn_shift, ffn_scale, ffn_gate = (stream.modulation + self.modulation).unbind(2)
         tokens = stream.tokens + (1.0 + gate) * self.to_out(attended)
         normed = modulated_norm(tokens, ffn_shift, ffn_scale)
@@ -86,7 +86,7 @@ class JointLayer(nn.Module):
     def forward(
         self, video: Stream, tactile: Stream, mask: Bool[Tensor, "tokens tokens"]
     ) -> tuple[Stream, Stream]:
-        """Both streams, each knowing of the other."""
+        """Update both streams through the shared attention."""
         parts = zip(
             self.video.queries_keys_values(video),
             self.tactile.queries_keys_values(tactile),
@@ -107,12 +107,12 @@ def modulated_norm(
     shift: Float32[Tensor, "*batch width"],
     scale: Float32[Tensor, "*batch width"],
 ) -> Float32[Tensor, "*batch width"]:
-    """Layer norm without weights of its own, then the condition's scale and shift (AdaLN)."""
+    """Layer norm without learned weights, then scale and shift by the condition (AdaLN)."""
     return functional.layer_norm(tokens, tokens.shape[-1:]) * (1.0 + scale) + shift
 
 
 def zero_linear(in_width: int, out_width: int) -> nn.Linear:
-    """A linear map that gives zero until it is trained: modulations and outputs begin neutral."""
+    """Linear layer initialized to zero, so that modulations and outputs start neutral."""
     layer = nn.Linear(in_width, out_width)
     nn.init.zeros_(layer.weight)
     nn.init.zeros_(layer.bias)

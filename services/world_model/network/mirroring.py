@@ -20,9 +20,9 @@ MIRROR_CAMERA = np.array([-1.0, 1.0, 1.0])
 
 @cache
 def left_joint_signs() -> Float64[np.ndarray, "20"]:
-    """Sign with which each left joint angle is that of the mirrored right joint.
+    """Signs that map left joint angles to those of the mirrored right joints.
 
-    A mirror turns an axis a into -S a; the sign says whether that is the right hand's axis.
+    A mirror maps an axis a to -S a; the sign says whether that is the right hand's axis.
     """
     left, right = RobotHand("left"), RobotHand("right")
     signs = [

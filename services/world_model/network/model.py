@@ -1,4 +1,4 @@
-"""The joint model of future images and pressures: two experts around shared attention."""
+"""Joint model of future images and pressures: two experts with shared attention."""
 
 import warnings
 from collections.abc import Iterator, Sequence
@@ -46,14 +46,14 @@ class FirstLatents:
 
 @dataclass(frozen=True)
 class Prediction:
-    """The future after the first step; images of all of its steps, or of the last four alone."""
+    """Future after the first step; images of all its steps, or of the last four only."""
 
     images: Float32[Tensor, "batch shown px px 3"]
     tactile_kpa: Float32[Tensor, "batch steps 2 320"]
 
 
 class JointWorldModel(nn.Module):
-    """Video and tactile expert over anchored residual latents, with their frozen codecs."""
+    """Video and tactile expert on anchored residual latents, with their frozen codecs."""
 
     video_residual_std: Tensor
     tactile_residual_std: Tensor
@@ -87,7 +87,7 @@ class JointWorldModel(nn.Module):
         images: UInt8[Tensor, "batch time px px 3"],
         tactile_kpa: Float32[Tensor, "batch time 2 320"],
     ) -> JointLatents:
-        """Anchored residuals of true windows, in units of their deviation: the target."""
+        """Anchored residuals of true windows in units of their deviation; the training target."""
         video, tactile = self.codec.encode(to_unit(images)), self.tokenizer.encode(tactile_kpa)
         return JointLatents(
             (video - video[:, :1]) / self.video_residual_std,
@@ -101,7 +101,7 @@ class JointWorldModel(nn.Module):
         noisy: JointLatents,
         t: Float32[Tensor, " batch"],
     ) -> JointLatents:
-        """The guess of the clean residuals from noisy ones at time t (the first step is clean)."""
+        """Predict the clean residuals from noisy ones at time t (the first step is clean)."""
         features = self.normalizer(inputs)
         video_condition = self.video_condition(inputs, features, _time_of_each(t, noisy.video))
         tactile_condition = self.tactile_condition(
@@ -120,14 +120,14 @@ class JointWorldModel(nn.Module):
         )
 
     def attention_mask(self, num_steps: int) -> Bool[Tensor, "tokens tokens"]:
-        """Clean tokens (first latent frame, first touch) see only each other."""
+        """Mask by which clean tokens (first latent frame and touch) attend to each other only."""
         per_latent = self.config.tokens_per_latent
         is_clean_video = torch.arange(num_latents(num_steps) * per_latent) < per_latent
         is_clean_tactile = torch.arange(2 * num_steps) < 2
         return clean_mask(torch.cat([is_clean_video, is_clean_tactile]))
 
     def noise(self, num_steps: int, generator: torch.Generator) -> JointLatents:
-        """Noise of one rollout's chunk; stack several for a batch."""
+        """Noise for one chunk of one rollout; stack several for a batch."""
         config = self.config
         video = (num_latents(num_steps), config.tokens_per_latent, config.video_channels)
         tactile = (num_steps, 2, self.tokenizer.channels)
@@ -146,17 +146,17 @@ class JointWorldModel(nn.Module):
         all_images: bool = True,
         precision: Precision = "float32",
     ) -> Prediction:
-        """Sample the future of every request.
+        """Sample a future for every request.
 
         Args:
             inputs: from `build_inputs`.
-            noise: one a request, from `noise`; like the inputs it may be on any device.
-            sampling_steps: Euler steps; None takes the configuration's.
+            noise: one per request, from `noise`; like the inputs it may be on any device.
+            sampling_steps: Euler steps; None uses the configuration's.
             all_images: decode every image, or only those of the last latent.
-            precision: of the experts' matrix products, by autocast; codecs are always float32.
+            precision: of the experts' matrix products (autocast); codecs always use float32.
 
         Raises:
-            InvalidInputError: weights that are not float32.
+            InvalidInputError: the weights are not float32.
         """
         device = self._checked_device()
         inputs = inputs.to(device)
@@ -178,7 +178,7 @@ class JointWorldModel(nn.Module):
         return Prediction(future.images, touch)
 
     def _checked_device(self) -> torch.device:
-        """Where the weights are; every one of them has to be float32."""
+        """Device of the weights; raises unless all of them are float32."""
         others = {weight.dtype for weight in self.parameters()} - {torch.float32}
         if others:
             raise InvalidInputError(
@@ -190,10 +190,10 @@ class JointWorldModel(nn.Module):
     def decode(
         self, first: FirstLatents, residuals: JointLatents, *, all_images: bool = True
     ) -> Prediction:
-        """Images and pressures after the first step.
+        """Decode images and pressures after the first step.
 
-        The last latent is decoded by itself, so that its images are the same to the last bit
-        whether the others are decoded or not.
+        The last latent is decoded separately, so that its images are bit-identical whether or not
+        the others are decoded.
         """
         video = first.video[:, None] + self.video_residual_std * _first_zero(residuals.video)
         tactile = first.tactile[:, None] + self.tactile_residual_std * residuals.tactile[:, 1:]
@@ -205,7 +205,7 @@ class JointWorldModel(nn.Module):
 
 @contextmanager
 def _products_in(precision: Precision, device_type: str) -> Iterator[None]:
-    """Matrix products in this precision; norms keep their float32 weights, of which torch warns."""
+    """Autocast matrix products; silences torch's warning about norm weights kept in float32."""
     if precision == "float32":
         yield
         return
@@ -216,7 +216,7 @@ def _products_in(precision: Precision, device_type: str) -> Iterator[None]:
 
 
 def stack_noise(noises: Sequence[JointLatents]) -> JointLatents:
-    """Noise of several rollouts as one batch."""
+    """Stack the noise of several rollouts into a batch."""
     return JointLatents(
         torch.cat([noise.video for noise in noises]), torch.cat([noise.tactile for noise in noises])
     )

@@ -1,7 +1,7 @@
 """Raster of both hands in the head image, drawn from the poses and joint angles of a window.
 
-The paper conditions by AdaLN alone; a raster of the projected hands is our addition. It tells the
-network where in the image the hands will be, to about one cell.
+The paper conditions by AdaLN alone; the raster of the projected hands is an addition. It tells the
+network, to within about one cell, where in the image the hands will be.
 """
 
 from functools import cache
@@ -15,7 +15,7 @@ from dextouch.hands.actions import CAMERA_HEAD as CAMERA
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, WRIST_LEFT, WRIST_RIGHT, pose_from_9d
 from dextouch.hands.robot_hand import RobotHand
 
-# Width of a point's blot, in cells of the raster.
+# Standard deviation of a point's Gaussian blot, in raster cells.
 BLOT_CELLS = 1.0
 _WRIST_AND_SIDES = (("left", WRIST_LEFT, JOINTS_LEFT), ("right", WRIST_RIGHT, JOINTS_RIGHT))
 
@@ -26,7 +26,7 @@ def _hand(side: str) -> RobotHand:
 
 
 def hand_points_m(joints_rad: np.ndarray, *, side: str) -> Float64[np.ndarray, "*batch 21 3"]:
-    """The wrist and four points a finger in wrist coordinates, for joint angles [..., 20]."""
+    """Wrist and four points per finger in wrist coordinates, for joint angles [..., 20]."""
     joints = np.asarray(joints_rad, dtype=np.float64)
     batch = joints.shape[:-1]
     chains = _hand(side).chain_points_m(joints.reshape(-1, 20)).reshape(*batch, 20, 3)
@@ -36,7 +36,7 @@ def hand_points_m(joints_rad: np.ndarray, *, side: str) -> Float64[np.ndarray, "
 def blots(
     pixels: np.ndarray, visible: np.ndarray, *, image_px: int, cells: int
 ) -> Float32[np.ndarray, "*batch cells cells"]:
-    """Blots of points [..., n, 2] on a cells × cells raster over the image; 0 … 1, rows first."""
+    """Gaussian blots of points [..., n, 2] on a cells × cells raster of the image, in 0 … 1."""
     position = pixels.astype(np.float32) * (cells / image_px)
     centres = np.arange(cells, dtype=np.float32) + 0.5
     across = np.exp(-0.5 * np.square((centres - position[..., :1]) / BLOT_CELLS))
@@ -49,12 +49,12 @@ def blots(
 def pose_raster(
     actions: np.ndarray, anchors: np.ndarray, K_head: np.ndarray, *, image_px: int, cells: int
 ) -> Float32[np.ndarray, "batch time 2 cells cells"]:
-    """Both hands where the actions put them, seen by the head camera where they put it.
+    """Rasters of both hands at the poses of the actions, seen by the moving head camera.
 
     Args:
         actions: [B, T, 67] relative to the anchors.
         anchors: [B, 3, 4, 4] T_world of left wrist, right wrist and head camera at step 0.
-        K_head: [B, 3, 3] in pixels of the image; the lens's distortion is not applied.
+        K_head: [B, 3, 3] in pixels of the image; lens distortion is not applied.
         image_px: side of the square image.
         cells: side of the raster.
 
@@ -70,7 +70,7 @@ def pose_raster(
         points_wrist = hand_points_m(actions[..., joints], side=side)
         points_camera = apply(Ts_camera_world @ Ts_world_wrist, points_wrist)
         pixels, visible = _project_each(K_head, points_camera)
-        # Far outside the image a blot is zero anyway; the bound keeps float32 squares finite.
+        # Far outside the image a blot is zero; clipping keeps float32 squares finite.
         pixels = np.clip(pixels, -10.0 * image_px, 10.0 * image_px)
         rasters.append(blots(pixels, visible, image_px=image_px, cells=cells))
     return np.stack(rasters, axis=2)

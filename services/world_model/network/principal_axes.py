@@ -4,7 +4,7 @@ import torch
 from jaxtyping import Float32, Float64
 from torch import Tensor
 
-# No channel is scaled up by more than the root of 1 / this share of the strongest one.
+# No channel is scaled up by more than sqrt(1 / this) relative to the strongest one.
 MIN_RELATIVE_SCALE = 1e-3
 
 
@@ -13,8 +13,8 @@ def principal_axes(
 ) -> tuple[Float32[Tensor, "dim channels"], Float32[Tensor, " channels"]]:
     """Strongest eigenvectors, strongest first, and the root mean square along each.
 
-    Signs are fixed by making each vector's largest entry positive, so that the same data always
-    give the same basis.
+    Each vector's largest entry is made positive, so that equal data give an equal basis.
+
     """
     values, vectors = torch.linalg.eigh(second_moment)
     basis = vectors[:, -num_channels:].flip(1)
@@ -25,10 +25,10 @@ def principal_axes(
 
 
 def root_scale(rms: Float32[Tensor, " channels"]) -> Float32[Tensor, " channels"]:
-    """Divisors that leave channel c with the amplitude sqrt(rms_c / rms_0).
+    """Divisors that give channel c the amplitude sqrt(rms_c / rms_0).
 
-    Full whitening would let the weakest channels, which are mostly noise, weigh as much as the
-    strongest; no whitening would hide everything but those.
+    Full whitening would give the weakest channels, mostly noise, as much weight as the strongest;
+    without whitening the strongest would dominate.
     """
     strongest = rms[0].clamp_min(1e-6)
     return torch.sqrt((rms / strongest).clamp_min(MIN_RELATIVE_SCALE)) * strongest

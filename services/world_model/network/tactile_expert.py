@@ -16,7 +16,7 @@ from services.world_model.network.joint_attention import (
 
 
 class TactileExpert(nn.Module):
-    """The tactile stream: one token a hand and step, the first step clean."""
+    """Tactile stream: one token per hand and step; the first step is clean."""
 
     def __init__(self, config: NetworkConfig, channels: int) -> None:
         super().__init__()
@@ -30,7 +30,7 @@ class TactileExpert(nn.Module):
 
     @staticmethod
     def block(config: NetworkConfig) -> ExpertBlock:
-        """This expert's part of one joint layer."""
+        """This expert's block of one joint layer."""
         return ExpertBlock(
             width=config.tactile_width,
             num_heads=config.num_heads,
@@ -53,7 +53,7 @@ class TactileExpert(nn.Module):
     def finish(
         self, stream: Stream, condition: Float32[Tensor, "batch time 2 width"]
     ) -> Float32[Tensor, "batch time 2 channels"]:
-        """The guess of the clean residual."""
+        """Predict the clean residual."""
         tokens = split_axis(stream.tokens, 1, (condition.shape[1], 2))
         shift, scale = self.modulate_out(condition).chunk(2, dim=-1)
         return self.predict(modulated_norm(tokens, shift, scale))

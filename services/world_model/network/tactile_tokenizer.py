@@ -1,8 +1,8 @@
 """Tactile tokenizer ("Split-Hands"): one latent for the pressures of each hand and step.
 
-All ten fingertips share one encoder and both palms another; a pad is known by its place in the
-hand's latent. Pressures are coded by their square root, which gives light touch its weight. Tips
-keep all sixteen values, palms their strongest axes. Closed form, fitted once, then frozen.
+All ten fingertips share one encoder and both palms another; a pad is identified by its position in
+the hand's latent. Pressures are encoded by their square root, which gives light touch more weight.
+Tips keep all sixteen values, palms their strongest axes. Closed form, fitted once, then frozen.
 """
 
 import torch
@@ -13,17 +13,17 @@ from dextouch.tactile.layout import NUM_TAXELS, NUM_TIP_TAXELS
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.principal_axes import principal_axes, root_scale
 
-# Palms get this share of the amplitude: found best against tips of amplitude one (touch study).
+# Amplitude of palms relative to that of tips; the best value in an ablation on touch.
 PALM_SCALE = 0.7
-# Of checkpoints that do not say what pressure they were trained up to: twice the peak of eight
-# demonstrations of the twin's first two tasks.
+# For checkpoints without a stored training peak: twice the peak of eight demonstrations of the
+# twin's first two tasks.
 UNKNOWN_PEAK_KPA = 200.0
 
 
 class TactileTokenizer(nn.Module):
     """Frozen encoder and decoder of taxels; zero pressure is the zero latent.
 
-    `peak_kpa` is the highest pressure of training.
+    `peak_kpa` is the highest pressure in training.
     """
 
     tip_scale: Tensor
@@ -41,10 +41,10 @@ class TactileTokenizer(nn.Module):
         self.register_buffer("palm_scale", torch.ones(config.palm_channels))
 
     def fit(self, tactile_kpa: Float32[Tensor, "n 2 320"]) -> None:
-        """Take scales and palm axes from training touch (both hands alike)."""
+        """Fit scales and palm axes to training touch (both hands alike)."""
         roots = root_pressure(tactile_kpa).double()
         palms = roots[..., NUM_TIP_TAXELS:].reshape(-1, NUM_TAXELS - NUM_TIP_TAXELS)
-        # Not centred: the mean of touch is no touch that ever happens.
+        # Not centred: the mean touch is not a touch that occurs.
         basis, rms = principal_axes(palms.T @ palms / len(palms), self.palm_basis.shape[1])
         tips_rms = roots[..., :NUM_TIP_TAXELS].square().mean().sqrt()
         self.palm_basis.copy_(basis)
@@ -57,7 +57,7 @@ class TactileTokenizer(nn.Module):
         tactile_kpa: Float32[Tensor, "batch steps 2 320"],
         first_kpa: Float32[Tensor, "batch 2 320"],
     ) -> Float32[Tensor, "batch steps 2 320"]:
-        """Decoded pressures, none above both the peak of training and the first touch's own."""
+        """Clip decoded pressures to the larger of the training peak and the first touch's peak."""
         highest_kpa = torch.maximum(first_kpa.flatten(1).amax(dim=1), self.peak_kpa)
         return torch.minimum(tactile_kpa, highest_kpa[:, None, None, None])
 
@@ -78,5 +78,5 @@ class TactileTokenizer(nn.Module):
 
 
 def root_pressure(tactile_kpa: Float32[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """Square root of pressures, those below zero taken as zero."""
+    """Square root of pressures; negative ones count as zero."""
     return tactile_kpa.clamp_min(0.0).sqrt()

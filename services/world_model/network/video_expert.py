@@ -20,7 +20,7 @@ from services.world_model.network.joint_attention import (
 
 
 class VideoExpert(nn.Module):
-    """The visual stream: `tokens_per_latent` tokens a latent frame, the first frame clean."""
+    """Visual stream: `tokens_per_latent` tokens per latent frame; the first frame is clean."""
 
     def __init__(self, config: NetworkConfig) -> None:
         super().__init__()
@@ -38,7 +38,7 @@ class VideoExpert(nn.Module):
 
     @staticmethod
     def block(config: NetworkConfig) -> ExpertBlock:
-        """This expert's part of one joint layer."""
+        """This expert's block of one joint layer."""
         return ExpertBlock(
             width=config.video_width,
             num_heads=config.num_heads,
@@ -66,7 +66,7 @@ class VideoExpert(nn.Module):
     def finish(
         self, stream: Stream, condition: Float32[Tensor, "batch latents width"]
     ) -> Float32[Tensor, "batch latents tokens channels"]:
-        """The guess of the clean residual."""
+        """Predict the clean residual."""
         tokens = split_axis(stream.tokens, 1, (condition.shape[1], -1))
         shift, scale = (
             self.modulate_out(condition)[:, :, None]
@@ -78,7 +78,7 @@ class VideoExpert(nn.Module):
     def raster_tokens(
         self, raster: Float32[Tensor, "batch time 2 cells cells"]
     ) -> Float32[Tensor, "batch latents tokens values"]:
-        """The raster cut like the image: four steps, four by four cells, two hands a token."""
+        """The raster cut into image tokens: four steps, four by four cells and two hands each."""
         first = raster[:, :1].expand(-1, FRAMES_PER_LATENT, -1, -1, -1)
         padded = torch.cat([first, raster[:, 1:]], dim=1)
         groups = split_axis(padded, 1, (-1, FRAMES_PER_LATENT))

@@ -1,7 +1,8 @@
 """Visual codec: latent tokens of 1 + 4k images by principal axes of 8×8×4 patches.
 
-The first image stands alone (repeated four times), then groups of four, as causal video
-autoencoders do. Closed form: fitted once on training images, then frozen in the checkpoint.
+The first image forms a group of its own (repeated four times), followed by groups of four, as in
+causal video autoencoders. Closed form: fitted once on training images, then frozen in the
+checkpoint.
 """
 
 import torch
@@ -14,7 +15,7 @@ from services.world_model.network.principal_axes import principal_axes, root_sca
 
 
 class VisualCodec(nn.Module):
-    """Linear tokenizer: a token is two by two patches of one latent frame."""
+    """Linear tokenizer; a token covers two by two patches of one latent frame."""
 
     mean: Tensor
     basis: Tensor
@@ -31,7 +32,7 @@ class VisualCodec(nn.Module):
         self.register_buffer("scale", torch.ones(config.codec_channels))
 
     def fit(self, windows: UInt8[Tensor, "n time px px 3"], *, batch: int = 16) -> None:
-        """Take mean and principal axes from windows of images."""
+        """Fit mean and principal axes to windows of images."""
         size = len(self.mean)
         total = torch.zeros(size, dtype=torch.float64)
         moment = torch.zeros(size, size, dtype=torch.float64)
@@ -83,10 +84,10 @@ class VisualCodec(nn.Module):
 
 
 def to_unit(images: UInt8[Tensor, "..."]) -> Float32[Tensor, "..."]:
-    """uint8 images as 0 … 1."""
+    """Scale uint8 images to 0 … 1."""
     return images.float() / 255.0
 
 
 def to_uint8(images: Float32[Tensor, "..."]) -> UInt8[Tensor, "..."]:
-    """Images in 0 … 1 as uint8."""
+    """Convert images in 0 … 1 to uint8."""
     return (images * 255.0).round().clamp(0, 255).to(torch.uint8)

@@ -1,1 +1,1 @@
-"""Head images drawn from a state: what the world model shows of a future that it imagined."""
+"""Renderer: draws head camera images of the scene states that the world model predicts."""

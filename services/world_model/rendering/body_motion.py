@@ -1,4 +1,4 @@
-"""How far hands and objects moved in the image against a start image that followed the camera."""
+"""Image motion of hands and objects relative to the start image warped by the camera motion."""
 
 from dataclasses import dataclass
 
@@ -11,16 +11,16 @@ from services.world_model.rendering.camera_motion import CameraMotion
 from services.world_model.rendering.hand_raster import MIN_DEPTH_M, base_points_world
 from services.world_model.rendering.scene_states import SceneStates
 
-# A body that moved less than the first against the warped image did not move; one that moved more
-# than the second did; in between its surroundings are mixed.
+# A body shifted less than the first against the warped image is still, one shifted more than the
+# second has moved; in between its motion share is interpolated.
 STILL_PX, MOVED_PX = 0.05, 0.3
 
 
 @dataclass(frozen=True)
 class Bodies:
-    """Hands and boxes of objects seen by one camera a state.
+    """Hands and object boxes in one camera per state.
 
-    `pixels` and `in_front` are of 22 points of each hand, then of the eight corners of each box.
+    `pixels` and `in_front` cover 22 points of each hand, then the eight corners of each box.
     """
 
     Ts_camera_box: Float64[np.ndarray, "n k 4 4"]
@@ -30,7 +30,7 @@ class Bodies:
 
     @classmethod
     def seen(cls, states: SceneStates, boxes_m: np.ndarray, K: np.ndarray) -> "Bodies":
-        """Bodies of states, whose objects have boxes [n, k, 6], by cameras [n, 3, 3]."""
+        """Bodies of states with object boxes [n, k, 6], seen by cameras [n, 3, 3]."""
         T_camera_world = invert(states.Ts_world_camera)
         Ts_object_box = np.tile(np.eye(4), (*boxes_m.shape[:2], 1, 1))
         Ts_object_box[..., :3, 3] = boxes_m[..., :3]
@@ -56,15 +56,15 @@ def motion_shares(
     owner: Int64[np.ndarray, " n"],
     motion: CameraMotion,
 ) -> Float64[np.ndarray, "n bodies"]:
-    """From 0 (still) to 1 (moved) for left hand, right hand and each object.
+    """Motion share, from 0 (still) to 1 (moved), of left hand, right hand and each object.
 
-    A body moves when any of its points is elsewhere than the warp of the start image shows it.
+    A body moves when any of its points leaves its position in the warped start image.
     """
     there = before.pixels[owner]
     shift = np.linalg.norm(motion.to_start(now.pixels) - there, axis=-1)
     both = before.in_front[owner] & now.in_front
     shift = np.where(both, shift, 0.0)
-    # A point that came before the camera, or left it, has moved.
+    # Points that crossed the camera plane have moved.
     shift[before.in_front[owner] != now.in_front] = np.inf
     hands, boxes = shift[:, :44].reshape(-1, 2, 22), shift[:, 44:].reshape(len(owner), -1, 8)
     largest = np.concatenate([hands.max(axis=-1), boxes.max(axis=-1)], axis=1)

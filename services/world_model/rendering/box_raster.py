@@ -1,7 +1,7 @@
-"""Objects as boxes: pixels' rays against the objects' bounding boxes, nearest box first.
+"""Ray casting of objects as bounding boxes; the nearest box wins.
 
-A box that is hit carries the start image's texture: the point that is hit moves with the object
-back to where it was at the start and takes the colour the start image shows there.
+Hits take their colour from the start image: the point moves with its object back to its pose at
+the start and is projected there.
 """
 
 from dataclasses import dataclass
@@ -11,9 +11,9 @@ from jaxtyping import Bool, Float, Float64, Int64
 
 from dextouch.geometry.transforms import invert, transform_from_pose
 
-# Boxes thinner than this are drawn as thick as this.
+# Minimum half size of a box; thinner boxes are drawn this thick.
 MIN_HALF_M = 1e-3
-# What is nearer along the optical axis is not hit, and not seen.
+# Points nearer along the optical axis are neither hit nor visible.
 NEAR_M = 0.02
 _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], dtype=float)
 
@@ -22,8 +22,8 @@ _CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1
 class BoxHits:
     """Pixels that see a box, each with its nearest one.
 
-    `place` numbers the pixels of all images, row by row; `local` is the point of entry in units of
-    the half sizes, `thickness_m` the difference of depth between entry and exit.
+    `place` is the flat pixel index over all images, row by row; `local` is the entry point in units
+    of the half sizes, `thickness_m` the difference in depth between entry and exit.
     """
 
     place: Int64[np.ndarray, " hits"]
@@ -35,7 +35,7 @@ class BoxHits:
 
 
 def object_transforms(poses: Float64[np.ndarray, "*n 7"]) -> Float64[np.ndarray, "*n 4 4"]:
-    """T_world_object; a quaternion of length zero counts as no turn."""
+    """T_world_object; a zero quaternion counts as the identity."""
     poses = np.array(poses, dtype=np.float64)
     lengths = np.linalg.norm(poses[..., 3:], axis=-1)
     poses[lengths < 1e-9, 3:] = [1.0, 0.0, 0.0, 0.0]
@@ -46,7 +46,7 @@ def object_transforms(poses: Float64[np.ndarray, "*n 7"]) -> Float64[np.ndarray,
 def box_corners(
     Ts_camera_box: Float64[np.ndarray, "*n 4 4"], half_m: Float64[np.ndarray, "*n 3"]
 ) -> Float64[np.ndarray, "*n 8 3"]:
-    """Corners of boxes in the camera."""
+    """Corners of boxes in camera coordinates."""
     corners = _CORNERS * half_m[..., None, :]
     R_box_camera = np.swapaxes(Ts_camera_box[..., :3, :3], -1, -2)
     return np.asarray(corners @ R_box_camera + Ts_camera_box[..., None, :3, 3])
@@ -59,10 +59,10 @@ def cast_boxes(
     K: Float64[np.ndarray, "n 3 3"],
     shape_px: tuple[int, int],
 ) -> BoxHits:
-    """Rays of pixel centres against boxes (slab method of Kay and Kajiya, 1986).
+    """Intersect the rays of pixel centres with boxes (slab method of Kay and Kajiya, 1986).
 
-    Only rays inside the rectangle around a box's corners are tried; a box with corners behind the
-    camera is tried everywhere.
+    Only pixels in the bounding rectangle of a box's corners are tested; a box with corners behind
+    the camera is tested everywhere.
     """
     half_m = np.maximum(half_m, MIN_HALF_M)
     image, slot, v, u = np.nonzero(_tried(Ts_camera_box, half_m, present, K, shape_px))
@@ -71,14 +71,14 @@ def cast_boxes(
     pixels = np.stack([u + 0.5, v + 0.5, np.ones(len(u))], axis=1)
     directions = (unprojected @ pixels[..., None])[..., 0]
     origins, half = Ts_box_camera[image, slot, :3, 3], half_m[image, slot]
-    # A ray along a face divides by almost nothing, never by nothing.
+    # Avoid division by zero for rays parallel to a face.
     inverse = 1.0 / np.where(np.abs(directions) < 1e-12, 1e-12, directions)
     middle, reach = -origins * inverse, half * np.abs(inverse)
     enter, leave = (middle - reach).max(axis=1), (middle + reach).min(axis=1)
     height, width = shape_px
     place = (image * height + v) * width + u
     hit = np.flatnonzero((leave > enter) & (enter > NEAR_M))
-    # By pixel, then by depth: the first of each pixel is the nearest.
+    # Sorted by pixel, then depth: the first hit of each pixel is the nearest.
     hit = hit[np.lexsort((enter[hit], place[hit]))]
     seen = hit[np.diff(place[hit], prepend=-1) > 0]
     entry = origins[seen] + directions[seen] * enter[seen, None]
@@ -95,7 +95,7 @@ def _tried(
     K: np.ndarray,
     shape_px: tuple[int, int],
 ) -> Bool[np.ndarray, "n k h w"]:
-    """Pixels inside the rectangle around each present box."""
+    """Pixels in the bounding rectangle of each present box."""
     corners = box_corners(Ts_camera_box, half_m)
     depth = corners[..., 2:]
     pixels = (corners @ np.swapaxes(K, -1, -2)[:, None])[..., :2] / np.maximum(depth, NEAR_M)
@@ -116,13 +116,13 @@ def positions_at_start(
     half_m: Float64[np.ndarray, "n k 3"],
     K: Float64[np.ndarray, "n 3 3"],
 ) -> Float64[np.ndarray, "hits 2"]:
-    """Pixels of the start image that show what is hit; far outside where it was not before it.
+    """Start image pixels of the hit points; far outside for points behind the start camera.
 
     Args:
         hits: from `cast_boxes`.
         Ts_start_box: pose of each box in the start camera, at the start.
-        half_m: half sizes.
-        K: of the start camera.
+        half_m: half sizes of the boxes.
+        K: intrinsics of the start camera.
     """
     points = hits.local * np.maximum(half_m, MIN_HALF_M)[hits.image, hits.slot]
     projections = (K[:, None] @ Ts_start_box[..., :3, :])[hits.image, hits.slot]
@@ -138,7 +138,7 @@ def colours_at_positions(
     owner: Int64[np.ndarray, " points"],
     positions: Float64[np.ndarray, "points 2"],
 ) -> Float64[np.ndarray, "points c"]:
-    """Bilinear samples of several images at positions in pixels; outside, the nearest border."""
+    """Bilinear samples of images at positions in pixels; outside, the nearest border pixel."""
     _, _, height, width = layers.shape
     limits = np.array([width - 1, height - 1])
     at = (positions - 0.5).clip(0.0, limits)

@@ -1,7 +1,7 @@
-"""What a known motion of the head camera does to an image of the table.
+"""Image motion caused by a known motion of the head camera over the table.
 
 Pixels of the table plane (z = 0 in the world) move by a homography; rays that meet the plane
-farther than `FAR_M`, or never, move as if they came from infinitely far.
+beyond `FAR_M`, or never, move as if they came from infinity.
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ from torch.nn import functional
 from dextouch.geometry.transforms import invert
 
 FAR_M = 20.0
-# A camera nearer to the plane than this sees it as a line.
+# A camera nearer to the plane than this sees it edge-on.
 MIN_HEIGHT_M = 1e-3
-# Positions farther outside than this many image sides are all the same to a border.
+# Positions farther outside than this many image sides all sample the border.
 _MAX_SIDES = 4.0
 _MIN_DEPTH = 1e-9
 Interpolation = Literal["bilinear", "bicubic"]
@@ -32,11 +32,11 @@ def pixel_centres(height_px: int, width_px: int) -> Float64[np.ndarray, "pixels 
 
 @dataclass(frozen=True)
 class CameraMotion:
-    """How pixels of later images map to pixels of start images.
+    """Maps from pixels of later images to pixels of start images.
 
     Attributes:
         table: homogeneous pixels of a later image to those of the start, on the table.
-        infinity: the same for what is infinitely far away.
+        infinity: the same for points at infinity.
         inverse_depth: row vectors whose product with a homogeneous pixel is 1 / (depth of the
             table there), in 1/m; zero for a camera that sees the table as a line.
     """
@@ -49,7 +49,7 @@ class CameraMotion:
     def between(
         cls, K: np.ndarray, T_world_start: np.ndarray, T_world_camera: np.ndarray
     ) -> "CameraMotion":
-        """Of cameras [n, 4, 4] with equal K [n, 3, 3] at the start and later."""
+        """Motion between the start and later cameras [n, 4, 4], with equal K [n, 3, 3]."""
         R_start_camera = np.swapaxes(T_world_start[:, :3, :3], -1, -2) @ T_world_camera[:, :3, :3]
         infinity = K @ R_start_camera @ np.linalg.inv(K)
         is_above = (np.abs(T_world_camera[:, 2, 3]) > MIN_HEIGHT_M)[:, None, None]
@@ -66,12 +66,12 @@ class CameraMotion:
     def to_start(
         self, pixels: Float64[np.ndarray, "n points 2"]
     ) -> Float64[np.ndarray, "n points 2"]:
-        """Where in the start image the table or the far background at these pixels is."""
+        """Start image positions of the table or the far background at these pixels."""
         homogeneous = np.concatenate([pixels, np.ones((*pixels.shape[:2], 1))], axis=2)
         return np.swapaxes(self._to_start(np.swapaxes(homogeneous, 1, 2)), 1, 2)
 
     def image_positions(self, shape_px: tuple[int, int]) -> Float32[np.ndarray, "n h w 2"]:
-        """Where in the start image each pixel of the later image is, at most four sides away."""
+        """Start image position of each pixel of the later image, at most four sides away."""
         height, width = shape_px
         centres = pixel_centres(height, width)
         homogeneous = np.ones((3, height * width), dtype=np.float32)
@@ -88,14 +88,14 @@ class CameraMotion:
         is_near &= chosen[:, 2:] > _MIN_DEPTH
         if not is_near.all():
             chosen = np.where(is_near, chosen, self.infinity.astype(kind) @ homogeneous)
-        # What is behind the start camera was not in its image: far to the left and above.
+        # Points behind the start camera were not in its image: move them far to the left and top.
         seen = chosen[:, 2:] > _MIN_DEPTH
         positions = chosen[:, :2] / np.where(seen, chosen[:, 2:], 1.0)
         return positions if seen.all() else np.where(seen, positions, kind.type(-1e6))
 
 
 def _plane_projection(K: np.ndarray, T_world_camera: np.ndarray) -> Float64[np.ndarray, "*b 3 3"]:
-    """Matrices that take points (x, y, 1) of the table to pixels times depth."""
+    """Matrices that project points (x, y, 1) of the table to pixels times depth."""
     return np.asarray(K @ invert(T_world_camera)[..., :3, [0, 1, 3]])
 
 
@@ -105,7 +105,7 @@ def sample_images(
     *,
     interpolation: Interpolation,
 ) -> Float32[Tensor, "n c rows cols"]:
-    """Images at positions in pixels; outside an image its nearest border."""
+    """Sample images at positions in pixels; outside, the nearest border pixel."""
     sides = torch.tensor([images.shape[3], images.shape[2]], dtype=torch.float32)
     return functional.grid_sample(
         images,
@@ -119,7 +119,7 @@ def sample_images(
 def is_inside(
     positions: Float[np.ndarray, "*b 2"], shape_px: tuple[int, int]
 ) -> Bool[np.ndarray, "*b"]:
-    """Whether positions in pixels lie in an image."""
+    """Whether positions in pixels lie inside an image."""
     height, width = shape_px
     u, v = positions[..., 0], positions[..., 1]
     return np.asarray((u >= 0) & (u <= width) & (v >= 0) & (v <= height))

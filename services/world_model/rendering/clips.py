@@ -1,4 +1,4 @@
-"""Episodes as the renderer learns from them: images at some steps, and the states there."""
+"""Training clips of the renderer: images of an episode with the states they show."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from services.world_model.rendering.scene_states import SceneStates
 
 @dataclass(frozen=True)
 class SceneClip:
-    """Images of one episode, in the order of `steps`, with the true state at each of them.
+    """Images of one episode at `steps`, with the true state at each of them.
 
-    `boxes_m` are centre and half sizes (x y z, x y z) of each object's box in its own frame.
+    `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
     """
 
     steps: Int64[np.ndarray, " images"]
@@ -39,7 +39,7 @@ class SceneClip:
 def gather(
     clips: Sequence[SceneClip], rows: Int64[np.ndarray, "b 2"]
 ) -> tuple[Scenes, UInt8[np.ndarray, "b h w 3"]]:
-    """Images with their states at rows (clip, image), as scenes; slots are filled up with none."""
+    """Images and states at rows (clip, image), as scenes; missing object slots are empty."""
     num_slots = max(len(clips[clip].boxes_m) for clip, _ in rows)
     boxes_m = np.zeros((len(rows), num_slots, 6))
     poses = np.zeros((len(rows), num_slots, 7))

@@ -1,4 +1,4 @@
-"""Every number that fixes the renderer's shape; stored with its weights."""
+"""Configuration of the renderer's network; stored with its weights."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -6,9 +6,9 @@ from services.world_model.rendering.camera_motion import Interpolation
 
 
 class RendererConfig(BaseModel):
-    """Shape of the renderer's network and of what it is given.
+    """Shape of the renderer's network and of its inputs.
 
-    Images have any sides divisible by 2^(number of widths); weights do not depend on their size.
+    Image sides must be divisible by 2^(number of widths); weights do not depend on the image size.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -17,15 +17,15 @@ class RendererConfig(BaseModel):
         default=(32, 64, 96), min_length=1, max_length=4, description="channels at 1/2, 1/4, …"
     )
     depths: tuple[int, ...] = Field(
-        default=(1, 1, 2), min_length=1, max_length=4, description="residual blocks a level"
+        default=(1, 1, 2), min_length=1, max_length=4, description="residual blocks per level"
     )
-    stem_px: int = Field(default=1, ge=1, le=5, description="side of the first convolution")
+    stem_px: int = Field(default=1, ge=1, le=5, description="kernel size of the first convolution")
     interpolation: Interpolation = Field(
-        default="bicubic", description="of the start image under the camera's motion"
+        default="bicubic", description="interpolation of the warped start image"
     )
     redraws_table: bool = Field(
         default=True,
-        description="whether a moving camera alone opens the whole image to the network",
+        description="let the network redraw the whole image when only the camera moves",
     )
 
     @property

@@ -1,7 +1,7 @@
-"""How true drawn images are, per chunk of steps, against a copy and a warp of the start image.
+"""Accuracy of drawn images per chunk of steps, beside copying and warping the start image.
 
-Three figures: PSNR of whole images, PSNR where objects are or were (a few pixels around), and
-sharpness, the mean absolute Laplacian as a share of the true images'.
+Three metrics: PSNR of whole images, PSNR around objects (where they are or were, plus a few
+pixels), and sharpness, the mean absolute Laplacian relative to the true images'.
 """
 
 from collections.abc import Callable, Sequence
@@ -26,7 +26,7 @@ _BATCH = 32
 
 @dataclass(frozen=True)
 class DrawingFigures:
-    """Truth of the images of one chunk; `psnr_objects_db` is NaN without any object."""
+    """Image metrics of one chunk; `psnr_objects_db` is NaN without any object."""
 
     psnr_db: float
     psnr_objects_db: float
@@ -38,7 +38,7 @@ StatesOf = Callable[[int, SceneClip], SceneStates]
 
 @dataclass(frozen=True)
 class DrawingReport:
-    """Figures by method (`copy`, `warp`, `drawn`) and by chunk; chunk 0 holds steps 1 … 16."""
+    """Metrics by method (`copy`, `warp`, `drawn`) and by chunk; chunk 0 holds steps 1 … 16."""
 
     chunks: dict[str, list[DrawingFigures]]
     num_images: int
@@ -51,14 +51,14 @@ def evaluate_drawing(
     states_of: StatesOf | None = None,
     chunk_steps: int = CHUNK_STEPS,
 ) -> DrawingReport:
-    """Draw every image of every clip from the clip's first one.
+    """Draw every image of every clip from the clip's first image and compare with the truth.
 
     Args:
-        network: to be judged.
+        network: the network to evaluate.
         clips: true images and states.
-        states_of: what the renderer is told instead of a clip's true states (number of the clip,
-            clip), for example poses that a model imagined.
-        chunk_steps: steps a chunk.
+        states_of: states given to the renderer instead of a clip's true ones, from the clip's
+            number and the clip; for example predicted poses.
+        chunk_steps: steps per chunk.
 
     Raises:
         InvalidInputError: no clips.
@@ -82,19 +82,19 @@ def evaluate_drawing(
 
 
 class _Sums:
-    """Errors and sharpness, added up by method and chunk."""
+    """Errors and sharpness summed by method and chunk."""
 
     def __init__(self) -> None:
         self.num_images = 0
         self._rows: dict[str, dict[int, list[Float64[np.ndarray, 5]]]] = {}
 
     def add(self, method: str, chunks: np.ndarray, rows: Float64[np.ndarray, "n 5"]) -> None:
-        """One row an image: squared error, the objects' one, their pixels, two Laplacians."""
+        """Add rows, one per image: squared error, that of objects, their pixels, two Laplacians."""
         for chunk, row in zip(chunks.tolist(), rows, strict=True):
             self._rows.setdefault(method, {}).setdefault(chunk, []).append(row)
 
     def report(self) -> DrawingReport:
-        """All figures."""
+        """All metrics."""
         chunks = {
             method: [_figures(np.stack(by_chunk[chunk])) for chunk in sorted(by_chunk)]
             for method, by_chunk in self._rows.items()
@@ -115,7 +115,7 @@ def _figures(rows: Float64[np.ndarray, "n 5"]) -> DrawingFigures:
 def _drawn(
     network: RendererNetwork, scenes: Scenes, true: SceneStates, told: SceneStates
 ) -> tuple[dict[str, np.ndarray], Bool[np.ndarray, "n h w"]]:
-    """Warped and drawn images, and where objects truly are or were."""
+    """Warped and drawn images, and the true regions of objects."""
     owner = np.zeros(len(true), dtype=np.int64)
     with torch.inference_mode():
         inputs = drawing_inputs(scenes, told, owner, network.config)
@@ -129,7 +129,7 @@ def _drawn(
 
 
 def objects_region(shown: torch.Tensor) -> Bool[np.ndarray, "n h w"]:
-    """Pixels at most five away from one that shows an object now or did at the start."""
+    """Pixels within five pixels of an object, now or at the start."""
     side = 2 * _REACH_PX + 1
     grown = functional.max_pool2d(shown[:, None], side, stride=1, padding=_REACH_PX)
     return np.asarray(grown[:, 0].numpy() > 0.5)
@@ -158,7 +158,7 @@ def sharpness(images: Float64[np.ndarray, "n h w 3"]) -> Float64[np.ndarray, " n
 
 
 def summary_lines(report: DrawingReport) -> list[str]:
-    """One line a method: PSNR of all / of objects / sharpness, chunk by chunk."""
+    """One line per method: PSNR of all / of objects / sharpness, chunk by chunk."""
     return [
         f"{method:<6}"
         + "  ".join(

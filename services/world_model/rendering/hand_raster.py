@@ -1,7 +1,7 @@
-"""Both hands as coloured bones: points of the kinematic chains, splatted into the image.
+"""Drawing of both hands as coloured bones: points of the kinematic chains, splatted.
 
-Each bone is a ribbon of points that faces the camera; a point keeps the colour that the start
-image shows where it was at the start. Nearer points win over farther ones by a soft depth test.
+Each bone is a ribbon of points that faces the camera; a point keeps the colour of its position in
+the start image. A soft depth test resolves occlusion.
 """
 
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ from services.world_model.rendering.scene_states import SceneStates
 
 SIDES = ("left", "right")
 MIN_DEPTH_M = 0.05
-# Half the width of a drawn bone, and how far the forearm is drawn behind the wrist.
+# Radii of drawn bones and forearms, and the length of the forearm drawn behind the wrist.
 _BONE_RADIUS_M, _FOREARM_RADIUS_M, _FOREARM_M = 0.008, 0.024, 0.06
-# Splats lose to others that are this much nearer.
+# Depth scale of the soft depth test.
 _SOFT_DEPTH_M = 0.012
-# How much of a pixel a single splat in its middle covers: 1 − exp(−this).
+# A single centred splat covers 1 − exp(−this) of a pixel.
 _OPACITY = 1.6
 _PALM_ROWS, _PALM_COLUMNS = 7, 9
 _WRIST, _FOREARM_END = 0, 21
@@ -29,7 +29,7 @@ _KNUCKLES = (5, 9, 13, 17)
 
 @dataclass(frozen=True)
 class _Ribbons:
-    """Fixed recipe of a hand's points: mixtures of 22 base points, and the ribbons' widths."""
+    """Fixed weights of a hand's points over 22 base points, and their offsets across ribbons."""
 
     mixture: Float64[np.ndarray, "points 22"]
     direction: Float64[np.ndarray, "points 22"]
@@ -38,7 +38,7 @@ class _Ribbons:
 
 @dataclass(frozen=True)
 class HandPoints:
-    """A hand's points on an image: pixels, depths, and which lie in front of the camera."""
+    """Points of both hands in an image: pixels, depths, and which are in front of the camera."""
 
     pixels: Float64[np.ndarray, "n 2 points 2"]
     depth_m: Float64[np.ndarray, "n 2 points"]
@@ -47,7 +47,7 @@ class HandPoints:
 
 @dataclass(frozen=True)
 class HandRaster:
-    """Both hands on images: coverage (0 … 1) of left and right, colour, nearness in 1/m."""
+    """Both hands in images: coverage (0 … 1) of left and right, colour, inverse depth in 1/m."""
 
     coverage: Float32[np.ndarray, "n 2 h w"]
     colour: Float32[np.ndarray, "n 3 h w"]
@@ -84,7 +84,7 @@ def _ribbons() -> _Ribbons:
 
 
 def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
-    """Wrist, four points a finger and a point on the forearm, of both hands."""
+    """Wrist, four points per finger and a point on the forearm, for both hands."""
     hands = []
     for index, side in enumerate(SIDES):
         points = hand_points_m(states.joints_rad[:, index], side=side)
@@ -97,13 +97,13 @@ def base_points_world(states: SceneStates) -> Float64[np.ndarray, "n 2 22 3"]:
 def project_hands(
     base_world: np.ndarray, K: np.ndarray, T_world_camera: np.ndarray, *, middle_only: bool = False
 ) -> HandPoints:
-    """All points of both hands seen by a camera.
+    """Project all points of both hands into a camera.
 
     Args:
         base_world: [n, 2, 22, 3] from `base_points_world`.
         K: [n, 3, 3] in pixels.
         T_world_camera: [n, 4, 4].
-        middle_only: every point on the middle of its bone.
+        middle_only: put every point on the centre line of its bone.
     """
     ribbons = _ribbons()
     T_camera_world = invert(T_world_camera)[:, None]
@@ -123,7 +123,7 @@ def project_hands(
 def colours_at(
     images: Float32[np.ndarray, "b 3 h w"], points: HandPoints
 ) -> Float32[np.ndarray, "b 2 points 3"]:
-    """What images in 0 … 1 show at the pixel of each point; black for points outside."""
+    """Colours of images in 0 … 1 at the pixel of each point; black for points outside."""
     _, _, height, width = images.shape
     u = np.floor(points.pixels[..., 0].clip(-1, width)).astype(np.int64)
     v = np.floor(points.pixels[..., 1].clip(-1, height)).astype(np.int64)
@@ -134,13 +134,13 @@ def colours_at(
 
 
 def splat_hands(points: HandPoints, colours: np.ndarray, shape_px: tuple[int, int]) -> HandRaster:
-    """Points of both hands drawn with their colours [n, 2, points, 3]; nearer ones win."""
+    """Splat points of both hands with their colours [n, 2, points, 3]; nearer points win."""
     height, width = shape_px
     num_images = len(points.pixels)
     place, weight, source = _taps(points, shape_px)
     size = num_images * height * width
     depth = points.depth_m.reshape(-1)[source]
-    # Weights of about one at a metre: exp does not overflow for any depth above MIN_DEPTH_M.
+    # Weights are about one at a metre: exp does not overflow for any depth above MIN_DEPTH_M.
     near = weight * np.exp(np.minimum((1.0 - depth) / _SOFT_DEPTH_M, 300.0))
     is_right = (source // points.depth_m.shape[2]) % 2 == 1
     total = np.bincount(place, near, size)
@@ -165,7 +165,7 @@ def splat_hands(points: HandPoints, colours: np.ndarray, shape_px: tuple[int, in
 def _taps(
     points: HandPoints, shape_px: tuple[int, int]
 ) -> tuple[Int64[np.ndarray, " taps"], Float64[np.ndarray, " taps"], Int64[np.ndarray, " taps"]]:
-    """Flat pixel, weight and point number of the four neighbours of each visible point."""
+    """Flat pixel, weight and point index of the four neighbours of each visible point."""
     height, width = shape_px
     flat = points.pixels.reshape(-1, 2) - 0.5
     shown = points.in_front.ravel() & (flat > -1).all(axis=1)

@@ -1,7 +1,7 @@
-"""What the renderer's network is given: the warped start image, drawn hands, drawn objects.
+"""Network inputs of the renderer: warped start image, drawn hands and drawn objects.
 
-Everything is computed for all asked images at once. `change` says where the network may draw: it
-is zero, and the image therefore exactly the warped start, where no body moved against the table
+All requested images are computed at once. `change` masks where the network may draw: it is zero,
+and the image therefore exactly the warped start image, where no body moved relative to the table
 and the camera stood still.
 """
 
@@ -38,20 +38,20 @@ from services.world_model.rendering.scene_states import SceneStates
 
 FINE_CHANNELS: Final = 15
 COARSE_CHANNELS: Final = 13
-# How far around a moved body the network may draw.
+# Margin around a moved body in which the network may draw.
 _REACH_PX = 4
 _COVERED = 0.05
-# The whole image is the network's once a pixel of it moved this far.
+# The network may redraw the whole image once a corner of it moved this far.
 _CAMERA_MOVED_PX = 0.25
-# Bring lengths of things that hands hold, and nearness of things at arm's length, to about one.
+# Scale lengths of held objects, and nearness at arm's length, to about one.
 _PER_M, _NEARNESS_M = 10.0, 0.5
 
 
 @dataclass(frozen=True)
 class Scenes:
-    """Start images with all that is known of them.
+    """Start images with their camera, states and object boxes.
 
-    `boxes_m` are centre and half sizes (x y z, x y z) of each object's box in its own frame.
+    `boxes_m` holds centre and half sizes (x y z, x y z) of each object's box in the object frame.
     """
 
     images: UInt8[np.ndarray, "b h w 3"]
@@ -62,9 +62,9 @@ class Scenes:
 
 @dataclass(frozen=True)
 class DrawingInputs:
-    """Channels at full size and at half size, and where the network may draw.
+    """Channels at full and half size, and the mask in which the network may draw.
 
-    The fine channels begin with the sources that are mixed: the colours of the warped start, of
+    The fine channels begin with the colours that are blended: those of the warped start image, of
     the objects and of the hands.
     """
 
@@ -75,7 +75,7 @@ class DrawingInputs:
 
 @dataclass(frozen=True)
 class _Start:
-    """Start images as planes: colours, coverage by each hand, pixels that show objects."""
+    """Start images as planes: colours, coverage by each hand, object pixels."""
 
     rgb: Float32[np.ndarray, "b 3 h w"]
     hands: Float32[np.ndarray, "b 2 h w"]
@@ -85,7 +85,7 @@ class _Start:
 
 @dataclass(frozen=True)
 class PreparedScenes:
-    """Scenes with all that does not depend on what is drawn of them: done once for all images."""
+    """Scenes with everything that does not depend on the states to draw, computed once."""
 
     scenes: Scenes
     before: Bodies
@@ -100,7 +100,7 @@ class PreparedScenes:
 
 @dataclass(frozen=True)
 class _SeenObjects:
-    """Pixels that show objects, the start each image belongs to, and where it shows the same."""
+    """Object pixels, the start of each image, and the matching start image positions."""
 
     hits: BoxHits
     owner: Int64[np.ndarray, " n"]
@@ -110,7 +110,7 @@ class _SeenObjects:
 def drawing_inputs(
     scenes: Scenes, states: SceneStates, owner: Int64[np.ndarray, " n"], config: RendererConfig
 ) -> DrawingInputs:
-    """Inputs for drawing each state from the scene whose number is in `owner`."""
+    """Inputs for drawing each state from the scene with the index in `owner`."""
     return drawing_inputs_from(PreparedScenes.of(scenes), states, owner, config)
 
 
@@ -120,7 +120,7 @@ def drawing_inputs_from(
     owner: Int64[np.ndarray, " n"],
     config: RendererConfig,
 ) -> DrawingInputs:
-    """`drawing_inputs` of scenes whose own part is done already."""
+    """`drawing_inputs` for prepared scenes."""
     scenes, before, start = prepared.scenes, prepared.before, prepared.start
     shape_px = scenes.images.shape[1], scenes.images.shape[2]
     K, boxes_m = scenes.K_head[owner], scenes.boxes_m[owner]
@@ -162,7 +162,7 @@ def _start(scenes: Scenes, before: Bodies) -> _Start:
 
 
 def _plane(hits: BoxHits, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    """Values of hits [hits, c] on images [n, c, h, w], zero elsewhere."""
+    """Scatter values of hits [hits, c] into images [n, c, h, w]; zero elsewhere."""
     num_images, height, width = shape
     flat = np.zeros((num_images * height * width, values.shape[1]), dtype=np.float32)
     flat[hits.place] = values
@@ -172,7 +172,7 @@ def _plane(hits: BoxHits, values: np.ndarray, shape: tuple[int, ...]) -> np.ndar
 def _warped(
     start: _Start, owner: np.ndarray, positions: np.ndarray, config: RendererConfig
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The start image after the camera's motion, its hands and objects, and what it lacks."""
+    """Start image, hands and objects under the camera motion, and pixels outside the view."""
     num_starts, _, height, width = start.rgb.shape
     hit = _plane(start.hits, np.ones((len(start.hits.place), 1)), (num_starts, height, width))
     layers = np.concatenate([start.rgb, start.hands.max(axis=1, keepdims=True), hit], axis=1)
@@ -188,7 +188,7 @@ def _warped(
 
 
 def _objects(seen: _SeenObjects, start: _Start) -> Float32[np.ndarray, "n 4 h w"]:
-    """Objects in the start image's colours, and where they are."""
+    """Objects in the start image's colours, and their mask."""
     hits = seen.hits
     texture = colours_at_positions(start.rgb, seen.owner[hits.image], seen.at_start)
     values = np.concatenate([texture, np.ones((len(texture), 1))], axis=1)
@@ -202,7 +202,7 @@ def _coarse(
     boxes_m: np.ndarray,
     hands_nearness: np.ndarray,
 ) -> Float32[np.ndarray, "n 13 rows cols"]:
-    """Hands' nearness, and what an object's pixels are told of it, at every second pixel."""
+    """Half-size channels: nearness of hands, and features of the object at each pixel."""
     _, _, height, width = start.rgb.shape
     hits, owner = seen.hits, seen.owner
     v, u = np.divmod(hits.place % (height * width), width)
@@ -226,7 +226,7 @@ def _coarse(
 
 @dataclass(frozen=True)
 class _Stirred:
-    """Bodies that moved, as they were in the start image."""
+    """Moved bodies at their positions in the start image."""
 
     start: _Start
     owner: Int64[np.ndarray, " n"]
@@ -234,7 +234,7 @@ class _Stirred:
     moved: Float64[np.ndarray, "n bodies"]
 
     def warped(self) -> Float32[np.ndarray, "n 1 h w"]:
-        """Shares of motion of what each pixel showed, after the camera's motion."""
+        """Motion share of the body shown at each pixel, warped by the camera motion."""
         num_starts, _, height, width = self.start.rgb.shape
         slots = self.start.hits.slot[:, None] + 1
         shown = _plane(self.start.hits, slots, (num_starts, height, width))[self.owner, 0]
@@ -251,7 +251,7 @@ class _Stirred:
 def _body_change(
     stirred: _Stirred, cover: np.ndarray, hits: BoxHits, outside: np.ndarray
 ) -> Float32[np.ndarray, "n 1 h w"]:
-    """Where something moved: around bodies that did, then and now; and unseen places."""
+    """Change mask: around moved bodies at the start and now, and pixels outside the view."""
     moved = stirred.moved
     shape = (len(cover), *cover.shape[2:])
     hands = ((cover > _COVERED) * moved[:, :2, None, None]).max(axis=1, keepdims=True)
@@ -264,7 +264,7 @@ def _body_change(
 
 
 def _camera_change(positions: Float32[np.ndarray, "n h w 2"]) -> Float64[np.ndarray, "n 1 1 1"]:
-    """From 0 to 1 by how far the image's corners moved."""
+    """Change from 0 to 1 by the motion of the image's corners."""
     _, height, width, _ = positions.shape
     home = pixel_centres(height, width).reshape(height, width, 2)
     corners = (positions - home)[:, :: height - 1, :: width - 1]

@@ -1,7 +1,7 @@
-"""The renderer's network: a small U-Net at half the image's size that mixes what it is given.
+"""The renderer's network: a small U-Net at half resolution that blends its input layers.
 
-Each pixel becomes a mixture of the warped start image, the objects' texture and the hands'
-colours, plus what the network adds; where nothing changed it is the warped start itself.
+Each pixel is a blend of the warped start image, the objects' texture and the hands' colours, plus
+a learned residual; where nothing changed it is the warped start image itself.
 """
 
 from itertools import pairwise
@@ -18,13 +18,13 @@ from services.world_model.rendering.inputs import (
     DrawingInputs,
 )
 
-# Weights of the three given colours, then what is added to their mixture.
+# Blend weights of the three input colours, then the residual added to the blend.
 _OUTPUTS = 6
 _WARPED_LOGIT = 2.0
 
 
 class ResidualBlock(nn.Module):
-    """Two 3×3 convolutions around which the input passes by."""
+    """Two 3×3 convolutions with a skip connection."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -33,13 +33,13 @@ class ResidualBlock(nn.Module):
         nn.init.zeros_(self.second.weight)
 
     def forward(self, x: Float[Tensor, "n width h w"]) -> Float[Tensor, "n width h w"]:
-        """The input and what the block adds to it."""
+        """The input plus the block's residual."""
         added: Tensor = self.second(functional.relu_(self.first(functional.relu(x))))
         return added.add_(x)
 
 
 class RendererNetwork(nn.Module):
-    """Mixes drawn and warped images; fully convolutional and without any normalization."""
+    """Blends drawn and warped images; fully convolutional, without normalization."""
 
     def __init__(self, config: RendererConfig) -> None:
         super().__init__()
@@ -56,7 +56,7 @@ class RendererNetwork(nn.Module):
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in steps)
         self.decoder = nn.ModuleList(ResidualBlock(a) for a, _ in steps)
         self.head = nn.Conv2d(widths[0], 4 * _OUTPUTS, 3, padding=1)
-        # At first an image is mostly the warped start, and nothing is added.
+        # Initially an image is mostly the warped start image, without a residual.
         nn.init.zeros_(self.head.weight)
         bias = torch.zeros(4 * _OUTPUTS)
         bias[:4] = _WARPED_LOGIT
@@ -70,14 +70,14 @@ class RendererNetwork(nn.Module):
         weights = drawn[:, :3].softmax(dim=1)
         hit = inputs.fine[:, 11:12]
         is_hand = torch.maximum(inputs.fine[:, 9:10], inputs.fine[:, 10:11])
-        # Colours exist only where something is hit: elsewhere the weights count for nothing.
+        # Colours exist only where something is hit: elsewhere the weights have no effect.
         mixed = weights[:, 1:2] * hit * (objects - warped)
         mixed = mixed + weights[:, 2:] * is_hand * (hands - warped)
         mixed = mixed + drawn[:, 3:].contiguous().tanh()
         return warped + inputs.change * mixed
 
     def _entered(self, inputs: DrawingInputs) -> Float[Tensor, "n width rows cols"]:
-        """The stem: a convolution of all channels, each 2×2 block of fine pixels side by side."""
+        """Stem convolution of all channels, with 2×2 blocks of fine pixels folded into channels."""
         dtype = self.stem.weight.dtype
         fine = functional.pixel_unshuffle(inputs.fine.to(dtype), 2)
         planes = torch.cat([fine, inputs.coarse.to(dtype)], dim=1)

@@ -1,4 +1,4 @@
-"""Whether this processor multiplies bfloat16 matrices in hardware."""
+"""Detection of hardware support for bfloat16 matrix products."""
 
 import torch
 

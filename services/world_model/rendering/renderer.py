@@ -1,4 +1,4 @@
-"""The renderer: asked images of a future whose states are known, from one start image."""
+"""Renderer: draws head camera images of known states from one start image."""
 
 import copy
 from collections.abc import Sequence
@@ -22,12 +22,12 @@ from services.world_model.rendering.scene_states import SceneState, SceneStates
 
 
 class Renderer:
-    """Draws head images of states; the same input always gives the same bytes.
+    """Draws head camera images of states; equal inputs give equal bytes.
 
     Args:
         network: trained weights; they are copied.
-        uses_bfloat16: whether convolutions run in bfloat16; by default where the processor has
-            instructions for it.
+        uses_bfloat16: run convolutions in bfloat16; default: if the processor has instructions for
+            it.
     """
 
     def __init__(self, network: RendererNetwork, *, uses_bfloat16: bool | None = None) -> None:
@@ -35,7 +35,7 @@ class Renderer:
         dtype = torch.bfloat16 if fast else torch.float32
         self._network = copy.deepcopy(network).eval().requires_grad_(requires_grad=False)
         self._network.to(dtype)
-        # A rollout draws chunk after chunk from one start.
+        # A rollout draws all its chunks from one start.
         self._last_start: tuple[bytes, PreparedScenes] | None = None
 
     @property
@@ -51,22 +51,22 @@ class Renderer:
         states: Sequence[SceneState],
         boxes_m: np.ndarray,
     ) -> UInt8[np.ndarray, "n h w 3"]:
-        """Images of states that follow a start, or precede it.
+        """Draw images of states that follow a start, or precede it.
 
-        A state in which the camera and everything else is where it was at the start gives exactly
-        the start image.
+        If camera, hands and objects are where they were at the start, the image is exactly the
+        start image.
 
         Args:
-            start_image: uint8 [h, w, 3], what the head camera saw at the start.
-            K_head: its matrix [3, 3] in pixels; a lens's distortion is not modelled.
-            start: where everything was then.
-            states: at least one; of which images are asked.
-            boxes_m: [k, 6], per object slot centre and half sizes (x y z, x y z) of its bounding
-                box in its own frame.
+            start_image: uint8 [h, w, 3], the head camera image at the start.
+            K_head: intrinsics [3, 3] in pixels; lens distortion is not modelled.
+            start: state at the start.
+            states: states to draw, at least one.
+            boxes_m: [k, 6], centre and half sizes (x y z, x y z) of the bounding box of each object
+                slot, in the object frame.
 
         Raises:
-            ShapeError: arrays of another shape, no state, or states of other slots than boxes.
-            InvalidInputError: an image whose sides the network does not fit.
+            ShapeError: wrong array shapes, no state, or object slots that do not match the boxes.
+            InvalidInputError: image sides that the network does not support.
             NonFiniteError: NaN or infinity.
         """
         scenes = self._scene(start_image, K_head, start, boxes_m)
@@ -84,7 +84,7 @@ class Renderer:
             return np.ascontiguousarray(rounded.permute(0, 2, 3, 1).numpy())
 
     def _drawn(self, inputs: DrawingInputs) -> Float32[Tensor, "n 3 h w"]:
-        """Images in 0 … 1; where nothing changed the network has no say, so it is not asked."""
+        """Images in 0 … 1; the network runs only where something changed."""
         asked = inputs.change.flatten(1).amax(dim=1) > 0
         if bool(asked.all()):
             return self._network(inputs)
@@ -95,7 +95,7 @@ class Renderer:
         return images
 
     def _prepared(self, scenes: Scenes) -> PreparedScenes:
-        """What is known of a start; that of the start before is not worked out again."""
+        """Prepared scenes; those of the last start are cached."""
         states = scenes.states
         arrays = (
             scenes.images, scenes.K_head, scenes.boxes_m, states.Ts_world_camera,

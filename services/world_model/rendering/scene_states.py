@@ -1,4 +1,4 @@
-"""States that a renderer draws: the head camera, both hands and every object at one step."""
+"""Scene states that a renderer draws: head camera, both hands and every object at one step."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ MAX_OBJECTS = 4
 
 @dataclass(frozen=True)
 class SceneState:
-    """Where everything is at one step; slots of objects that are absent hold anything finite."""
+    """Poses at one step; slots of absent objects hold arbitrary finite numbers."""
 
     T_world_camera: Float64[np.ndarray, "4 4"]
     Ts_world_wrist: Float64[np.ndarray, "2 4 4"]
@@ -34,7 +34,7 @@ class SceneStates:
 
     @classmethod
     def stack(cls, states: Sequence[SceneState]) -> "SceneStates":
-        """One or more states of one number of object slots.
+        """Stack states with the same number of object slots.
 
         Raises:
             ShapeError: no state, arrays of another shape, or more than four slots.
@@ -63,7 +63,7 @@ class SceneStates:
         return len(self.Ts_world_camera)
 
     def take(self, rows: Int64[np.ndarray, " m"]) -> "SceneStates":
-        """Some of the states, in the order of `rows`."""
+        """Select states, in the order of `rows`."""
         return SceneStates(
             self.Ts_world_camera[rows],
             self.Ts_world_wrist[rows],

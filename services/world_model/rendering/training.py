@@ -1,4 +1,4 @@
-"""Training of the renderer on true states, some of them shaken as imagined ones will be."""
+"""Training of the renderer on true states, some of them with pose noise like predicted ones."""
 
 import math
 import time
@@ -38,38 +38,34 @@ class RendererTraining(BaseModel):
     max_steps: int | None = Field(
         default=None,
         ge=1,
-        description="steps after which training ends, if it is not out of time before",
+        description="steps after which training ends, unless the CPU budget ends it",
     )
     batch: int = Field(default=24, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
-    warmup_steps: int = Field(
-        default=50, ge=1, description="steps until the learning rate is reached"
-    )
-    weight_decay: float = Field(default=0.01, ge=0, description="of AdamW")
-    ema_decay: float = Field(
-        default=0.995, ge=0, lt=1, description="of the running average of the weights that is kept"
-    )
+    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
+    warmup_steps: int = Field(default=50, ge=1, description="warm-up steps of the learning rate")
+    weight_decay: float = Field(default=0.01, ge=0, description="AdamW weight decay")
+    ema_decay: float = Field(default=0.995, ge=0, lt=1, description="decay of the averaged weights")
     max_gradient_norm: float = Field(
-        default=1.0, gt=0, description="longer gradients are shortened to this"
+        default=1.0, gt=0, description="norm that gradients are clipped to"
     )
-    gradient_weight: float = Field(default=0.5, ge=0, description="of neighbours' differences")
+    gradient_weight: float = Field(default=0.5, ge=0, description="image gradient loss")
     sharpness_weight: float = Field(
-        default=0.3, ge=0, description="of the strength of edges in windows of 7 pixels"
+        default=0.3, ge=0, description="weight of the edge strength loss (7 px windows)"
     )
     late_start_fraction: float = Field(
-        default=0.5, ge=0, le=1, description="of pairs that start at any image, not the first"
+        default=0.5, ge=0, le=1, description="share of pairs with a random start image"
     )
-    shaken_fraction: float = Field(default=0.5, ge=0, le=1, description="of pairs with wrong poses")
-    shake_m: float = Field(default=0.003, ge=0, description="deviation of a wrong place, per axis")
-    shake_rad: float = Field(default=0.05, ge=0, description="deviation of a wrong turn, per axis")
+    shaken_fraction: float = Field(default=0.5, ge=0, le=1, description="pairs with pose noise")
+    shake_m: float = Field(default=0.003, ge=0, description="position noise per axis")
+    shake_rad: float = Field(default=0.05, ge=0, description="rotation noise per axis")
     uses_bfloat16: bool = Field(
-        default=True, description="where the processor multiplies it faster than float32"
+        default=True, description="convolve in bfloat16 where the processor supports it"
     )
 
 
 @dataclass(frozen=True)
 class RendererProgress:
-    """Where a run stands."""
+    """Progress of a training run."""
 
     step: int
     share: float
@@ -78,7 +74,7 @@ class RendererProgress:
 
 @dataclass(frozen=True)
 class TrainedRenderer:
-    """The averaged network and how it got there."""
+    """The averaged network with its training log."""
 
     network: RendererNetwork
     steps: int
@@ -94,17 +90,17 @@ def train_renderer(
     rng: np.random.Generator,
     on_progress: Callable[[RendererProgress], None] | None = None,
 ) -> TrainedRenderer:
-    """Train on pairs of images of one clip: a start and a later one.
+    """Train on pairs of images of one clip: a start image and a target image.
 
     Args:
         clips: at least one, all of images of one size.
         config: shape of the network.
         settings: how to train.
-        rng: decides initial weights, pairs and what is shaken.
-        on_progress: is told every few steps.
+        rng: source of initial weights, pairs and pose noise.
+        on_progress: called every few steps.
 
     Raises:
-        InvalidInputError: no clips, or images of sides that the network does not fit.
+        InvalidInputError: no clips, or image sides that the network does not support.
     """
     run = RendererRun(clips, config, settings, rng=rng)
     log: list[RendererProgress] = []
@@ -121,7 +117,7 @@ def train_renderer(
 
 
 class RendererRun:
-    """One run: network, its running average, optimizer and what is random."""
+    """One run: network, weight average, optimizer and random state."""
 
     def __init__(
         self,
@@ -151,13 +147,13 @@ class RendererRun:
         )
 
     def share(self, cpu_s: float) -> float:
-        """Share of the run that is done, by the tighter of its two limits."""
+        """Completed fraction of the run, by the tighter of its two limits."""
         by_time = cpu_s / self._settings.cpu_budget_s
         limit = self._settings.max_steps
         return by_time if limit is None else max(by_time, self.step / limit)
 
     def learn(self, share: float) -> float:
-        """One step of the optimizer on a fresh batch; its loss."""
+        """One optimizer step on a fresh batch; returns its loss."""
         inputs, true = self.batch()
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self._bfloat16):
             drawn = self.network(inputs)
@@ -198,7 +194,7 @@ class RendererRun:
         return np.array(starts), np.array(laters)
 
     def _shaken(self, states: SceneStates) -> SceneStates:
-        """Objects a little off, in some of the states; always as many random numbers."""
+        """Add pose noise to objects in some states; always draws as many random numbers."""
         settings, shape = self._settings, states.object_present.shape
         is_shaken = self._rng.random(len(states)) < settings.shaken_fraction
         shift = self._rng.normal(size=(*shape, 3)) * settings.shake_m
@@ -217,7 +213,7 @@ class RendererRun:
 
     @torch.no_grad()
     def _average(self) -> None:
-        # Early weights are forgotten faster, so that short runs are not held back by the start.
+        # A shorter memory at first, so that short runs do not keep the initial weights.
         decay = min(self._settings.ema_decay, (1 + self.step) / (10 + self.step))
         pairs = zip(self.averaged.parameters(), self.network.parameters(), strict=True)
         for mean, weight in pairs:
@@ -229,16 +225,16 @@ def drawing_loss(
     true: Float32[Tensor, "n 3 h w"],
     settings: RendererTraining,
 ) -> Float32[Tensor, ""]:
-    """Mean absolute error of colours, of neighbours' differences, and of the strength of edges.
+    """Mean absolute error of colours, of image gradients and of edge strength.
 
-    An edge drawn a pixel beside its place costs twice by colours, and none at all costs once, so
-    by colours alone images become blurred; the mean strength of edges in a window does not ask
-    where they are.
+    An edge drawn a pixel off costs twice in colours and a missing edge once, so that colours alone
+    lead to blurred images; the mean strength of edges in a window does not depend on where exactly
+    they are.
 
     Args:
         drawn: colours in 0 … 1.
-        true: the same.
-        settings: the weights.
+        true: true colours in 0 … 1.
+        settings: weights of the losses.
     """
     error = drawn - true
     across = (error[..., 1:] - error[..., :-1]).abs().mean()
@@ -261,7 +257,7 @@ def _edges(images: Float32[Tensor, "n 3 h w"]) -> Float32[Tensor, "n 3 rows colu
 
 
 def check_clips(clips: Sequence[SceneClip], config: RendererConfig) -> None:
-    """Refuse clips that the network cannot learn from."""
+    """Reject clips that the network cannot learn from."""
     sizes = {clip.images.shape[1:3] for clip in clips}
     multiple = config.pixel_multiple
     if len(sizes) != 1 or any(side % multiple for size in sizes for side in size):

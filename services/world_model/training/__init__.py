@@ -1,1 +1,1 @@
-"""Training: episodes to windows, windows to a loss, a loss to a measured checkpoint."""
+"""Training of world models: windows of episodes, losses, training loops and evaluation."""

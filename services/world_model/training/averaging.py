@@ -1,4 +1,4 @@
-"""Running average of weights and the learning-rate schedule that the small networks share."""
+"""Moving average of weights and learning-rate schedule, shared by the small networks."""
 
 import math
 
@@ -9,11 +9,11 @@ _WARMUP_STEPS = 100
 
 
 class WeightAverage:
-    """Exponential moving average of a network's weights; its early part forgets faster.
+    """Exponential moving average of a network's weights, with a shorter memory at first.
 
     Args:
-        network: whose present weights it begins with.
-        decay: of a long-running average, such as 0.995.
+        network: its current weights initialize the average.
+        decay: decay after many updates, such as 0.995.
     """
 
     def __init__(self, network: nn.Module, decay: float) -> None:
@@ -22,14 +22,14 @@ class WeightAverage:
 
     @torch.no_grad()
     def update(self, network: nn.Module) -> None:
-        """Take the present weights in."""
+        """Update the average with the current weights."""
         self._num_updates += 1
         decay = min(self._decay, (1 + self._num_updates) / (10 + self._num_updates))
         for name, value in network.state_dict().items():
             self._weights[name].lerp_(value, 1 - decay)
 
     def copy_to(self, network: nn.Module) -> None:
-        """Put the average in place of a network's weights."""
+        """Overwrite a network's weights with the average."""
         network.load_state_dict(self._weights)
 
 

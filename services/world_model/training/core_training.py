@@ -1,4 +1,4 @@
-"""Training of a recurrent core on whole episodes: where objects go, and how that feels."""
+"""Training of a recurrent core on whole episodes: object motion and touch."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -22,13 +22,13 @@ from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
 _FIT_EPISODES = 400
-# Added to the deviation of features, some of which hardly change within a task.
+# Added to the deviation of features, some of which hardly vary within a task.
 _LEAST_DEVIATION = 0.05
-# How much more often hands are held still at later starts, of which fewer are free to be.
+# How much more often hands are held still from later starts, where fewer scenes allow it.
 _LATER_HELD = 2.5
-# Objects that moved less than this in the latent step before lie still.
+# Objects that moved less than this in the previous latent step count as settled.
 _SETTLED_M = 1e-3
-# Cores learn to begin at the first step and at every so many steps after it.
+# Cores are trained from the first step and from every so many steps after it.
 _START_STRIDE = 8
 _TAXEL_SHARE = 4
 OnStep = Callable[[int, float], None]
@@ -36,11 +36,11 @@ OnStep = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class CoreData:
-    """What cores are trained on: episodes, their touch as latents, and what readers saw.
+    """Training data of cores: episodes, touch latents and the readers' outputs.
 
-    `readings` are a reader's objects by start step, of the same episodes that the reader learned
-    from. Since it errs less there than elsewhere, the core learns from true poses with errors of
-    `pose_noise_m` as often.
+    `readings` are a reader's objects by start step, for the episodes that the reader was trained
+    on. Since it errs less there than elsewhere, the core is trained equally often on true poses
+    with noise of `pose_noise_m`.
     """
 
     table: SceneTable
@@ -65,13 +65,13 @@ def train_core(
     seed: int,
     on_step: OnStep | None = None,
 ) -> RecurrentCore:
-    """A core that follows scenes from any start step to the end.
+    """Train a core to predict scenes from any start step to the end.
 
     Args:
         data: training episodes.
         config: of the dynamics model.
-        settings: number of steps, weights of the losses and the like.
-        seed: of weights and of everything that is drawn.
+        settings: number of steps, loss weights and so on.
+        seed: seed of weights and sampling.
         on_step: called with the step and its loss.
     """
     generator, rng = torch.Generator().manual_seed(seed), np.random.default_rng(seed)
@@ -104,7 +104,7 @@ def train_core(
 
 @torch.no_grad()
 def fit_features(core: RecurrentCore, table: SceneTable) -> None:
-    """Mean and deviation of command features over the training episodes of each task."""
+    """Fit mean and deviation of command features to the training episodes of each task."""
     for task in range(len(core.config.tasks)):
         known = torch.nonzero(table.labelled & (table.task == task))[:, 0]
         rows = known[:: max(1, len(known) // _FIT_EPISODES)]
@@ -118,16 +118,16 @@ def fit_features(core: RecurrentCore, table: SceneTable) -> None:
 
 
 def start_steps(table: SceneTable) -> list[int]:
-    """Steps with an image at which cores learn to begin: up to the last latent step of all."""
+    """Steps with an image from which cores are trained, up to the last possible latent step."""
     last = table.num_steps - 1 - STEPS_PER_LATENT
     wanted = {*range(0, last, _START_STRIDE), last}
     return [step for step in table.image_steps if step in wanted]
 
 
 def _later_start(later: list[int], num_steps: int, rng: np.random.Generator) -> int:
-    """One of some starts, as often as the root of what follows it is long.
+    """Random start, with a probability proportional to the root of the remaining length.
 
-    A start near the end teaches little of what lasts, but rollouts begin there, too.
+    Starts near the end teach little about persistence, but rollouts begin there, too.
     """
     weight = np.sqrt([num_steps - 1 - step for step in later])
     return int(rng.choice(later, p=weight / weight.sum()))
@@ -166,7 +166,7 @@ def _draw(
 
 
 def _is_settled(table: SceneTable, rows: Tensor, start_step: int) -> Bool[Tensor, " batch"]:
-    """Where hands touch nothing and nothing moves by itself: there, nothing would ever happen."""
+    """Entries without contact and object motion: holding still, nothing would change."""
     free = ~table.in_contact[rows, start_step].any(-1)
     before = max(0, start_step - STEPS_PER_LATENT)
     position_m = table.objects.position_m
@@ -181,7 +181,7 @@ def _start_objects(
     settings: CoreSettings,
     generator: torch.Generator,
 ) -> ObjectPoses:
-    """A reader's objects, or, where they are known, true ones with an error half of the time."""
+    """A reader's objects or, half of the time and where known, true objects with noise."""
     true, read = data.table.objects_at(rows, start_step), data.readings[start_step][rows]
     size = settings.pose_noise_m * 2 * torch.rand((len(rows), 1, 1), generator=generator)
     shift = torch.randn(true.position_m.shape, generator=generator) * size
@@ -209,7 +209,7 @@ def core_loss(
 ) -> Float32[Tensor, ""]:
     """Weighted sum of the errors in objects, touch, contact and final success.
 
-    Where hands are held still in the air, nothing moves and nothing is felt beyond the start.
+    Where hands are held still without contact, the targets are no motion and no change of touch.
     """
     commands, start = batch.commands, batch.start
     features = command_features(
@@ -226,7 +226,7 @@ def core_loss(
     at_start = start.touch[:, None, None].expand_as(touch)
     touch = torch.where(moves.view(-1, 1, 1, 1, 1), touch, at_start)
     contact = table.in_contact[rows][:, steps] & moves.view(-1, 1, 1, 1)
-    # Of part of the batch: each of its rows has thousands of taxels already.
+    # Part of the batch suffices: each of its rows has thousands of taxels.
     few = slice(0, -(-len(rows) // _TAXEL_SHARE))
     felt = table.tactile_kpa[rows[few]][:, steps] >= CONTACT_THRESHOLD_KPA
     felt &= moves[few].view(-1, 1, 1, 1, 1)
@@ -269,7 +269,7 @@ def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:
 def _object_error(
     told: ObjectPoses, true: ObjectPoses, seen: Float32[Tensor, "batch objects"]
 ) -> Float32[Tensor, ""]:
-    """Errors of position (twice) and axes, of objects that are there and were seen at the start."""
+    """Errors of positions (twice) and axes of objects present now and seen at the start."""
     weight = true.present * (seen > 0.5)[:, None]
     position = functional.smooth_l1_loss(
         told.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.2, reduction="none"

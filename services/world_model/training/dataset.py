@@ -1,8 +1,8 @@
-"""Random windows of episodes as training requests and targets.
+"""Random training windows of episodes in memory, as requests and targets.
 
-Windows are cut from whole episodes read once, through the same re-anchoring that the store's
-reader uses, so that an epoch touches no disk. `services.world_model.training.streaming` has the
-same windows of episodes that stay on the disk.
+Episodes are read once and cut with the same re-anchoring as in the store's reader, so that an epoch
+reads nothing from disk. `services.world_model.training.streaming` provides the same windows for
+episodes that stay on disk.
 """
 
 import hashlib
@@ -23,7 +23,7 @@ from services.world_model.network.inputs import PredictionRequest
 
 @dataclass(frozen=True)
 class Place:
-    """Where a window lies: steps start … start + num_steps − 1 of one of several episodes.
+    """Position of a window: steps start … start + num_steps − 1 of an episode.
 
     `from_command` anchors commanded actions at the first step's *commanded* pose.
     """
@@ -37,44 +37,44 @@ class Place:
 
 @runtime_checkable
 class TrainingEpisode(Protocol):
-    """An episode that windows are cut from, in memory or on the disk."""
+    """Episode that windows are cut from, in memory or on disk."""
 
     @property
     def episode_id(self) -> str:
-        """Its name in the store."""
+        """Id of the episode in its store."""
         ...
 
     @property
     def task(self) -> str:
-        """What is done in it."""
+        """Task of the episode."""
         ...
 
     @property
     def seed(self) -> int | None:
-        """Of the scene, if it was made by the twin."""
+        """Seed of the scene if the twin made the episode."""
         ...
 
     @property
     def action_kinds(self) -> tuple[ActionKind, ...]:
-        """The kinds of actions it holds."""
+        """Available kinds of actions."""
         ...
 
     def content_hash(self) -> str:
-        """The `fingerprint` of its content."""
+        """`fingerprint` of the content."""
         ...
 
     def __len__(self) -> int:
-        """Its steps."""
+        """Number of steps."""
         ...
 
     def cut(self, place: Place) -> "Window":
-        """The window at a place in this episode."""
+        """Cut the window at a place in this episode."""
         ...
 
 
 @dataclass(frozen=True)
 class EpisodeArrays:
-    """One episode on the model grid, ready for cutting; actions relative to its step 0."""
+    """One episode on the model grid, ready for cutting; actions are relative to its step 0."""
 
     episode_id: str
     task: str
@@ -93,15 +93,15 @@ class EpisodeArrays:
 
     @property
     def action_kinds(self) -> tuple[ActionKind, ...]:
-        """The kinds of actions it holds."""
+        """Available kinds of actions."""
         return tuple(self.actions)
 
     def content_hash(self) -> str:
-        """The `fingerprint` of its content."""
+        """`fingerprint` of the content."""
         return fingerprint(self)
 
     def cut(self, place: Place) -> "Window":
-        """The window at a place in this episode."""
+        """Cut the window at a place in this episode."""
         return cut_window(
             self,
             place.start,
@@ -113,7 +113,7 @@ class EpisodeArrays:
 
 @dataclass(frozen=True)
 class Window:
-    """One slice of an episode: what is asked of the model and what came true."""
+    """One slice of an episode: the request to the model and the true future."""
 
     request: PredictionRequest
     images: UInt8[np.ndarray, "time h w 3"]
@@ -123,7 +123,7 @@ class Window:
 
 @dataclass(frozen=True)
 class WindowBatch:
-    """Windows of one length."""
+    """Batch of windows of one length."""
 
     requests: list[PredictionRequest]
     images: UInt8[Tensor, "batch time px px 3"]
@@ -132,13 +132,13 @@ class WindowBatch:
 
 
 def fingerprint(episode: EpisodeArrays) -> str:
-    """SHA-256 of what was seen, felt and done: the same data under another name is found out."""
+    """SHA-256 of observations and actions; identifies equal data under another name."""
     digest = hashlib.sha256()
     digest.update(np.ascontiguousarray(episode.images).tobytes())
     digest.update(np.ascontiguousarray(episode.tactile_kpa, dtype="<f4").tobytes())
     for kind in sorted(episode.actions):
         digest.update(kind.encode())
-        # Rounded to a micrometre: re-anchoring on the way here changes the last bits. Adding zero
+        # Rounded to a micrometre: re-anchoring changes the last bits of poses. Adding zero
         # turns minus zero into zero.
         rounded = episode.actions[kind].round(6) + 0.0
         digest.update(np.ascontiguousarray(rounded, dtype="<f8").tobytes())
@@ -146,7 +146,7 @@ def fingerprint(episode: EpisodeArrays) -> str:
 
 
 def combined_hash(fingerprints: Sequence[str]) -> str:
-    """One hash of a set of episodes, whatever their order."""
+    """Order-independent hash of a set of episodes."""
     return hashlib.sha256("\n".join(sorted(fingerprints)).encode()).hexdigest()
 
 
@@ -158,18 +158,18 @@ def cut_window(
     action_kind: ActionKind = "measured",
     from_command: bool = False,
 ) -> Window:
-    """Steps start … start + num_steps - 1, re-anchored to the first of them.
+    """Cut steps start … start + num_steps - 1 and re-anchor them to the first.
 
     Args:
-        episode: what to cut from.
+        episode: the episode to cut from.
         start: first step.
         num_steps: 1 + 4k.
-        action_kind: of the actions the model is given.
-        from_command: with commanded actions, anchor at the first step's *commanded* pose, which
-            is what a served rollout does after its first chunk: it senses no pose of its own.
+        action_kind: kind of actions in the request.
+        from_command: with commanded actions, anchor at the first step's *commanded* pose, as a
+            served rollout does after its first chunk, since it measures no pose.
 
     Raises:
-        InvalidInputError: a slice outside the episode or actions it does not have.
+        InvalidInputError: steps outside the episode, or an action kind it does not have.
     """
     if not 0 <= start <= len(episode) - num_steps:
         raise InvalidInputError(
@@ -210,13 +210,13 @@ def stack_windows(windows: Sequence[Window]) -> WindowBatch:
 
 
 class WindowSampler:
-    """Draws windows evenly over episodes and starts.
+    """Samples windows uniformly over episodes and starts.
 
     Args:
         episodes: at least one, each at least `max_steps` long.
-        rng: decides everything that is random.
-        commanded_fraction: of the windows of episodes that hold commanded actions.
-        chained_fraction: of the commanded windows, those anchored like a later chunk.
+        rng: source of all randomness.
+        commanded_fraction: share of commanded windows, from episodes with commanded actions.
+        chained_fraction: share of commanded windows that are anchored like a later chunk.
     """
 
     def __init__(
@@ -244,7 +244,7 @@ class WindowSampler:
         return self.cut(self.places(batch, num_steps))
 
     def places(self, batch: int, num_steps: int) -> list[Place]:
-        """Where the windows of the next batch lie."""
+        """Places of the windows of the next batch."""
         return [self._place(num_steps) for _ in range(batch)]
 
     def cut(self, places: Sequence[Place]) -> WindowBatch:

@@ -19,8 +19,7 @@ def load_episodes(url: str) -> list[EpisodeArrays]:
     """All episodes of a store, read once into memory.
 
     Raises:
-        InvalidInputError: a store without episodes, one of another rate than the others, or one
-            without an image for every step.
+        InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
         UnknownNameError: an episode without the head camera.
     """
     store = EpisodeStore(url)
@@ -30,10 +29,10 @@ def load_episodes(url: str) -> list[EpisodeArrays]:
 
 
 def check_rates(rates_hz: set[float], url: str) -> None:
-    """Refuse a store without episodes, or with several model rates.
+    """Reject an empty store and a store with several model rates.
 
     Raises:
-        InvalidInputError: what `load_episodes` says.
+        InvalidInputError: the store is empty or mixes model rates.
     """
     if not rates_hz:
         raise InvalidInputError(
@@ -47,7 +46,7 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
     """One whole episode as a single window for each kind of action it holds.
 
     Raises:
-        InvalidInputError: there is not an image for every step.
+        InvalidInputError: the image of a step is missing.
         UnknownNameError: an episode without the head camera.
     """
     reader.require_images(CAMERA)
@@ -73,10 +72,10 @@ def read_episode(reader: EpisodeReader) -> EpisodeArrays:
 
 
 def split_by_hash(episodes: Sequence[E], *, heldout_percent: int) -> tuple[list[E], list[E]]:
-    """Training and held-out episodes; which is which depends on an episode's content alone.
+    """Split into training and held-out episodes by a hash of their content.
 
     Raises:
-        InvalidInputError: one of the two sides would be empty.
+        InvalidInputError: either side would be empty.
     """
     trained: list[E] = []
     heldout: list[E] = []

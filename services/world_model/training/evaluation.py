@@ -1,4 +1,4 @@
-"""Errors of a model on held-out episodes, beside those of simple rivals."""
+"""Errors of a model on held-out episodes, compared with simple baselines."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -29,7 +29,7 @@ BATCH = 24
 
 @dataclass(frozen=True)
 class Futures:
-    """Images and pressures after the first step, of all windows."""
+    """Images and pressures after the first step, for all windows."""
 
     images: UInt8[np.ndarray, "n steps h w 3"]
     tactile_kpa: Float32[np.ndarray, "n steps 2 320"]
@@ -49,22 +49,23 @@ def evaluate_prediction(
     Args:
         model: ready to predict.
         episodes: held out, none of them trained on.
-        train_fingerprints: of the episodes trained on, from the checkpoint.
+        train_fingerprints: fingerprints of the training episodes, from the checkpoint.
         stride: steps between window starts.
-        action_kind: of the actions given; episodes without it give their measured ones.
-        seed: of the noise.
+        action_kind: kind of actions given; episodes without it give their measured ones.
+        seed: seed of the noise.
 
     Returns:
-        psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the rivals
-        that the suffix names, and num_windows.
+        psnr (dB, mean over images), tactile_mse (kPa²) and contact_f1, each also for the baselines
+        named by the suffix, and num_windows.
 
-        - _copy repeats the first step; tactile_mse_zero feels nothing.
-        - _codec encodes and decodes the truth: what the model could reach at best.
+        - _copy repeats the first step; tactile_mse_zero predicts no touch.
+        - _codec encodes and decodes the truth, which bounds what the model can reach.
         - _other_take is the model given the actions of another held-out episode of the same task
-          at the same moment (absent where no task has two episodes).
-        - _hold is the model given actions in which nothing moves; in _hands_still the head does.
+          at the same time (absent where no task has two episodes).
+        - _hold is the model given actions in which nothing moves; in _hands_still only the head
+          moves.
 
-        A model whose own figures are no better than these does not use its actions.
+        A model that is no better than with these actions makes no use of its own.
 
     Raises:
         InvalidInputError: an episode that was trained on, or no window at all.
@@ -119,7 +120,7 @@ def refuse_trained(episodes: Sequence[EpisodeArrays], train_fingerprints: Sequen
 def predict_all(
     model: JointWorldModel, requests: Sequence[PredictionRequest], *, seed: int
 ) -> Futures:
-    """One sample for each request, in batches; request i has its own noise, seeded by i."""
+    """One sample per request, in batches; the noise of request i is seeded by i."""
     images, touches = [], []
     for begin in range(0, len(requests), BATCH):
         part = requests[begin : begin + BATCH]
@@ -165,7 +166,7 @@ def _actions_of_other_takes(
     requests: Sequence[PredictionRequest],
     kind: ActionKind,
 ) -> list[tuple[int, PredictionRequest]]:
-    """Each request with the actions of the next other episode of its task at the same moment."""
+    """Each request with the actions of the next episode of its task at the same time."""
     by_task: dict[str, list[EpisodeArrays]] = {}
     for episode, _ in places:
         if all(episode is not known for known in by_task.setdefault(episode.task, [])):
@@ -185,7 +186,7 @@ def _actions_of_other_takes(
 
 
 def _standing_still(request: PredictionRequest, *, head_moves: bool) -> PredictionRequest:
-    """The request with every row of its actions like the first, except, if wished, the head's."""
+    """The request with its first action repeated, optionally except for the head."""
     actions = np.repeat(request.actions[:1], len(request.actions), axis=0)
     if head_moves:
         actions[:, CAMERA_HEAD] = request.actions[:, CAMERA_HEAD]

@@ -28,18 +28,18 @@ def losses(
     generator: torch.Generator,
     context_noise: float = 0.0,
 ) -> Losses:
-    """x_0-prediction errors at random times, every tactile token with weight one.
+    """x_0-prediction errors at random times, with equal weight for every tactile token.
 
-    The paper weighs only tokens in contact or changing, which never trains idle pads. Here they
-    count as much as the others, so that the model learns to predict no contact.
+    The paper weights only tokens in contact or changing, so that idle pads are never trained. With
+    equal weights the model also learns to predict the absence of contact.
 
     Args:
         model: the network.
         inputs: from `build_inputs` of the batch's requests.
-        batch: what came true.
-        generator: of times and noise.
-        context_noise: deviation of noise on the first latents, as a share of theirs; teaches the
-            model to start from its own imperfect output.
+        batch: the true windows.
+        generator: source of times and noise.
+        context_noise: relative deviation of noise on the first latents, which makes the model
+            robust to starting from its own output.
     """
     target = model.residuals(batch.images, batch.tactile_kpa)
     first = _with_noise(model.first_latents(inputs), context_noise, generator)
@@ -63,7 +63,7 @@ def _with_noise(
         return first
 
     def shaken(latents: Tensor) -> Tensor:
-        # A different amount for each window, from none to the full share.
+        # A random amount for each window, from none to the full share.
         amount = torch.rand(len(latents), *[1] * (latents.ndim - 1), generator=generator)
         noise = torch.randn(latents.shape, generator=generator)
         return latents + context_noise * amount * latents.std() * noise

@@ -1,4 +1,4 @@
-"""Measurement of throughput: windows read and windows trained on in a second."""
+"""Throughput of data loading and training, in windows per second."""
 
 import time
 from collections.abc import Generator, Iterator
@@ -13,13 +13,13 @@ from services.world_model.training.trainer import TrainingRun
 
 
 class TrainingPace:
-    """Windows a second of the loader and of the training step, each by itself and together.
+    """Windows per second of the loader and the training step, separately and together.
 
-    All use the same network, the same sampling of windows and one thread, and leave out what
-    happens once: codecs are fitted and worker processes started before the clock starts.
+    All measurements use the same network, the same sampling of windows and one thread, and exclude
+    one-time work: codecs are fitted and worker processes started beforehand.
 
     Args:
-        url: of an episode store.
+        url: URL of an episode store.
         fit_windows: windows the codecs are fitted on.
     """
 
@@ -40,11 +40,11 @@ class TrainingPace:
 
     @property
     def batch(self) -> int:
-        """Windows a step."""
+        """Windows per step."""
         return self._settings.optimizer.batch
 
     def loading(self, num_batches: int, *, num_workers: int) -> float:
-        """Windows a second that the loader gives when nobody else needs the processor."""
+        """Windows per second of the loader alone."""
         batches = self._batches(num_workers)
         start_s = time.perf_counter()
         for _ in islice(batches, num_batches):
@@ -54,12 +54,12 @@ class TrainingPace:
         return num_batches * self.batch / elapsed_s
 
     def learning(self, num_batches: int) -> float:
-        """Windows a second that training consumes when they are in memory already."""
+        """Windows per second of training on windows in memory."""
         ready = list(islice(self._batches(0), num_batches))
         return self._learn(iter(ready), num_batches)
 
     def both(self, num_batches: int, *, num_workers: int) -> float:
-        """Windows a second of training that reads its windows from the disk."""
+        """Windows per second of training on windows read from disk."""
         batches = self._batches(num_workers)
         rate = self._learn(batches, num_batches)
         batches.close()
@@ -67,7 +67,7 @@ class TrainingPace:
 
     def _batches(self, num_workers: int) -> Generator[WindowBatch, None, None]:
         batches = read_batches(self._episodes, self._run.places(), num_workers=num_workers)
-        # What was read ahead while the processes started must not count: two batches a process.
+        # Skip what was read ahead while the processes started: two batches each.
         for _ in islice(batches, 2 * num_workers + 1):
             pass
         return batches

@@ -15,7 +15,7 @@ from services.world_model.settings import ReaderSettings
 from services.world_model.training.averaging import WeightAverage, cosine_rate
 from services.world_model.training.scene_table import SceneTable
 
-# Errors of positions are measured in this unit.
+# Unit of position errors in the loss.
 _UNIT_M = 0.05
 _BATCH_OF_READING = 128
 OnStep = Callable[[int, float], None]
@@ -23,7 +23,7 @@ OnStep = Callable[[int, float], None]
 
 @dataclass(frozen=True)
 class ReaderError:
-    """Errors on held-out steps, of objects that are there: medians and 90 % quantiles in mm."""
+    """Errors on held-out steps, of present objects: median and 90 % quantile in mm."""
 
     lateral_mm: float
     lateral_90_mm: float
@@ -40,13 +40,13 @@ def train_reader(
     seed: int,
     on_step: OnStep | None = None,
 ) -> StartReader:
-    """A reader of objects from single steps: first ones, and ones from amid episodes.
+    """Train a reader of objects from single steps, both first and later ones.
 
     Args:
-        table: training episodes, of which the labelled ones are learned from.
+        table: training episodes; only labelled ones are used.
         config: of the dynamics model.
-        settings: number of steps and the like.
-        seed: of weights and of everything that is drawn.
+        settings: number of steps and so on.
+        seed: seed of weights and sampling.
         on_step: called with the step and its loss.
     """
     generator = torch.Generator().manual_seed(seed)
@@ -80,7 +80,7 @@ def train_reader(
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:
-    """Resting heights: medians over the first steps of each task's episodes."""
+    """Fit resting heights: medians over the first steps of each task's episodes."""
     for task, count in enumerate(config.num_objects):
         for slot in range(count):
             first = table.objects.position_m[:, 0, slot, 2]
@@ -118,7 +118,7 @@ def _loss(
 
 @torch.no_grad()
 def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPoses:
-    """What a reader makes of one step of every episode."""
+    """The reader's objects at one step of every episode."""
     parts: list[ObjectPoses] = [
         reader(table.first_steps(rows, torch.full_like(rows, step)))
         for rows in torch.split(torch.arange(len(table)), _BATCH_OF_READING)
@@ -131,7 +131,7 @@ def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPos
 
 
 def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str, ReaderError]:
-    """Errors by task at one step of held-out episodes; tasks without objects there are left out."""
+    """Errors by task at one step of held-out episodes; tasks without objects are omitted."""
     told, errors = read_objects(reader, table, step), {}
     rows = torch.arange(len(table))
     true = table.objects_at(rows, step)

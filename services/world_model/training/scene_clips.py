@@ -1,4 +1,4 @@
-"""Episodes as the renderer learns from them: images with the true states that they show."""
+"""Training clips of the renderer from episodes with object poses."""
 
 from collections.abc import Sequence
 
@@ -17,7 +17,7 @@ from services.world_model.training.scene_episodes import SceneEpisode
 
 
 def scene_clips(episodes: Sequence[SceneEpisode]) -> list[SceneClip]:
-    """Clips of the episodes that have images and boxes of their objects."""
+    """Clips of the episodes that have images and object boxes."""
     return [_clip(each) for each in episodes if len(each.images) > 1 and len(each.object_boxes_m)]
 
 

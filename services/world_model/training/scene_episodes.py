@@ -1,8 +1,8 @@
 """True episodes of a store as arrays on the model grid, with the poses of their objects.
 
-What decides success in a world model is trained on these: whole episodes, where each object was at
-every step, and what became of it. Only truth is taken: imagined episodes, those that were cut off
-and those whose outcome nobody knows are left out, and counted.
+Training data of the state model: whole episodes with the pose of every object at every step and the
+outcome. Imagined episodes, truncated episodes and those with an unknown outcome are skipped and
+counted.
 """
 
 import hashlib
@@ -29,14 +29,14 @@ logger = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class SceneEpisode:
-    """One whole episode, all of it relative to or from its step 0.
+    """One whole episode; poses and times are relative to its step 0 where they are relative.
 
-    `actions` are the commanded ones where the episode has them (`action_kind` says so), and
-    `measured_actions` what was reached; `anchor` are the poses of left wrist, right wrist and head
-    camera that both are relative to. `tactile_kpa` is the mean over each step, `object_poses` are
-    x y z (m), qw qx qy qz in the world. `images` are those of the head camera that show a grid
-    step, and `image_steps` says which. `motion` is "script", "miss", "hold", "frozen", "policy",
-    "other_scene" or the motion that left the script.
+    `actions` are the commanded ones where the episode has them (see `action_kind`), and
+    `measured_actions` the measured ones; both are relative to `anchor`, the poses of left wrist,
+    right wrist and head camera. `tactile_kpa` is the mean over each step, `object_poses` are
+    x y z (m), qw qx qy qz in the world. `images` are the head camera images at the grid steps
+    `image_steps`. `motion` is "script", "miss", "hold", "frozen", "policy", "other_scene" or the
+    name of the deviation from the script.
     """
 
     episode_id: str
@@ -63,7 +63,7 @@ class SceneEpisode:
 
     @property
     def scene(self) -> tuple[str, int]:
-        """Task and seed: what must not be on both sides of a split."""
+        """Task and seed; a split must not have them on both sides."""
         return self.task, self.seed
 
     def __len__(self) -> int:
@@ -78,19 +78,19 @@ def load_scene_episodes(
     origins: Collection[Origin] = TWIN_ONLY,
     with_images: bool = True,
 ) -> list[SceneEpisode]:
-    """The true episodes of a store, in the order of their ids.
+    """Load the true episodes of a store, in the order of their ids.
 
-    How many were left out, and why, is logged.
+    The number of skipped episodes is logged by reason.
 
     Args:
-        url: of the store.
-        tasks: only these; None for all.
-        domains: only these; None for both.
-        origins: only these; "imagined" is refused.
-        with_images: False leaves the images in the store.
+        url: URL of the store.
+        tasks: tasks to load; None for all.
+        domains: domains to load; None for both.
+        origins: origins to load; "imagined" is rejected.
+        with_images: False skips the images.
 
     Raises:
-        InvalidInputError: imagined episodes are asked for, or no episode is left.
+        InvalidInputError: imagined episodes are requested, or no episode remains.
     """
     if "imagined" in origins:
         raise InvalidInputError(
@@ -123,7 +123,7 @@ def load_scene_episodes(
 
 
 def _unfit(reader: EpisodeReader, origins: Collection[Origin]) -> str | None:
-    """Why an episode is no truth to train on."""
+    """Reason why an episode is not usable as ground truth, or None."""
     attributes = reader.attributes
     if attributes.origin not in origins:
         return f"origin {attributes.origin}"
@@ -138,10 +138,10 @@ def _unfit(reader: EpisodeReader, origins: Collection[Origin]) -> str | None:
 
 
 def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> SceneEpisode:
-    """One episode of known success and seed.
+    """Read one episode of known success and seed.
 
     Raises:
-        InvalidInputError: success or seed are not known.
+        InvalidInputError: success or seed is unknown.
         UnknownNameError: a stream is missing.
         CorruptDataError: damaged bytes.
     """
@@ -184,7 +184,7 @@ def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> Sc
 
 
 def motion_of(attributes: EpisodeAttributes) -> str:
-    """What the hands did, by the figures that the twin keeps in `quality`."""
+    """Kind of motion, from the annotations that the twin stores in `quality`."""
     quality = attributes.quality
     if "played" in quality:
         return "policy"
@@ -202,7 +202,7 @@ def _no_images() -> tuple[np.ndarray, np.ndarray]:
 
 
 def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
-    """Images of the steps that have one of their own, and these steps."""
+    """Images of the grid steps that have one, and these steps."""
     if CAMERA not in reader.streams or not reader.num_samples(CAMERA):
         return _no_images()
     steps, images = reader.shown_steps(CAMERA)
@@ -212,7 +212,7 @@ def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
 def _object_poses(
     reader: EpisodeReader, grid_ns: np.ndarray
 ) -> Float32[np.ndarray, "steps objects 7"]:
-    """Poses at the grid steps, between the two samples around each where none lies on it."""
+    """Poses at the grid steps, interpolated between the neighbouring samples."""
     data = reader.read("object_poses")
     if np.array_equal(data.t_ref_ns, grid_ns):
         return data.values.astype(np.float32)
@@ -225,7 +225,7 @@ def _object_poses(
 
 
 def place_of_scene(episode: SceneEpisode) -> float:
-    """A number in 0 … 1 from a hash of task and seed: it never changes when episodes are added."""
+    """Hash of task and seed as a number in 0 … 1; adding episodes does not change it."""
     digest = hashlib.sha256(f"{episode.task}/{episode.seed}".encode()).digest()
     return int.from_bytes(digest[:8], "big") / 2**64
 
@@ -233,7 +233,7 @@ def place_of_scene(episode: SceneEpisode) -> float:
 def split_by_scene(
     episodes: Iterable[SceneEpisode], *, held_out_share: float
 ) -> tuple[list[SceneEpisode], list[SceneEpisode]]:
-    """Training and held-out episodes; all of a task and seed fall on the same side.
+    """Training and held-out episodes; a task and seed is always on one side.
 
     Raises:
         InvalidInputError: a share outside 0 … 1, or an empty side.
@@ -253,10 +253,10 @@ def split_by_scene(
 def refuse_shared_scenes(
     training: Sequence[SceneEpisode], held_out: Sequence[SceneEpisode]
 ) -> None:
-    """Refuse a split with the same task and seed on both sides.
+    """Reject a split with the same task and seed on both sides.
 
     Raises:
-        ConflictError: there is one; the first few are named.
+        ConflictError: scenes are shared; the first few are named.
     """
     shared = sorted({e.scene for e in training} & {e.scene for e in held_out})
     if shared:

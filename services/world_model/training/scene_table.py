@@ -1,4 +1,4 @@
-"""Episodes as tensors for training start readers and recurrent cores on whole episodes."""
+"""Tensors of whole episodes for training start readers and recurrent cores."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -28,7 +28,7 @@ from services.world_model.training.scene_episodes import SceneEpisode
 
 @dataclass(frozen=True)
 class HandTable:
-    """Hands of every step of every episode, in the world."""
+    """Hands at every step of every episode, in the world."""
 
     points_m: Float32[Tensor, "episodes steps 2 6 3"]
     axes: Float32[Tensor, "episodes steps 2 6"]
@@ -36,7 +36,7 @@ class HandTable:
 
     @classmethod
     def of(cls, motions: Sequence[HandMotion]) -> "HandTable":
-        """Motions of one length."""
+        """Stack motions of one length."""
         return cls(
             torch.from_numpy(np.stack([motion.points_m for motion in motions])),
             torch.from_numpy(np.stack([motion.axes for motion in motions])),
@@ -48,9 +48,9 @@ class HandTable:
 class SceneTable:
     """Episodes of one length on the model grid.
 
-    `images` are of the steps `image_steps`; `in_contact` says which pads touch something;
-    `sent` are commanded hands where an episode has them, measured ones elsewhere, and `commanded`
-    says which. `labelled` says of which episodes the object poses may be learned from.
+    `images` are those of the steps `image_steps`; `in_contact` marks pads in contact; `sent` are
+    commanded hands where available and measured ones elsewhere, as given by `commanded`.
+    `labelled` marks episodes whose object poses are trained on.
     """
 
     sent: HandTable
@@ -73,13 +73,13 @@ class SceneTable:
 
     @property
     def num_steps(self) -> int:
-        """Steps of every episode, the first one included."""
+        """Steps of every episode, including the first one."""
         return self.tactile_kpa.shape[1]
 
     def first_steps(
         self, rows: Int64[Tensor, " batch"], steps: Int64[Tensor, " batch"]
     ) -> FirstStep:
-        """What a start reader sees of some steps, each of which has an image."""
+        """Start reader inputs at steps that have an image."""
         places = torch.tensor([self.image_steps.index(int(step)) for step in steps])
         return FirstStep(
             self.images[rows, places],
@@ -108,7 +108,7 @@ class SceneTable:
         )
 
     def commands(self, rows: Tensor, start: int, use_measured: Bool[Tensor, " batch"]) -> Commands:
-        """Standing where measured at `start`, then as sent (or measured) until the end."""
+        """Measured hands at `start`, then the sent (or measured) ones until the end."""
         latents = torch.arange(start, self.num_steps - 1, STEPS_PER_LATENT)
         looks = latents[:, None] + torch.tensor(LOOKS)
         ends = looks[:, -1]
@@ -132,7 +132,7 @@ class SceneTable:
         return latents[:, None] + torch.arange(1, STEPS_PER_LATENT + 1)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything as named tensors, for a file that other processes read."""
+        """All data as named tensors, to share with other processes through a file."""
         flat = {"image_steps": torch.tensor(self.image_steps)}
         for name in (one.name for one in fields(self) if one.name != "image_steps"):
             part = getattr(self, name)
@@ -189,16 +189,16 @@ def vocabulary(episodes: Sequence[SceneEpisode]) -> tuple[tuple[str, ...], tuple
 def scene_table(
     episodes: Sequence[SceneEpisode], config: DynamicsConfig, *, labelled: Sequence[bool] = ()
 ) -> SceneTable:
-    """Tensors of episodes.
+    """Build the tensors of episodes.
 
     Args:
         episodes: at least one.
         config: of the dynamics model.
-        labelled: for each episode, whether its object poses may be learned from; without it all.
+        labelled: for each episode, whether its object poses are trained on; default: all.
 
     Raises:
-        InvalidInputError: lengths or image steps differ, a length is not 1 + 4k, or a task or an
-            image size is not the configuration's.
+        InvalidInputError: lengths or image steps differ, a length is not 1 + 4k, or a task or
+            image size is not in the configuration.
     """
     _check(episodes, config)
     sent, measured = [], []

@@ -1,4 +1,4 @@
-"""Episodes to train on and episodes to be judged on, and the checks that keep them apart."""
+"""Training and held-out episodes, and the checks that keep them disjoint."""
 
 from collections.abc import Sequence
 
@@ -13,7 +13,7 @@ from services.world_model.training.streaming import index_episodes
 def load_split(
     settings: TrainSettings,
 ) -> tuple[Sequence[TrainingEpisode], list[EpisodeArrays]]:
-    """Training and held-out episodes of the settings' stores; the latter always in memory."""
+    """Training and held-out episodes of the settings' stores; held-out ones are in memory."""
     if settings.streaming:
         return _stream_split(settings)
     episodes = load_episodes(settings.episodes)
@@ -33,7 +33,7 @@ def _stream_split(
 
 
 def check_not_learned(heldout: Sequence[TrainingEpisode], ancestor: Checkpoint) -> None:
-    """Raise if the checkpoint that a run starts from was trained on a held-out episode."""
+    """Raise if the initial checkpoint was trained on a held-out episode."""
     learned = set(ancestor.metadata.train_fingerprints)
     both = [episode.episode_id for episode in heldout if episode.content_hash() in learned]
     if both:

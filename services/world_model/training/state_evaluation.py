@@ -1,4 +1,4 @@
-"""Accuracy of a dynamics model on held-out scenes, open loop from several starts to the end."""
+"""Accuracy of a dynamics model on held-out scenes: open-loop rollouts from several starts."""
 
 from dataclasses import dataclass
 
@@ -14,23 +14,23 @@ from services.world_model.training.reader_training import reader_errors
 from services.world_model.training.scene_table import SceneTable
 
 CHUNK_STEPS = 16
-# Rollouts begin at these steps, as far as there are images of them.
+# Start steps of rollouts, as far as they have images.
 STARTS = (0, 16, 32, 48, 64)
 _BATCH = 64
-# Of held-out chunks of 16 steps, from any start, this share may pass a bound; of episodes of five
-# chunks, therefore, at most one in 200.
+# Bounds are this quantile over held-out chunks of 16 steps from any start, so that at most one in
+# 200 episodes of five chunks exceeds one.
 _BOUND_QUANTILE = 0.999
 _SMALLEST_DISTANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class StateFigures:
-    """What was measured, with the bounds that almost no held-out chunk passes.
+    """Measured accuracy, with the bounds that almost no held-out chunk exceeds.
 
-    `figures` hold errors of readers (of the first member) and objects in mm, contact F1 and error
-    of touch for each chunk of 16 steps, and those of copying the touch before the chunk. Names with
-    `from_16` are of rollouts that begin with the true step 16, and so on; their chunks are counted
-    from there. `object_mm` is the median error of an object's place at the end of a chunk.
+    `figures` hold errors of readers (first member) and objects in mm, and contact F1 and error of
+    touch for each chunk of 16 steps, also for repeating the touch before the chunk. Names with
+    `from_16` are of rollouts from the true step 16, and so on; their chunks count from there.
+    `object_mm` is the median position error of an object at the end of a chunk.
     """
 
     figures: dict[str, float]
@@ -41,7 +41,7 @@ class StateFigures:
 
 @dataclass(frozen=True)
 class _Imagined:
-    """Whole episodes from one start; the last two say how far each latent step is doubted."""
+    """Predictions of whole episodes from one start; the last two are uncertainty measures."""
 
     tactile_kpa: Float32[Tensor, "episodes steps 2 320"]
     position_m: Float32[Tensor, "episodes steps objects 3"]
@@ -50,7 +50,7 @@ class _Imagined:
 
 
 def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigures:
-    """Imagine every episode from its first step and from later ones, and compare."""
+    """Predict every episode from its first step and from later ones, and compare."""
     figures: dict[str, float] = {}
     disagreement_m, distance = [], []
     last_start = table.num_steps - 1 - STEPS_PER_LATENT
@@ -70,7 +70,7 @@ def evaluate_dynamics(dynamics: DynamicsModel, table: SceneTable) -> StateFigure
 
 
 def chunk_peaks(latents: Float32[Tensor, "episodes latents"]) -> Float32[Tensor, " chunks"]:
-    """Figures of the worst latent step of every chunk of 16 steps: what a rollout is asked."""
+    """Maximum over the latent steps of each chunk of 16 steps, which rollouts compare."""
     chunks = torch.split(latents, CHUNK_STEPS // STEPS_PER_LATENT, dim=1)
     return torch.cat([chunk.amax(1) for chunk in chunks])
 
@@ -101,7 +101,7 @@ def _chunk_figures(imagined: _Imagined, table: SceneTable, start: int) -> dict[s
 def _episode_figures(
     imagined: _Imagined, table: SceneTable, dynamics: DynamicsModel
 ) -> dict[str, float]:
-    """Errors of objects at the end and of readers at the start, task by task."""
+    """Errors of objects at the end and of readers at the start, by task."""
     figures: dict[str, float] = {}
     off_mm, there = _object_errors(imagined.position_m[:, -1], table, 0, table.num_steps - 1)
     for index, task in enumerate(dynamics.config.tasks):
@@ -117,7 +117,7 @@ def _episode_figures(
 def _object_errors(
     position_m: Float32[Tensor, "episodes objects 3"], table: SceneTable, start: int, step: int
 ) -> tuple[Tensor, Tensor]:
-    """Errors in mm at a step, and which objects are there both then and at the start."""
+    """Position errors in mm at a step, and which objects are present then and at the start."""
     rows = torch.arange(len(table))
     true = table.objects_at(rows, step)
     there = (true.present > 0) & (table.objects_at(rows, start).present > 0)

@@ -1,7 +1,7 @@
-"""Training of a state model: episodes of stores to a measured checkpoint, member by member.
+"""Training of a state model: trains, evaluates and writes an ensemble from episode stores.
 
-Members are trained in processes of their own and kept as soon as they are finished, so that an
-interrupted run goes on with those that are missing.
+Members are trained in separate processes and stored when they are finished, so that an interrupted
+run resumes with the missing ones.
 """
 
 import hashlib
@@ -51,9 +51,9 @@ from services.world_model.training.scene_episodes import (
 from services.world_model.training.scene_table import SceneTable, scene_table, vocabulary
 from services.world_model.training.state_evaluation import evaluate_dynamics
 
-# Each goes up with a change of training that makes other weights of the same settings and data.
+# Increment on changes of training that make other weights from equal settings and data.
 READER_VERSION, CORE_VERSION, RENDERER_VERSION = 3, 4, 3
-# The renderer learns from this many episodes at most: it sees few of their images anyway.
+# Largest number of episodes the renderer is trained on; it samples few of their images anyway.
 MAX_CLIPS = 1500
 _LOG_EVERY = 500
 _SEED_STRIDE = 1000
@@ -63,7 +63,7 @@ logger = structlog.get_logger(__name__)
 
 @dataclass(frozen=True)
 class StateReport:
-    """What a run made and how good it is on held-out scenes."""
+    """Result of a run, with its accuracy on held-out scenes."""
 
     checkpoint: Path
     digest: str
@@ -75,10 +75,10 @@ class StateReport:
 
 
 def train_state(settings: StateTrainSettings) -> StateReport:
-    """Train every member, measure the ensemble, write it.
+    """Train every member, evaluate the ensemble and write it.
 
     Raises:
-        InvalidInputError: no episodes, or ones that do not fit each other.
+        InvalidInputError: no episodes, or episodes that do not fit together.
     """
     torch.set_num_threads(1)
     episodes = _episodes(settings)
@@ -88,7 +88,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     parts = settings.output.with_suffix(".parts")
     parts.mkdir(parents=True, exist_ok=True)
     data_hash = _data_hash(training)
-    # Before training, so that episodes that do not fit are found at once.
+    # Before training, so that invalid episodes are found at once.
     heldout_table = scene_table(heldout, config)
     table = scene_table(training, config, labelled=_labelled(training, settings))
     codec = TouchCodec(config.touch_channels)
@@ -141,7 +141,7 @@ def train_state(settings: StateTrainSettings) -> StateReport:
 
 @dataclass(frozen=True)
 class _Work:
-    """What every member's process is given."""
+    """Input of every member's process."""
 
     settings: StateTrainSettings
     config: DynamicsConfig
@@ -149,22 +149,22 @@ class _Work:
     data_hash: str
 
     def reader_file(self, member: int) -> Path:
-        """Where a member's finished reader is kept; other settings or data have other names."""
+        """File of a member's finished reader; its name depends on settings and data."""
         return self.parts / f"reader-{self._key(READER_VERSION, 'reader')}-{member}.safetensors"
 
     def core_file(self, member: int) -> Path:
-        """Where a member's finished core is kept, which has learned with that member's reader."""
+        """File of a member's finished core, which was trained with that member's reader."""
         key = self._key(CORE_VERSION, "width", "reader", "core")
         return self.parts / f"core-{key}-{member}.safetensors"
 
     @property
     def renderer_file(self) -> Path:
-        """Where the finished renderer is kept."""
+        """File of the finished renderer."""
         key = self._key(RENDERER_VERSION, "renderer", "drawing")
         return self.parts / f"renderer-{key}.safetensors"
 
     def _key(self, version: int, *names: str) -> str:
-        """A digest of the data and of those settings that make other weights."""
+        """Digest of the data and of the settings that affect the weights."""
         chosen = self.settings.model_dump_json(
             include={"seed", "heldout_share", "labelled_share", *names}
         )
@@ -199,7 +199,7 @@ def _data_hash(episodes: list[SceneEpisode]) -> str:
 
 
 def _labelled(episodes: list[SceneEpisode], settings: StateTrainSettings) -> list[bool]:
-    """Of which episodes object poses are learned from: all takes of a scene, or none."""
+    """Mask of episodes whose object poses are trained on; equal for all takes of a scene."""
     # Training scenes lie above the held-out share.
     share = settings.heldout_share + (1 - settings.heldout_share) * settings.labelled_share
     labelled = [place_of_scene(episode) <= share for episode in episodes]
@@ -226,7 +226,7 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
 
 
 def _train_parts(work: _Work) -> float:
-    """Train the parts that are not there yet, several at a time; the CPU seconds of all parts."""
+    """Train missing parts, several in parallel; returns the CPU seconds of all parts."""
     missing = [m for m in range(work.settings.num_members) if not work.core_file(m).exists()]
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
@@ -265,7 +265,7 @@ def _say_drawing(now: RendererProgress) -> None:
 
 
 def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
-    """Write a finished part in one move, with the CPU seconds that it took."""
+    """Write a finished part atomically, with its CPU seconds."""
     partial = path.with_suffix(".partial")
     tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
     save_file(tensors, partial, metadata={_CPU_S: str(cpu_s)})
@@ -310,17 +310,17 @@ def _train_member(work: _Work, member: int) -> None:
 
 
 class _Log:
-    """Says now and then where a member's training stands."""
+    """Periodic progress log of a member's training."""
 
     def __init__(self, member: int) -> None:
         self._member = member
 
     def reader(self, step: int, loss: float) -> None:
-        """One step of the reader."""
+        """Log one step of the reader."""
         self._say("reader", step, loss)
 
     def core(self, step: int, loss: float) -> None:
-        """One step of the core."""
+        """Log one step of the core."""
         self._say("core", step, loss)
 
     def _say(self, part: str, step: int, loss: float) -> None:
@@ -341,7 +341,7 @@ def _assembled(work: _Work, codec: TouchCodec) -> DynamicsModel:
 
 
 def _command(settings: StateTrainSettings) -> str:
-    """The command that repeats a run; stores go by their last name, since folders do not travel."""
+    """Command that repeats a run; stores are given by their last path component."""
     left_out = {"output", "episodes", "jobs", "json_path"}
     given = settings.model_dump(mode="json", exclude_defaults=True, exclude=left_out)
     flags = [f"--episodes={url.rstrip('/').rsplit('/', 1)[-1]}" for url in settings.episodes]

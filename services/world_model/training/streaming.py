@@ -1,7 +1,7 @@
-"""Streaming dataset: windows are read from the disk when they are needed.
+"""Streaming dataset: reads windows from disk when they are needed.
 
-For more episodes than memory holds. A window is read through the store's reader, which decodes one
-camera and the span of the window only.
+For data larger than memory. A window is read through the store's reader, which decodes one camera
+and only the span of the window.
 """
 
 import multiprocessing
@@ -31,7 +31,7 @@ from services.world_model.training.dataset import (
 )
 from services.world_model.training.episodes import CAMERA, check_rates, read_episode
 
-# Readers that a process keeps open; each holds an episode's stamps and actions.
+# Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
 StartMethod = Literal["fork", "spawn", "forkserver"]
 
@@ -43,7 +43,7 @@ def _reader(url: str, episode_id: str) -> EpisodeReader:
 
 @dataclass(frozen=True)
 class StoredEpisode:
-    """One episode that stays on the disk; `index_episodes` makes it."""
+    """One episode that stays on disk; created by `index_episodes`."""
 
     url: str
     episode_id: str
@@ -57,19 +57,19 @@ class StoredEpisode:
         return self.num_steps
 
     def content_hash(self) -> str:
-        """The `fingerprint` of its content when it was indexed."""
+        """`fingerprint` of the content at the time of indexing."""
         return self.content_sha256
 
     def load(self) -> EpisodeArrays:
-        """The whole episode in memory."""
+        """Load the whole episode."""
         return read_episode(_reader(self.url, self.episode_id))
 
     def cut(self, place: Place) -> Window:
-        """The window at a place in this episode, read now.
+        """Read the window at a place in this episode.
 
         Raises:
             InvalidInputError: steps outside the episode.
-            UnknownNameError: a kind of action that it does not hold.
+            UnknownNameError: an action kind that it does not have.
             CorruptDataError: damaged bytes.
         """
         read = _reader(self.url, self.episode_id).window(
@@ -93,18 +93,17 @@ class StoredEpisode:
 
 
 def index_episodes(url: str) -> list[StoredEpisode]:
-    """All episodes of a store; each is read once, for the hash of its content, and let go.
+    """All episodes of a store; each is read once to hash its content.
 
     Raises:
-        InvalidInputError: a store without episodes, one of another rate than the others, or one
-            without an image for every step.
+        InvalidInputError: the store is empty, mixes model rates, or lacks the image of a step.
         UnknownNameError: an episode without the head camera.
     """
-    # An id may hold something else than when it was last read.
+    # The episode of an id may have changed since it was last read.
     _reader.cache_clear()
     episodes, rates_hz = [], set()
     for episode_id in EpisodeStore(url).list():
-        # Through the readers that are kept: processes that are forked later find them open.
+        # Uses the cached readers, so that processes forked later inherit them open.
         arrays = read_episode(_reader(url, episode_id))
         rates_hz.add(arrays.model_rate_hz)
         episodes.append(
@@ -123,27 +122,26 @@ def index_episodes(url: str) -> list[StoredEpisode]:
 
 
 class WindowDataset(Dataset[Window]):
-    """Every window of `num_steps` steps with measured actions, by number; others by place.
+    """Every window of `num_steps` steps with measured actions, by index; others by place.
 
-    Windows are numbered by episode, then by start. It may be taken along into the worker processes
-    of a DataLoader, forked or spawned.
+    Windows are numbered by episode, then by start. Works in DataLoader workers, forked or spawned.
 
     Args:
-        episodes: to cut from; those shorter than a window give none.
-        num_steps: of the windows that are asked for by number.
+        episodes: episodes to cut from; those shorter than a window contribute none.
+        num_steps: length of the windows accessed by index.
     """
 
     def __init__(self, episodes: Sequence[TrainingEpisode], *, num_steps: int) -> None:
         self._episodes, self._num_steps = list(episodes), num_steps
         counts = (max(0, len(episode) - num_steps + 1) for episode in self._episodes)
-        # First number of each episode's windows, and one past the last of all.
+        # Index of each episode's first window, and the total number at the end.
         self._firsts = np.array(list(accumulate(counts, initial=0)), dtype=np.int64)
 
     def __len__(self) -> int:
         return int(self._firsts[-1])
 
     def place(self, number: int) -> Place:
-        """Where window `number` lies.
+        """Place of window `number`.
 
         Raises:
             InvalidInputError: no such window.
@@ -165,13 +163,13 @@ def read_batches(
     num_workers: int = 0,
     start_method: StartMethod | None = None,
 ) -> Generator[WindowBatch, None, None]:
-    """The batches at these places, in their order, however many processes read them.
+    """Batches at these places, in order, whatever the number of processes.
 
     Args:
-        episodes: that the places count from.
-        places: of each batch; may be endless, some are asked for ahead.
-        num_workers: processes that read; 0 reads in this one. They end with the iterator.
-        start_method: of the processes; None for the platform's own.
+        episodes: episodes that the places refer to.
+        places: places of each batch; may be endless and is read ahead.
+        num_workers: reader processes, which end with the iterator; 0 reads in this process.
+        start_method: start method of the processes; None for the platform's default.
     """
     loader = DataLoader(
         WindowDataset(episodes, num_steps=1),
@@ -179,7 +177,7 @@ def read_batches(
         collate_fn=stack_windows,
         num_workers=num_workers,
         multiprocessing_context=_context(start_method) if num_workers else None,
-        # Its own generator: otherwise the loader draws a seed for its workers from the global one.
+        # Its own generator: otherwise the loader seeds its workers from the global one.
         generator=torch.Generator().manual_seed(0),
     )
     yield from loader

@@ -1,4 +1,4 @@
-"""Training of the paper's form, from settings to a measured checkpoint and a report."""
+"""Training of the joint flow-matching model, from settings to an evaluated checkpoint."""
 
 import json
 import math
@@ -53,7 +53,7 @@ MIN_LEARNING_RATE_SHARE = 0.01
 
 @dataclass(frozen=True)
 class TrainingProgress:
-    """Where a run stands: what a progress bar needs."""
+    """Progress of a run, as a progress bar shows it."""
 
     step: int
     share: float
@@ -63,7 +63,7 @@ class TrainingProgress:
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """What a run made and how good it is on held-out episodes."""
+    """Result of a run, with its accuracy on held-out episodes."""
 
     checkpoint: Path
     digest: str
@@ -81,7 +81,7 @@ OnState = Callable[["TrainingRun"], None]
 
 
 def train(settings: TrainSettings, on_progress: OnProgress | None = None) -> TrainingReport:
-    """Load episodes, train, store, and measure what was stored.
+    """Load episodes, train, write and evaluate the checkpoint.
 
     Raises:
         InvalidInputError: no episodes, too short ones, or held-out ones among those trained on.
@@ -103,7 +103,7 @@ def train_on(
     prints = {episode.content_hash() for episode in trained}
     names = {episode.episode_id for episode in trained}
     if ancestor is not None:
-        # What the ancestor was trained on is no test either.
+        # Episodes that the initial checkpoint was trained on cannot be held out either.
         check_not_learned(heldout, ancestor)
         prints |= set(ancestor.metadata.train_fingerprints)
         names |= set(ancestor.metadata.train_episode_ids)
@@ -124,7 +124,7 @@ def train_on(
         initialized_from=None if ancestor is None else ancestor.digest,
     )
     write_checkpoint(settings.output, run.averaged, metadata)
-    # Measured on the weights as stored, then stored again with the figures.
+    # Evaluate the weights as stored, then store them again with the results.
     stored = read_checkpoint(settings.output).model
     metrics = {
         **evaluate_prediction(
@@ -151,7 +151,7 @@ def train_on(
 def _run_or_resume(
     run: "TrainingRun", ancestor: Checkpoint | None, on_progress: OnProgress | None
 ) -> list[TrainingProgress]:
-    """The whole run, or what a process that died left of it; its state is kept on the way."""
+    """Run from the start or resume an interrupted run; saves its state regularly."""
     settings = run.settings
     path = state_path(settings.output)
     identity = identity_of(
@@ -178,9 +178,9 @@ def _run_or_resume(
 
 
 class TrainingRun:
-    """One run: network, its running average, optimizer and clock.
+    """One run: network, weight average, optimizer and clock.
 
-    Windows of a seed are the same ones whether they are cut in memory or streamed from the disk.
+    Windows depend on the seed only, not on whether they are cut in memory or streamed from disk.
     """
 
     def __init__(self, episodes: Sequence[TrainingEpisode], settings: TrainSettings) -> None:
@@ -195,7 +195,7 @@ class TrainingRun:
         self.averaged = JointWorldModel(settings.network).eval()
         self._generator = torch.Generator().manual_seed(settings.seed + 1)
         self._rng = np.random.default_rng(settings.seed + 2)
-        # Its state after the windows that were learned from, and after those that wait.
+        # Generator states after the windows trained on, and after those read ahead.
         self._window_numbers = json.dumps(self._rng.bit_generator.state)
         self._drawn: deque[str] = deque()
         windows = settings.windows
@@ -216,7 +216,7 @@ class TrainingRun:
 
     @torch.no_grad()
     def fit_codecs(self) -> None:
-        """Fit everything that is closed form: codecs, action statistics, residual scales."""
+        """Fit everything in closed form: codecs, action statistics, residual scales."""
         model, config = self.model, self.settings.network
         batch = self._sampler.draw(self.settings.windows.fit_windows, config.max_steps)
         model.codec.fit(batch.images)
@@ -228,10 +228,10 @@ class TrainingRun:
         self.averaged.load_state_dict(model.state_dict())
 
     def start_from(self, checkpoint: Checkpoint) -> None:
-        """Take over weights and codecs, as `fit_codecs` and training left them.
+        """Take over the weights and codecs of a checkpoint.
 
         Raises:
-            ConflictError: a checkpoint of other network settings; they are named.
+            ConflictError: the checkpoint has other network settings; they are named.
         """
         asked = self.settings.network.model_dump()
         there = checkpoint.metadata.network.model_dump()
@@ -245,7 +245,7 @@ class TrainingRun:
         self.averaged.load_state_dict(checkpoint.model.state_dict())
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Tensors and other facts that the next steps depend on."""
+        """Tensors and metadata that the next steps depend on."""
         tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
         tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
         tensors |= optimizer_tensors(self._optimizer)
@@ -259,7 +259,7 @@ class TrainingRun:
         return tensors, facts
 
     def restore(self, state: TrainingState) -> None:
-        """Go on where `state` was taken."""
+        """Continue from `state`."""
         self.model.load_state_dict(part_of(state.tensors, "model."))
         self.averaged.load_state_dict(part_of(state.tensors, "averaged."))
         restore_optimizer(self._optimizer, state.tensors)
@@ -275,8 +275,8 @@ class TrainingRun:
         """Train until the budget or the number of steps is used up; returns the loss log.
 
         Args:
-            on_progress: gets every entry of the log.
-            on_step: gets the run after every step.
+            on_progress: called with every entry of the log.
+            on_step: called with the run after every step.
         """
         start_s = time.process_time() - self.cpu_s
         self.model.train()
@@ -298,13 +298,13 @@ class TrainingRun:
         return self.log
 
     def share(self) -> float:
-        """Share of the run that is done, by the tighter of its two limits."""
+        """Completed fraction of the run, by the tighter of its two limits."""
         by_time = self.cpu_s / self.settings.cpu_budget_s
         limit = self.settings.max_steps
         return by_time if limit is None else max(by_time, self.step / limit)
 
     def learn(self, batch: WindowBatch) -> tuple[float, float]:
-        """One step of the optimizer; the losses of sight and touch come back."""
+        """One optimizer step; returns the video and tactile losses."""
         settings = self.settings.optimizer
         inputs = build_inputs(batch.requests, self.settings.network)
         loss = losses(
@@ -331,25 +331,25 @@ class TrainingRun:
         return loss.video.item(), loss.tactile.item()
 
     def _batches(self) -> Iterator[WindowBatch]:
-        """The windows of each step, for ever."""
+        """Endless iterator over the windows of each step."""
         if self.settings.streaming:
             workers = self.settings.loader_workers
             return read_batches(self.episodes, self._noted_places(), num_workers=workers)
         return map(self._sampler.cut, self._noted_places())
 
     def _noted_places(self) -> Iterator[list[Place]]:
-        """`places`, noting the random numbers after each: readers ask for some ahead."""
+        """`places`, recording the generator state after each, since readers fetch ahead."""
         for places in self.places():
             self._drawn.append(json.dumps(self._rng.bit_generator.state))
             yield places
 
     def places(self) -> Iterator[list[Place]]:
-        """Where the windows of each step lie, for ever."""
+        """Endless iterator over the places of the windows of each step."""
         while True:
             yield self._sampler.places(self.settings.optimizer.batch, self._num_steps())
 
     def _num_steps(self) -> int:
-        """Mostly the full window; sometimes 5, 9, … steps, since short chunks are served too."""
+        """Mostly the full window; sometimes 5, 9, … steps, since short chunks are served, too."""
         longest = self.settings.network.max_steps
         if self._rng.random() >= self.settings.windows.short_fraction:
             return longest
@@ -357,14 +357,14 @@ class TrainingRun:
 
     @torch.no_grad()
     def _average(self) -> None:
-        # Early weights are forgotten faster, so that short runs are not held back by the start.
+        # A shorter memory at first, so that short runs do not keep the initial weights.
         decay = min(self.settings.optimizer.ema_decay, (1 + self.step) / (10 + self.step))
         for mean, weight in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
             mean.lerp_(weight, 1.0 - decay)
 
 
 def learning_rate(settings: OptimizerSettings, step: int, share: float) -> float:
-    """Linear warm-up, then half a cosine over the share of the run that is done."""
+    """Linear warm-up, then half a cosine over the completed fraction of the run."""
     warmup = min(1.0, (step + 1) / settings.warmup_steps)
     cosine = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
     return settings.learning_rate * warmup * max(cosine, MIN_LEARNING_RATE_SHARE)

@@ -1,8 +1,8 @@
-"""State of a training run beside its output, so that a run whose process died can go on.
+"""State of a training run, saved beside its output so that an interrupted run can resume.
 
-One safetensors file holds the weights, their running average, the optimizer and the state of the
-random numbers; its metadata holds the counters as JSON. The file is replaced in one move, so that
-a kill at any moment leaves the last complete state. It is removed when the run has ended.
+One safetensors file holds the weights, their moving average, the optimizer and the random state;
+its metadata holds the counters as JSON. The file is replaced atomically, so that a crash at any
+time leaves the last complete state. It is removed when the run has ended.
 """
 
 import json
@@ -23,7 +23,7 @@ from services.world_model.settings import TrainSettings
 
 METADATA_KEY: Final = "dextouch_training_state"
 SUFFIX: Final = ".resume"
-# Settings that may be others when a run goes on.
+# Settings that may change when a run resumes.
 _FREE_SETTINGS: Final = {
     "episodes", "heldout", "output", "json_path", "resume", "state_every_cpu_s", "init",
     "streaming", "loader_workers", "num_threads",
@@ -31,11 +31,11 @@ _FREE_SETTINGS: Final = {
 
 
 class RunFacts(BaseModel):
-    """What a state holds beside its tensors.
+    """Metadata of a state.
 
-    `identity` are the settings and data that the run began with, `window_numbers` is the state of
-    the generator that draws windows, as JSON, after the last step that was learned from. `log` has
-    rows of step, share of the run, and the losses of sight and touch.
+    `identity` holds the settings and data of the run, `window_numbers` the state of the generator
+    that draws windows after the last completed step, as JSON. `log` has rows of step, completed
+    fraction of the run, and the video and tactile losses.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -51,8 +51,8 @@ class RunFacts(BaseModel):
 class TrainingState:
     """Everything that the next steps of a run depend on.
 
-    Names of tensors begin with `model.`, `averaged.`, `optimizer.` (then the number of the
-    parameter and the name of its moment) or are `generator`.
+    Tensor names begin with `model.`, `averaged.` or `optimizer.` (followed by the number of the
+    parameter and the name of its moment), or are `generator`.
     """
 
     tensors: dict[str, Tensor]
@@ -60,20 +60,20 @@ class TrainingState:
 
 
 def state_path(output: Path) -> Path:
-    """Where the state of a run with this output lies."""
+    """Path of the state of a run with this output."""
     return output.with_name(output.name + SUFFIX)
 
 
 def identity_of(
     settings: TrainSettings, *, data_hash: str, init_digest: str | None
 ) -> dict[str, JsonValue]:
-    """What has to be the same when a run goes on."""
+    """Settings and data that must not change when a run resumes."""
     kept: dict[str, JsonValue] = settings.model_dump(mode="json", exclude=_FREE_SETTINGS)
     return {**kept, "data_hash": data_hash, "init_digest": init_digest}
 
 
 def write_state(path: Path, state: TrainingState) -> None:
-    """Replace the state of a run in one move."""
+    """Replace the state of a run atomically."""
     path.parent.mkdir(parents=True, exist_ok=True)
     tensors = {name: tensor.detach().contiguous() for name, tensor in state.tensors.items()}
     partial = path.with_name(path.name + ".partial")
@@ -85,11 +85,11 @@ def write_state(path: Path, state: TrainingState) -> None:
 
 
 def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
-    """The state of a run that went on with these settings and data.
+    """Read the state of a run with these settings and data.
 
     Raises:
-        ConflictError: it is of other settings or data; they are named.
-        CorruptDataError: no state of ours, or a damaged one.
+        ConflictError: the state has other settings or data; they are named.
+        CorruptDataError: not a training state, or a damaged one.
     """
     try:
         with safe_open(path, framework="pt") as file:
@@ -114,7 +114,7 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
 
 
 def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
-    """The moments of every parameter by name."""
+    """Optimizer moments of every parameter, by name."""
     kept: dict[int, dict[str, Tensor]] = optimizer.state_dict()["state"]
     return {
         f"optimizer.{number}.{name}": moment
@@ -124,7 +124,7 @@ def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
 
 
 def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor]) -> None:
-    """Bring back what `optimizer_tensors` gave."""
+    """Restore the moments returned by `optimizer_tensors`."""
     moments: dict[int, dict[str, Any]] = {}
     for name, tensor in part_of(tensors, "optimizer.").items():
         number, moment = name.split(".", 1)
@@ -134,5 +134,5 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: Mapping[str, Te
 
 
 def part_of(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Those whose names begin with a prefix, without it."""
+    """Tensors whose names begin with a prefix, without that prefix."""
     return {n.removeprefix(prefix): t for n, t in tensors.items() if n.startswith(prefix)}
