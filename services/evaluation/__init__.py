@@ -1,1 +1,1 @@
-"""Policies, success probes, closed-loop evaluation of worlds, and the report about all of it."""
+"""Policies, success probes, closed-loop evaluation in worlds, and evaluation reports."""

@@ -1,4 +1,4 @@
-"""The commands of the evaluation service: train a policy or the probe, or score policies."""
+"""Command line of the evaluation service: train policies and probes, and score policies."""
 
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -41,18 +41,18 @@ from services.evaluation.success_probe_training import train_success_probe
 
 USAGE = """usage: python -m services.evaluation COMMAND [flags]
 
-  train-policy         imitate the successful robot episodes of a store
-  train-probe          learn to tell success from the last images and touch
-  train-direct-judge   the probe's rival: success from first observation and commands alone
-  run                  roll policies out in a real and in imagined worlds, and score both
+  train-policy         train a policy on the successful robot episodes of a store
+  train-probe          train the success probe on final images and touch
+  train-direct-judge   train the probe's baseline on first observations and commands
+  run                  roll out policies in a real and in imagined worlds and score them
 
-Each explains itself with --help."""
+Run a command with --help for its options."""
 EXIT_FAILED = 1
 EXIT_USAGE = 2
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command; returns its exit status, 2 for an unknown command."""
+    """Run one command and return its exit status (2 for an unknown command)."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     commands: dict[str, Callable[[list[str]], int]] = {
         "train-policy": run_train_policy,
@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def run_train_policy(arguments: list[str]) -> int:
-    """Train the cloned policy and keep it, and an early one if asked."""
+    """Train the cloned policy and save it, optionally with an early checkpoint."""
     settings = load_settings(TrainPolicySettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
     trained = train_cloned_policy(
@@ -86,7 +86,7 @@ def run_train_policy(arguments: list[str]) -> int:
 
 
 def run_train_probe(arguments: list[str]) -> int:
-    """Train the success probe and keep it."""
+    """Train the success probe and save it."""
     settings = load_settings(TrainProbeSettings, arguments)
 
     def read(urls: Sequence[str]) -> list[EndingEpisode]:
@@ -104,7 +104,7 @@ def run_train_probe(arguments: list[str]) -> int:
 
 
 def run_train_direct_judge(arguments: list[str]) -> int:
-    """Train the direct judge and keep it."""
+    """Train the direct judge and save it."""
     settings = load_settings(TrainDirectSettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
     items = read_attempts(*stores, tasks=settings.tasks)
@@ -124,10 +124,10 @@ def _keep(checkpoint: Checkpoint, output: Path, json_path: Path | None) -> int:
 
 
 def run_evaluation(arguments: list[str]) -> int:
-    """Score every policy in every world; the figures go to the terminal and the asked files.
+    """Score every policy in every world; print the results and write the requested files.
 
     Returns:
-        0, or 1 when a rollout failed.
+        0, or 1 if a rollout failed.
     """
     settings = load_settings(RunSettings, arguments)
     probe = SuccessProbe.load(settings.probe)
@@ -158,11 +158,11 @@ def run_evaluation(arguments: list[str]) -> int:
 
 
 def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str, Sequence[str]]]:
-    """Every asked policy by its name, and the starts that ours were trained on.
+    """All requested policies by name, and the training starts of the bundled ones.
 
     Raises:
-        InvalidInputError: two policies of one name, or one of yours that does not load.
-        UnknownNameError: arguments for a policy that is not there.
+        InvalidInputError: two policies of one name, or a user policy that does not load.
+        UnknownNameError: arguments for a policy that was not requested.
     """
     sources = [PolicySource.parse(text) for text in settings.policy]
     names = [source.name for source in sources]
@@ -188,7 +188,7 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
 
 
 def instructions_for(tasks: Sequence[str], known: Mapping[str, str]) -> dict[str, str]:
-    """The sentences of tasks; of all that are known when none is named.
+    """Instructions of the given tasks, or of all known tasks if none is given.
 
     Raises:
         UnknownNameError: a task that the success probe does not know.
@@ -220,7 +220,7 @@ def _print_scores(report: Mapping[str, Any]) -> None:
 
 
 def _print_failures(report: Mapping[str, Any], results: Path) -> None:
-    """What failed, to standard error, with one example of each kind."""
+    """Print the failed rollouts to standard error, with one example of each kind."""
     rows = failure_rows(report)
     if rows:
         print(

@@ -1,7 +1,7 @@
-"""Calibration of a judge: how its log odds become probabilities that come true as often as said.
+"""Calibration of a success classifier: maps log odds to probabilities that match frequencies.
 
-Two numbers for each task and kind of ending, fitted on episodes that the judge was not trained
-on, and from the same episodes the band of probabilities in which it had better not decide.
+Temperature and bias for each task and kind of ending are fitted on episodes that the classifier was
+not trained on, together with the band of probabilities in which it should abstain.
 """
 
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ from dextouch.errors import InvalidInputError
 
 NUM_BINS: Final = 10
 _MAX_NEWTON_STEPS: Final = 50
-# Weight of "as the network says" in the fit of the inverse temperature and the bias, in endings.
+# Weight of the prior (temperature 1, bias 0) in the fit, in endings.
 _PRIOR_ENDINGS: Final = 2.0
-# The judge may refuse what lies between 5 % and 95 %, never more.
+# The undecided band is at most 5 % … 95 %.
 _WIDEST_BAND: Final = 0.45
 
 
 class Calibration(BaseModel):
-    """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of a half."""
+    """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of 0.5."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -37,14 +37,14 @@ class Calibration(BaseModel):
 
 @dataclass(frozen=True)
 class Reliability:
-    """How far probabilities can be taken at their word: both figures are best at 0."""
+    """Calibration metrics of probabilities; 0 is best for both."""
 
     expected_calibration_error: float
     brier: float
 
     @classmethod
     def of(cls, probabilities: np.ndarray, success: np.ndarray) -> "Reliability":
-        """The figures of some endings."""
+        """Metrics of a set of endings."""
         return cls(
             expected_calibration_error(probabilities, success), brier(probabilities, success)
         )
@@ -58,13 +58,13 @@ def sigmoid(log_odds: np.ndarray) -> Float64[np.ndarray, "*n"]:
 def expected_calibration_error(
     probabilities: np.ndarray, success: np.ndarray, *, num_bins: int = NUM_BINS
 ) -> float:
-    """Mean distance of said and true success rates over equally wide bins (Guo et al. 2017).
+    """Mean distance of predicted and true success rates over bins of equal width (Guo et al. 2017).
 
-    Every bin counts by its endings. A perfectly honest judge has an error above 0 as well, of
-    about √(p(1−p)/n) in a bin of n.
+    Bins are weighted by their number of endings. Even a perfectly calibrated classifier has an
+    error of about √(p(1−p)/n) in a bin of n.
 
     Raises:
-        InvalidInputError: nothing to measure on, or arrays that do not fit.
+        InvalidInputError: no endings, or arrays of different lengths.
     """
     told, came = _pair(probabilities, success)
     bins = np.minimum((told * num_bins).astype(int), num_bins - 1)
@@ -73,10 +73,10 @@ def expected_calibration_error(
 
 
 def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
-    """Mean squared distance of probability and outcome (Brier 1950).
+    """Mean squared difference of probability and outcome (Brier 1950).
 
     Raises:
-        InvalidInputError: nothing to measure on, or arrays that do not fit.
+        InvalidInputError: no endings, or arrays of different lengths.
     """
     told, came = _pair(probabilities, success)
     return float(np.mean((told - came) ** 2))
@@ -85,19 +85,19 @@ def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
 def fit_calibration(
     log_odds: np.ndarray, success: np.ndarray, *, risk: float = 0.05
 ) -> Calibration:
-    """Temperature, bias and undecided band from endings that the judge was not trained on.
+    """Fit temperature, bias and undecided band to endings that were not trained on.
 
-    Platt's scaling with his targets, (n⁺ + 1) / (n⁺ + 2) and 1 / (n⁻ + 2), which keep the fit
-    finite where the judge separates the endings without error (Platt 1999), and a weak pull
-    towards the network's own odds for a handful of endings.
+    Platt scaling with his targets (n⁺ + 1) / (n⁺ + 2) and 1 / (n⁻ + 2), which keep the fit finite
+    for endings that are separated without error (Platt 1999), and a weak prior towards the
+    network's own odds for small samples.
 
     Args:
-        log_odds: [n] of the network.
-        success: [n], what came true.
-        risk: share of errors that is allowed among the decided endings.
+        log_odds: [n] log odds from the network.
+        success: [n] outcomes.
+        risk: allowed share of errors among the decided endings.
 
     Raises:
-        InvalidInputError: only one outcome, or a risk that is none.
+        InvalidInputError: only one outcome, or a risk outside 0 … 1.
     """
     odds, came = np.asarray(log_odds, dtype=np.float64), np.asarray(success, dtype=bool)
     if odds.shape != came.shape or came.all() or not came.any() or not 0 < risk < 1:
@@ -113,15 +113,15 @@ def fit_calibration(
 
 
 def undecided_band(probabilities: np.ndarray, success: np.ndarray, *, risk: float) -> float:
-    """Least half width about 0.5 outside of which the judge errs in at most `risk` of the cases.
+    """Smallest half width about 0.5 outside of which at most `risk` of the decisions are wrong.
 
-    One more error than was seen is assumed, as in conformal risk control, so few endings give a
-    wide band. It is never wider than 0.45, even where the risk is not met then.
+    One error more than observed is assumed, as in conformal risk control, so that few endings give
+    a wide band. The half width is capped at 0.45, even if the risk is then exceeded.
     """
     told, came = _pair(probabilities, success)
     sureness = np.abs(told - 0.5)
     wrong = (told >= 0.5) != (came > 0.5)
-    # Just below a half width of 0 all are decided; each further one leaves out the least sure.
+    # Just below a half width of 0 all are decided; each step excludes the least certain one.
     for width in np.concatenate([[0.0], np.sort(sureness)]):
         decided = sureness > width if width else np.ones(len(told), dtype=bool)
         if width >= _WIDEST_BAND:
@@ -132,11 +132,11 @@ def undecided_band(probabilities: np.ndarray, success: np.ndarray, *, risk: floa
 
 
 def _platt(odds: np.ndarray, came: np.ndarray) -> tuple[float, float]:
-    """Slope and bias that minimize the cross entropy to Platt's targets, by Newton's method."""
+    """Slope and bias that minimize the cross entropy to Platt's targets (Newton's method)."""
     wins, losses = int(came.sum()), int((~came).sum())
     target = np.where(came, (wins + 1) / (wins + 2), 1 / (losses + 2))
     design = np.stack([odds, np.ones_like(odds)], axis=1)
-    # In units of the odds' own spread, so that the pull does not depend on the network's scale.
+    # In units of the odds' own spread, so that the prior does not depend on the network's scale.
     pull = np.diag([np.mean(odds**2), 1.0]) * _PRIOR_ENDINGS / 4
     own = np.array([1.0, 0.0])
     fitted = own.copy()
@@ -148,7 +148,7 @@ def _platt(odds: np.ndarray, came: np.ndarray) -> tuple[float, float]:
         fitted -= step * min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
         if np.abs(step).max() < 1e-9:
             break
-    # A judge that orders the endings backwards is not turned round: it is told to know nothing.
+    # A classifier that ranks endings backwards is not inverted: it is made uninformative.
     return max(float(fitted[0]), 1e-3), float(fitted[1])
 
 

@@ -1,4 +1,4 @@
-"""A network's weights and everything needed to judge it, as one safetensors file, in and out."""
+"""Safetensors checkpoints of the evaluation's networks: weights, configuration and provenance."""
 
 import json
 from dataclasses import dataclass
@@ -18,10 +18,10 @@ _METADATA_KEY = "dextouch"
 
 
 class CheckpointMetadata(BaseModel):
-    """How a network came about.
+    """Provenance of a network.
 
-    `training_episodes` and `training_starts` (digests of first observations) are what an
-    evaluation must not be made of.
+    Evaluations must not contain any of `training_episodes` and `training_starts` (digests of first
+    observations).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -40,14 +40,14 @@ class CheckpointMetadata(BaseModel):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Weights by name, and where they come from."""
+    """Weights by name, with their provenance."""
 
     metadata: CheckpointMetadata
     tensors: dict[str, torch.Tensor]
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint) -> None:
-    """Write the file whole or not at all.
+    """Write the file atomically.
 
     Raises:
         InvalidInputError: weights that are not finite.
@@ -74,7 +74,7 @@ def load_checkpoint(path: Path, *, kind: str) -> Checkpoint:
 
     Raises:
         NotFoundError: no such file.
-        CorruptDataError: no safetensors file, no or foreign metadata, NaN weights.
+        CorruptDataError: not a safetensors file, missing or unknown metadata, NaN weights.
         InvalidInputError: a checkpoint of another kind or a newer format.
     """
     if not path.is_file():
@@ -109,10 +109,10 @@ def _parse_metadata(text: str | None, name: str) -> CheckpointMetadata:
 
 
 def load_weights(module: torch.nn.Module, checkpoint: Checkpoint, *, prefix: str) -> None:
-    """Put the tensors under `prefix` into the module, all of them and nothing else.
+    """Load the tensors under `prefix` into the module; the names must match exactly.
 
     Raises:
-        CorruptDataError: missing, foreign or differently shaped tensors.
+        CorruptDataError: missing or unexpected tensors, or wrong shapes.
     """
     start = len(prefix) + 1
     weights = {

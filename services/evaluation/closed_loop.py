@@ -1,9 +1,9 @@
-"""Closed-loop evaluation: policies rolled out in worlds from matched starts, and scored.
+"""Closed-loop evaluation: rolls out policies in worlds from matched starts and scores them.
 
-The real world begins each (task, seed) once for every policy; every imagined world begins from
-exactly that first observation, anchor and camera. Real success is what the real world says,
-imagined success what the probe says about the last three steps. A rollout that fails is kept as a
-failure, and the others go on.
+The real world starts each (task, seed) once for every policy; every imagined world starts from
+exactly that first observation, anchor and camera. Real success is reported by the real world,
+imagined success is the probe's decision on the last three steps. A failed rollout is recorded as a
+failure, and the others continue.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -28,17 +28,17 @@ from services.evaluation.success_probe import SuccessProbe
 
 __all__ = ["EvaluationPlan", "MatchedStart", "WorldAddress", "evaluate", "matched_start"]
 
-# What becomes of one rollout.
+# Result of one rollout.
 Outcome = RolloutScore | RolloutFailure
 
 
 @dataclass(frozen=True)
 class EvaluationPlan:
-    """What is rolled out.
+    """Tasks, seeds and length of an evaluation.
 
-    `instructions` maps every task to its sentence; every rollout lasts `num_steps` steps of the
-    model grid, however many steps a policy sends at once; `trained_on` maps what was trained
-    (world model, policy, probe) to digests of its training starts, none of which may be judged on.
+    `instructions` maps every task to its instruction; every rollout lasts `num_steps` steps of the
+    model grid, whatever the length of a policy's chunks; `trained_on` maps each trained component
+    (world model, policy, probe) to digests of its training starts, which the evaluation rejects.
     """
 
     instructions: Mapping[str, str]
@@ -49,7 +49,7 @@ class EvaluationPlan:
 
 @dataclass(frozen=True)
 class MatchedStart:
-    """A first observation of the real world that every rollout begins from."""
+    """A first observation of the real world from which every rollout starts."""
 
     task: str
     seed: int
@@ -64,7 +64,7 @@ class MatchedStart:
         return first_digest(self.observation)
 
     def for_policy(self) -> PolicyStart:
-        """What a policy is told before it acts."""
+        """Information given to a policy before it acts."""
         return PolicyStart(self.task, self.instruction, self.seed, self.anchor, self.K_head)
 
 
@@ -82,24 +82,24 @@ def evaluate(
     probe: SuccessProbe,
     keep: Callable[[Outcome], None] | None = None,
 ) -> ClosedLoopReport:
-    """Roll every policy out from every start in every world.
+    """Roll out every policy from every start in every world.
 
     Args:
-        real: the world that judges success itself.
-        imagined: worlds to compare with it, by the name they have in the report; may be none.
-        policies: by the name they have in the report.
+        real: the world that reports success itself.
+        imagined: worlds to compare with it, by their names in the report; may be empty.
+        policies: by their names in the report.
         plan: tasks, seeds and length.
-        probe: judge of imagined success.
+        probe: classifier of imagined success.
         keep: called with every outcome as soon as it is known.
 
     Returns:
-        The scores, and beside them the rollouts that failed with their errors.
+        The scores, and the rollouts that failed with their errors.
 
     Raises:
-        ConflictError: a start that something was trained on.
-        UnknownNameError: a world or task that is not there.
-        InvalidInputError: nothing to evaluate, or worlds that do not fit each other or the plan.
-        UnavailableError: a world is not there at the beginning.
+        ConflictError: a start was trained on.
+        UnknownNameError: unknown world or task.
+        InvalidInputError: nothing to evaluate, or worlds that do not match each other or the plan.
+        UnavailableError: a world cannot be reached at the beginning.
     """
     if not policies or not plan.instructions or not plan.seeds:
         raise InvalidInputError(
@@ -134,7 +134,7 @@ def evaluate(
 
 @dataclass(frozen=True)
 class _FailedStart:
-    """A task and seed that the real world did not begin."""
+    """A task and seed that the real world failed to start."""
 
     task: str
     seed: int
@@ -166,7 +166,7 @@ def _failure(
 
 
 def matched_start(real: WorldAddress, task: str, seed: int, instruction: str) -> MatchedStart:
-    """How the real world begins a task and seed, with the images of all its cameras."""
+    """First observation of the real world for a task and seed, with all its cameras."""
     with real.client.start(
         world=real.world, task=task, seed=seed, instruction=instruction
     ) as rollout:
@@ -177,7 +177,7 @@ def matched_start(real: WorldAddress, task: str, seed: int, instruction: str) ->
 
 @dataclass(frozen=True)
 class _Study:
-    """Everything that the rollouts of one evaluation have in common."""
+    """Shared context of the rollouts of one evaluation."""
 
     worlds: StudyWorlds
     policies: Mapping[str, Policy]
@@ -185,7 +185,7 @@ class _Study:
     probe: SuccessProbe
 
     def outcomes(self, starts: Iterable[MatchedStart | _FailedStart]) -> Iterator[Outcome]:
-        """What becomes of every rollout, one after the other."""
+        """Outcomes of all rollouts, one after the other."""
         for start in starts:
             for policy in self.policies:
                 for world in self.worlds.addresses:
@@ -200,7 +200,7 @@ class _Study:
             return _failure(error, start, policy, world)
 
     def _score(self, start: MatchedStart, policy: str, world: str) -> RolloutScore:
-        """A score; where the world does not tell, the probe decides."""
+        """Score one rollout; the probe decides where the world does not report success."""
         with self._begin(start, world) as rollout:
             ending = self._play(rollout, start, policy, world)
             success = rollout.observation.success if world == REAL else None
@@ -217,10 +217,10 @@ class _Study:
         )
 
     def _begin(self, start: MatchedStart, world: str) -> Rollout:
-        """A rollout from a matched start: by task and seed in the real world.
+        """Start a rollout from a matched start (by task and seed in the real world).
 
         Raises:
-            ConflictError: the real world began differently than before.
+            ConflictError: the real world started differently than before.
         """
         address = self.worlds.addresses[world]
         client = address.client.selecting(ReturnSelector(cameras=self.worlds.cameras))
@@ -242,7 +242,7 @@ class _Study:
         return rollout
 
     def _play(self, rollout: Rollout, start: MatchedStart, policy: str, world: str) -> Ending:
-        """Let a policy act in a rollout; what is seen in its last three steps."""
+        """Run a policy in a rollout and return the last three steps."""
         actor, description = self.policies[policy], self.worlds.descriptions[world]
         where = f"policy {policy!r}, task {start.task!r}, seed {start.seed}"
         ask(actor.reset, start.for_policy(), where=f"{where}: reset")
@@ -269,13 +269,13 @@ class _Study:
 def _step_unseen(
     rollout: Rollout, chunk: np.ndarray, left: int, description: WorldDescription
 ) -> None:
-    """Advance by a chunk of which only the rollout's ending is seen: images take most of the time.
+    """Advance by a chunk but render only the rollout's ending, since images take most of the time.
 
     Args:
-        rollout: whose policy does not look at the steps before.
-        chunk: rows to carry out.
-        left: steps to the end of the rollout, those of the chunk included.
-        description: of the world; its chunks are whole multiples of something.
+        rollout: rollout of a policy that ignores the steps before.
+        chunk: actions to execute.
+        left: steps to the end of the rollout, including this chunk.
+        description: the world, which determines the chunk multiple.
     """
     multiple = description.chunk_multiple
     shown = -(-NUM_SEEN_STEPS // multiple) * multiple if len(chunk) == left else 0

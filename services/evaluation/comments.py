@@ -1,10 +1,10 @@
-"""Plain sentences about scores: how many there are, which way a world errs, what is undefined."""
+"""Plain sentences about scores: sample size, bias of a world, undefined figures."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 UNDEFINED = "undefined"
-# Mean differences of success below this are not worth a word.
+# Smaller mean differences of success are not mentioned.
 NOTABLE_BIAS = 0.05
 
 
@@ -14,8 +14,8 @@ def task_comments(
     """Sentences about one task.
 
     Args:
-        rows: of the task's policies, as `ClosedLoopReport.policy_rows` has them.
-        agreement: of the task, as `ClosedLoopReport.agreement` has it.
+        rows: rows of the task's policies, from `ClosedLoopReport.policy_rows`.
+        agreement: figures of the task, from `ClosedLoopReport.agreement`.
         world: name of the imagined world.
     """
     both = f"both worlds (real and {world})"
@@ -46,7 +46,7 @@ def _compared_starts(
 
 
 def _size_of_a_step(rows: Sequence[Mapping[str, Any]]) -> str:
-    """How much one rollout weighs, by the number of real rollouts that ended."""
+    """Contribution of one rollout to a rate, by the number of completed real rollouts."""
     policies: dict[int, list[str]] = {}
     for row in rows:
         if row["real_rollouts"]:
@@ -74,9 +74,9 @@ def _mean_error(bias: float, world: str) -> str:
 
 
 def _widest_gaps(rows: Sequence[Mapping[str, Any]], world: str) -> list[str]:
-    """For each direction the policy farthest off, among those whose 95 % intervals are apart.
+    """The policy with the largest gap in each direction, if its 95 % intervals do not overlap.
 
-    The rates are those of the report, each over all its own rollouts that ended.
+    The rates are those of the report, over all completed rollouts of a policy.
     """
     rows = [row for row in rows if UNDEFINED not in {row["real"], row["imagined"]}]
     sentences = []

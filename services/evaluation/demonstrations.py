@@ -1,4 +1,4 @@
-"""Robot episodes of stores as plain arrays on the model grid."""
+"""Robot episodes of stores as arrays on the model grid."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -18,7 +18,7 @@ CAMERA = "camera_head"
 
 @dataclass(frozen=True)
 class Demonstration:
-    """One robot episode: what was seen, felt, reached and commanded at every step.
+    """Images, touch, measured and commanded actions of one robot episode at every step.
 
     Both actions are relative to the measured poses of step 0.
     """
@@ -35,7 +35,7 @@ class Demonstration:
 
     @property
     def num_steps(self) -> int:
-        """Steps of the model grid, the first included."""
+        """Steps of the model grid, including the first one."""
         return len(self.measured)
 
     @property
@@ -45,11 +45,11 @@ class Demonstration:
 
 
 def read_demonstration(reader: EpisodeReader) -> Demonstration:
-    """One robot episode with a known outcome as arrays.
+    """Read one robot episode with a known outcome.
 
     Raises:
-        InvalidInputError: the episode does not say whether it succeeded, has no seed, or not an
-            image for every step.
+        InvalidInputError: the episode has no outcome, no seed, or not an image for every
+            step.
     """
     attributes = reader.attributes
     if attributes.success is None or attributes.seed is None:
@@ -73,14 +73,14 @@ def read_demonstration(reader: EpisodeReader) -> Demonstration:
 
 
 def read_demonstrations(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[Demonstration]:
-    """All robot episodes of some stores, store by store in the order of their ids.
+    """Read all robot episodes of some stores, store by store in the order of their ids.
 
     Args:
-        stores: where to read.
-        tasks: only these; empty for all.
+        stores: stores to read.
+        tasks: tasks to read; empty for all.
 
     Raises:
-        NotFoundError: not one such episode, or a store without any.
+        NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
     """
     return [read_demonstration(reader) for reader in robot_episodes(stores, tasks=tasks)]
@@ -88,7 +88,7 @@ def read_demonstrations(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> lis
 
 @runtime_checkable
 class Seeded(Protocol):
-    """Anything that belongs to a task and a seed of the twin."""
+    """Anything with a task and a seed of the twin."""
 
     @property
     def task(self) -> str:
@@ -96,11 +96,11 @@ class Seeded(Protocol):
 
     @property
     def instruction(self) -> str:
-        """Its sentence."""
+        """Instruction of the task."""
 
     @property
     def seed(self) -> int:
-        """What decided where everything lies."""
+        """Seed of the scene."""
 
 
 SeededT = TypeVar("SeededT", bound=Seeded)
@@ -109,10 +109,10 @@ SeededT = TypeVar("SeededT", bound=Seeded)
 def split_by_seed(
     demonstrations: Sequence[SeededT], *, held_out_share: float, salt: str = ""
 ) -> tuple[list[SeededT], list[SeededT]]:
-    """Training and held-out episodes; all episodes of a task and seed fall on the same side.
+    """Training and held-out episodes; all episodes of a task and seed are on the same side.
 
-    The side is decided by a hash of task and seed, so it never changes when episodes are added;
-    another `salt` gives another split.
+    The side depends on a hash of task, seed and `salt` alone, so that adding episodes does not
+    change it.
     """
     training: list[SeededT] = []
     held_out: list[SeededT] = []
@@ -129,7 +129,7 @@ def split_by_seed(
 
 
 def instructions_of(demonstrations: Iterable[Seeded]) -> dict[str, str]:
-    """The sentence of every task, as the first episode of it has it."""
+    """Instruction of every task, from its first episode."""
     found: dict[str, str] = {}
     for item in demonstrations:
         found.setdefault(item.task, item.instruction)

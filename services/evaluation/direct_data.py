@@ -1,4 +1,4 @@
-"""Stored episodes as attempts of known outcome: what a direct judge learns from."""
+"""Training data of a direct judge: stored episodes as attempts with known outcomes."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,13 +16,13 @@ from services.evaluation.endings import OBJECT_POSES
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
-# Where objects lie is learned from the images of these steps.
+# Object poses are learned from the images at these steps.
 _VIEW_STEPS = (0, 16, 32, 48, 64, 80)
 
 
 @dataclass(frozen=True)
 class View:
-    """One image of an episode, with the camera's pose and the true poses of the objects."""
+    """One image of an episode, with the camera pose and the true object poses."""
 
     image: np.ndarray
     T_world_camera: Float64[np.ndarray, "4 4"]
@@ -31,7 +31,7 @@ class View:
 
 @dataclass(frozen=True)
 class LabelledAttempt:
-    """An attempt, what came of it, and some of its views, the first one at the start."""
+    """An attempt with its outcome and some of its views, the first one at the start."""
 
     episode_id: str
     instruction: str
@@ -52,16 +52,16 @@ class LabelledAttempt:
 
 
 def read_attempts(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[LabelledAttempt]:
-    """The true robot episodes of some stores.
+    """Read the true robot episodes of some stores.
 
     Args:
-        stores: where to read; imagined episodes and those of people are left out.
-        tasks: only these; empty for all.
+        stores: stores to read; imagined and human episodes are skipped.
+        tasks: tasks to read; empty for all.
 
     Raises:
-        NotFoundError: not one such episode, or a store without any.
+        NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
-        InvalidInputError: an episode of unknown outcome, of another length or without object
+        InvalidInputError: an episode with an unknown outcome, another length or no object
             poses.
     """
     readers = robot_episodes(
@@ -74,7 +74,7 @@ def read_attempts(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[Labe
 
 
 def read_attempt(reader: EpisodeReader) -> LabelledAttempt:
-    """One episode as an attempt.
+    """Read one episode as an attempt.
 
     Raises:
         InvalidInputError: unknown outcome, another length, or no object poses or commands.
@@ -119,7 +119,7 @@ def _nearest(t_ref_ns: np.ndarray, values: np.ndarray, now_ns: int) -> Float64[n
 
 
 def attempts_hash(items: Iterable[LabelledAttempt]) -> str:
-    """sha256 over everything that a direct judge learns from, in the order of the ids."""
+    """SHA-256 of all training data, in the order of the ids."""
     digest = hashlib.sha256()
     for item in sorted(items, key=lambda one: one.episode_id):
         digest.update(repr((item.episode_id, item.task, item.success)).encode())

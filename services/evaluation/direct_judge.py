@@ -1,7 +1,7 @@
-"""Direct judge: the rival that tells success from the first observation and the commands alone.
+"""Direct judge: predicts success from the first observation and the commands alone.
 
-It imagines nothing. What a world model adds to judging is what its imagined endings tell beyond
-this judge, trained on the same episodes with as much processor time.
+It is the baseline for world models, since it imagines nothing. The benefit of a world model is what
+its imagined endings tell beyond this judge, trained on the same episodes for as much CPU time.
 """
 
 from collections.abc import Sequence
@@ -29,10 +29,10 @@ class DirectJudge:
     """A trained direct judge.
 
     Args:
-        checkpoint: from `load_checkpoint` or straight from training.
+        checkpoint: from `load_checkpoint` or from training.
 
     Raises:
-        CorruptDataError: weights that do not fit the shape in the metadata.
+        CorruptDataError: the weights do not match the shape in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -49,14 +49,14 @@ class DirectJudge:
 
     @classmethod
     def load(cls, path: Path) -> "DirectJudge":
-        """A judge from its file."""
+        """Load a judge from its file."""
         return cls(load_checkpoint(path, kind=KIND))
 
     def log_odds(self, attempts: Sequence[Attempt]) -> Float64[np.ndarray, " n"]:
-        """Log odds of success, as the network says.
+        """Uncalibrated log odds of success.
 
         Raises:
-            UnknownNameError: a task that the judge was not made for.
+            UnknownNameError: a task that the judge was not trained for.
             InvalidInputError: no attempts, or images of another size.
         """
         if not attempts:

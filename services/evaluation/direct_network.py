@@ -1,4 +1,4 @@
-"""Network of the direct judge: where objects lie in the first image, and commands beside them."""
+"""Network of the direct judge: object poses from the first image, and commands relative to them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -19,7 +19,7 @@ from services.evaluation.features import NUM_PAD_FEATURES, pad_features
 from services.evaluation.object_features import MAX_OBJECTS
 
 NUM_STEPS: Final = 80
-# Commands are looked at twice in each of 20 groups of four steps, in the middle and at the end.
+# Commands are sampled in the middle and at the end of each of 20 groups of four steps.
 GROUP_STEPS: Final = 4
 NUM_GROUPS: Final = NUM_STEPS // GROUP_STEPS
 # A wrist and five fingertips.
@@ -28,13 +28,13 @@ _NEAR_M = 0.01
 _CHANNELS, _KEYPOINTS, _TASK_WIDTH = 24, 24, 16
 _CAMERA_SIZE, _PER_OBJECT = 9, 9
 _GROUP_FEATURES = 2 * 2 * _NUM_POINTS * (MAX_OBJECTS * 6 + 1) + 2 * 6 + 2 * 20
-# Rays that look less far down than this are bent: they would meet the table far away.
+# Flatter rays are tilted down: they would meet the table far away.
 _FLATTEST = -0.15
 
 
 @dataclass(frozen=True)
 class Attempt:
-    """What is seen and felt before a rollout, and all that is commanded in it.
+    """First observation of a rollout and all its commands.
 
     `actions` are those of steps 1 … 80, relative to `anchor`, the poses of step 0.
     """
@@ -48,7 +48,7 @@ class Attempt:
 
 
 class DirectShape(BaseModel):
-    """What the judge looks like; kept in the checkpoint. `num_objects` is by task."""
+    """Shape of the judge's network; stored in the checkpoint. `num_objects` is by task."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -60,7 +60,7 @@ class DirectShape(BaseModel):
 
 @dataclass(frozen=True)
 class Views:
-    """Head images with the camera's matrix and pose in the world, and the index of the task."""
+    """Head images with camera matrix, camera pose in the world and task index."""
 
     image: UInt8[torch.Tensor, "n 3 h w"]
     K_head: Float32[torch.Tensor, "n 3 3"]
@@ -68,13 +68,13 @@ class Views:
     task: Int64[torch.Tensor, " n"]
 
     def __getitem__(self, index: torch.Tensor) -> "Views":
-        """Some of them."""
+        """Select views."""
         return Views(*(getattr(self, part.name)[index] for part in fields(self)))
 
 
 @dataclass(frozen=True)
 class Commands:
-    """Hands over the groups of steps in the world frame (m), and touch at the start."""
+    """Hand motion by groups of steps in the world frame (m), and touch at the start."""
 
     points_m: Float32[torch.Tensor, "n 20 2 2 6 3"]
     axes: Float32[torch.Tensor, "n 20 2 6"]
@@ -82,22 +82,22 @@ class Commands:
     touch: Float32[torch.Tensor, "n 24"]
 
     def __getitem__(self, index: torch.Tensor) -> "Commands":
-        """Some of them."""
+        """Select attempts."""
         return Commands(*(getattr(self, part.name)[index] for part in fields(self)))
 
 
 @dataclass(frozen=True)
 class Objects:
-    """Positions (m) and two axes (z and x) of objects in the world; empty slots hold anything."""
+    """Positions (m) and axes (z and x) of objects in the world; empty slots are arbitrary."""
 
     position_m: Float32[torch.Tensor, "n 3 3"]
     axes: Float32[torch.Tensor, "n 3 2 3"]
 
 
 class ObjectFinder(nn.Module):
-    """Feature points of the image give a pixel and a height for each object of the task.
+    """Predicts a pixel and a height for each object of the task from feature points of the image.
 
-    The position is where the pixel's ray meets the height, so that the camera's pose is used
+    The position is where the pixel's ray reaches the height, so that the camera pose is used
     exactly (feature points: spatial soft-argmax, Levine et al. 2016).
     """
 
@@ -127,7 +127,7 @@ class ObjectFinder(nn.Module):
     def find(
         self, image: Float32[torch.Tensor, "n 3 h w"], views: Views, *, bfloat16: bool = False
     ) -> Objects:
-        """Objects of views whose images stand apart, in −0.5 … 0.5; convolved in bfloat16."""
+        """Objects of views with images given separately in −0.5 … 0.5; optionally in bfloat16."""
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
             maps = self.eye(image)
         maps = maps.float()
@@ -147,7 +147,7 @@ class ObjectFinder(nn.Module):
 def _at_height(
     pixel: Float32[torch.Tensor, "n 3 2"], height_m: Float32[torch.Tensor, "n 3"], views: Views
 ) -> Float32[torch.Tensor, "n 3 3"]:
-    """Where the rays of pixels meet heights above the table."""
+    """Points at which the rays of pixels reach heights above the table."""
     K, T = views.K_head, views.T_world_camera
     focal = torch.diagonal(K, dim1=1, dim2=2)[:, None, :2]
     seen = torch.cat([(pixel - K[:, None, :2, 2]) / focal, torch.ones_like(pixel[..., :1])], dim=-1)
@@ -158,7 +158,7 @@ def _at_height(
 
 
 class DirectNetwork(nn.Module):
-    """Commands relative to the found objects go through a gated recurrent network to a verdict."""
+    """Gated recurrent network on commands relative to the objects found."""
 
     num_objects: torch.Tensor
 
@@ -183,7 +183,7 @@ class DirectNetwork(nn.Module):
     def judge(
         self, objects: Objects, commands: Commands, task: Int64[torch.Tensor, " n"]
     ) -> Float32[torch.Tensor, " n"]:
-        """Log odds of success where the objects are known."""
+        """Log odds of success for known objects."""
         used = torch.arange(MAX_OBJECTS) < self.num_objects[task][:, None]
         features = command_features(commands, objects, used)
         known = self.task(task)
@@ -196,7 +196,7 @@ class DirectNetwork(nn.Module):
 def command_features(
     commands: Commands, objects: Objects, used: torch.Tensor
 ) -> Float32[torch.Tensor, "n 20 features"]:
-    """Points of the hands from each object, in world axes and its own, and the hands themselves.
+    """Hand points relative to each object, in world axes and the object's axes, and hand poses.
 
     Distances are compressed, asinh(d / 1 cm) / 2: success is decided by millimetres.
     """
@@ -212,10 +212,10 @@ def command_features(
 
 
 def attempt_tensors(attempts: Sequence[Attempt], shape: DirectShape) -> tuple[Views, Commands]:
-    """Network tensors of attempts; the same code serves training and judging.
+    """Network tensors of attempts, for training and prediction alike.
 
     Raises:
-        UnknownNameError: a task that the judge was not made for.
+        UnknownNameError: a task that the judge was not trained for.
         InvalidInputError: an image of another size.
     """
     for one in attempts:
@@ -260,7 +260,7 @@ def _hand(side: str) -> RobotHand:
 
 
 def _hand_motion(attempt: Attempt) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Points, wrist axes and joint angles of an attempt at what is looked at."""
+    """Points, wrist axes and joint angles of an attempt at the sampled steps."""
     poses = poses_from_actions(attempt.actions, attempt.anchor)
     Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)
     joints = np.stack([attempt.actions[:, JOINTS_LEFT], attempt.actions[:, JOINTS_RIGHT]], axis=1)

@@ -1,7 +1,7 @@
-"""Training of a direct judge: first where objects lie in images, then what becomes of commands.
+"""Training of a direct judge: first the object finder, then the recurrent network.
 
-The true places of objects are learned from as by the world model's start reader. The recurrent
-part learns beside true places, off by as much as the finder errs on development episodes.
+The finder is trained on true object poses, like the world model's start reader. The recurrent
+network is trained on true poses with noise as large as the finder's errors on development episodes.
 """
 
 import copy
@@ -42,39 +42,35 @@ _CHECK_EVERY = 100
 
 
 class DirectSettings(BaseModel):
-    """How to train a direct judge; `finder_share` of the time goes to finding objects."""
+    """Training settings of a direct judge; the finder gets `finder_share` of the time."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(default=0, description="of weights and of everything that is drawn")
+    seed: int = Field(default=0, description="seed of weights and sampling")
     max_cpu_s: float = Field(
         default=600.0, gt=0, description="CPU seconds after which training ends"
     )
     finder_share: float = Field(
-        default=0.6, gt=0, lt=1, description="of the time, for finding objects in images"
+        default=0.6, gt=0, lt=1, description="share of the time for the object finder"
     )
-    num_finder_steps: int = Field(
-        default=6000, ge=1, description="steps of finding objects, if time lasts"
-    )
-    num_judge_steps: int = Field(default=6000, ge=1, description="steps of judging, if time lasts")
+    num_finder_steps: int = Field(default=6000, ge=1, description="largest number of finder steps")
+    num_judge_steps: int = Field(default=6000, ge=1, description="largest number of judge steps")
     batch_size: int = Field(default=64, ge=2, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="largest; it falls along a cosine")
-    weight_decay: float = Field(default=2e-2, ge=0, description="of AdamW")
+    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
+    weight_decay: float = Field(default=2e-2, ge=0, description="AdamW weight decay")
     bfloat16: bool = Field(default=False, description="convolve in bfloat16: twice as fast on AMX")
-    image_noise: float = Field(
-        default=0.01, ge=0, description="deviation of the noise on training images, of 1"
-    )
+    image_noise: float = Field(default=0.01, ge=0, description="noise on training images in 0 … 1")
     brightness: float = Field(
-        default=0.03, ge=0, description="deviation of training images' brightness, of 1"
+        default=0.03, ge=0, description="brightness variation of training images"
     )
     development_share: float = Field(
-        default=0.1, gt=0, lt=1, description="of seeds, to calibrate on"
+        default=0.1, gt=0, lt=1, description="share of seeds to calibrate on"
     )
 
 
 @dataclass(frozen=True)
 class Learned:
-    """Tensors of episodes: views with the objects in them, starts with commands and outcomes."""
+    """Training tensors: views with object poses, starts with commands and outcomes."""
 
     views: Views
     seen: Objects
@@ -85,7 +81,7 @@ class Learned:
 
     @classmethod
     def of(cls, items: Sequence[LabelledAttempt], shape: DirectShape) -> "Learned":
-        """Everything that is learned from some episodes."""
+        """Training tensors of some episodes."""
         views = [(item, view) for item in items for view in item.views]
         starts, commands = attempt_tensors([item.attempt for item in items], shape)
         return cls(
@@ -117,12 +113,12 @@ def _objects(poses: Sequence[np.ndarray]) -> Objects:
 def train_direct_judge(
     items: Sequence[LabelledAttempt], settings: DirectSettings, *, command: str
 ) -> Checkpoint:
-    """Learn success from first observations and commands.
+    """Train a judge to predict success from first observations and commands.
 
-    A share of the seeds is kept apart: it says when to stop, calibrates, and gives the figures.
+    A share of the seeds is held out for early stopping, calibration and evaluation.
 
     Raises:
-        InvalidInputError: only one outcome, or too few seeds to keep some apart.
+        InvalidInputError: only one outcome, or too few seeds to hold some out.
     """
     torch.manual_seed(settings.seed)
     share = settings.development_share
@@ -176,7 +172,7 @@ def train_direct_judge(
 
 
 def _calibrated(checkpoint: Checkpoint, apart: Sequence[LabelledAttempt]) -> Checkpoint:
-    """The checkpoint with calibrations and figures of the episodes that were kept apart."""
+    """The checkpoint with calibrations and metrics on the held-out episodes."""
     judge, metadata = DirectJudge(checkpoint), checkpoint.metadata
     calibration: dict[str, Calibration] = {}
     metrics = dict(metadata.metrics)
@@ -200,7 +196,7 @@ def _calibrated(checkpoint: Checkpoint, apart: Sequence[LabelledAttempt]) -> Che
 def _train_finder(
     finder: ObjectFinder, learned: Learned, settings: DirectSettings, num_objects: torch.Tensor
 ) -> None:
-    """Minimize errors of places and axes over views."""
+    """Minimize errors of object positions and axes over views."""
     used = _used(learned.views, num_objects)
     for task in range(len(finder.height_m)):
         mine = learned.views.task == task
@@ -239,7 +235,7 @@ def _found(finder: ObjectFinder, views: Views) -> Objects:
 def _finder_errors(
     finder: ObjectFinder, checked: Learned, num_objects: torch.Tensor
 ) -> torch.Tensor:
-    """Median absolute error (m) along each axis at the start, by task and object, as sigma."""
+    """Error (m) at the start along each axis, by task and object, as sigma from the median."""
     off = (_found(finder, checked.starts).position_m - checked.placed.position_m).abs()
     sigma = torch.zeros((len(num_objects), MAX_OBJECTS, 3))
     for task in range(len(num_objects)):
@@ -256,7 +252,7 @@ def _train_judge(
     settings: DirectSettings,
     noise_m: torch.Tensor,
 ) -> int:
-    """Minimize the cross entropy; the weights are those of the best step on what is kept apart."""
+    """Minimize the cross entropy; keeps the weights of the best step on held-out episodes."""
     learned, checked = sets
     found, shown = (_found(network.finder, one.starts) for one in sets)
 
@@ -293,11 +289,11 @@ def _optimized(
     settings: DirectSettings,
     title: str,
 ) -> Iterator[int]:
-    """Steps of AdamW with a cosine rate; each is given after it was taken.
+    """AdamW steps with a cosine schedule; yields each step's number after it was taken.
 
     Args:
-        module: whose parameters are learned.
-        loss: of some rows.
+        module: module to train.
+        loss: loss of some rows.
         size: number of rows, and the limits: steps and CPU seconds.
         settings: rate, decay, batch and seed.
         title: for the progress bar.

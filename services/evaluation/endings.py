@@ -1,4 +1,4 @@
-"""Endings of rollouts, true and imagined: what a judge of success looks at and learns from."""
+"""Endings of rollouts, true and imagined: input and training data of success probes."""
 
 import hashlib
 from collections.abc import Iterable, Mapping, Sequence
@@ -17,30 +17,30 @@ from services.evaluation.starts import start_digest
 
 NUM_SEEN_STEPS: Final = 3
 OBJECT_POSES: Final = "object_poses"
-# One of each a training episode, in turn of seeds. What ends this early is no success: nothing
-# was done yet. In the middle only the milestones are known.
+# Each training episode is cut at one early and one middle step, in turn of seeds. Early endings are
+# failures, since nothing was done yet; in the middle only the milestones are known.
 EARLY_ENDS: Final = (2, 8, 14)
 MIDDLE_ENDS: Final = (32, 48, 64)
 
 
 def early_step(seed: int) -> int:
-    """The one of `EARLY_ENDS` that an episode of this seed is shown at."""
+    """The step of `EARLY_ENDS` at which an episode of this seed is cut."""
     return EARLY_ENDS[seed % len(EARLY_ENDS)]
 
 
 def middle_step(seed: int) -> int:
-    """The one of `MIDDLE_ENDS` that an episode of this seed is shown at."""
+    """The step of `MIDDLE_ENDS` at which an episode of this seed is cut."""
     return MIDDLE_ENDS[seed // len(EARLY_ENDS) % len(MIDDLE_ENDS)]
 
 
 @dataclass(frozen=True)
 class Ending:
-    """The last three steps of a rollout: head images, taxels in kPa, and where objects are.
+    """The last three steps of a rollout: head images, taxels in kPa, and object poses.
 
-    `object_poses` are T_world_object (x y z m, qw qx qy qz) of at most three objects; an object
-    that nobody knows of is NaN. Only imagined worlds give them. `images` are None where they were
-    not asked for; one of the two has to be there. `doubted` is why the world itself does not
-    trust what it shows.
+    `object_poses` are T_world_object (x y z m, qw qx qy qz) of at most three objects, NaN for an
+    unknown object; only imagined worlds provide them. `images` are None if they were not
+    requested; images or object poses are required. `doubted` is the reason why the world itself
+    flags its prediction as uncertain.
     """
 
     images: UInt8[np.ndarray, "3 h w 3"] | None
@@ -52,7 +52,7 @@ class Ending:
 
     @classmethod
     def of(cls, observation: Observation, task: str, *, imagined: bool) -> "Ending":
-        """The ending that the last observation of a rollout shows.
+        """Ending shown by the last observation of a rollout.
 
         Raises:
             InvalidInputError: fewer than three steps.
@@ -76,11 +76,11 @@ class Ending:
 
 @dataclass(frozen=True)
 class EndingEpisode:
-    """One episode of known outcome, as far as a judge learns from it.
+    """One episode of known outcome with the endings used for training.
 
-    `endings` holds what is seen at the end of some steps, the last step among them; `success` is
-    what these actions led to in reality, also of an imagined episode. `event_times_s` says when
-    each milestone was first reached, None where nobody noted it.
+    `endings` holds the observations at some steps, including the last step; `success` is the real
+    outcome of these actions, also for an imagined episode. `event_times_s` is when each milestone
+    was first reached, None where that is unknown.
     """
 
     episode_id: str
@@ -101,21 +101,21 @@ class EndingEpisode:
 
     @property
     def final(self) -> Ending:
-        """How it ended."""
+        """The final ending."""
         return self.endings[self.last_step]
 
     @property
     def early_step(self) -> int:
-        """The one of `EARLY_ENDS` that this episode is shown at."""
+        """The step of `EARLY_ENDS` at which this episode is cut."""
         return early_step(self.seed)
 
     @property
     def middle_step(self) -> int:
-        """The one of `MIDDLE_ENDS` that this episode is shown at."""
+        """The step of `MIDDLE_ENDS` at which this episode is cut."""
         return middle_step(self.seed)
 
     def reached(self, milestones: Sequence[str], step: int) -> list[bool] | None:
-        """Whether each milestone was reached by a step; None where nobody noted it."""
+        """Whether each milestone was reached by a step; None where that is unknown."""
         times = self.event_times_s
         if times is None:
             return None
@@ -124,7 +124,7 @@ class EndingEpisode:
 
     @classmethod
     def of(cls, item: Demonstration) -> "EndingEpisode":
-        """The endings of an episode that is in memory."""
+        """Endings of an episode in memory."""
         last = item.num_steps - 1
         steps = {last, last - 1, *EARLY_ENDS, *MIDDLE_ENDS} & set(range(2, item.num_steps))
         return cls(
@@ -146,11 +146,10 @@ def final_ending(item: Demonstration, end: int) -> Ending:
 
 
 def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
-    """The endings of one stored robot episode; only the steps that are shown are decoded.
+    """Endings of one stored robot episode; only the steps shown are decoded.
 
     Raises:
-        InvalidInputError: the episode does not say whether it succeeded, has no seed, or is too
-            short.
+        InvalidInputError: the episode has no outcome, no seed, or too few steps.
     """
     about = reader.attributes
     last = reader.num_steps - 1
@@ -184,7 +183,7 @@ def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:
 def _event_times(
     times: Mapping[str, float], *, unknown_if_empty: bool
 ) -> Mapping[str, float] | None:
-    """Nothing noted in a true failure means that nothing was reached; elsewhere it says nothing."""
+    """Event times; none noted in a true failure means none reached, otherwise it is unknown."""
     return times if times or not unknown_if_empty else None
 
 
@@ -192,7 +191,7 @@ def _read_ending(reader: EpisodeReader, end: int) -> Ending:
     start = end - NUM_SEEN_STEPS + 1
     window = reader.window(start, num_steps=NUM_SEEN_STEPS, cameras=(CAMERA,))
     half_step_ns = 5e8 / reader.attributes.model_rate_hz
-    # Where images were not drawn at these steps, the nearest ones belong to others.
+    # Where these steps were not rendered, the nearest images belong to other steps.
     are_near = bool((np.abs(window.image_dt_ns[CAMERA]) <= half_step_ns).all())
     return Ending(
         window.images[CAMERA] if are_near else None,
@@ -217,21 +216,21 @@ def _object_poses(
 
 
 def read_ending_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[EndingEpisode]:
-    """All robot episodes of some stores with their endings.
+    """Read all robot episodes of some stores with their endings.
 
     Args:
-        stores: where to read; true and imagined episodes may be mixed.
-        tasks: only these; empty for all.
+        stores: stores to read; true and imagined episodes may be mixed.
+        tasks: tasks to read; empty for all.
 
     Raises:
-        NotFoundError: not one such episode, or a store without any.
+        NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
     """
     return [read_ending_episode(reader) for reader in robot_episodes(stores, tasks=tasks)]
 
 
 def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...]]:
-    """The milestones of every task in the order in which they are usually reached."""
+    """Milestones of every task, in the order in which they are usually reached."""
     times: dict[str, dict[str, list[float]]] = {}
     for item in episodes:
         for name, time_s in (item.event_times_s or {}).items():
@@ -243,7 +242,7 @@ def milestones_of(episodes: Iterable[EndingEpisode]) -> dict[str, tuple[str, ...
 
 
 def endings_hash(episodes: Iterable[EndingEpisode]) -> str:
-    """sha256 over everything that a judge learns from, in the order of the episode ids."""
+    """SHA-256 of all training data, in the order of the episode ids."""
     digest = hashlib.sha256()
     for item in sorted(episodes, key=lambda e: e.episode_id):
         digest.update(repr((item.episode_id, item.task, item.success)).encode())

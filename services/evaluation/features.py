@@ -10,7 +10,7 @@ NUM_PAD_FEATURES = 24
 
 
 def pad_features(tactile_kpa: np.ndarray) -> Float32[np.ndarray, "*batch 24"]:
-    """Per hand and pad the mean and the maximum of √kPa / 4: what of the hand touches, how hard.
+    """Mean and maximum of √kPa / 4 per hand and pad: where the hand touches, and how hard.
 
     Args:
         tactile_kpa: [..., 2, 320]; small negative readings count as zero.

@@ -1,4 +1,4 @@
-"""Network of the success probe: the last image, touch and, where they are known, object poses."""
+"""Network of the success probe: final image, touch and, where known, object poses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
@@ -18,14 +18,14 @@ from services.evaluation.object_features import NUM_OBJECT_FEATURES, object_feat
 NUM_TOUCH_FEATURES = 2 * NUM_PAD_FEATURES
 _CHANNELS = (24, 32, 48, 48)
 _OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
-# A pose further from usual than this many standard deviations tells no more than this.
+# Pose features are clipped to this many standard deviations.
 _FARTHEST = 5.0
 
 
 class ProbeShape(BaseModel):
-    """What the probe looks like; kept in the checkpoint.
+    """Shape of the probe's network; stored in the checkpoint.
 
-    `milestones` are the further things it tells about each task, in the order of its outputs.
+    `milestones` are the further outputs of each task, in their order.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -37,7 +37,7 @@ class ProbeShape(BaseModel):
 
     @property
     def num_outputs(self) -> int:
-        """Success, and the milestones of the task that has most of them."""
+        """Success and the milestones of the task with the most of them."""
         return 1 + max((len(names) for names in self.milestones.values()), default=0)
 
 
@@ -45,8 +45,8 @@ class ProbeShape(BaseModel):
 class ProbeBatch:
     """Inputs of the network: last images as bytes, touch, features of object poses, task index.
 
-    What an ending does not have is zero, and marked in `has_image` and `has_objects`. `imagined`
-    is for training; the network does not see it.
+    Missing inputs are zero and marked in `has_image` and `has_objects`. `imagined` is used in
+    training only; the network does not see it.
     """
 
     images: UInt8[torch.Tensor, "n 3 h w"]
@@ -58,16 +58,16 @@ class ProbeBatch:
     imagined: Bool[torch.Tensor, " n"]
 
     def __getitem__(self, index: torch.Tensor) -> "ProbeBatch":
-        """Some of the endings."""
+        """Select endings."""
         return ProbeBatch(*(getattr(self, part.name)[index] for part in fields(self)))
 
 
 class TaskNetwork(nn.Module):
-    """What judges one task: four strided convolutions on the image, two layers on the poses.
+    """Network of one task: four strided convolutions on the image, two layers on the poses.
 
-    Few features of the image reach the last layers, so that they learn where things lie and not
-    one training episode from another. Features of poses are measured in the task's own standard
-    deviations, `object_mean` and `object_std`, which training sets.
+    Few image features reach the last layers, so that they encode positions instead of memorizing
+    training episodes. Pose features are standardized with the task's `object_mean` and
+    `object_std`, which training sets.
     """
 
     object_mean: torch.Tensor
@@ -98,7 +98,7 @@ class TaskNetwork(nn.Module):
     def forward(
         self, images: Float32[torch.Tensor, "n 3 h w"], batch: ProbeBatch
     ) -> Float32[torch.Tensor, "n outputs"]:
-        """Log odds of a batch whose images stand apart, in −0.5 … 0.5."""
+        """Log odds of a batch with images given separately in −0.5 … 0.5."""
         usual = (batch.objects - self.object_mean) / self.object_std
         poses = self.objects(usual.clamp(-_FARTHEST, _FARTHEST))
         has_image, has_objects = batch.has_image[:, None], batch.has_objects[:, None]
@@ -113,10 +113,10 @@ class TaskNetwork(nn.Module):
 
 
 class ProbeNetwork(nn.Module):
-    """One network a task.
+    """One network per task.
 
-    A network that six tasks share has to learn from an image which task it shows before it can
-    look for millimetres: at equal cost it tells stacked bowls from tilted ones far worse.
+    A network shared by six tasks has to recognize the task in the image before it can resolve
+    millimetres: at equal cost it separates stacked from tilted bowls far worse.
     """
 
     def __init__(self, shape: ProbeShape) -> None:
@@ -140,15 +140,15 @@ class ProbeNetwork(nn.Module):
 
 
 def unit_images(images: UInt8[torch.Tensor, "n 3 h w"]) -> Float32[torch.Tensor, "n 3 h w"]:
-    """Bytes as −0.5 … 0.5."""
+    """Scale bytes to −0.5 … 0.5."""
     return images.float() / 255 - 0.5
 
 
 def probe_batch(endings: Sequence[Ending], shape: ProbeShape) -> ProbeBatch:
-    """Network tensors of endings; the same code serves training and judging.
+    """Network tensors of endings, for training and prediction alike.
 
     Raises:
-        UnknownNameError: a task the probe was not made for.
+        UnknownNameError: a task that the probe was not trained for.
         InvalidInputError: images of another size, or neither images nor object poses.
     """
     for ending in endings:

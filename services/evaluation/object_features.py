@@ -1,7 +1,7 @@
-"""Features of object poses that show success: heights, axes, places relative to each other, motion.
+"""Features of object poses that predict success: heights, axes, relative positions, motion.
 
-Success is decided by millimetres within half a metre, so distances enter twice: as they are, and
-stretched about zero by asinh.
+Success is decided by millimetres within half a metre, so distances enter twice: linearly, and
+compressed by asinh.
 """
 
 from itertools import combinations
@@ -22,12 +22,12 @@ NUM_OBJECT_FEATURES: Final = MAX_OBJECTS * _OF_OBJECT + len(_PAIRS) * _OF_PAIR
 
 
 def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:
-    """What the poses of the last steps show; an absent object and its pairs are zeros.
+    """Features of the poses at the last steps; an absent object and its pairs give zeros.
 
     Args:
         object_poses: T_world_object [steps, objects ≤ 3, 7] (x y z m, qw qx qy qz), the last step
-            being now. An object with a number that is not finite, or a quaternion of length
-            zero, counts as absent.
+            being the current one. An object with a non-finite number or a zero quaternion counts as
+            absent.
 
     Raises:
         ShapeError: other shapes, or more objects.
@@ -52,7 +52,7 @@ def object_features(object_poses: np.ndarray) -> Float32[np.ndarray, "105"]:
 
 
 def known_objects(object_poses: np.ndarray) -> Bool[np.ndarray, " objects"]:
-    """Which objects of poses [steps, objects, 7] have a pose at every step."""
+    """Mask of objects in poses [steps, objects, 7] that have a pose at every step."""
     finite = np.isfinite(object_poses).all(axis=(0, 2))
     length = np.linalg.norm(np.nan_to_num(object_poses[..., 3:]), axis=-1)
     return np.asarray(finite & (length > 1e-6).all(axis=0))
@@ -77,7 +77,7 @@ def _of_object(Ts_world_object: np.ndarray) -> Float64[np.ndarray, "17"]:
 
 
 def _of_pair(T_world_a: np.ndarray, T_world_b: np.ndarray) -> Float64[np.ndarray, "18"]:
-    """The second object seen from the first, and how far apart they are across and upwards."""
+    """Second object relative to the first, and their horizontal and vertical distance."""
     T_a_b = invert(T_world_a) @ T_world_b
     apart_m = T_world_b[:3, 3] - T_world_a[:3, 3]
     return np.concatenate(

@@ -1,4 +1,4 @@
-"""Progress of a long job on standard error: a bar at a terminal, a line a tenth elsewhere."""
+"""Progress of a long job on standard error: a bar on a terminal, a line per tenth elsewhere."""
 
 from types import TracebackType
 
@@ -8,10 +8,10 @@ from rich.progress import Progress as RichProgress
 
 
 class Progress:
-    """A progress bar at a terminal; elsewhere (a log, a pipe) a line at every tenth.
+    """A progress bar on a terminal; elsewhere (a log, a pipe) a line at every tenth.
 
     Args:
-        title: what is going on.
+        title: name of the job.
         total: number of steps.
     """
 
@@ -40,7 +40,7 @@ class Progress:
         self._bar.stop()
 
     def advance(self, **figures: float) -> None:
-        """One step is done; the figures are shown beside the bar."""
+        """Complete one step; the figures are shown beside the bar."""
         told = "  ".join(f"{name} {value:.3g}" for name, value in figures.items())
         self._bar.update(self._task, advance=1, told=told)
         tenths = self._done * 10 // self._total

@@ -1,9 +1,9 @@
-"""Bootstrap of evaluation figures over matched starts, all draws at once.
+"""Bootstrap of evaluation figures over matched starts, vectorized over all draws.
 
-A draw takes as many starts as there are, with replacement; all rollouts of a start are drawn
-together, since they share its objects and its errors. Use `start_counts` once and give its counts
-to every figure of a table, so that all of them see the same draws. Figures of single rollouts
-stand in `services.evaluation.statistics` and `dextouch.metrics.policy`.
+A draw resamples the starts with replacement; all rollouts of a start are drawn together, since they
+share its objects and errors. Call `start_counts` once and pass its counts to every figure of a
+table, so that all figures use the same draws. Figures of single rollouts are in
+`services.evaluation.statistics` and `dextouch.metrics.policy`.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ def rates_of_draws(outcomes: np.ndarray, counts: Counts) -> Float64[np.ndarray, 
 
     Args:
         outcomes: [policies, starts].
-        counts: of `start_counts`.
+        counts: from `start_counts`.
     """
     return counts @ np.asarray(outcomes, dtype=np.float64).T / counts.sum(axis=1, keepdims=True)
 
@@ -68,10 +68,10 @@ def area_under_roc_of_draws(
     """Area under the ROC curve of every draw, ties half; NaN where one outcome is missing.
 
     Args:
-        scores: [n], higher for a surer success.
-        success: [n], what came true.
-        start_index: [n], the start that each rollout began from.
-        counts: of `start_counts`.
+        scores: [n], higher for more certain success.
+        success: [n] outcomes.
+        start_index: [n], start of each rollout.
+        counts: from `start_counts`.
     """
     scores, positive = np.asarray(scores), np.asarray(success, dtype=bool)
     weight = _weights(counts, start_index)
@@ -99,7 +99,7 @@ def balanced_accuracy_of_draws(
 def mean_of_draws(
     values: np.ndarray, start_index: np.ndarray, counts: Counts
 ) -> Float64[np.ndarray, " draws"]:
-    """Mean of values [n] over the rollouts of every draw; NaN where none was drawn."""
+    """Mean of values [n] over the rollouts of every draw; NaN for a draw without any."""
     weight = _weights(counts, start_index)
     with np.errstate(invalid="ignore"):
         return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))

@@ -1,4 +1,4 @@
-"""Append-only file of results: one JSON object a line for every rollout, as soon as it ended."""
+"""Append-only result file: one JSON line per rollout, written when the rollout ends."""
 
 import json
 from dataclasses import asdict
@@ -10,12 +10,12 @@ from services.evaluation.scores import RolloutFailure, RolloutScore
 
 
 class ResultLog:
-    """Keeps rollouts one by one, so that a study that is broken off keeps what it has.
+    """Appends rollouts one by one, so that an interrupted study keeps its results.
 
-    Rows of an earlier study stay; `study`, the time this one began, tells them apart.
+    Rows of earlier studies are kept; `study`, the start time of this one, tells them apart.
 
     Args:
-        path: of the file; it and its folder are created with the first row.
+        path: file to append to; it and its folder are created with the first row.
     """
 
     def __init__(self, path: Path) -> None:
@@ -23,7 +23,7 @@ class ResultLog:
         self._study = datetime.now(UTC).isoformat(timespec="milliseconds")
 
     def keep(self, outcome: RolloutScore | RolloutFailure) -> None:
-        """Write one row.
+        """Append one row.
 
         Raises:
             StorageError: the file cannot be written.

@@ -1,4 +1,4 @@
-"""Selection of the robot episodes from which networks of the evaluation learn."""
+"""Selection of robot episodes for training the networks of the evaluation."""
 
 from collections.abc import Callable, Iterator, Sequence
 
@@ -14,16 +14,16 @@ def robot_episodes(
     wanted: Callable[[EpisodeAttributes], bool] | None = None,
     what: str = "robot episode",
 ) -> Iterator[EpisodeReader]:
-    """Robot episodes, store by store in the order of their ids, opened one at a time.
+    """Iterate over robot episodes, store by store in the order of their ids.
 
     Args:
-        stores: where to read.
-        tasks: only these; empty for all.
-        wanted: whether an episode of these attributes is taken; without it all are.
-        what: is looked for, for messages.
+        stores: stores to read.
+        tasks: tasks to read; empty for all.
+        wanted: predicate on the attributes of an episode; default: all episodes.
+        what: what is read, for error messages.
 
     Raises:
-        NotFoundError: not one such episode, or a store without any episode.
+        NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
     """
     found: set[str] = set()

@@ -1,4 +1,4 @@
-"""Success rates of policies with intervals, and how far the rates of two worlds agree."""
+"""Success rates of policies with confidence intervals, and their agreement between two worlds."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -29,11 +29,11 @@ _AGREEMENT_FIGURES: dict[str, Callable[..., float]] = {
 
 @dataclass(frozen=True)
 class RolloutScore:
-    """How one rollout ended.
+    """Result of one rollout.
 
-    `success` is the world's own verdict in the real world and the probe's decision elsewhere;
-    `probability` is always the probe's, so that the probe itself can be judged. `cannot_tell` is
-    why the probe had better not decide an imagined rollout; `success` is the likelier outcome then.
+    `success` is reported by the real world and decided by the probe elsewhere; `probability` is
+    always the probe's, so that the probe itself can be evaluated. `cannot_tell` is the reason why
+    the probe abstains on an imagined rollout; `success` is then the more likely outcome.
     """
 
     world: str
@@ -48,7 +48,7 @@ class RolloutScore:
 
 @dataclass(frozen=True)
 class RolloutFailure:
-    """A rollout that did not come to its end: it says nothing about the policy's success.
+    """A rollout that did not finish, which says nothing about the policy's success.
 
     `error` is the class of the error, `traceback` that of the policy's own code, if it raised.
     """
@@ -64,9 +64,9 @@ class RolloutFailure:
 
 @dataclass(frozen=True)
 class ClosedLoopReport:
-    """Every rollout of an evaluation; the first imagined world, if any, is the one reported.
+    """Every rollout of an evaluation; the first imagined world, if any, is reported.
 
-    Rollouts that failed are missing from every figure, and counted beside it.
+    Failed rollouts are excluded from all figures and counted separately.
     """
 
     scores: tuple[RolloutScore, ...]
@@ -76,19 +76,19 @@ class ClosedLoopReport:
 
     @property
     def rollouts(self) -> tuple[RolloutScore | RolloutFailure, ...]:
-        """Those that ended and those that failed."""
+        """Finished and failed rollouts."""
         return self.scores + self.failures
 
     @property
     def tasks(self) -> tuple[str, ...]:
-        """In the order of the rollouts."""
+        """Tasks, in the order of the rollouts."""
         return tuple(dict.fromkeys(rollout.task for rollout in self.rollouts))
 
     def outcomes(self, world: str, task: str) -> Float64[np.ndarray, "policies starts"]:
-        """Success (1 or 0) of every policy from every start; NaN where the rollout failed.
+        """Success (1 or 0) of every policy from every start; NaN for failed rollouts.
 
         Raises:
-            InvalidInputError: a policy that was not rolled out from the same starts as the others.
+            InvalidInputError: policies have different starts.
         """
         scores = {(s.policy, s.seed): s for s in self._of(world, task)}
         failed = {(f.policy, f.seed) for f in self._failed(world, task)}
@@ -110,7 +110,7 @@ class ClosedLoopReport:
         return [f for f in self.failures if f.world == world and f.task == task]
 
     def policy_rows(self) -> list[dict[str, Any]]:
-        """One row a policy and task: real and imagined success rate with Wilson intervals."""
+        """One row per policy and task: real and imagined success rate with Wilson intervals."""
         rows = []
         for task in self.tasks:
             for policy in self.policies:
@@ -143,11 +143,11 @@ class ClosedLoopReport:
         }
 
     def agreement(self, world: str) -> dict[str, dict[str, Any]]:
-        """How the policies' success rates in a world agree with the real ones, by task.
+        """Agreement of the policies' success rates in a world with the real ones, by task.
 
         `mmrv` counts ties (`ties="simpler"`); `mmrv_paper` does not, so it is 0 for a world that
-        gives every policy the same score. `rates` are the success rates that are compared: over
-        the starts that ended in both worlds for every policy, `num_starts` of them.
+        gives every policy the same score. `rates` are the compared success rates, over the
+        `num_starts` starts that finished in both worlds for every policy.
         """
         return {task: self._agreement(world, task) for task in self.tasks}
 
@@ -180,14 +180,14 @@ class ClosedLoopReport:
         return found
 
     def probe_accuracy(self) -> float | str:
-        """Share of real rollouts whose outcome the probe's probability tells rightly."""
+        """Share of real rollouts whose outcome the probe classifies correctly."""
         real = [s for s in self.scores if s.world == REAL]
         if not real:
             return UNDEFINED
         return float(np.mean([(s.probability >= 0.5) == s.success for s in real]))
 
     def to_report(self) -> dict[str, Any]:
-        """What a report holds of it: `policies`, `agreement` and the rest, as plain JSON."""
+        """Report entries as plain JSON: `policies`, `agreement` and the rest."""
         first, *others = self.imagined_worlds or (None,)
         rows, agreement = self.policy_rows(), {} if first is None else self.agreement(first)
         return {
@@ -211,10 +211,10 @@ def matched(
 ) -> tuple[
     list[str], Float64[np.ndarray, "policies starts"], Float64[np.ndarray, "policies starts"]
 ]:
-    """The policies that are compared, and their outcomes [policies, starts] in both worlds.
+    """Compared policies, and their outcomes [policies, starts] in both worlds.
 
-    Policies without a single start that ended in both worlds are left out, then starts that did
-    not end in both worlds for every policy that is left.
+    Excludes policies without a start that finished in both worlds, then starts that did not
+    finish in both worlds for every remaining policy.
     """
     known = np.isfinite(real) & np.isfinite(imagined)
     rows = known.any(axis=1)
@@ -224,5 +224,5 @@ def matched(
 
 
 def defined(value: float) -> float | str:
-    """The figure, or the word "undefined" where there is none: JSON has no NaN."""
+    """The value, or "undefined" for NaN, which JSON does not have."""
     return value if math.isfinite(value) else UNDEFINED

@@ -1,4 +1,4 @@
-"""Settings of training and of an evaluation, from flags and environment."""
+"""Settings of training and evaluation, from flags and environment variables."""
 
 import re
 import shlex
@@ -22,7 +22,7 @@ _SEEDS = re.compile(r"(\d+):(\d+)")
 
 
 class TrainPolicySettings(BaseSettings):
-    """Train a closed-loop policy that imitates the successful robot episodes of some stores.
+    """Train a closed-loop policy on the successful robot episodes of some stores.
 
     Example:
       dextouch train policy --episodes runs/episodes --output runs/cloned.safetensors
@@ -30,29 +30,29 @@ class TrainPolicySettings(BaseSettings):
 
     model_config = service_config("evaluation_train_policy", "dextouch train policy")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
     output: Path = Field(
         default=Path("runs/evaluation/behaviour_cloning.safetensors"),
         description="checkpoint to write",
     )
-    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
+    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
     early_at: float | None = Field(
         default=None,
         gt=0,
         lt=1,
-        description="share of training after which a policy that is not finished is kept too, "
+        description="fraction of training after which an early policy is saved, too, "
         "beside the output as …_early.safetensors",
     )
-    training: CloningSettings = Field(default=CloningSettings(), description="how it is trained")
+    training: CloningSettings = Field(default=CloningSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
     def early_output(self) -> Path:
-        """Where the early policy goes."""
+        """Path of the early policy."""
         return self.output.with_stem(f"{self.output.stem}_early")
 
 
 class TrainProbeSettings(BaseSettings):
-    """Train the judge of success on the robot episodes of some stores, true and imagined ones.
+    """Train the success probe on true and imagined robot episodes of some stores.
 
     Example:
       dextouch train probe --episodes runs/true,runs/imagined --output runs/probe.safetensors
@@ -60,23 +60,23 @@ class TrainProbeSettings(BaseSettings):
 
     model_config = service_config("evaluation_train_probe", "dextouch train probe")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
     development: tuple[str, ...] = Field(
-        default=(), description="stores to calibrate on (a share of the seeds of `episodes`)"
+        default=(), description="stores to calibrate on (default: a share of the seeds)"
     )
     held_out: tuple[str, ...] = Field(
-        default=(), description="stores to measure on (a fifth of the seeds of `episodes`)"
+        default=(), description="stores to evaluate on (default: a fifth of the seeds)"
     )
     output: Path = Field(
         default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"
     )
-    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
-    training: ProbeSettings = Field(default=ProbeSettings(), description="how it is trained")
+    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
+    training: ProbeSettings = Field(default=ProbeSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class TrainDirectSettings(BaseSettings):
-    """Train a judge that tells success from first observations and commands, imagining nothing.
+    """Train a baseline that predicts success from first observations and commands alone.
 
     Example:
       dextouch train direct-judge --episodes runs/episodes --output runs/direct.safetensors
@@ -84,30 +84,30 @@ class TrainDirectSettings(BaseSettings):
 
     model_config = service_config("evaluation_train_direct_judge", "dextouch train direct-judge")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores: folders or file:// URLs")
+    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
     output: Path = Field(
         default=Path("runs/evaluation/direct_judge.safetensors"), description="checkpoint to write"
     )
-    tasks: tuple[str, ...] = Field(default=(), description="only these; default: all there are")
-    training: DirectSettings = Field(default=DirectSettings(), description="how it is trained")
+    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
+    training: DirectSettings = Field(default=DirectSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
 class ServedWorld(BaseModel):
-    """A world behind a URL."""
+    """A world served at a URL."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    url: str = Field(description="of the service")
-    world: str = Field(description="its name there")
-    api_key: str | None = Field(default=None, description="for it, if it asks for one")
+    url: str = Field(description="URL of the service")
+    world: str = Field(description="name of the world")
+    api_key: str | None = Field(default=None, description="API key, if required")
 
 
 class RunSettings(BaseSettings):
-    r"""Roll policies out in a real and in imagined worlds, and score both.
+    r"""Roll out policies in a real and in imagined worlds and score them.
 
-    How to write a policy of your own and score it: docs/policies.md. The exit status is 1 when a
-    rollout failed; the others count.
+    docs/policies.md shows how to write and score a policy. The exit status is 1 if a rollout
+    failed; the other rollouts still count.
 
     Example:
       dextouch evaluate --seeds 10000:10010 --tasks stand_bottle --json report.json \
@@ -117,36 +117,36 @@ class RunSettings(BaseSettings):
 
     model_config = service_config("evaluation_run", "dextouch evaluate")
 
-    real: ServedWorld = Field(description="the world that judges success itself, such as the twin")
+    real: ServedWorld = Field(description="world that reports success, such as the twin")
     imagined: dict[str, ServedWorld] = Field(
         default={},
-        description="worlds to compare with it, by their names in the report; may be left out",
+        description="worlds to compare with it, by their names in the report; optional",
     )
     seeds: str = Field(description="FIRST:LAST+1, such as 10000:10010")
-    tasks: tuple[str, ...] = Field(default=(), description="default: all the success probe knows")
+    tasks: tuple[str, ...] = Field(default=(), description="tasks; default: all of the probe")
     policy: tuple[str, ...] = Field(
-        default=(), description="policy of your own, [NAME=]MODULE:FACTORY; may be repeated"
+        default=(), description="custom policy, [NAME=]MODULE:FACTORY; repeatable"
     )
     policy_arguments: dict[str, dict[str, Any]] = Field(
-        default={}, description="keyword arguments of factories, by the policy's name"
+        default={}, description="factory arguments, by policy name"
     )
     scripts: dict[str, str] = Field(
-        default={}, description="stores whose robot episodes are replayed, by the policy's name"
+        default={}, description="stores of episodes to replay, by policy name"
     )
     builtin: tuple[Literal["behaviour-cloning", "hold"], ...] = Field(
         default=("behaviour-cloning", "hold"),
-        description="policies of ours beside them; [] for none",
+        description="bundled policies; [] for none",
     )
     cloned_policy: Path = Field(default=DEFAULT_POLICY, description="checkpoint of train-policy")
     probe: Path = Field(default=DEFAULT_PROBE, description="checkpoint of train-probe")
-    num_steps: int = Field(default=80, ge=4, description="length of a rollout; 15 steps a second")
+    num_steps: int = Field(default=80, ge=4, description="steps of a rollout, at 15 per second")
     results: Path | None = Field(
         default=None,
-        description="every rollout is added here as a line of JSON when it ends; default: beside "
+        description="JSON Lines file to which rollouts are appended as they end; default: beside "
         "the report, as .jsonl; not the file of --json or --html",
     )
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
-    html: Path | None = Field(default=None, description="write a page here")
+    html: Path | None = Field(default=None, description="HTML page to write")
 
     @field_validator("seeds")
     @classmethod
@@ -170,7 +170,7 @@ class RunSettings(BaseSettings):
         return self
 
     def results_path(self) -> Path:
-        """Where rollouts are kept: as asked, beside the report, or in the working folder."""
+        """Path of the results: as requested, beside the report, or in the working folder."""
         report = self.json_path or self.html or Path("evaluation")
         return self.results or report.with_suffix(".jsonl")
 
@@ -181,9 +181,9 @@ class RunSettings(BaseSettings):
 
 
 def command_line(word: str, arguments: list[str]) -> str:
-    """A command of this service as it would be typed; kept in checkpoints.
+    """Command line of this service as typed; stored in checkpoints.
 
-    Files and folders go by their last name, since others have other folders.
+    Files and folders are given by their last path component, since folders differ.
     """
     named = [
         f"{flag}{separator}{value.rstrip('/').rsplit('/', 1)[-1]}"

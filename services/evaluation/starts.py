@@ -1,4 +1,4 @@
-"""Digests of first observations, by which training and evaluation starts are kept apart."""
+"""Digests of first observations, which keep training and evaluation starts disjoint."""
 
 import hashlib
 from collections.abc import Iterable
@@ -9,7 +9,7 @@ from dextouch.errors import ConflictError, InvalidInputError
 
 
 def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
-    """sha256 of a first observation: head camera image [h, w, 3] and taxels [2, 320] in kPa.
+    """SHA-256 of a first observation: head camera image [h, w, 3] and taxels [2, 320] in kPa.
 
     The same task and seed give the same first observation, so equal digests mean the same start.
     """
@@ -27,12 +27,12 @@ def start_digest(head_image: np.ndarray, tactile_kpa: np.ndarray) -> str:
 
 
 def refuse_training_starts(digests: Iterable[str], *, trained_on: Iterable[str], what: str) -> None:
-    """Let nothing be judged on what it was trained on.
+    """Raise if a start of the evaluation was trained on.
 
     Args:
-        digests: of the starts to judge on.
+        digests: digests of the evaluation's starts.
         trained_on: digests of the first observations of the training episodes.
-        what: network that was trained, for the message.
+        what: the trained network, for the error message.
 
     Raises:
         ConflictError: a start of the evaluation was trained on.

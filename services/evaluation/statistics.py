@@ -1,4 +1,4 @@
-"""Success rates, judging figures and agreement figures with their confidence intervals."""
+"""Success rates, classification metrics and agreement figures with confidence intervals."""
 
 import math
 from dataclasses import dataclass
@@ -20,10 +20,10 @@ class Interval:
 
 @dataclass(frozen=True)
 class AgreementInterval:
-    """How sure an agreement figure is.
+    """Confidence interval of an agreement figure.
 
-    `interval` is None when too few draws were defined; `undefined_share` is the share of draws
-    in which the figure had no value (all scores of one side equal).
+    `interval` is None if too few draws were defined; `undefined_share` is the share of draws
+    without a value (all scores of one side equal).
     """
 
     interval: Interval | None
@@ -39,8 +39,8 @@ def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
     """Probability that a success scores above a failure; ties count half.
 
     Args:
-        scores: [n], higher for a surer success.
-        success: [n], what came true.
+        scores: [n], higher for more certain success.
+        success: [n] outcomes.
 
     Raises:
         InvalidInputError: only successes, or only failures.
@@ -50,7 +50,7 @@ def area_under_roc(scores: np.ndarray, success: np.ndarray) -> float:
 
 
 def balanced_accuracy(decisions: np.ndarray, success: np.ndarray) -> float:
-    """Mean of the shares of successes and of failures that were decided rightly.
+    """Mean of the shares of successes and of failures that were classified correctly.
 
     Raises:
         InvalidInputError: only successes, or only failures.
@@ -120,7 +120,7 @@ def bootstrap_agreement(
     generator: np.random.Generator,
     num_draws: int = 1000,
 ) -> AgreementInterval:
-    """95 % percentile interval of an agreement figure, drawing the matched starts anew.
+    """95 % percentile interval of an agreement figure by resampling the matched starts.
 
     Args:
         real: scores [policies, starts]; column k of both arrays began from the same start.
@@ -131,7 +131,7 @@ def bootstrap_agreement(
 
     Raises:
         ShapeError: different shapes or not two axes.
-        InvalidInputError: another measure.
+        InvalidInputError: unknown measure.
     """
     real, imagined = np.asarray(real, dtype=np.float64), np.asarray(imagined, dtype=np.float64)
     if real.shape != imagined.shape or real.ndim != 2 or real.size == 0:

@@ -1,4 +1,4 @@
-"""The worlds of one evaluation: where they are served, and whether they fit each other."""
+"""Worlds of one evaluation: their addresses, and checks that they are compatible."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -12,7 +12,7 @@ from services.evaluation.scores import REAL
 
 @dataclass(frozen=True)
 class WorldAddress:
-    """Where a world is served, and what it is called there."""
+    """Service of a world, and the world's name there."""
 
     client: RolloutClient
     world: str
@@ -20,19 +20,19 @@ class WorldAddress:
 
 @dataclass(frozen=True)
 class StudyWorlds:
-    """The real world, as `real`, and the imagined ones, by their names in the report."""
+    """The real world, as `real`, and the imagined worlds by their names in the report."""
 
     addresses: Mapping[str, WorldAddress]
     descriptions: Mapping[str, WorldDescription]
 
     @classmethod
     def ask(cls, real: WorldAddress, imagined: Mapping[str, WorldAddress]) -> "StudyWorlds":
-        """Ask every service what its world is.
+        """Request the description of every world from its service.
 
         Raises:
             UnavailableError: a service does not answer.
-            UnknownNameError: a service without a world of this name.
-            InvalidInputError: an imagined world with the name of the real one.
+            UnknownNameError: a service has no world of this name.
+            InvalidInputError: an imagined world has the name of the real one.
         """
         if REAL in imagined:
             raise InvalidInputError(f"imagined world {REAL!r}: that is the real one; rename it")
@@ -42,7 +42,7 @@ class StudyWorlds:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Cameras that every world has: what policies see."""
+        """Cameras that all worlds have and policies can see."""
         others = [set(one.cameras) for one in self.descriptions.values()]
         return tuple(
             camera
@@ -51,14 +51,14 @@ class StudyWorlds:
         )
 
     def check(self, tasks: Sequence[str], num_steps: int, image_size_px: int) -> None:
-        """Refuse worlds that cannot take part, before the first rollout.
+        """Reject incompatible worlds before the first rollout.
 
         Raises:
             UnknownNameError: a task that a world does not have.
-            InvalidInputError: a real world that does not know success or does not begin from task
-                and seed, an imagined one that does not begin from its observations, images of
-                another size than the success probe's, or a length that is no multiple of a
-                world's chunk.
+            InvalidInputError: a real world that does not report success or does not start from
+                task and seed, an imagined one that does not start from its observations, images
+                of another size than the success probe's, or a length that is not a multiple of
+                a world's chunk.
         """
         real = self.descriptions[REAL]
         if not real.knows_success or "task_seed" not in real.starts_from:

@@ -1,6 +1,6 @@
-"""Success probe: the judge that tells from the end of a rollout whether it succeeded.
+"""Success probe: classifies the end of a rollout as success or failure.
 
-It sees images, touch and, of imagined endings, the imagined object poses; never the actions.
+Its inputs are images, touch and, for imagined endings, the predicted object poses; never actions.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,7 +18,7 @@ from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_we
 from services.evaluation.endings import Ending
 from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, probe_batch
 
-# Version 4 of the network, one a task; checkpoints of earlier ones are refused by this name.
+# Version 4 of the network, one per task; older checkpoints are rejected by this name.
 KIND = "success-probe-4"
 DECISION_THRESHOLD = 0.5
 Decision = Literal["success", "failure", "cannot tell"]
@@ -28,11 +28,11 @@ _BATCH = 256
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the judge says about one ending.
+    """Decision of the probe about one ending.
 
-    `likely_success` is the more probable outcome, also where the judge had better not decide;
-    `reason` says why it cannot tell. `milestones` are probabilities that each was reached by the
-    end, of those that can be told.
+    `likely_success` is the more probable outcome, also where the probe abstains; `reason` says why
+    it does. `milestones` are the probabilities that each was reached by the end, for those that the
+    probe can classify.
     """
 
     probability: float
@@ -46,10 +46,10 @@ class SuccessProbe:
     """A trained probe.
 
     Args:
-        checkpoint: from `load_checkpoint` or straight from training.
+        checkpoint: from `load_checkpoint` or from training.
 
     Raises:
-        CorruptDataError: weights that do not fit the shape in the metadata.
+        CorruptDataError: the weights do not match the shape in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -68,13 +68,13 @@ class SuccessProbe:
 
     @classmethod
     def load(cls, path: Path) -> "SuccessProbe":
-        """A probe from its file."""
+        """Load a probe from its file."""
         return cls(load_checkpoint(path, kind=KIND))
 
     def calibration(self, task: str, *, imagined: bool) -> Calibration:
-        """How log odds of a task's endings become probabilities.
+        """Calibration of a task's endings.
 
-        Imagined endings are taken as true ones where none were there to calibrate on.
+        Imagined endings use that of true ones if there were none to calibrate on.
         """
         for kind in (IMAGINED, TRUE) if imagined else (TRUE,):
             if (name := calibration_name(task, kind)) in self._calibrations:
@@ -82,11 +82,11 @@ class SuccessProbe:
         return Calibration()
 
     def log_odds(self, endings: Sequence[Ending]) -> Float64[np.ndarray, "n outputs"]:
-        """What the network says: log odds of success and of the task's milestones.
+        """Uncalibrated log odds of success and of the task's milestones.
 
         Raises:
-            UnknownNameError: a task the probe was not made for.
-            InvalidInputError: no endings, images of another size, or none where they are needed.
+            UnknownNameError: a task that the probe was not trained for.
+            InvalidInputError: no endings, images of another size, or missing images.
         """
         if not endings:
             raise InvalidInputError("success probe: got no endings, expected at least one")
@@ -96,9 +96,9 @@ class SuccessProbe:
         return torch.cat(odds).double().numpy()
 
     def _seen(self, batch: ProbeBatch) -> Float32[torch.Tensor, "n outputs"]:
-        """Log odds; of endings with images and poses the mean with and without the images.
+        """Log odds; with images and poses, the mean of those with and without the images.
 
-        Where poses are known, what is drawn of them adds as much error as it adds sight.
+        Where poses are known, images rendered from them add as much error as information.
         """
         odds: torch.Tensor = self._network(batch)
         both = batch.has_image & batch.has_objects
@@ -123,7 +123,7 @@ class SuccessProbe:
         return float(self.probabilities([ending])[0])
 
     def verdicts(self, endings: Sequence[Ending]) -> list[Verdict]:
-        """What to believe of each ending; raises as `log_odds`."""
+        """Decision about each ending; raises as `log_odds`."""
         odds = self.log_odds(endings)
         probabilities = self._calibrated(endings, odds)
         return [
@@ -132,7 +132,7 @@ class SuccessProbe:
         ]
 
     def verdict(self, ending: Ending) -> Verdict:
-        """What to believe of one ending."""
+        """Decision about one ending."""
         return self.verdicts([ending])[0]
 
     def _verdict(self, ending: Ending, probability: float, odds: np.ndarray) -> Verdict:
@@ -160,5 +160,5 @@ class SuccessProbe:
 
 
 def calibration_name(task: str, kind: str) -> str:
-    """The key of a task's calibration for true or imagined endings, in checkpoints."""
+    """Key of a task's calibration for true or imagined endings, in checkpoints."""
     return f"{task}/{kind}"

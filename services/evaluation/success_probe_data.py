@@ -1,4 +1,4 @@
-"""Endings as training examples of the success probe: tensors, labels and how much each counts."""
+"""Training examples of the success probe: endings as tensors, with labels and weights."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from dextouch.errors import InvalidInputError
 from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.judge_network import ProbeBatch, ProbeShape, probe_batch
 
-# Of the weight of a task's failures. They are easy: with more weight they would crowd out the
-# near misses that the probe is there for.
+# Share of early endings in the weight of a task's failures. They are easy: with more weight they
+# would dominate the near misses, which matter.
 EARLY_SHARE: Final = 0.1
-# Of a task's whole weight, for endings in the middle, which only milestones are learned from.
+# Share of middle endings, which train milestones only, in a task's total weight.
 MIDDLE_SHARE: Final = 0.15
-# Features that never change in a task are measured in this unit, so that noise stays small.
+# Lower bound of the deviation of features that hardly vary in a task, so that noise stays small.
 _LEAST_STD: Final = 0.05
 
 
 @dataclass(frozen=True)
 class Labelled:
-    """Endings as tensors, what came true, and how much each counts.
+    """Endings as tensors, with their outcomes and weights.
 
-    `outcome` [n, outputs] holds success and the task's milestones, `known` which of them anybody
-    knows.
+    `outcome` [n, outputs] holds success and the task's milestones, `known` marks those that are
+    known.
     """
 
     batch: ProbeBatch
@@ -38,7 +38,7 @@ class Labelled:
         return len(self.outcome)
 
     def of_task(self, index: int) -> "Labelled":
-        """The endings of one task."""
+        """Endings of one task."""
         mine = torch.nonzero(self.batch.task == index)[:, 0]
         return Labelled(self.batch[mine], self.outcome[mine], self.known[mine], self.weight[mine])
 
@@ -56,19 +56,19 @@ class _Example:
 def labelled_endings(
     episodes: Sequence[EndingEpisode], shape: ProbeShape, *, imagined_share: float = 0.5
 ) -> Labelled:
-    """Endings with their outcome, weighted so that both outcomes count the same in every task.
+    """Endings with outcomes, weighted so that both outcomes count the same in every task.
 
-    Every episode is shown at its end and a step earlier; once near its beginning, as a failure
-    with a tenth of the weight of all failures; and once in the middle where its milestones are
-    known.
+    Every episode contributes its end and the step before; an early ending, as a failure with a
+    tenth of the weight of all failures; and a middle ending where its milestones are known.
+
 
     Args:
-        episodes: with known success.
-        shape: of the probe.
-        imagined_share: weight of a task's imagined endings beside its true ones.
+        episodes: episodes with known success.
+        shape: shape of the probe.
+        imagined_share: weight of a task's imagined endings relative to its true ones.
 
     Raises:
-        InvalidInputError: a task of which only one outcome is known.
+        InvalidInputError: a task has only one outcome.
     """
     examples = [example for item in episodes for example in _examples(item, shape)]
     weight = _weights(examples, imagined_share)
@@ -138,9 +138,9 @@ def _group_weights(examples: Sequence[_Example], what: str) -> Float64[np.ndarra
 
 
 def object_scale(batch: ProbeBatch) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean and standard deviation of the features of object poses, each [features].
+    """Mean and standard deviation of the object pose features, each [features].
 
-    They are 0 and 1 where no pose, or a single one, is known.
+    They are 0 and 1 for fewer than two known poses.
     """
     known = batch.objects[batch.has_objects]
     if len(known) < 2:

@@ -1,4 +1,4 @@
-"""Calibration of a trained success probe, and its figures on endings that it never saw."""
+"""Calibration of a trained success probe, and its metrics on held-out endings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,9 +12,9 @@ from services.evaluation.endings import Ending, EndingEpisode
 from services.evaluation.statistics import area_under_roc, balanced_accuracy
 from services.evaluation.success_probe import IMAGINED, TRUE, SuccessProbe, calibration_name
 
-# With fewer endings of an outcome, nothing is calibrated on them.
+# No calibration is fitted with fewer endings of either outcome.
 MIN_OUTCOMES: Final = 5
-# A milestone can be told where endings that reached it score this much above others.
+# Milestones with a lower area under the ROC curve are not reported by the probe.
 MIN_MILESTONE_AUC: Final = 0.9
 Figures = dict[str, float | int]
 
@@ -22,7 +22,7 @@ Figures = dict[str, float | int]
 def fit_calibrations(
     probe: SuccessProbe, episodes: Sequence[EndingEpisode], *, risk: float
 ) -> dict[str, Calibration]:
-    """Calibration of every task and kind of ending that has enough of both outcomes."""
+    """Calibration of every task and kind of ending with enough of both outcomes."""
     found: dict[str, Calibration] = {}
     for task in probe.shape.tasks:
         for kind in (TRUE, IMAGINED):
@@ -37,7 +37,7 @@ def fit_calibrations(
 def milestones_that_can_be_told(
     probe: SuccessProbe, episodes: Sequence[EndingEpisode]
 ) -> dict[str, tuple[str, ...]]:
-    """The milestones of every task that the probe tells from endings it did not learn from."""
+    """Milestones of every task that the probe classifies well on held-out endings."""
     areas = milestone_areas(probe, episodes)
     return {
         task: tuple(n for n in names if areas.get((task, n), 0.0) >= MIN_MILESTONE_AUC)
@@ -48,7 +48,7 @@ def milestones_that_can_be_told(
 def milestone_areas(
     probe: SuccessProbe, episodes: Sequence[EndingEpisode]
 ) -> dict[tuple[str, str], float]:
-    """Area under the ROC curve of every task and milestone of which both outcomes are there."""
+    """Area under the ROC curve of every task and milestone with both outcomes."""
     areas: dict[tuple[str, str], float] = {}
     for task, names in probe.shape.milestones.items():
         mine = [e for e in episodes if e.task == task and e.event_times_s is not None]
@@ -63,13 +63,13 @@ def milestone_areas(
 
 
 def held_out_figures(probe: SuccessProbe, episodes: Sequence[EndingEpisode]) -> Figures:
-    """Share of right decisions over all tasks; by task what is told of true and imagined endings.
+    """Share of correct decisions over all tasks, and metrics of true and imagined endings by task.
 
-    True endings are shown without object poses, as a real robot has none; `poses` are true
-    endings with poses and touch and no image; `imagined` endings are shown as they are.
+    True endings are given without object poses, which a real robot does not have; `poses` are true
+    endings with poses and touch but no image; `imagined` endings are given as they are.
 
     Raises:
-        InvalidInputError: a task of which not both outcomes are there.
+        InvalidInputError: a task has only one outcome.
     """
     figures: Figures = {}
     right: list[bool] = []
@@ -116,7 +116,7 @@ def _figures(
 def final_endings(
     episodes: Sequence[EndingEpisode], task: str, kind: str
 ) -> tuple[list[Ending], Bool[np.ndarray, " n"]]:
-    """The last endings of a task, true or imagined, as a judge meets them, and their outcomes."""
+    """Final endings of a task, true or imagined, as a probe gets them, and their outcomes."""
     mine = [e for e in episodes if e.task == task and e.imagined == (kind == IMAGINED)]
     success = np.array([e.success for e in mine], dtype=bool)
     return [_as_seen(e.final, kind) for e in mine], success

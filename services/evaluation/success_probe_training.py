@@ -1,7 +1,7 @@
 """Training of the success probe on true and imagined endings of known outcome.
 
-Three sets of episodes with different starts: what is learned from, what the probabilities are
-calibrated on (development), and what the figures in the checkpoint are measured on (held out).
+Three disjoint sets of episodes: training, development (to calibrate the probabilities) and held out
+(for the metrics in the checkpoint).
 """
 
 import time
@@ -35,81 +35,75 @@ from services.evaluation.success_probe_figures import (
 
 
 class ProbeSettings(BaseModel):
-    """How to train a success probe."""
+    """Training settings of a success probe."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(default=0, description="of weights and of everything that is drawn")
-    # Of each task.
+    seed: int = Field(default=0, description="seed of weights and sampling")
+    # For each task.
     num_training_steps: int = Field(default=2000, ge=1, description="training steps")
     max_cpu_s: float = Field(
         default=200.0, gt=0, description="CPU seconds after which training ends"
     )
     batch_size: int = Field(default=48, ge=2, description="examples per training step")
-    learning_rate: float = Field(
-        default=1.5e-3, gt=0, description="largest; it falls along a cosine"
-    )
-    weight_decay: float = Field(default=5e-2, ge=0, description="of AdamW")
-    image_noise: float = Field(
-        default=0.02, ge=0, description="deviation of the noise on training images, of 1"
-    )
+    learning_rate: float = Field(default=1.5e-3, gt=0, description="peak of the cosine schedule")
+    weight_decay: float = Field(default=5e-2, ge=0, description="AdamW weight decay")
+    image_noise: float = Field(default=0.02, ge=0, description="noise on training images in 0 … 1")
     brightness: float = Field(
-        default=0.05, ge=0, description="deviation of training images' brightness, of 1"
+        default=0.05, ge=0, description="brightness variation of training images"
     )
-    # At 64 pixels one is about 10 mm on the table, which is what decides success.
-    shift_px: int = Field(default=1, ge=0, description="training images are shifted by up to this")
-    # Of true endings with both, how many are learned from without poses, without images: what is
-    # really seen comes without poses, and with them nobody would look at the image.
+    # At 64 pixels, one pixel is about 10 mm on the table, the scale that decides success.
+    shift_px: int = Field(default=1, ge=0, description="largest shift of training images")
+    # Shares of true endings with both inputs that lose their poses, or their image: real endings
+    # come without poses, and with poses the network would ignore the image.
     true_without_poses: float = Field(
         default=0.85,
         ge=0,
         le=1,
-        description="of true endings with both, learned from without object poses",
+        description="share of true endings with object poses dropped",
     )
     true_without_images: float = Field(
         default=0.1,
         ge=0,
         le=1,
-        description="of true endings with both, learned from without images",
+        description="share of true endings with images dropped",
     )
-    # The same of imagined endings: worlds that imagine poses do so always, images when asked.
+    # The same for imagined endings: worlds always predict poses, but render images on request.
     imagined_without_poses: float = Field(
         default=0.3,
         ge=0,
         le=1,
-        description="of imagined endings with both, learned from without object poses",
+        description="share of imagined endings with object poses dropped",
     )
     imagined_without_images: float = Field(
         default=0.3,
         ge=0,
         le=1,
-        description="of imagined endings with both, learned from without images",
+        description="share of imagined endings with images dropped",
     )
-    # In standard deviations of each feature of the poses.
     pose_noise: float = Field(
         default=0.03,
         ge=0,
-        description="noise on object poses, in each feature's standard deviations",
+        description="noise on object poses, in standard deviations of each feature",
     )
     imagined_share: float = Field(
-        default=0.4, gt=0, lt=1, description="weight of imagined endings beside true ones"
+        default=0.4, gt=0, lt=1, description="weight of imagined endings relative to true ones"
     )
     milestone_weight: float = Field(
-        default=0.3, ge=0, description="of milestones in the loss, beside success"
+        default=0.3, ge=0, description="weight of the milestones in the loss"
     )
     development_share: float = Field(
-        default=0.15, gt=0, lt=1, description="of seeds, to calibrate on"
+        default=0.15, gt=0, lt=1, description="share of seeds to calibrate on"
     )
-    held_out_share: float = Field(default=0.2, gt=0, lt=1, description="of seeds, to measure on")
-    # Errors that are allowed among the endings that the judge decides.
+    held_out_share: float = Field(default=0.2, gt=0, lt=1, description="share of held-out seeds")
     risk: float = Field(
-        default=0.05, gt=0, lt=1, description="errors allowed among the endings that are decided"
+        default=0.05, gt=0, lt=1, description="allowed share of errors among decided endings"
     )
 
 
 @dataclass(frozen=True)
 class ProbeSets:
-    """Episodes by what they are for; no two sets share a start."""
+    """Disjoint sets of episodes; no two sets share a start."""
 
     training: Sequence[EndingEpisode]
     development: Sequence[EndingEpisode]
@@ -124,7 +118,7 @@ class ProbeSets:
         development: Sequence[EndingEpisode] = (),
         held_out: Sequence[EndingEpisode] = (),
     ) -> "ProbeSets":
-        """The sets as they are given; one that is not is a share of the seeds of `episodes`."""
+        """The given sets; missing ones are taken from a share of the seeds of `episodes`."""
         training, tested, calibrated = list(episodes), list(held_out), list(development)
         if not tested:
             training, tested = split_by_seed(training, held_out_share=settings.held_out_share)
@@ -136,14 +130,14 @@ class ProbeSets:
 
     @property
     def training_starts(self) -> tuple[str, ...]:
-        """Digests of the starts that the weights were learned from, or the calibration."""
+        """Digests of the starts of the weights' training or the calibration."""
         return tuple(sorted({e.start_digest for e in (*self.training, *self.development)}))
 
     def check(self) -> None:
-        """Refuse sets that share a start.
+        """Raise if two sets share a start.
 
         Raises:
-            ConflictError: a held-out or development episode that begins like a training episode.
+            ConflictError: a held-out or development episode starts like a training episode.
         """
         learned = {e.start_digest for e in self.training}
         for others, trained_on in (
@@ -163,21 +157,21 @@ def train_success_probe(
     development: Sequence[EndingEpisode] = (),
     held_out: Sequence[EndingEpisode] = (),
 ) -> Checkpoint:
-    """Learn to tell success from the end of a rollout.
+    """Train a probe to predict success from the end of a rollout.
 
     Args:
-        episodes: true and imagined ones with known success.
-        settings: of the training.
-        command: that is kept in the checkpoint.
-        development: episodes to calibrate on; without them a share of the seeds of `episodes`.
-        held_out: episodes to measure on; without them a share of the seeds of `episodes`.
+        episodes: true and imagined episodes with known success.
+        settings: training settings.
+        command: command to store in the checkpoint.
+        development: episodes to calibrate on; default: a share of the seeds of `episodes`.
+        held_out: episodes to evaluate on; default: a share of the seeds of `episodes`.
 
     Returns:
-        The weights and the calibration, with figures of the held-out episodes in the metadata.
+        Weights and calibration; the metadata holds the metrics on held-out episodes.
 
     Raises:
-        ConflictError: a held-out or development episode that begins like a training episode.
-        InvalidInputError: a task of which only one outcome is known.
+        ConflictError: a held-out or development episode starts like a training episode.
+        InvalidInputError: a task has only one outcome.
     """
     torch.manual_seed(settings.seed)
     sets = ProbeSets.split(episodes, settings, development=development, held_out=held_out)
@@ -231,7 +225,7 @@ def _metadata(
 
 
 def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings) -> Checkpoint:
-    """The checkpoint with what the development episodes say of it."""
+    """The checkpoint with calibration and milestones from the development episodes."""
     probe = SuccessProbe(checkpoint)
     found = fit_calibrations(probe, sets.development, risk=settings.risk)
     added = {
@@ -246,7 +240,7 @@ def _calibrated(checkpoint: Checkpoint, sets: ProbeSets, settings: ProbeSettings
 
 
 def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
-    """The checkpoint with its figures on the held-out episodes."""
+    """The checkpoint with its metrics on the held-out episodes."""
     figures = held_out_figures(SuccessProbe(checkpoint), sets.held_out)
     metadata = checkpoint.metadata
     return replace(
@@ -258,7 +252,7 @@ def _measured(checkpoint: Checkpoint, sets: ProbeSets) -> Checkpoint:
 def _optimize(
     network: TaskNetwork, learned: Labelled, settings: ProbeSettings, *, name: str
 ) -> float:
-    """Minimize the balanced cross entropy of one task; gives the CPU seconds it took."""
+    """Minimize the balanced cross entropy of one task; returns the CPU seconds used."""
     mean, std = object_scale(learned.batch)
     network.object_mean.copy_(mean)
     network.object_std.copy_(std)
@@ -295,7 +289,7 @@ def _optimize(
 def _loss(
     odds: torch.Tensor, outcome: torch.Tensor, known: torch.Tensor, settings: ProbeSettings
 ) -> torch.Tensor:
-    """Cross entropy of success, and, with less weight, of the milestones; only of what is known."""
+    """Cross entropy of success and, with less weight, milestones, where they are known."""
     each = functional.binary_cross_entropy_with_logits(odds, outcome, reduction="none") * known
     success = each[:, 0].sum() / known[:, 0].sum().clamp_min(1)
     milestones = each[:, 1:].sum() / known[:, 1:].sum().clamp_min(1)
@@ -305,13 +299,13 @@ def _loss(
 def some_parts(
     batch: ProbeBatch, object_std: torch.Tensor, settings: ProbeSettings, generator: torch.Generator
 ) -> ProbeBatch:
-    """The batch with noise on the poses, and without poses or without images here and there.
+    """Add noise to the poses, and drop poses or images at random.
 
     Args:
-        batch: of one task.
-        object_std: [features], of the task's poses; noise is measured in it.
-        settings: how often, and how much noise.
-        generator: of everything that is drawn.
+        batch: examples of one task.
+        object_std: [features], deviation of the task's pose features, the unit of the noise.
+        settings: dropout shares and noise level.
+        generator: source of randomness.
     """
     drawn = torch.rand(len(batch.task), generator=generator)
     both = batch.has_image & batch.has_objects
@@ -335,7 +329,7 @@ def some_parts(
 def _disturb(
     images: torch.Tensor, settings: ProbeSettings, generator: torch.Generator
 ) -> torch.Tensor:
-    """Noise, brightness, a small shift, and for half the examples a blur: as models imagine."""
+    """Noise, brightness and a small shift, and a blur of half the examples, as in predictions."""
     num = len(images)
     noise = torch.randn(images.shape, generator=generator) * settings.image_noise
     brightness = torch.randn((num, 1, 1, 1), generator=generator) * settings.brightness

@@ -1,1 +1,1 @@
-"""Policies that act on observations: still, replayed, and learned by behaviour cloning."""
+"""Policies that act on observations: hold, replay, behaviour cloning, visual servo and custom."""

@@ -1,4 +1,4 @@
-"""Calls of a policy's own code: what it raises and what it returns, checked and named."""
+"""Calls into policy code, with validation of results and errors that name the policy."""
 
 import importlib
 import traceback
@@ -12,16 +12,16 @@ from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM, check_actions
 from dextouch.schemas.rollouts import WorldDescription
 
-# Where a traceback does not begin: here, and in the machinery of imports.
+# Frames cut from tracebacks: this file and the import machinery.
 _OUR_FRAMES = (__file__, "<frozen importlib", importlib.__file__)
 
 
 def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401 - whatever the policy gives
-    """What a function of a policy returns.
+    """Call a function of a policy.
 
     Raises:
-        InvalidInputError: it raised; `details["traceback"]` is its own traceback, without frames
-            of ours.
+        InvalidInputError: the function raised; `details["traceback"]` is its own traceback,
+            without frames of the caller.
     """
     try:
         return call(*arguments, **keywords)
@@ -32,7 +32,7 @@ def ask(call: Callable[..., Any], *arguments: object, where: str, **keywords: ob
 
 
 def own_traceback(error: BaseException) -> str:
-    """The traceback of an error without the frames that led to the policy's code."""
+    """Traceback of an error without the frames that led to the policy's code."""
     trace = error.__traceback__
     while trace and trace.tb_frame.f_code.co_filename.startswith(_OUR_FRAMES):
         trace = trace.tb_next
@@ -42,15 +42,15 @@ def own_traceback(error: BaseException) -> str:
 def action_chunk(
     answer: object, world: WorldDescription, *, where: str
 ) -> Float64[np.ndarray, "steps 67"]:
-    """What a policy's `act` returned as a chunk that a world takes.
+    """Validate the return value of a policy's `act` as an action chunk of a world.
 
     Args:
         answer: array, nested list or tensor [K, 67] of any kind of real number.
-        world: whose chunks it must fit.
-        where: policy, task, seed and chunk, for messages.
+        world: world that the chunk is for.
+        where: policy, task, seed and chunk, for error messages.
 
     Raises:
-        ShapeError: other shapes or kinds of number, or a K that the world does not take.
+        ShapeError: wrong shape or dtype, or a K that the world does not accept.
         NonFiniteError: NaN or infinity.
     """
     rows = _array(answer, where)
@@ -69,7 +69,7 @@ def action_chunk(
 
 
 def _array(answer: object, where: str) -> np.ndarray:
-    # Tensors of torch: one that requires a gradient or lies on a GPU does not convert by itself.
+    # A torch tensor that requires a gradient or lies on a GPU does not convert by itself.
     detach = getattr(answer, "detach", None)
     try:
         return np.asarray(answer if detach is None else detach().cpu().double())

@@ -1,4 +1,4 @@
-"""A policy that imitates demonstrations: a network that looks, feels and acts in closed loop."""
+"""Behaviour cloning policy: a closed-loop network on images, touch and poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -28,16 +28,16 @@ from services.evaluation.policies.cloning_network import (
     phase_features,
 )
 
-# Checkpoints of "behaviour-cloning-policy", whose chunks began at the reached pose, do not fit.
+# Older checkpoints, "behaviour-cloning-policy", are incompatible: chunks began at the reached pose.
 KIND = "cloned-policy"
 _WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
-# Coefficients further from the mean chunk than this many standard deviations of training are cut:
-# no touch or image, however odd, sends a hand where no demonstration came near.
+# Coefficients are clipped to this many standard deviations from the mean chunk, so that no image or
+# touch sends a hand far from all demonstrations.
 MAX_DEVIATIONS = 5.0
 
 
 class CloningShape(BaseModel):
-    """What the network looks like; kept in the checkpoint."""
+    """Shape of the network; stored in the checkpoint."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -48,7 +48,7 @@ class CloningShape(BaseModel):
     image_size_px: int = 64
 
     def network(self) -> CloningNetwork:
-        """A network of this shape, not trained yet."""
+        """Untrained network of this shape."""
         return CloningNetwork(
             num_tasks=len(self.tasks),
             num_slots=self.num_slots,
@@ -58,13 +58,13 @@ class CloningShape(BaseModel):
 
     @property
     def num_slots(self) -> int:
-        """Stretches of time that have a mean chunk of their own."""
+        """Time slots with a mean chunk of their own."""
         return self.horizon_steps // SLOT_STEPS + 1
 
 
 @dataclass(frozen=True)
 class CloningInput:
-    """What the policy looks at in one moment."""
+    """Input of the policy at one step."""
 
     first_image: UInt8[np.ndarray, "h w 3"]
     image: UInt8[np.ndarray, "h w 3"]
@@ -77,10 +77,10 @@ class CloningInput:
 
 
 def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> CloningBatch:
-    """Network tensors of moments; the same code serves training and acting.
+    """Network tensors of inputs, for training and acting alike.
 
     Raises:
-        UnknownNameError: a task the network was not made for.
+        UnknownNameError: a task that the network was not trained for.
         InvalidInputError: images of another size.
     """
     size = (shape.image_size_px, shape.image_size_px, 3)
@@ -101,21 +101,21 @@ def cloning_batch(inputs: Sequence[CloningInput], shape: CloningShape) -> Clonin
 
 
 def half_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "half_h half_w 3"]:
-    """The image with the mean of 2 × 2 pixels in each; an odd last row or column is left out."""
+    """Average 2 × 2 pixels; an odd last row or column is dropped."""
     height, width = image.shape[0] // 2, image.shape[1] // 2
     blocks = image[: 2 * height, : 2 * width].reshape(height, 2, width, 2, 3)
     return np.rint(blocks.mean(axis=(1, 3))).astype(np.uint8)
 
 
 def scaled_images(images: torch.Tensor) -> torch.Tensor:
-    """Bytes [..., h, w, 3] as the network wants them: [..., 3, h, w] in −0.5 … 0.5."""
+    """Convert bytes [..., h, w, 3] to network input [..., 3, h, w] in −0.5 … 0.5."""
     return images.movedim(-1, -3).float() / 255 - 0.5
 
 
 def cloning_state(
     inputs: Sequence[CloningInput], shape: CloningShape
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """State, task and slot of moments: a `CloningBatch` without its images."""
+    """State, task and slot of inputs: a `CloningBatch` without its images."""
     state = np.concatenate(
         [
             pad_features(np.stack([i.tactile_kpa for i in inputs])),
@@ -134,26 +134,26 @@ def cloning_state(
 
 
 def in_world(actions: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "steps 67"]:
-    """Actions [K, 67] relative to the anchor as the same ones with absolute poses."""
+    """Convert actions [K, 67] relative to the anchor to absolute poses."""
     return actions_from_poses(poses_from_actions(actions, anchor), _WORLD)
 
 
 def from_world(actions: np.ndarray, anchor: AnchorPoses) -> Float64[np.ndarray, "steps 67"]:
-    """The inverse of `in_world`."""
+    """Inverse of `in_world`."""
     return actions_from_poses(poses_from_actions(actions, _WORLD), anchor)
 
 
 class BehaviourCloningPolicy:
-    """Looks at the newest image, touch and pose, and sends the next 16 actions.
+    """Sends the next 16 actions, given the newest image, touch and pose.
 
-    Between `reset` calls it remembers the first image and the anchor of the rollout, nothing else.
-    Of an observation it needs the last step alone (`looks`).
+    The only state between `reset` calls is the rollout's first image and anchor. Of an observation
+    it needs the last step only (`looks`).
 
     Args:
-        checkpoint: from `load_checkpoint` or straight from training.
+        checkpoint: from `load_checkpoint` or from training.
 
     Raises:
-        CorruptDataError: weights that do not fit the shape in the metadata.
+        CorruptDataError: the weights do not match the shape in the metadata.
     """
 
     looks = "last"
@@ -174,14 +174,14 @@ class BehaviourCloningPolicy:
 
     @classmethod
     def load(cls, path: Path) -> "BehaviourCloningPolicy":
-        """A policy from its file."""
+        """Load a policy from its file."""
         return cls(load_checkpoint(path, kind=KIND))
 
     def reset(self, start: PolicyStart) -> None:
-        """Forget the last rollout.
+        """Start a new rollout.
 
         Raises:
-            UnknownNameError: a task the network was not made for.
+            UnknownNameError: a task that the network was not trained for.
         """
         if start.task not in self.shape.tasks:
             raise UnknownNameError("task of the cloned policy", start.task, list(self.shape.tasks))
@@ -192,7 +192,7 @@ class BehaviourCloningPolicy:
         """The next 16 commanded actions, relative to the rollout's step 0.
 
         Raises:
-            InvalidInputError: not reset, or images of another size.
+            InvalidInputError: `reset` was not called, or images of another size.
             UnknownNameError: the observation has no head camera.
         """
         if self._start is None:

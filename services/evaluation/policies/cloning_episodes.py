@@ -1,4 +1,4 @@
-"""Successful robot episodes as a cloned policy learns from them: only moments of decision."""
+"""Training episodes of behaviour cloning: successful robot episodes at decision steps only."""
 
 import hashlib
 from collections.abc import Mapping, Sequence
@@ -16,13 +16,13 @@ from services.evaluation.policies.cloning_network import SLOT_STEPS
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
-# Decisions are learned at these steps; an evaluation with chunks of 16 decides at every second.
+# Training uses every such step; an evaluation with chunks of 16 decides at every second of them.
 DECISION_STRIDE: Final = SLOT_STEPS
 
 
 @dataclass(frozen=True)
 class Moment:
-    """What is seen and felt at one step."""
+    """Image and touch at one step."""
 
     image: UInt8[np.ndarray, "h w 3"]
     tactile_kpa: Float32[np.ndarray, "2 320"]
@@ -30,10 +30,10 @@ class Moment:
 
 @dataclass(frozen=True)
 class CloningEpisode:
-    """One robot episode: what was reached and commanded at every step, and seen at some.
+    """One robot episode: measured and commanded actions at every step, observations at some.
 
     Both actions are relative to the measured poses of step 0, which are `anchor`. `moments` maps
-    steps to what was seen there; step 0 is among them.
+    steps to observations and includes step 0.
     """
 
     episode_id: str
@@ -48,7 +48,7 @@ class CloningEpisode:
 
     @property
     def num_steps(self) -> int:
-        """Steps of the model grid, the first included."""
+        """Steps of the model grid, including the first one."""
         return len(self.measured)
 
     @property
@@ -58,10 +58,10 @@ class CloningEpisode:
 
 
 def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
-    """One robot episode that succeeded; only images of decisions are decoded.
+    """Read one successful robot episode; only images at decision steps are decoded.
 
     Raises:
-        InvalidInputError: no seed, or no image at a decision's step.
+        InvalidInputError: no seed, or no image at a decision step.
     """
     about = reader.attributes
     if about.seed is None:
@@ -97,14 +97,14 @@ def read_cloning_episode(reader: EpisodeReader) -> CloningEpisode:
 
 
 def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> list[CloningEpisode]:
-    """The robot episodes of some stores that succeeded, store by store in the order of their ids.
+    """Read the successful robot episodes of some stores, store by store in the order of ids.
 
     Args:
-        stores: where to read.
-        tasks: only these; empty for all.
+        stores: stores to read.
+        tasks: tasks to read; empty for all.
 
     Raises:
-        NotFoundError: not one such episode, or a store without any episode.
+        NotFoundError: no such episode, or an empty store.
         ConflictError: two stores hold an episode of the same id.
     """
     readers = robot_episodes(
@@ -117,7 +117,7 @@ def read_cloning_episodes(*stores: EpisodeStore, tasks: Sequence[str] = ()) -> l
 
 
 def cloning_hash(episodes: Sequence[CloningEpisode]) -> str:
-    """sha256 over everything that training sees, in the order of the episode ids."""
+    """SHA-256 of all training data, in the order of the episode ids."""
     digest = hashlib.sha256()
     for item in sorted(episodes, key=lambda e: e.episode_id):
         digest.update(repr((item.episode_id, item.task, item.instruction, item.success)).encode())

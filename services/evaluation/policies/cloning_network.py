@@ -1,4 +1,4 @@
-"""The network of a cloned policy: head images, touch, poses and time to the next action chunk."""
+"""Network of behaviour cloning: predicts action chunks from images, touch, poses and time."""
 
 import math
 from dataclasses import dataclass
@@ -14,7 +14,7 @@ CHUNK_STEPS = 16
 CHUNK_SIZE = CHUNK_STEPS * ACTION_DIM
 NUM_PHASE_FEATURES = 8
 SLOT_STEPS = 8
-# Where hands and head are now (as an action), and where they were at step 0 (three poses).
+# Current poses of hands and head (as an action), and their poses at step 0 (three poses).
 NUM_POSE_FEATURES = ACTION_DIM + POSE_DIM * len(POSE_SLICES)
 STATE_DIM = NUM_PAD_FEATURES + NUM_POSE_FEATURES + NUM_PHASE_FEATURES + 1
 _POSES = slice(NUM_PAD_FEATURES, NUM_PAD_FEATURES + NUM_POSE_FEATURES)
@@ -24,16 +24,16 @@ _TASK_FEATURES = 8
 
 @dataclass(frozen=True)
 class CloningBatch:
-    """Inputs of the network, all images in −0.5 … 0.5.
+    """Inputs of the network; all images are in −0.5 … 0.5.
 
     Args:
-        first: [m, 3, h, w], the first images of rollouts.
-        rollout: [n], which of them belongs to each moment.
-        newest: [n, 3, h/2, w/2], what is seen now, at half size.
+        first: [m, 3, h, w], first images of rollouts.
+        rollout: [n], index of the first image of each sample.
+        newest: [n, 3, h/2, w/2], current images at half size.
         state: [n, 127]: pad features, the reached action with poses in the world, the poses of
             step 0 in the world, the phase, and whether the reached action was measured.
         task: [n].
-        slot: [n], the stretch of `SLOT_STEPS` steps since the start.
+        slot: [n], number of `SLOT_STEPS` steps since the start.
     """
 
     first: torch.Tensor
@@ -45,7 +45,7 @@ class CloningBatch:
 
 
 def action_weights() -> np.ndarray:
-    """What an error of one weighs per action number: 2 cm = 0.1 of rotation = 0.1 rad."""
+    """Error weights of the action numbers: 2 cm = 0.1 of rotation = 0.1 rad."""
     weights = np.full(ACTION_DIM, 10.0)
     for part in POSE_SLICES:
         weights[part.start : part.start + 3] = 50.0
@@ -54,14 +54,14 @@ def action_weights() -> np.ndarray:
 
 
 def phase_features(step: np.ndarray, *, horizon_steps: int) -> np.ndarray:
-    """Time since the start [n] as 8 smooth numbers; it stops at the horizon."""
+    """Time since the start [n] as 8 smooth features; it saturates at the horizon."""
     phase = np.clip(np.asarray(step, dtype=np.float64) / horizon_steps, 0.0, 1.0)[:, None]
     octaves = math.pi * phase * 2.0 ** np.arange(NUM_PHASE_FEATURES // 2)
     return np.concatenate([np.sin(octaves), np.cos(octaves)], axis=1)
 
 
 class SpatialSoftmax(nn.Module):
-    """Feature maps [n, c, h, w] to the expected image position of each: [n, 2c] in −1 … 1."""
+    """Expected image position, [n, 2c] in −1 … 1, of each of the feature maps [n, c, h, w]."""
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
         """Expected column and row of every channel."""
@@ -75,11 +75,11 @@ class SpatialSoftmax(nn.Module):
 
 
 class ChunkCodec(nn.Module):
-    """Action chunks [n, 16, 67], their poses in the world, as a few principal components.
+    """Principal components of action chunks [n, 16, 67] with poses in the world.
 
-    The mean chunk of a task and slot is taken off first, so that the network only has to tell how
-    this moment differs from others of its kind. Linear and orthonormal in weighted units: the
-    squared error of coefficients is the weighted squared error of actions.
+    The mean chunk of a task and slot is subtracted first, so that the network only predicts the
+    deviation from it. Linear and orthonormal in weighted units: the squared error of coefficients
+    is the weighted squared error of actions.
     """
 
     mean: torch.Tensor
@@ -93,7 +93,7 @@ class ChunkCodec(nn.Module):
         self.register_buffer("weights", torch.tensor(action_weights(), dtype=torch.float32))
 
     def fit(self, chunks: torch.Tensor, tasks: torch.Tensor, slots: torch.Tensor) -> None:
-        """Take means and principal components from training chunks [n, 16, 67].
+        """Fit means and principal components to training chunks [n, 16, 67].
 
         A slot without examples gets the mean of the nearest earlier one.
         """
@@ -108,7 +108,7 @@ class ChunkCodec(nn.Module):
         residual = flat - self.mean[tasks, slots]
         _, _, directions = torch.linalg.svd(residual, full_matrices=False)
         basis = directions[: len(self.basis)]
-        # The sign of a direction is free: make its largest entry positive.
+        # Signs are arbitrary: the largest entry of each direction is made positive.
         largest = basis.gather(1, basis.abs().argmax(1, keepdim=True))
         self.basis[: len(basis)].copy_(basis * largest.sign())
 
@@ -128,7 +128,7 @@ class ChunkCodec(nn.Module):
 
 
 class CloningEye(nn.Module):
-    """Where the things of a task are in an image: 2 numbers for each of 24 feature maps."""
+    """Image positions of task-relevant features: 2 numbers for each of 24 feature maps."""
 
     num_features = 2 * _CHANNELS[-1]
 
@@ -138,7 +138,7 @@ class CloningEye(nn.Module):
         self.coarse = nn.Conv2d(3, first, 5, stride=2, padding=2)
         self.middle = nn.Conv2d(first, second, 3, padding=1)
         self.fine = nn.Conv2d(second, third, 3, padding=1)
-        # Which of the things matter depends on the task.
+        # The relevant features depend on the task.
         self.wanted = nn.Linear(_TASK_FEATURES, first + second)
         self.places = SpatialSoftmax()
 
@@ -152,7 +152,7 @@ class CloningEye(nn.Module):
 
 
 class CloningNetwork(nn.Module):
-    """A small convolutional network with spatial softmax, and a multilayer perceptron on top."""
+    """A small convolutional network with spatial softmax, followed by a multilayer perceptron."""
 
     pose_mean: torch.Tensor
     pose_scale: torch.Tensor
@@ -180,7 +180,7 @@ class CloningNetwork(nn.Module):
     def forward(self, batch: CloningBatch) -> torch.Tensor:
         """Codec coefficients [n, k] of the next chunk.
 
-        Convolutions of training run in bfloat16: half the time.
+        In training, convolutions run in bfloat16, which halves the time.
         """
         before, after = batch.state[:, : _POSES.start], batch.state[:, _POSES.stop :]
         poses = (self.poses(batch.state) - self.pose_mean) / self.pose_scale
@@ -195,5 +195,5 @@ class CloningNetwork(nn.Module):
 
     @staticmethod
     def poses(state: torch.Tensor) -> torch.Tensor:
-        """The part [n, 94] of the state that says where hands and head are and were."""
+        """Part [n, 94] of the state with the current and initial poses of hands and head."""
         return state[:, _POSES]

@@ -1,4 +1,4 @@
-"""Training of a cloned policy, with its held-out error; it can keep an early checkpoint too."""
+"""Training of behaviour cloning, with held-out error and an optional early checkpoint."""
 
 import time
 from collections.abc import Iterator, Sequence
@@ -34,41 +34,37 @@ from services.evaluation.policies.cloning_network import (
 )
 from services.evaluation.progress import Progress
 
-# Moments a pass through the network when it is tested.
+# Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128
 MOMENTS_AN_EPISODE = 3
-# Large weights whose last digits do not matter: files stay below a megabyte.
+# Large weights stored as float16 to keep files below a megabyte.
 _KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
 
 class CloningSettings(BaseModel):
-    """How to train a cloned policy."""
+    """Training settings of behaviour cloning."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(default=0, description="of weights and of everything that is drawn")
+    seed: int = Field(default=0, description="seed of weights and sampling")
     num_training_steps: int = Field(default=3000, ge=1, description="training steps")
     max_cpu_s: float = Field(
         default=240.0, gt=0, description="CPU seconds after which training ends"
     )
     batch_size: int = Field(default=72, ge=1, description="examples per training step")
-    learning_rate: float = Field(
-        default=1.5e-3, gt=0, description="largest; it falls along a cosine"
-    )
-    weight_decay: float = Field(default=1e-3, ge=0, description="of AdamW")
-    image_noise: float = Field(
-        default=0.02, ge=0, description="deviation of the noise on training images, of 1"
-    )
+    learning_rate: float = Field(default=1.5e-3, gt=0, description="peak of the cosine schedule")
+    weight_decay: float = Field(default=1e-3, ge=0, description="AdamW weight decay")
+    image_noise: float = Field(default=0.02, ge=0, description="noise on training images in 0 … 1")
     brightness: float = Field(
-        default=0.06, ge=0, description="deviation of training images' brightness, of 1"
+        default=0.06, ge=0, description="brightness variation of training images"
     )
-    pose_noise: float = Field(default=0.2, ge=0, description="of the spread of each number")
-    held_out_share: float = Field(default=0.12, gt=0, lt=1, description="of seeds, to measure on")
+    pose_noise: float = Field(default=0.2, ge=0, description="pose noise, relative to the spread")
+    held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
 
 @dataclass(frozen=True)
 class Trained:
-    """The finished policy, and the early one if it was asked for."""
+    """The final policy, and the early one if requested."""
 
     finished: Checkpoint
     early: Checkpoint | None = None
@@ -76,10 +72,10 @@ class Trained:
 
 @dataclass(frozen=True)
 class Decisions:
-    """Moments of decision as tensors, with the chunks (in the world) that were sent next.
+    """Training samples at decision steps, with the chunks (in the world) that were sent next.
 
-    Images are bytes: `firsts` [m, h, w, 3], one an episode; `newest` [k, h/2, w/2, 3]. Of moment n,
-    `episode` and `frame` say which. The moments of an episode lie side by side: `begins` [m + 1].
+    Images are bytes: `firsts` [m, h, w, 3], one per episode; `newest` [k, h/2, w/2, 3]. `episode`
+    and `frame` index them for sample n. Samples of an episode are contiguous: `begins` [m + 1].
     """
 
     firsts: torch.Tensor
@@ -96,7 +92,7 @@ class Decisions:
         return len(self.chunks)
 
     def batch(self, index: torch.Tensor) -> CloningBatch:
-        """Inputs of some moments; first images that several of them share are there once."""
+        """Inputs of some samples; first images are deduplicated."""
         episodes, rollout = torch.unique(self.episode[index], return_inverse=True)
         return CloningBatch(
             scaled_images(self.firsts[episodes]),
@@ -108,7 +104,7 @@ class Decisions:
         )
 
     def drawn(self, num_moments: int, generator: torch.Generator) -> torch.Tensor:
-        """Indices of random moments, three an episode: looking at first images takes most time."""
+        """Random samples, three per episode: encoding first images takes most of the time."""
         num_episodes = -(-num_moments // MOMENTS_AN_EPISODE)
         episodes = torch.randint(len(self.firsts), (num_episodes,), generator=generator)
         shares = torch.rand((num_episodes, MOMENTS_AN_EPISODE), generator=generator)
@@ -117,13 +113,13 @@ class Decisions:
 
 
 def decisions_of(episodes: Sequence[CloningEpisode], shape: CloningShape) -> Decisions:
-    """Every eighth step of successful episodes, twice: as measured and as imagined.
+    """Samples at every eighth step of successful episodes, once as measured and once as imagined.
 
-    An imagined world senses no joints and answers with the actions it was given, so each moment
-    is also learned with the commanded pose in the place of the reached one.
+    An imagined world measures no joints and returns the given actions, so each sample is also
+    trained on with the commanded pose in place of the measured one.
 
     Raises:
-        InvalidInputError: no successful episode that is long enough, or images of several sizes.
+        InvalidInputError: no successful episode is long enough, or image sizes differ.
     """
     wanted = [item for item in episodes if item.success and item.num_steps > CHUNK_STEPS]
     if not wanted:
@@ -173,16 +169,16 @@ def train_cloned_policy(
     command: str,
     early_at: float | None = None,
 ) -> Trained:
-    """Imitate successful episodes.
+    """Train a policy on successful episodes.
 
     Args:
-        episodes: failed ones among them are left out.
-        settings: of training.
-        command: that repeats it.
-        early_at: share of the training after which the early policy is kept.
+        episodes: episodes to imitate; failed ones are skipped.
+        settings: training settings.
+        command: command that repeats the training.
+        early_at: fraction of the training after which the early policy is saved.
 
     Returns:
-        The weights, with the held-out error beside that of the mean chunk in the metadata.
+        The weights; the metadata holds the held-out error and that of the mean chunk.
     """
     torch.manual_seed(settings.seed)
     tasks = tuple(sorted({item.task for item in episodes}))
@@ -242,9 +238,9 @@ def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
 def _optimize(
     network: CloningNetwork, learned: Decisions, settings: CloningSettings
 ) -> Iterator[tuple[float, float]]:
-    """Minimize the weighted action error; says after each step what share is done, in how many s.
+    """Minimize the weighted action error; yields completed fraction and CPU seconds per step.
 
-    The seconds are of the CPU, since the first step.
+    The seconds count from the first step.
     """
     generator = torch.Generator().manual_seed(settings.seed)
     optimizer = torch.optim.AdamW(
@@ -272,7 +268,7 @@ def _optimize(
             elapsed = now - started - others_s
             done = max((step + 1) / settings.num_training_steps, elapsed / settings.max_cpu_s)
             yield done, elapsed
-            # Keeping and measuring an early policy in between is not training.
+            # Time to save and evaluate an early policy does not count as training.
             others_s += time.process_time() - now
 
 
@@ -282,10 +278,10 @@ def _disturbed(
     settings: CloningSettings,
     generator: torch.Generator,
 ) -> CloningBatch:
-    """Pixel noise, a random brightness for each example, and poses that are slightly wrong.
+    """Augment with pixel noise, a random brightness per sample, and noise on poses.
 
-    What is commanded next stays where it is in the world, so that a policy that strayed comes
-    back.
+    The target stays where it is in the world, so that the policy learns to recover from
+    deviations.
     """
     state = batch.state.clone()
     noise = torch.randn((len(state), NUM_POSE_FEATURES), generator=generator)
@@ -300,7 +296,7 @@ def _disturbed(
 
 
 def _errors(network: CloningNetwork, tested: Decisions, tasks: Sequence[str]) -> dict[str, float]:
-    """Wrist error at the end of a held-out chunk, and that of its task's and slot's mean chunk."""
+    """Wrist error at the end of held-out chunks, and that of the mean chunk of task and slot."""
     columns = [*range(WRIST_LEFT.start, WRIST_LEFT.start + 3)]
     columns += [*range(WRIST_RIGHT.start, WRIST_RIGHT.start + 3)]
     found: dict[str, list[torch.Tensor]] = {"": [], "_of_mean_chunk": []}

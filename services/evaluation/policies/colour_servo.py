@@ -1,8 +1,8 @@
-"""A visual servo without learning: it reaches for a colour in the head image and acts by touch.
+"""Colour servo: a policy without learning that reaches for a colour and reacts to touch.
 
-An example of a policy of your own that shares nothing with the scripts or with cloning:
+An example of a custom policy that is independent of the scripts and of behaviour cloning:
 `dextouch evaluate --policy servo=services.evaluation.policies.colour_servo:ColourServo`. It knows
-two tasks by the colours of their things, and needs five chunks of 16 steps.
+the object colours of two tasks and needs five chunks of 16 steps.
 """
 
 from dataclasses import dataclass, replace
@@ -25,14 +25,14 @@ from dextouch.schemas.rollouts import Observation
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
-# A pixel belongs to the thing if it is brighter than this and its hue (share of each colour in
-# their sum) is at most so far from the wanted one.
+# Pixels of the object are brighter than this, and their hue (share of each colour in their sum)
+# differs by at most this from the object's.
 _LEAST_BRIGHTNESS, _HUE_TOLERANCE, _LEAST_PIXELS = 60, 0.10, 4
-# A hand holds or hooks something if a taxel feels more than this.
+# Pressure above which a taxel indicates a grasp.
 _FELT_KPA: Final = 2.0
-# Fingers that are closer to upright than this share do not point forward.
+# Fingers that point forward by less than this share count as upright.
 _LEAST_FORWARD: Final = 0.1
-# Thumb, index, middle, ring and little finger when they close, added to the open hand's joints.
+# Joint angles of the closed hand relative to the open one: thumb, index, middle, ring, little.
 _CLOSING_RAD: Final = np.array(
     [[0.5, 0.1, 0.7, 0.4], [0.0, 0.0, 0.55, 0.4], [0.1, 0.0, 0.45, 0.25], [0.1, 0.0, 0.4, 0.2],
      [0.0, 0.0, 0.35, 0.2]]
@@ -41,10 +41,10 @@ _CLOSING_RAD: Final = np.array(
 
 @dataclass(frozen=True)
 class Thing:
-    """What to reach for.
+    """Object to reach for.
 
-    Its colour as red, green and blue; how high above the table its middle is; and which point of
-    the right hand goes there, in the wrist's frame.
+    Its colour as red, green and blue, the height of its centre above the table, and the point of
+    the right hand that goes there, in the wrist frame.
     """
 
     colour: tuple[float, float, float]
@@ -57,7 +57,7 @@ BOTTLE: Final = Thing((0.20, 0.62, 0.32), 0.034, (0.009, 0.035, -0.099))
 
 
 def thing_pixels(image: UInt8[np.ndarray, "h w 3"], thing: Thing) -> Bool[np.ndarray, "h w"]:
-    """Where in an image a thing's colour is."""
+    """Mask of the pixels with the object's colour."""
     rgb = image.astype(np.float64)
     hue = rgb / np.maximum(rgb.sum(axis=-1, keepdims=True), 1.0)
     wanted = np.array(thing.colour) / sum(thing.colour)
@@ -71,9 +71,9 @@ def thing_place_m(
     T_world_camera: Float64[np.ndarray, "4 4"],
     K: Float64[np.ndarray, "3 3"],
 ) -> Float64[np.ndarray, "3"] | None:
-    """Where the middle of a colour is in the world, if it lies at the thing's height.
+    """World position of the centre of a colour, assumed at the object's height.
 
-    None where fewer than four pixels have the colour, or the camera does not look down on them.
+    None if fewer than four pixels have the colour, or the camera does not look down on them.
     """
     rows, columns = np.nonzero(thing_pixels(image, thing))
     if len(rows) < _LEAST_PIXELS:
@@ -89,10 +89,10 @@ def thing_place_m(
 
 @dataclass(frozen=True)
 class Key:
-    """Where the hand is to be at a step of a chunk.
+    """Target of the hand at a step of a chunk.
 
-    The grip's place is to the right, forward (where the fingers pointed at step 0) and up from the
-    thing; the hand is turned by a rotation vector in those axes, and closed by a share.
+    The grip's offset from the object is given to the right, forward (the direction of the fingers
+    at step 0) and up; the hand is turned by a rotation vector in those axes, and closed by a share.
     """
 
     step: int
@@ -101,7 +101,7 @@ class Key:
     closed: float = 0.0
 
 
-# Of the yellow handle mostly its bar is seen; fingers go down between bar and drawer.
+# Mostly the bar of the yellow handle is visible; fingers go down between bar and drawer.
 _PULL: Final = (
     (Key(10, (0.0, 0.016, 0.045)), Key(16, (0.0, 0.016, 0.0))),
     (Key(4, (0.0, 0.016, -0.018)), Key(16, (0.0, -0.030, -0.018))),
@@ -109,7 +109,7 @@ _PULL: Final = (
     (Key(4, (0.0, -0.062, -0.018)), Key(14, (0.0, -0.062, 0.060))),
     (Key(14, (0.13, -0.110, 0.090)),),
 )
-# The turn that stands up a bottle lying in the closed hand, found by trying.
+# Rotation that stands up a bottle lying in the closed hand; found empirically.
 _UP: Final = (0.70, 1.29, 0.66)
 _STAND: Final = (
     (Key(10, (0.0, 0.0, 0.02)), Key(14, (0.0, 0.0, 0.0))),
@@ -122,19 +122,19 @@ _STAND: Final = (
     ),
     (Key(2, (0.0, 0.02, 0.081), _UP), Key(16, (0.13, 0.0, 0.101), _UP)),
 )
-# What follows when the hand feels nothing where it should.
+# Motion after a grasp without touch.
 _GIVE_UP: Final = (Key(12, (0.0, -0.06, 0.14)),)
-# Chunks that are only begun by a hand that feels something.
+# Chunks that require touch at their beginning.
 _NEEDS_TOUCH: Final = (2,)
 _PLANS: Final = {"open_drawer": (HANDLE, _PULL), "stand_bottle": (BOTTLE, _STAND)}
 
 
 class ColourServo:
-    """Goes where a colour is, and on by what the hand feels; the left hand and the head stay.
+    """Moves to a colour and reacts to touch; the left hand and the head stay still.
 
     `open_drawer`: behind the yellow handle, down, back, up. `stand_bottle`: over the green bottle,
-    close, lift, turn, set down. Where the colour is hidden it remembers where it was. A hand that
-    feels nothing after it hooked or closed goes up and stops.
+    close, lift, turn, set down. If the colour is hidden, its last position is used. A hand without
+    touch after hooking or closing goes up and stops.
     """
 
     looks = "last"
@@ -148,10 +148,10 @@ class ColourServo:
         self._gave_up = False
 
     def reset(self, start: PolicyStart) -> None:
-        """Forget where the last thing was.
+        """Start a new rollout.
 
         Raises:
-            UnknownNameError: a task whose colours it does not know.
+            UnknownNameError: a task whose colours are not known.
         """
         if start.task not in _PLANS:
             raise UnknownNameError("task of the colour servo", start.task, list(_PLANS))
@@ -161,7 +161,7 @@ class ColourServo:
         """The next 16 commanded actions, relative to the rollout's step 0.
 
         Raises:
-            InvalidInputError: not reset.
+            InvalidInputError: `reset` was not called.
             UnknownNameError: the observation has no head camera.
         """
         if self._start is None:
@@ -190,7 +190,7 @@ class ColourServo:
     def _chunk(
         self, now: Float64[np.ndarray, "67"], keys: tuple[Key, ...], thing: Thing
     ) -> Float64[np.ndarray, "16 67"]:
-        """Straight ways between keys, from what was sent last."""
+        """Linear interpolation between keys, from the last action sent."""
         assert self._start is not None  # noqa: S101 - act has checked both
         assert self._place_m is not None  # noqa: S101
         anchor = self._start.anchor
@@ -228,7 +228,7 @@ def _axes(R_world_wrist: Float64[np.ndarray, "3 3"]) -> Float64[np.ndarray, "3 3
 
 
 def _between(keys: tuple[Key, ...]) -> Float64[np.ndarray, "16 7"]:
-    """Offset, turn and closing at steps 1 … 16 of a chunk; the last key is held."""
+    """Offset, rotation and closing at steps 1 … 16 of a chunk; the last key is held."""
     values = np.array([(*key.offset_m, *key.turn_rad, key.closed) for key in keys])
     steps = np.arange(1, CHUNK_STEPS + 1)
     at = [key.step for key in keys]

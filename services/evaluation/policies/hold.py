@@ -1,4 +1,4 @@
-"""Policy that holds the hands where they are: the weakest baseline."""
+"""Hold policy: keeps the hands where they are; the weakest baseline."""
 
 import numpy as np
 from jaxtyping import Float64
@@ -9,7 +9,7 @@ from dextouch.schemas.rollouts import Observation
 
 
 class HoldPolicy:
-    """Keeps the pose it saw first.
+    """Keeps the pose of the first observation.
 
     Args:
         chunk_steps: length of its chunks, a multiple of 4.
@@ -26,12 +26,12 @@ class HoldPolicy:
         self._pose: np.ndarray | None = None
 
     def reset(self, start: PolicyStart) -> None:
-        """Forget the pose of the last rollout; the task does not matter."""
+        """Forget the pose of the last rollout; the task is ignored."""
         del start
         self._pose = None
 
     def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
-        """The pose of the first observation, again and again."""
+        """Repeat the pose of the first observation."""
         if self._pose is None:
             self._pose = np.array(observation.action_reached[-1])
         return np.tile(self._pose, (self.chunk_steps, 1))

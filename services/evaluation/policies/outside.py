@@ -1,4 +1,4 @@
-"""Policies of one's own, named on the command line as MODULE:FACTORY."""
+"""Custom policies, given on the command line as MODULE:FACTORY."""
 
 import importlib
 import inspect
@@ -20,7 +20,7 @@ _SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<fact
 
 @dataclass(frozen=True)
 class PolicySource:
-    """Where a policy comes from, and what it is called in the report."""
+    """Module and factory of a policy, and its name in the report."""
 
     name: str
     module: str
@@ -28,7 +28,7 @@ class PolicySource:
 
     @classmethod
     def parse(cls, text: str) -> "PolicySource":
-        """A source from `MODULE:FACTORY` or `NAME=MODULE:FACTORY`.
+        """Parse `MODULE:FACTORY` or `NAME=MODULE:FACTORY`.
 
         Raises:
             InvalidInputError: any other text.
@@ -44,16 +44,16 @@ class PolicySource:
         return cls(match["name"] or f"{module}:{factory}", module, factory)
 
     def load(self, arguments: Mapping[str, Any]) -> Policy:
-        """Import the module, from the current directory too, and call the factory.
+        """Import the module, also from the current directory, and call the factory.
 
         Args:
-            arguments: of the factory, by keyword.
+            arguments: keyword arguments of the factory.
 
         Raises:
             NotFoundError: no such module.
-            UnknownNameError: a module without the factory; callables it has are listed.
-            InvalidInputError: the module or the factory raised (with its own traceback), or what
-                it returned has no `act`.
+            UnknownNameError: no such factory in the module; its callables are listed.
+            InvalidInputError: the module or the factory raised (with its own traceback), or the
+                policy has no `act`.
         """
         where = f"policy {self.name!r}"
         module = self._module(where)
@@ -96,24 +96,24 @@ class PolicySource:
         )
 
     def _is_inside(self, package: str | None) -> bool:
-        """Whether this is the module itself or a package around it, not something it imports."""
+        """Whether this is the module itself or one of its parent packages, not an import of it."""
         return package is not None and f"{self.module}.".startswith(f"{package}.")
 
 
 class _WithoutReset:
-    """A policy that does not care where a rollout begins."""
+    """Adds an empty `reset` to a policy without one."""
 
     def __init__(self, act: Callable[[Observation], Any]) -> None:
         self.act = act
 
     def reset(self, start: PolicyStart) -> None:
-        """Nothing to forget."""
+        """Do nothing."""
 
 
 def _loudly(call: Any, *arguments: object, where: str, **keywords: object) -> Any:  # noqa: ANN401
-    """`ask`, with the traceback in the message: the policy's author needs it.
+    """`ask`, with the traceback in the message for the policy's author.
 
-    The cause of the error is what the call raised.
+    The cause of the error is the original exception.
     """
     try:
         return ask(call, *arguments, where=where, **keywords)

@@ -1,4 +1,4 @@
-"""Recorded demonstrations in; a policy that plays their commanded actions, whatever it sees."""
+"""Replay policy: sends the commanded actions of recorded demonstrations, whatever it observes."""
 
 from collections.abc import Iterable, Mapping
 
@@ -13,11 +13,11 @@ from services.evaluation.demonstrations import Demonstration
 
 
 class ReplayPolicy:
-    """Open loop: the scripted demonstrator, as good as its noise level lets it be.
+    """Open-loop baseline; as good as the recorded demonstrator.
 
     Args:
-        actions: for every (task, seed) the commanded actions [T, 67] of steps 1 … T, relative to
-            the measured poses of step 0.
+        actions: commanded actions [T, 67] of steps 1 … T for every (task, seed), relative to the
+            measured poses of step 0.
         chunk_steps: length of its chunks, a multiple of 4.
     """
 
@@ -39,10 +39,10 @@ class ReplayPolicy:
 
     @classmethod
     def of(cls, demonstrations: Iterable[Demonstration]) -> "ReplayPolicy":
-        """The policy that plays these episodes.
+        """Policy that replays these episodes.
 
         Raises:
-            ConflictError: two episodes of one task and seed.
+            ConflictError: two episodes have the same task and seed.
         """
         actions: dict[tuple[str, int], np.ndarray] = {}
         for item in demonstrations:
@@ -56,10 +56,10 @@ class ReplayPolicy:
         return cls(actions)
 
     def reset(self, start: PolicyStart) -> None:
-        """Take out the episode of this task and seed.
+        """Select the episode of this task and seed.
 
         Raises:
-            NotFoundError: there is none.
+            NotFoundError: there is no such episode.
         """
         key = (start.task, start.seed)
         if key not in self._actions:
@@ -70,7 +70,7 @@ class ReplayPolicy:
         self._playing = self._actions[key]
 
     def act(self, observation: Observation) -> Float64[np.ndarray, "steps 67"]:
-        """The actions of the steps after the newest one; at the end it stays where it is."""
+        """Actions of the steps after the newest one; the last action is repeated at the end."""
         if self._playing is None:
             raise InvalidInputError("replay policy: act before reset; call reset with the start")
         step = observation.first_step + len(observation) - 1

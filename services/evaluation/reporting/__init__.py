@@ -1,4 +1,4 @@
-"""The HTML report of an evaluation: one self-contained page of figures and pictures."""
+"""HTML report of an evaluation: one self-contained page of figures and images."""
 
 from services.evaluation.reporting.from_episodes import action_picture, episode_picture
 from services.evaluation.reporting.page import write_report

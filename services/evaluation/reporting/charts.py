@@ -14,7 +14,7 @@ _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 10, 36
 
 @dataclass(frozen=True)
 class Line:
-    """One curve; `style` picks its colour on the page, `dashed` sets it apart."""
+    """One curve; `style` selects its colour on the page, `dashed` its dash pattern."""
 
     label: str
     x: np.ndarray
@@ -25,7 +25,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Point:
-    """One policy in two worlds, with the interval of each score."""
+    """One policy in two worlds, with the confidence interval of each score."""
 
     label: str
     real: float
@@ -37,7 +37,7 @@ class Point:
 
 @dataclass(frozen=True)
 class _Axes:
-    """Where numbers lie on the picture."""
+    """Scaling from data to picture coordinates."""
 
     x: tuple[float, float]
     y: tuple[float, float]
@@ -53,7 +53,7 @@ class _Axes:
 
 
 def ticks(low: float, high: float, *, about: int = 5) -> list[float]:
-    """Round numbers inside low … high, roughly `about` of them."""
+    """Round numbers in low … high, roughly `about` of them."""
     step = 10.0 ** math.floor(math.log10((high - low) / about))
     for factor in (1, 2, 5, 10):
         if (high - low) / (step * factor) <= about + 1:
@@ -66,7 +66,7 @@ def ticks(low: float, high: float, *, about: int = 5) -> list[float]:
 def line_chart(
     lines: Sequence[Line], *, x_label: str, y_label: str, width: int = 560, height: int = 240
 ) -> Markup:
-    """Curves over a common axis; long ones are thinned to at most 600 points each."""
+    """Curves over a common axis; long ones are decimated to at most 600 points each."""
     x = np.concatenate([line.x for line in lines])
     y = np.concatenate([line.y for line in lines])
     axes = _Axes(_range(x, margin=0.0), _range(y, margin=0.06), width, height)
@@ -86,7 +86,7 @@ def line_chart(
 
 
 def agreement_chart(points: Sequence[Point], *, size: int = 300) -> Markup:
-    """Imagined over real success, both 0 … 1, with intervals and the line of agreement."""
+    """Imagined over real success, both 0 … 1, with intervals and the identity line."""
     axes = _Axes((-0.04, 1.04), (-0.04, 1.04), size + _LEFT - _TOP, size)
     (x0, y0), (x1, y1) = axes.to_px(0.0, 0.0), axes.to_px(1.0, 1.0)
     body = [
@@ -108,7 +108,7 @@ def agreement_chart(points: Sequence[Point], *, size: int = 300) -> Markup:
 
 
 def _range(values: np.ndarray, *, margin: float) -> tuple[float, float]:
-    """Smallest and largest number with some room; flat data gets a range of its own."""
+    """Smallest and largest number with a margin; constant data get a range of their own."""
     low, high = float(values.min()), float(values.max())
     room = (high - low) * margin
     if high - low < 1e-12:
@@ -144,7 +144,7 @@ def _grid(axes: _Axes, x_label: str, y_label: str) -> str:
 
 
 def _svg(body: Sequence[str], axes: _Axes, title: str) -> Markup:
-    # Every label went through escape; the rest are our own numbers.
+    # Every label is escaped; the rest are numbers of this module.
     return Markup(  # noqa: S704
         f'<svg class="chart" viewBox="0 0 {axes.width} {axes.height}" role="img" '
         f'aria-label="{escape(title)}">{"".join(body)}</svg>'

@@ -1,4 +1,4 @@
-"""Charts and image strips of the report, drawn from the pictures and scores of a run."""
+"""Charts and image strips of the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -18,13 +18,13 @@ from services.evaluation.reporting.pictures import (
 )
 from services.evaluation.reporting.sections import AgreementFigure, agreement_figures, is_number
 
-# S2 of every finger is abduction; the other three hinges bend it.
+# S2 of every finger is abduction; the other three joints are flexion.
 _FLEXION_HINGES = [0, 2, 3]
 
 
 @dataclass(frozen=True)
 class NamedChart:
-    """A chart with its title and the names of its colours."""
+    """A chart with its title and legend."""
 
     title: str
     svg: Markup
@@ -33,7 +33,7 @@ class NamedChart:
 
 @dataclass(frozen=True)
 class PolicyPanel:
-    """One task: its policies, its agreement, sentences about it, and its chart."""
+    """Policies, agreement, comments and chart of one task."""
 
     task: str
     rows: list[Mapping[str, Any]]
@@ -44,7 +44,7 @@ class PolicyPanel:
 
 @dataclass(frozen=True)
 class Strip:
-    """Moments in rows: an episode, or truth above prediction."""
+    """Images in rows over time: an episode, or truth above prediction."""
 
     title: str
     kind: str
@@ -65,7 +65,7 @@ def clock_chart(pictures: ReportPictures) -> NamedChart | None:
 
 
 def action_charts(actions: ActionPicture | None) -> list[NamedChart]:
-    """Wrist translation and finger flexion of both hands, reached and commanded."""
+    """Wrist translation and finger flexion of both hands, measured and commanded."""
     if actions is None:
         return []
     kinds = {"reached": actions.measured}
@@ -110,7 +110,7 @@ def _flexion_rad(actions: np.ndarray, side: str) -> np.ndarray:
 
 
 def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
-    """Scores of the policies and the agreement of the worlds, one panel a task."""
+    """Scores of the policies and agreement of the worlds, one panel per task."""
     entries = report.get("policies", [])
     agreement, comments = report.get("agreement", {}), report.get("comments", {})
     panels = []
@@ -135,13 +135,13 @@ def policy_panels(report: Mapping[str, Any]) -> list[PolicyPanel]:
 
 
 def _interval(entry: Mapping[str, Any], world: str) -> tuple[float, float]:
-    """The interval of a score; the score itself where the report has none."""
+    """Interval of a score, or the score itself if the report has none."""
     low, high = entry.get(f"{world}_interval") or (entry[world], entry[world])
     return float(low), float(high)
 
 
 def strips(pictures: ReportPictures) -> list[Strip]:
-    """Episodes as one row of moments, predictions as truth above prediction."""
+    """Episodes as one row of images, predictions as truth above prediction."""
     found = [
         Strip(e.title, "episode", [("", moments(e.times_s, e.images, e.tactile_kpa))])
         for e in pictures.episodes

@@ -1,4 +1,4 @@
-"""Pictures of stored episodes for the report."""
+"""Report pictures of stored episodes."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from services.evaluation.reporting.pictures import ActionPicture, EpisodePicture
 
 
 def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePicture:
-    """Evenly spread moments of a whole episode, the first and the last among them."""
+    """Evenly spaced moments of a whole episode, including the first and the last."""
     window = reader.window(0, num_steps=reader.num_steps, cameras=(CAMERA,))
     steps = np.unique(np.linspace(0, reader.num_steps - 1, num_moments).round().astype(int))
     attributes = reader.attributes
@@ -22,7 +22,7 @@ def episode_picture(reader: EpisodeReader, *, num_moments: int = 8) -> EpisodePi
 
 
 def action_picture(reader: EpisodeReader) -> ActionPicture:
-    """The actions of a whole episode, commanded ones too where it has them."""
+    """Actions of a whole episode, including commanded ones where available."""
     window = reader.window(0, num_steps=reader.num_steps, cameras=())
     commanded = None
     if "action_commanded" in reader.streams:
@@ -31,5 +31,5 @@ def action_picture(reader: EpisodeReader) -> ActionPicture:
 
 
 def _seconds(t_ref_ns: np.ndarray) -> np.ndarray:
-    """Seconds since the first stamp; subtracted in int64 first."""
+    """Seconds since the first timestamp; subtracted in int64 first."""
     return (t_ref_ns - t_ref_ns[0]) / 1e9

@@ -1,8 +1,8 @@
-"""The HTML page of a report (the content of report.json) and its pictures, in one file.
+"""HTML page of a report (the content of report.json) and its pictures, in one file.
 
-Every section is optional: what a run did not do is not on the page. The report may hold
-`about`, `stages`, `errors`, `world_model`, `policies`, `agreement` and `failures`; unknown keys
-only appear in the raw figures at the end.
+Every section is optional and omitted without data. The report may hold `about`, `stages`, `errors`,
+`world_model`, `policies`, `agreement` and `failures`; unknown keys only appear in the raw figures
+at the end.
 """
 
 import json
@@ -30,12 +30,12 @@ from services.evaluation.reporting.sections import (
 
 
 def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path) -> None:
-    """Write the page, whole or not at all.
+    """Write the page atomically.
 
     Args:
         report: figures; NaN and None are shown as "undefined".
         pictures: arrays to draw.
-        path: of the HTML file; its folder is created.
+        path: HTML file; its folder is created.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     unfinished = path.with_suffix(".unfinished")
@@ -44,7 +44,7 @@ def write_report(report: Mapping[str, Any], pictures: ReportPictures, path: Path
 
 
 def render_report(report: Mapping[str, Any], pictures: ReportPictures) -> str:
-    """The page as text."""
+    """Render the page as text."""
     environment = Environment(
         loader=PackageLoader("services.evaluation.reporting"),
         autoescape=select_autoescape(["j2"], default=True),

@@ -1,4 +1,4 @@
-"""Arrays of a run, as the report shows them: images, taxel maps, residuals and actions."""
+"""Image and array data of a report: head images, taxel maps, residuals and actions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -23,7 +23,7 @@ class EpisodePicture:
 
 @dataclass(frozen=True)
 class ActionPicture:
-    """The actions of one episode on the model grid; commanded ones only of a robot."""
+    """Actions of one episode on the model grid; commanded ones only for robots."""
 
     times_s: Float64[np.ndarray, " n"]
     measured: Float64[np.ndarray, "n 67"]
@@ -32,7 +32,7 @@ class ActionPicture:
 
 @dataclass(frozen=True)
 class PredictionPicture:
-    """A few moments of one held-out window, true and imagined."""
+    """A few moments of one held-out window, true and predicted."""
 
     title: str
     times_s: Float64[np.ndarray, " n"]
@@ -44,7 +44,7 @@ class PredictionPicture:
 
 @dataclass(frozen=True)
 class ReportPictures:
-    """Everything of a report that is not a figure; what is absent is left out of the page.
+    """Data of all pictures of a report; missing ones are omitted from the page.
 
     `clock_residuals_ms` maps a stream to its reference times (s) and residuals (ms), [2, n].
     """
@@ -57,7 +57,7 @@ class ReportPictures:
 
 @dataclass(frozen=True)
 class Moment:
-    """One column of a strip: a caption, the head image, and the taxel maps of both hands."""
+    """One column of a strip: caption, head image, and taxel maps of both hands."""
 
     caption: str
     image: str
@@ -65,7 +65,7 @@ class Moment:
 
 
 def moments(times_s: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray) -> list[Moment]:
-    """Columns of a strip, as addresses of embedded images."""
+    """Columns of a strip, as data URLs of embedded images."""
     return [
         Moment(f"{time:.2f} s", data_address(image), data_address(touch_image(taxels)))
         for time, image, taxels in zip(times_s, images, tactile_kpa, strict=True)

@@ -9,13 +9,13 @@ import numpy as np
 from dextouch.errors import ShapeError
 from dextouch.images.jpeg import encode_jpeg
 
-# Photographs larger than this travel as JPEG.
+# Larger images are embedded as JPEG.
 MAX_PNG_SIDE_PX = 256
 _COLOUR_TYPES = {3: 2, 4: 6}
 
 
 def encode_png(image: np.ndarray) -> bytes:
-    """PNG bytes of one image; a fourth channel is opacity.
+    """Encode one image as PNG; a fourth channel is opacity.
 
     Raises:
         ShapeError: not uint8 [h ≥ 1, w ≥ 1, 3 or 4].
@@ -41,7 +41,7 @@ def _chunk(kind: bytes, data: bytes) -> bytes:
 
 
 def data_address(image: np.ndarray) -> str:
-    """The image as an address that a page can show without fetching anything."""
+    """Data URL of the image."""
     if image.shape[2] == 3 and max(image.shape[:2]) > MAX_PNG_SIDE_PX:
         return "data:image/jpeg;base64," + base64.b64encode(encode_jpeg(image)).decode()
     return "data:image/png;base64," + base64.b64encode(encode_png(image)).decode()

@@ -1,4 +1,4 @@
-"""Sections of the report's page: tiles, bars and rows of errors."""
+"""Sections of the report page: tiles, bars and error rows."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 UNDEFINED = "undefined"
-# Figure, its name on the page, its unit, and the bound it should keep, if any.
+# Key of the figure, its name on the page, its unit, and its bound, if any.
 ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("taxel_iou", "Contact agreement (IoU)", "", ("≥", 0.98)),
     ("taxel_mae_kpa", "Taxel error", "kPa", None),
@@ -24,10 +24,10 @@ AGREEMENT: tuple[tuple[str, str], ...] = (
     ("bias", "mean of imagined minus real"),
     ("mean_absolute_error", "mean absolute error"),
 )
-# What images must be foreseen better than: the camera's own motion is known to all but the copy.
+# Image baselines that the model must beat; the camera motion is known to all but the copy.
 IMAGE_RIVALS = ("psnr_copy", "psnr_warp", "psnr_hands_still")
 _FAILURE_FIELDS = ("policy", "world", "error", "message", "traceback")
-# Title, unit, what is better, and the bars: figure and name.
+# Title, unit, direction, and the bars (key and name).
 COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
     (
         "Images, PSNR",
@@ -71,7 +71,7 @@ COMPARISONS: tuple[tuple[str, str, str, tuple[tuple[str, str], ...]], ...] = (
 
 @dataclass(frozen=True)
 class Bar:
-    """A named amount; `share` of the longest bar, `main` for the one that matters."""
+    """A named value; `share` relative to the longest bar, `main` for the highlighted one."""
 
     name: str
     value: float
@@ -81,7 +81,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class BarGroup:
-    """Bars of one unit below a title."""
+    """Bars of one unit under a title."""
 
     title: str
     unit: str
@@ -91,7 +91,7 @@ class BarGroup:
 
 @dataclass(frozen=True)
 class ErrorRow:
-    """One error with its bound; `holds` is None where there is no bound or no figure."""
+    """One error with its bound; `holds` is None without a bound or a figure."""
 
     name: str
     value: Any
@@ -102,7 +102,7 @@ class ErrorRow:
 
 @dataclass(frozen=True)
 class AgreementFigure:
-    """One figure of agreement, with its 95 % interval where it has one."""
+    """One agreement figure, with its 95 % interval if it has one."""
 
     name: str
     value: Any
@@ -120,7 +120,7 @@ class Tile:
 
 @dataclass(frozen=True)
 class FailureRow:
-    """Rollouts of one policy in one world that failed alike; the message is the first one's."""
+    """Failed rollouts of one policy in one world with the same error; shows the first message."""
 
     policy: str
     world: str
@@ -131,12 +131,12 @@ class FailureRow:
 
 
 def is_number(value: object) -> bool:
-    """Whether a figure is a finite number."""
+    """Whether a value is a finite number."""
     return isinstance(value, int | float) and math.isfinite(value)
 
 
 def figure(value: object, digits: int = 3) -> str:
-    """A figure with three significant digits; what is not a finite number is "undefined"."""
+    """Format a figure with three significant digits; non-finite values are "undefined"."""
     if not is_number(value):
         return UNDEFINED
     number = float(str(value))
@@ -153,7 +153,7 @@ def stage_bars(stages: Sequence[Mapping[str, Any]]) -> list[Bar]:
 
 
 def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
-    """The world model beside the predictors that it must beat."""
+    """World model compared with its baselines."""
     groups = []
     for title, unit, note, entries in COMPARISONS:
         known = [
@@ -168,7 +168,7 @@ def comparison_bars(figures: Mapping[str, Any]) -> list[BarGroup]:
 
 
 def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
-    """Errors of the recording path against the twin's truth, with their bounds."""
+    """Errors of the recording path against the twin's ground truth, with their bounds."""
     rows = []
     for stream, value in dict(errors.get("clock_rms_ms", {})).items():
         holds = value <= CLOCK_BOUND_MS if is_number(value) else None
@@ -184,7 +184,7 @@ def error_rows(errors: Mapping[str, Any]) -> list[ErrorRow]:
 
 
 def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
-    """The figures of agreement that a task has."""
+    """Agreement figures available for a task."""
     found = []
     for key, name in AGREEMENT:
         if key in agreement:
@@ -195,7 +195,7 @@ def agreement_figures(agreement: Mapping[str, Any]) -> list[AgreementFigure]:
 
 
 def failure_rows(report: Mapping[str, Any]) -> list[FailureRow]:
-    """Rollouts that failed, counted by policy, world and class of error."""
+    """Failed rollouts, counted by policy, world and error class."""
     rows: dict[tuple[str, ...], FailureRow] = {}
     for entry in report.get("failures", []):
         row = FailureRow(**{name: entry[name] for name in _FAILURE_FIELDS})
@@ -205,7 +205,7 @@ def failure_rows(report: Mapping[str, Any]) -> list[FailureRow]:
 
 
 def tiles(report: Mapping[str, Any]) -> list[Tile]:
-    """The headline figures that this report has."""
+    """Headline figures available in this report."""
     found = []
     stages, errors = report.get("stages", []), report.get("errors", {})
     model, agreement = report.get("world_model", {}), report.get("agreement", {})
