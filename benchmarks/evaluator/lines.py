@@ -18,6 +18,7 @@ from benchmarks.evaluator.drawn import (
 from benchmarks.evaluator.plan import IDLE
 from benchmarks.evaluator.rival_lines import rival_figures, rival_rows
 from dextouch.metrics.policy import mmrv, pearson
+from services.evaluation.calibration import UNDECIDED_RISK
 from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws, rates_of_draws
 
 TRUE, IMAGINED = "true verdict", "imagined verdict"
@@ -52,6 +53,7 @@ class TaskFigures:
         return [
             *_judge_figures(sampling, scripts),
             *_rollout_figures(sampling, scripts),
+            *_decision_figures(sampling, scripts),
             *_policy_figures(sampling, scripts, everything),
             *_idle_figures(sampling, everything),
             *chunk_figures_drawn(sampling, scripts),
@@ -112,6 +114,19 @@ def _rollout_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Draw
         sampling.area(f"{image}, AUC", _LAST_IMAGE, scripts, 0.93, None),
         sampling.balanced(f"{image}, balanced accuracy", _LAST_IMAGE, scripts, 0.80),
     ]
+
+
+def _decision_figures(sampling: Sampling, scripts: Sequence[Rolled]) -> list[Drawn]:
+    """Wrong answers among the decided ones; the judge's undecided band allows one in twenty."""
+    found = []
+    for name, kind in (("true", TRUE), ("imagined", IMAGINED)):
+        mine = [one for one in scripts if one.rows[kind]["decision"] != "cannot tell"]
+        wrong = np.array(
+            [(one.rows[kind]["decision"] == "success") != one.success for one in mine], dtype=float
+        )
+        what = f"wrong among the decided {name} endings"
+        found.append(sampling.mean(what, wrong, mine, ("at most", UNDECIDED_RISK)))
+    return found
 
 
 def _policy_figures(

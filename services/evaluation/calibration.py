@@ -17,6 +17,8 @@ NUM_BINS: Final = 10
 _MAX_NEWTON_STEPS: Final = 50
 # Weight of the prior (temperature 1, bias 0) in the fit, in endings.
 _PRIOR_ENDINGS: Final = 2.0
+# Allowed share of wrong answers among the decided endings.
+UNDECIDED_RISK: Final = 0.05
 # The undecided band is at most 5 % … 95 %.
 _WIDEST_BAND: Final = 0.45
 
@@ -83,7 +85,7 @@ def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
 
 
 def fit_calibration(
-    log_odds: np.ndarray, success: np.ndarray, *, risk: float = 0.05
+    log_odds: np.ndarray, success: np.ndarray, *, risk: float = UNDECIDED_RISK
 ) -> Calibration:
     """Fit temperature, bias and undecided band to endings that were not trained on.
 

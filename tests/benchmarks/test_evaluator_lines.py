@@ -23,7 +23,8 @@ CONTEXT = "chained contact F1 over F1 with true context, worst chunk where anyth
 
 
 def _verdict(told: float) -> dict:
-    return {"probability": told, "likely_success": told >= 0.5, "decision": "success"}
+    decision = "success" if told >= 0.7 else "failure" if told <= 0.3 else "cannot tell"
+    return {"probability": told, "likely_success": told >= 0.5, "decision": decision}
 
 
 def _rolled(policy: str, seed: int, *, real: bool, told: float) -> Rolled:
@@ -73,6 +74,9 @@ def test_lines_by_hand(rolled, tmp_path):
     assert balanced.value == pytest.approx(0.75)
     assert lines["judge of the last imagined image alone, AUC"].value == pytest.approx(3.5 / 4)
     assert lines["judge on true endings, AUC"].value == 1.0
+    # It decides two of the scripts' four endings, and is right.
+    decided = lines["wrong among the decided imagined endings"]
+    assert (decided.value, decided.num, decided.bound) == (0.0, 2, 0.05)
     assert lines["policies (scripts), Pearson"].value == pytest.approx(1.0)
     # Real 1, 0, 0 and imagined 0.5, 0, 0.5: the first is not above the last in imagination.
     worst = lines["policies (all), MMRV with ties"]
