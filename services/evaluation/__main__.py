@@ -77,7 +77,7 @@ def run_train_policy(arguments: list[str]) -> int:
     trained = train_cloned_policy(
         read_cloning_episodes(*stores, tasks=settings.tasks),
         settings.training,
-        command=command_line("train-policy", arguments),
+        command=command_line("policy", arguments),
         early_at=settings.early_at,
     )
     if trained.early is not None:
@@ -96,7 +96,7 @@ def run_train_probe(arguments: list[str]) -> int:
     checkpoint = train_success_probe(
         read(settings.episodes),
         settings.training,
-        command=command_line("train-probe", arguments),
+        command=command_line("probe", arguments),
         development=read(settings.development),
         held_out=read(settings.held_out),
     )
@@ -108,7 +108,7 @@ def run_train_direct_judge(arguments: list[str]) -> int:
     settings = load_settings(TrainDirectSettings, arguments)
     stores = [EpisodeStore(url) for url in settings.episodes]
     items = read_attempts(*stores, tasks=settings.tasks)
-    command = command_line("train-direct-judge", arguments)
+    command = command_line("direct-judge", arguments)
     checkpoint = train_direct_judge(items, settings.training, command=command)
     return _keep(checkpoint, settings.output, settings.json_path)
 

@@ -189,4 +189,4 @@ def command_line(word: str, arguments: list[str]) -> str:
         f"{flag}{separator}{value.rstrip('/').rsplit('/', 1)[-1]}"
         for flag, separator, value in (one.rpartition("=") for one in arguments)
     ]
-    return shlex.join(["python", "-m", "services.evaluation", word, *named])
+    return shlex.join(["dextouch", "train", word, *named])

@@ -268,11 +268,16 @@ def command_line(settings: TrainSettings) -> str:
         flags.append(f"--init={settings.init.name}")
     for name, value in given.items():
         if isinstance(value, bool):
-            flags.append(f"--{name}" if value else f"--no-{name}")
+            flags.append(f"--{_dashed(name)}" if value else f"--no-{_dashed(name)}")
             continue
         fields = value.items() if isinstance(value, dict) else [("", value)]
-        flags += [f"--{name}{'.' if field else ''}{field}={number}" for field, number in fields]
-    return " ".join(["python -m services.world_model train", *flags])
+        words = [(f"{name}.{field}" if field else name, number) for field, number in fields]
+        flags += [f"--{_dashed(word)}={number}" for word, number in words]
+    return " ".join(["dextouch train world-model", *flags])
+
+
+def _dashed(name: str) -> str:
+    return name.replace("_", "-")
 
 
 def _last_name(url: str) -> str:

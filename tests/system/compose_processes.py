@@ -123,8 +123,8 @@ class ComposeProcesses:
 
     def _command(self, name, command):
         words = [self._local(interpolate(word, self.variables), name) for word in command]
-        if words[0] == "python":
-            return [sys.executable, *words[1:]]
+        if words[0] == "dextouch":
+            return [sys.executable, "-m", "services.cli.main", *words[1:]]
         if words[0] == "redis-server":
             port = ["--port", str(self.ports[name]), "--bind", "127.0.0.1"]
             return [shutil.which("redis-server"), *words[1:], *port]

@@ -233,5 +233,7 @@ def test_the_command_line_streams(toy_store, tmp_path, capsys):
     assert main(["train", "--streaming", *arguments]) == 0
     assert json.loads(report.read_text())["steps"] == 2
     command = read_checkpoint(output).metadata.command
+    assert command.startswith("dextouch train world-model --")
     assert " --streaming " in command
+    assert " --network.image-px=32" in command
     capsys.readouterr()
