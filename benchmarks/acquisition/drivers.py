@@ -10,8 +10,8 @@ import numpy as np
 from benchmarks.acquisition.families import FULL_SCALE, NUM_VALUES, make_families
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
-from dextouch.hands.skeleton import NUM_KEYPOINTS
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.hands import NUM_KEYPOINTS
+from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera.driver import (
     CameraDecoder,
     ImageEncoding,

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
 from services.acquisition.devices.justfloat_glove.packets import TAIL, JustFloatGloveDecoder
 from services.acquisition.devices.tactile_glove.packets import (

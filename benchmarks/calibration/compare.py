@@ -13,7 +13,7 @@ from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import invert
+from dextouch.geometry import invert
 from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.twists import twist
 from services.cli.simulated.board_scenes import Scene

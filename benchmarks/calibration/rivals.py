@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError
-from dextouch.geometry.transforms import invert, transform
+from dextouch.geometry import invert, transform
 from services.alignment.calibration.closed_form import park
 from services.alignment.calibration.hand_eye import HandEyeResult, solve_hand_eye
 

@@ -5,7 +5,7 @@ from jaxtyping import Float64, Int64
 
 from benchmarks.clocks.scenes import Scene, Take
 from dextouch.clocks import OnlineClock, fit_clock
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams import ClockCapabilities, StreamDescriptor
 
 # Half-life of the forgetting regression.
 HALF_TIME_S = 90.0

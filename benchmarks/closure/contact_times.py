@@ -7,9 +7,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from dextouch.tactile.contact import in_contact
+from dextouch.tactile import PADS, in_contact
 from dextouch.tactile.layout import SIDES, split_pads
-from dextouch.tactile.pad_forces import PADS
 from services.twin.recorder import TruthStream
 
 # The whole hand comes last: in contact if any of its pads is.

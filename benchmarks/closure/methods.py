@@ -22,8 +22,8 @@ from benchmarks.closure.wrist_transfer import (
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import HandTrajectory
 from dextouch.hands.robot_hand import RobotHand
+from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import SIDES, Side
-from dextouch.tactile.pad_forces import pad_forces_n
 from services.alignment.retargeting import HandRetargeter
 from services.alignment.synchronization.resampling import (
     GridPlacement,

@@ -9,8 +9,8 @@ from jaxtyping import UInt8
 
 from benchmarks.closure.methods import Method, retarget_take, robot_trajectory
 from benchmarks.closure.replay import human_take, replay
-from dextouch.geometry.interpolation import nearest_index
-from dextouch.images.jpeg import encode_jpeg
+from dextouch.geometry import nearest_index
+from dextouch.images import encode_jpeg
 from services.twin.recorder import TruthStream
 
 CAMERA: Final = "camera_head"

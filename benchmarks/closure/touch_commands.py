@@ -23,8 +23,8 @@ from jaxtyping import Float64
 from benchmarks.closure.touch_anchor import fingertip_jacobians
 from benchmarks.closure.wrist_transfer import NUM_PADS, robot_places_m
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS, RobotHand
 
 # Turning is weighed against pushing with a lever of about half a grasp.

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, WRIST
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, WRIST
 
 _TIPS = [NODE_INDEX[chain, "tip"] for chain in CHAINS]
 _PALM = [NODE_INDEX[WRIST, WRIST], *(NODE_INDEX[chain, "proximal"] for chain in CHAINS[1:])]
@@ -137,7 +137,7 @@ def touch_offsets_m(
     Args:
         points: of T samples.
         pad_forces_n: [T, 6] forces on thumb … little fingertip and palm, 0 or more
-            (`dextouch.tactile.pad_forces`).
+            (`dextouch.tactile.pad_forces_n`).
         t_s: [T] rising times, relative to any moment.
         options: None takes the defaults.
 

@@ -7,11 +7,11 @@ from jaxtyping import Bool
 
 from benchmarks.evaluator.plan import CHUNK_STEPS
 from benchmarks.evaluator.playing import ImaginedRollout, TrueRollout
-from dextouch.geometry.transforms import apply, invert, transform_from_pose
+from dextouch.geometry import apply, invert, transform_from_pose
 from dextouch.hands.actions import AnchorPoses, poses_from_actions
 from dextouch.metrics.image import PEAK, decibels
 from dextouch.metrics.tactile import mse
-from dextouch.tactile.contact import in_contact
+from dextouch.tactile import in_contact
 from services.evaluation.camera_warp import warp_over_table
 from services.world_model.rendering.evaluation import sharpness
 

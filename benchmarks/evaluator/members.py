@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.evaluator.plan import Trained
 from dextouch.errors import InvalidInputError
-from dextouch.worlds.world import BatchWorld
+from dextouch.worlds import BatchWorld
 from services.evaluation.direct_judge import DirectJudge
 from services.evaluation.success_probe import SuccessProbe
 from services.world_model.world import open_world

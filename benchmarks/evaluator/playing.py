@@ -7,15 +7,9 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from benchmarks.evaluator.plan import CAMERA, CHUNK_STEPS, NUM_STEPS
-from dextouch.clients.policy import Policy, PolicyStart
-from dextouch.worlds.world import (
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    StartedRollout,
-    State,
-    World,
-)
+from dextouch.clients import Policy, PolicyStart
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import StartedRollout, State, World
 from services.evaluation.endings import NUM_SEEN_STEPS
 from services.evaluation.policies.asking import action_chunk, ask
 from services.twin.scripted_actions import Actions

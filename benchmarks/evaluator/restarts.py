@@ -14,14 +14,8 @@ from dextouch.hands.actions import (
     poses_from_actions,
     reanchor,
 )
-from dextouch.worlds.world import (
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    StartedRollout,
-    State,
-    World,
-)
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import StartedRollout, State, World
 from services.twin.world import TwinState, TwinWorld
 
 _NO_IMAGES = ReturnSelector(cameras=())

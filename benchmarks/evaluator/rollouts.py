@@ -25,10 +25,11 @@ from benchmarks.evaluator.playing import (
 )
 from benchmarks.evaluator.restarts import chunks_that_move, contact_with_true_context
 from benchmarks.evaluator.still_hand import StillRollout, hold_still, still_figures
-from dextouch.clients.policy import Policy
+from dextouch.clients import Policy
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions
-from dextouch.worlds.world import BatchWorld, RolloutStart
+from dextouch.schemas import RolloutStart
+from dextouch.worlds import BatchWorld
 from services.evaluation.direct_network import Attempt
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.success_probe import DECISION_THRESHOLD

@@ -12,7 +12,8 @@ from benchmarks.evaluator.plan import (
     STILL_CHUNKS,
     STILL_SHOWN_EVERY,
 )
-from dextouch.worlds.world import ReturnSelector, RolloutStart, State, World
+from dextouch.schemas import ReturnSelector, RolloutStart
+from dextouch.worlds import State, World
 
 _NO_IMAGES = ReturnSelector(cameras=())
 _LAST_IMAGE = ReturnSelector(cameras=(CAMERA,), steps="last")

@@ -11,7 +11,7 @@ from benchmarks.evaluator.members import Member, open_members, refuse_unequal_ri
 from benchmarks.evaluator.plan import CAMERA, StudyPlan
 from benchmarks.evaluator.playing import start_in_twin
 from benchmarks.evaluator.rollouts import DEPENDS_ON, PolicyRollout
-from dextouch.clients.policy import Policy
+from dextouch.clients import Policy
 from dextouch.errors import DexTouchError
 from services.evaluation.closed_loop import first_digest
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy

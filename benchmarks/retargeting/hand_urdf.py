@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 
 from dextouch.geometry.rotations import rotation_from_quaternion
+from dextouch.hands import CHAINS
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS
 
 WRIST_LINK: Final = "wrist"
 # URDF requires effort and velocity limits; neither is used here.

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float64
 from scipy.optimize import least_squares
 
 from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.robot_hand import NUM_FINGERS
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX
 from dextouch.tactile.layout import Side
 from services.cli.simulated.hand_motions import Motion
 from services.twin.hands import HumanHand

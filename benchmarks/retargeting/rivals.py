@@ -18,8 +18,8 @@ from jaxtyping import Float64
 
 from benchmarks.retargeting.hand_urdf import WRIST_LINK, hand_urdf, link_name, tip_name
 from dextouch.errors import UnavailableError, UnknownNameError
+from dextouch.hands import CHAINS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, solver_indices
 
 INSTALL: Final = "pip install -c constraints.txt '.[bench]'"
 DEX, DEXI = "dex", "dexi"

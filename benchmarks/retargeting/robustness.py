@@ -11,7 +11,7 @@ from benchmarks.retargeting.ours import OURS
 from benchmarks.retargeting.scores import score_robot
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError, LimitExceededError
-from dextouch.hands.skeleton import NODE_INDEX
+from dextouch.hands import NODE_INDEX
 from services.cli.simulated.hand_motions import Motion, robot_motion, with_dropouts
 
 NODE_LOST, HAND_LOST, NODES_LOST = "one node lost once", "hand lost once", "2 % of nodes lost"

@@ -15,8 +15,8 @@ from benchmarks.stages import Bar
 from benchmarks.store.our_design import descriptors
 from benchmarks.store.workload import Workload
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.samples import NO_DEVICE_TIME, SampleBatch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import NO_DEVICE_TIME, SampleBatch
 
 STREAM = "tactile_left"
 SPOOL, SPOOL_SYNCED, ZARR = "spool", "spool, on the disk", "zarr append"

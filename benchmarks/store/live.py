@@ -11,7 +11,7 @@ from benchmarks.store.our_design import arrivals, descriptors
 from benchmarks.store.workload import Workload
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.write_options import WriteOptions
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import RecordingAttributes
 
 SPEED = 4.0
 # A station's queues hold this much; a row that waits longer in front of the store is late.

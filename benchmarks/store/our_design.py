@@ -16,8 +16,8 @@ from benchmarks.store.workload import (
     Workload,
 )
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams import StreamDescriptor, StreamKind
 
 EPISODE_ID = "take"
 Block = tuple[str, np.ndarray, np.ndarray]

@@ -6,7 +6,7 @@ from functools import partial
 from typing import Final
 
 from dextouch.hands.actions import actions_from_poses
-from dextouch.worlds.world import EVERYTHING, ReturnSelector, RolloutStart
+from dextouch.schemas import EVERYTHING, ReturnSelector, RolloutStart
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.world import TwinState, TwinWorld

@@ -29,8 +29,8 @@ from benchmarks.world_model.tables import (
     variant_name,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.world import EVERYTHING, ReturnSelector, World
+from dextouch.schemas import EVERYTHING, ReturnSelector
+from dextouch.worlds import CopyFirstWorld, World
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:

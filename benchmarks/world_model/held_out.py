@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.hands.actions import actions_from_poses
-from dextouch.worlds.world import ReturnSelector, RolloutStart
+from dextouch.schemas import ReturnSelector, RolloutStart
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.world import TwinWorld

@@ -9,7 +9,8 @@ import numpy as np
 
 from benchmarks.world_model.held_out import CAMERA, CHUNK_STEPS, HeldOut
 from dextouch.metrics.tactile import contact_f1
-from dextouch.worlds.world import EVERYTHING, BatchWorld, Observation, ReturnSelector, World
+from dextouch.schemas import EVERYTHING, Observation, ReturnSelector
+from dextouch.worlds import BatchWorld, World
 
 
 @dataclass(frozen=True)

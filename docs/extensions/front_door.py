@@ -1,7 +1,7 @@
 """Sphinx directive `front-door` that documents the public names of a package of `dextouch`.
 
-A package that names them in `__all__` is documented by these alone, under the package's name; one
-that does not is documented module by module.
+A package is documented by the names in its `__all__`: functions, classes and constants under the
+package's name, public modules in a section of their own.
 """
 
 import importlib
@@ -22,12 +22,12 @@ class FrontDoor(SphinxDirective):
     required_arguments = 1
 
     def run(self) -> list[nodes.Node]:
-        """The nodes of `automodule` for the package, or for it and its modules."""
+        """The nodes of `automodule` for the package and for each of its public modules."""
         name = self.arguments[0]
         package = importlib.import_module(name)
         lines = [f".. automodule:: {name}", ""]
-        if not hasattr(package, "__all__"):
-            for module in pkgutil.iter_modules(getattr(package, "__path__", ())):
+        for module in pkgutil.iter_modules(getattr(package, "__path__", ())):
+            if module.name in package.__all__:
                 title = f"{name}.{module.name}"
                 lines += [title, "-" * len(title), "", f".. automodule:: {title}", ""]
         section = nodes.section()

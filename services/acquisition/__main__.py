@@ -3,8 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from dextouch.serving.logs import configure_logging
-from dextouch.serving.settings import load_settings, run
+from dextouch.serving import configure_logging, load_settings, run
 from services.acquisition.app import create_app
 from services.acquisition.memory import keep_for_life
 from services.acquisition.settings import AcquisitionSettings

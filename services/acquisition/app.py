@@ -7,7 +7,7 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.episodes.files import disk_errors
-from dextouch.serving.app import create_service_app
+from dextouch.serving import create_service_app
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
 from services.acquisition.routes import recorder_router, station_router
@@ -90,7 +90,7 @@ def _spool_safety(settings: AcquisitionSettings) -> SpoolSafety:
 def _make_uploader(settings: AcquisitionSettings) -> Uploader:
     store = None
     if settings.episode_store_url is not None:
-        from dextouch.clients.episode_store import EpisodeStoreClient
+        from dextouch.clients import EpisodeStoreClient
 
         key = settings.episode_store_key
         store = EpisodeStoreClient(

@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from dextouch.schemas.recordings import LedgerEntry
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import LedgerEntry
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.packets import DecoderStatistics

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import UInt16
 
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition.drivers.base import Driver, Readings
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health_blocks import Block

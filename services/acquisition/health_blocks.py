@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 
 # What is kept between two evaluations, which are a second apart.

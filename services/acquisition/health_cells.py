@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Shaped
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.acquisition.drivers.base import Decoder, TellsCells
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_levels import Verdict, above

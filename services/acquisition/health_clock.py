@@ -10,7 +10,7 @@ import numpy as np
 
 from dextouch.clocks import CountingClock, OnlineClock
 from dextouch.errors import InvalidInputError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.health_blocks import Block, Rolling
 from services.acquisition.health_levels import Verdict, above
 from services.acquisition.schemas import HealthFinding

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health_blocks import Block, Rolling
 from services.acquisition.health_camera import ChecksImages

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_levels import Verdict
 from services.acquisition.path_latency import PathWatch

@@ -5,7 +5,7 @@ Silent streams are detected here, for every report; a silent stream has no figur
 
 from collections.abc import Mapping, Sequence
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.health_advice import ADVICE
 from services.acquisition.health_levels import worst
 from services.acquisition.health_link import queue_dropped

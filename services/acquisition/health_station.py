@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import Matrix
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.health_levels import Verdict
 from services.acquisition.schemas import HealthFinding

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64
 
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
+from dextouch.streams import StreamDescriptor
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
 from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS
 from services.acquisition.health_blocks import Block

@@ -6,7 +6,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.tracking import TrackingEvents
 from services.acquisition.health_blocks import Block, Rolling

@@ -9,10 +9,8 @@ import numpy as np
 from jaxtyping import Float32, Float64, Int64
 
 from dextouch.errors import InvalidInputError, NotFoundError, StaleDataError
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.checks import H264_UNIT
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.schemas import Matrix
+from dextouch.streams import H264_UNIT, Sample, StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, raw_indices, select_taxels
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import GroupPreview
@@ -125,7 +123,7 @@ class LiveView:
             NotFoundError: no such camera, or no image yet (of H.264: no key frame yet).
             StaleDataError: the newest image is older than 0.5 s.
         """
-        from dextouch.images.jpeg import encode_jpeg
+        from dextouch.images import encode_jpeg
 
         descriptor = self._descriptors.get(camera)
         sample = self._newest.get(camera)

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from dextouch.tactile.layout import SIDES, Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.camera.driver import CameraDecoder, CameraDriver

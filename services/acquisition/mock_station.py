@@ -10,7 +10,7 @@ from types import TracebackType
 import structlog
 
 from dextouch.errors import DeviceError, InvalidInputError
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.mock_devices import MockFactory, duration_ns
 from services.acquisition.mock_links import MockLinks

@@ -15,9 +15,8 @@ import structlog
 
 from dextouch.clocks import KnownSkew, OnlineClock, PathLatency, RoundTrip, RoundTripClock
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.schemas import Matrix
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.drivers.base import Readings
 from services.acquisition.supervisor import DeviceSupervisor

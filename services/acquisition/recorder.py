@@ -13,9 +13,8 @@ from dextouch.clocks import PathLatency
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError
-from dextouch.schemas.episodes import Matrix
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import Matrix, RecordingAttributes
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import begin_take

@@ -7,9 +7,9 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, FastAPI, Query, Response
 from starlette.concurrency import run_in_threadpool
 
-from dextouch.schemas.episodes import StoreId
-from dextouch.serving.access import RequireScope
-from dextouch.streams.packing import pack
+from dextouch.schemas import StoreId
+from dextouch.serving import RequireScope
+from dextouch.streams import pack
 from services.acquisition.health_metrics import HealthCollector
 from services.acquisition.schemas import (
     CameraList,

@@ -4,7 +4,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from dextouch.schemas.episodes import Domain, StoreId
+from dextouch.schemas import Domain, StoreId
 
 Level = Literal["OK", "WARN", "ERROR", "STALE"]
 StaleCode = Literal["unplugged", "silent"]

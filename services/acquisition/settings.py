@@ -6,7 +6,7 @@ from typing import Literal
 from pydantic import Field, SecretStr, model_validator
 
 from dextouch.data_folder import default_spool
-from dextouch.serving.settings import ServiceSettings, service_config
+from dextouch.serving import ServiceSettings, service_config
 from services.acquisition.devices.chosen import ChosenDevice
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.supervisor import SpoolSafety

@@ -14,8 +14,7 @@ import structlog
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.spool_log import LOG_FILE
 from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.counters import DeviceCounters
 from services.acquisition.drivers.base import Driver, Readings

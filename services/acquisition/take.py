@@ -8,8 +8,8 @@ import structlog
 
 from dextouch.episodes.spool import SpoolWriter, StreamRecord
 from dextouch.errors import StorageError
-from dextouch.schemas.recordings import LedgerEntry
-from dextouch.streams.samples import Sample, SampleBatch
+from dextouch.schemas import LedgerEntry
+from dextouch.streams import Sample, SampleBatch
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.completeness import (
     StreamFacts,

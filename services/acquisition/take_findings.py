@@ -7,7 +7,7 @@ warnings of its check, and figures of its quality.
 from collections.abc import Collection
 from typing import Protocol, runtime_checkable
 
-from dextouch.schemas.recordings import LedgerEntry
+from dextouch.schemas import LedgerEntry
 from services.acquisition.health_advice import ADVICE
 from services.acquisition.schemas import HealthEvents, StationHealth, TakeProblem
 

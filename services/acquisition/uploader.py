@@ -20,15 +20,14 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
-from dextouch.schemas.recordings import (
+from dextouch.schemas import (
     ID_TAKEN,
     BatchReceipt,
     LedgerEntry,
     RecordingAttributes,
     RecordingStatus,
 )
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.schemas import UploadStatus
 

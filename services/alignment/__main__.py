@@ -15,9 +15,8 @@ from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
 from dextouch.hands.hand_files import load_hand
-from dextouch.schemas.episodes import json_ready
-from dextouch.serving.logs import configure_logging
-from dextouch.serving.settings import load_settings, run
+from dextouch.schemas import json_ready
+from dextouch.serving import configure_logging, load_settings, run
 from services.alignment.batch import OnRecordingProgress, Outcome, align_batch, not_aligned
 from services.alignment.jobs import episode_id_of
 from services.alignment.options import AlignmentOptions

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
-from dextouch.serving.app import create_service_app
+from dextouch.serving import create_service_app
 from services.alignment.job_runner import JobRunner
 from services.alignment.new_recordings import NewRecordings
 from services.alignment.routes import alignments_router

@@ -9,12 +9,12 @@ from jaxtyping import Float64, Int64
 
 from dextouch.episodes import StreamData
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.interpolation import nearest_index
+from dextouch.geometry import nearest_index
 from dextouch.hands.actions import HandTrajectory, poses_from_actions
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.tactile.contact import in_contact
+from dextouch.schemas import EpisodeAttributes
+from dextouch.streams import StreamDescriptor
+from dextouch.tactile import in_contact
 from dextouch.tactile.layout import SIDES
 from services.alignment.retargeting.hand_retargeter import HandRetargeter
 from services.alignment.retargeting.wrist import pose_difference

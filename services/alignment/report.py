@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from dextouch.episodes import EpisodeReader
-from dextouch.schemas.episodes import ClockReport, Domain, Matrix
+from dextouch.schemas import ClockReport, Domain, Matrix
 from dextouch.tactile.layout import SIDES
 from services.alignment.calibration.tactile_baseline import REASONS
 from services.alignment.synchronization.refused_parts import RefusedPart, refused_parts

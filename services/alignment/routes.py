@@ -4,9 +4,8 @@ from typing import Annotated
 
 from fastapi import APIRouter, Depends, Query, Response, status
 
-from dextouch.schemas.problems import error_from_problem
-from dextouch.serving.access import RequireScope
-from dextouch.serving.bodies import JSON, KIB, takes
+from dextouch.schemas import error_from_problem
+from dextouch.serving import JSON, KIB, RequireScope, takes
 from services.alignment.job_runner import JobRunner
 from services.alignment.schemas import (
     ENDED,

@@ -6,8 +6,7 @@ from typing import Literal
 from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
 from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.schemas.episodes import StoreId
-from dextouch.schemas.problems import Problem, problem_from_error
+from dextouch.schemas import Problem, StoreId, problem_from_error
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport
 from services.alignment.synchronization.progress import Progress, Stage

@@ -6,7 +6,7 @@ from pathlib import Path
 from pydantic import Field
 
 from dextouch.data_folder import default_store
-from dextouch.serving.settings import ServiceSettings, service_config
+from dextouch.serving import ServiceSettings, service_config
 from services.alignment.options import AlignmentOptions
 
 

@@ -4,8 +4,8 @@ import threading
 from typing import Any
 
 from dextouch.errors import UnavailableError
-from dextouch.schemas.problems import Problem, error_from_problem
-from dextouch.serving.child_process import ChildProcess
+from dextouch.schemas import Problem, error_from_problem
+from dextouch.serving import ChildProcess
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport
 from services.alignment.synchronization.progress import OnProgress, Progress

@@ -12,10 +12,8 @@ import structlog
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError
-from dextouch.schemas.episodes import json_ready
-from dextouch.schemas.problems import Problem, problem_from_error
-from dextouch.serving.child_process import Answer, serve_parent
-from dextouch.serving.logs import configure_logging
+from dextouch.schemas import Problem, json_ready, problem_from_error
+from dextouch.serving import Answer, configure_logging, serve_parent
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization.progress import Progress

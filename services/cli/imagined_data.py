@@ -17,10 +17,10 @@ from pathlib import Path
 import torch
 from rich.progress import track
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
 from services.evaluation.endings import NUM_SEEN_STEPS, early_step, middle_step
 from services.generation.demonstrations import imagine_episode

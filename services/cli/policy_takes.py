@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from dextouch.clients.policy import Policy, PolicyStart
-from dextouch.schemas.rollouts import RolloutStart
+from dextouch.clients import Policy, PolicyStart
+from dextouch.schemas import RolloutStart
 from services.evaluation.policies.asking import action_chunk, ask
 from services.evaluation.policies.outside import PolicySource
 from services.twin.demonstrators import NUM_GRID_STEPS

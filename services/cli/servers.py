@@ -11,7 +11,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from dextouch.errors import ConflictError, UnavailableError
-from dextouch.serving.settings import MAX_WEBSOCKET_BYTES
+from dextouch.serving import MAX_WEBSOCKET_BYTES
 
 BACKLOG = 128
 

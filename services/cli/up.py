@@ -14,8 +14,7 @@ from pydantic_settings import BaseSettings, SettingsConfigDict
 from dextouch.command_line import write_result
 from dextouch.data_folder import data_folder
 from dextouch.errors import ConflictError, UnknownNameError
-from dextouch.serving.logs import configure_logging
-from dextouch.serving.settings import load_settings
+from dextouch.serving import configure_logging, load_settings
 from services.cli.extras import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 
@@ -192,7 +191,7 @@ def _acquisition(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
 
 
 def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
-    from dextouch.worlds.serve import create_world_app
+    from dextouch.worlds import create_world_app
     from services.twin.serving import TwinServiceSettings, twin_worlds
 
     settings = TwinServiceSettings()
@@ -200,7 +199,7 @@ def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
 
 
 def _world_model(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
-    from dextouch.worlds.serve import create_world_app
+    from dextouch.worlds import create_world_app
     from services.world_model.settings import WorldModelSettings
     from services.world_model.world import open_world
 

@@ -3,8 +3,7 @@
 import sys
 from collections.abc import Sequence
 
-from dextouch.serving.logs import configure_logging
-from dextouch.serving.settings import load_settings, run
+from dextouch.serving import configure_logging, load_settings, run
 from services.dashboard.app import create_app
 from services.dashboard.settings import DashboardSettings
 

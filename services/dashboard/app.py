@@ -8,8 +8,7 @@ from pathlib import Path
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from dextouch.serving.access import AccessControl
-from dextouch.serving.app import create_service_app
+from dextouch.serving import AccessControl, create_service_app
 from services.dashboard.feeds import Feeds
 from services.dashboard.pages import page_router, refusal_page
 from services.dashboard.routes import api_router, live_router

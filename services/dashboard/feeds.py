@@ -7,7 +7,7 @@ from typing import Any
 import structlog
 
 from dextouch.errors import DexTouchError, NotFoundError
-from dextouch.streams.packing import unpack
+from dextouch.streams import unpack
 from dextouch.tactile.layout import SIDES
 from services.dashboard import station_api, store_api
 from services.dashboard.settings import DashboardSettings

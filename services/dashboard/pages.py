@@ -8,8 +8,8 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 from jinja2 import Environment, FileSystemLoader
 
 from dextouch.errors import AccessDeniedError, DexTouchError
-from dextouch.schemas.problems import status_of
-from dextouch.serving.bodies import FORM, KIB, takes
+from dextouch.schemas import status_of
+from dextouch.serving import FORM, KIB, takes
 from services.dashboard.sessions import COOKIE, Sessions
 from services.dashboard.settings import DashboardSettings
 

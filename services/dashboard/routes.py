@@ -21,7 +21,7 @@ from starlette.requests import HTTPConnection
 from starlette.websockets import WebSocketState
 
 from dextouch.errors import AccessDeniedError, InvalidInputError
-from dextouch.serving.access import not_signed_in
+from dextouch.serving import not_signed_in
 from services.dashboard.feeds import Feeds
 from services.dashboard.sessions import Sessions
 from services.dashboard.settings import DashboardSettings
@@ -32,7 +32,7 @@ MAX_VIEW_CHARACTERS = 1000
 WEBSOCKET_REFUSED = 1008
 # Interval at which a WebSocket checks that its session is still valid.
 SESSION_CHECK_S = 1.0
-# Same pattern as stream names (dextouch.streams.descriptors).
+# Same pattern as stream names (dextouch.streams.StreamDescriptor).
 CameraName = Annotated[str, Path(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 from starlette.requests import HTTPConnection
 
-from dextouch.serving.access import AccessControl
+from dextouch.serving import AccessControl
 
 COOKIE = "dextouch_session"
 SCOPE = "operate"

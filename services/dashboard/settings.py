@@ -2,7 +2,7 @@
 
 from pydantic import Field, SecretStr
 
-from dextouch.serving.settings import ServiceSettings, service_config
+from dextouch.serving import ServiceSettings, service_config
 
 
 class DashboardSettings(ServiceSettings):

@@ -6,8 +6,13 @@ from typing import TypeVar
 from pydantic import BaseModel, ValidationError
 
 from dextouch.errors import UnavailableError
-from dextouch.schemas.episodes import EpisodeDetail, EpisodeList, EpisodeSummary
-from dextouch.schemas.recordings import RecordingList, RecordingSummary
+from dextouch.schemas import (
+    EpisodeDetail,
+    EpisodeList,
+    EpisodeSummary,
+    RecordingList,
+    RecordingSummary,
+)
 from services.dashboard.upstream import Upstream
 from services.dashboard.views import TakeView
 

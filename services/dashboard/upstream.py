@@ -7,7 +7,7 @@ import httpx
 from pydantic import SecretStr, ValidationError
 
 from dextouch.errors import UnavailableError
-from dextouch.schemas.problems import Problem, error_from_problem
+from dextouch.schemas import Problem, error_from_problem
 
 
 class Upstream:

@@ -5,8 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
-from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour, hand_canvas
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 
 Level = Literal["OK", "WARN", "ERROR", "STALE"]

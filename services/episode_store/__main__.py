@@ -8,8 +8,7 @@ from dextouch.command_line import STANDARD_OUTPUT, CommandParser, add_json, writ
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.trash import TRASH_KINDS
 from dextouch.errors import DexTouchError
-from dextouch.serving.logs import configure_logging
-from dextouch.serving.settings import load_settings, run
+from dextouch.serving import configure_logging, load_settings, run
 from services.episode_store.app import create_app
 from services.episode_store.commands import delete, inspect, repair
 from services.episode_store.commands.context import Context, Outcome, seconds_of

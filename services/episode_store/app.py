@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError
-from dextouch.serving.app import create_service_app
+from dextouch.serving import create_service_app
 from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.catalog import Catalog
 from services.episode_store.commit_process import CommitProcess

@@ -13,8 +13,14 @@ import structlog
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
 from dextouch.episodes.format import Kind
 from dextouch.errors import NotFoundError, StorageError
-from dextouch.schemas.episodes import CatalogHours, EpisodeList, EpisodeSummary, HoursRow
-from dextouch.schemas.recordings import RecordingList, RecordingSummary
+from dextouch.schemas import (
+    CatalogHours,
+    EpisodeList,
+    EpisodeSummary,
+    HoursRow,
+    RecordingList,
+    RecordingSummary,
+)
 from services.episode_store.changes import FolderChanges, Revision
 from services.episode_store.filters import CatalogFilter, EpisodeFilter, RecordingFilter
 

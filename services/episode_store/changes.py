@@ -7,7 +7,7 @@ import time
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import COMMIT_FILE, Kind
-from dextouch.schemas.episodes import ID_PATTERN
+from dextouch.schemas import ID_PATTERN
 
 # Stamps of a file system can be this coarse: another change may get the same stamp.
 SETTLED_NS = 2_000_000_000

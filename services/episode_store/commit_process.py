@@ -10,9 +10,8 @@ from pathlib import Path
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.schemas.problems import Problem, error_from_problem, problem_from_error
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.serving.child_process import ChildProcess, serve_parent
+from dextouch.schemas import Problem, RecordingAttributes, error_from_problem, problem_from_error
+from dextouch.serving import ChildProcess, serve_parent
 from services.episode_store.committing import commit_spool
 
 # Acknowledging batches has priority over committing.

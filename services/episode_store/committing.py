@@ -5,8 +5,8 @@ from pathlib import Path
 
 from dextouch.episodes import EpisodeStore, WriteOptions
 from dextouch.episodes.spool import SpoolReader
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import ENCODED_UNITS
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import ENCODED_UNITS
 
 COPY_SAMPLES = 256
 COPY_BYTES = 4 << 20

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Protocol, runtime_checkable
 
 from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
 
-from dextouch.schemas.episodes import Domain, Origin
+from dextouch.schemas import Domain, Origin
 
 
 @runtime_checkable

@@ -14,7 +14,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import check_id
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas.recordings import (
+from dextouch.schemas import (
     ID_TAKEN,
     BatchReceipt,
     FinishRecording,

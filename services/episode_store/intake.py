@@ -8,7 +8,7 @@ import anyio
 import anyio.to_thread
 
 from dextouch.errors import LimitExceededError, StorageFullError
-from dextouch.schemas.recordings import (
+from dextouch.schemas import (
     BatchReceipt,
     ExpireUploads,
     FinishRecording,
@@ -16,7 +16,7 @@ from dextouch.schemas.recordings import (
     RecordingStatus,
     UploadList,
 )
-from dextouch.streams.wire import MAX_BATCH_BYTES
+from dextouch.streams import MAX_BATCH_BYTES
 from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.ingest import Ingest
 from services.episode_store.metrics import StoreMetrics

@@ -11,7 +11,7 @@ import structlog
 from dextouch.episodes.files import disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import NotFoundError, StorageError, StorageFullError
-from dextouch.schemas.recordings import RecordingAttributes, UploadList, UploadSummary
+from dextouch.schemas import RecordingAttributes, UploadList, UploadSummary
 from services.episode_store.admission import FULL_RETRY_S
 
 logger = structlog.get_logger(__name__)

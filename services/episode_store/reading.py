@@ -10,10 +10,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader
 from dextouch.episodes.window_codec import encode_window
 from dextouch.errors import LimitExceededError
-from dextouch.schemas.episodes import EpisodeDetail
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.schemas.rollouts import ActionKind
-from dextouch.streams.packing import pack
+from dextouch.schemas import ActionKind, EpisodeDetail, RecordingAttributes
+from dextouch.streams import pack
 
 # To be incremented whenever the same query gives other bytes.
 ANSWER_VERSION = 1

@@ -3,7 +3,7 @@
 from pydantic import Field
 
 from dextouch.data_folder import default_store
-from dextouch.serving.settings import ServiceSettings, service_config
+from dextouch.serving import ServiceSettings, service_config
 
 
 class EpisodeStoreSettings(ServiceSettings):

@@ -4,9 +4,8 @@ import numpy as np
 
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, UnknownNameError
-from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
-from dextouch.streams.samples import SampleBatch
-from dextouch.streams.wire import decode_batch
+from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
+from dextouch.streams import SampleBatch, decode_batch
 
 
 class Upload:

@@ -7,12 +7,11 @@ from pathlib import Path
 from textwrap import indent
 from typing import Any
 
-from dextouch.clients.policy import Policy
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import Policy, RolloutClient
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.serving.settings import load_settings
+from dextouch.serving import load_settings
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
 from services.evaluation.demonstrations import read_demonstrations

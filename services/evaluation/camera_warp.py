@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from dextouch.geometry.transforms import apply, invert
+from dextouch.geometry import apply, invert
 
 
 def warp_over_table(

@@ -12,11 +12,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients.policy import Policy, PolicyStart
-from dextouch.clients.rollouts import Rollout
+from dextouch.clients import Policy, PolicyStart, Rollout
 from dextouch.errors import ConflictError, DexTouchError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import Observation, ReturnSelector, WorldDescription
+from dextouch.schemas import Observation, ReturnSelector, WorldDescription
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.policies.asking import action_chunk, ask

@@ -16,7 +16,7 @@ from torch import nn
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import transform_from_pose
+from dextouch.geometry import transform_from_pose
 from services.evaluation.calibration import Calibration, expected_calibration_error, fit_calibration
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
 from services.evaluation.demonstrations import instructions_of, split_by_seed

@@ -10,7 +10,7 @@ from jaxtyping import Float32, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 from services.evaluation.demonstrations import CAMERA, Demonstration
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from dextouch.errors import ShapeError
+from dextouch.geometry import invert, transform_from_pose
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.geometry.transforms import invert, transform_from_pose
 
 MAX_OBJECTS: Final = 3
 _PAIRS: Final = tuple(combinations(range(MAX_OBJECTS), 2))

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import ConflictError, NotFoundError
-from dextouch.schemas.episodes import EpisodeAttributes
+from dextouch.schemas import EpisodeAttributes
 
 
 def robot_episodes(

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 from pydantic_settings import BaseSettings
 
 from dextouch.command_line import JSON_HELP
-from dextouch.serving.settings import service_config
+from dextouch.serving import service_config
 from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
 from services.evaluation.success_probe_training import ProbeSettings

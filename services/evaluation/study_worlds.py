@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.schemas.rollouts import WorldDescription
+from dextouch.schemas import WorldDescription
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.scores import REAL
 

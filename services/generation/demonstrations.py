@@ -6,12 +6,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.schemas.rollouts import Observation, ReturnSelector
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, LineageEntry, Observation, ReturnSelector
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import SIDES
 
 CAMERA: Final = "camera_head"

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry.transforms import apply, invert, transform, transform_from_pose
+from dextouch.geometry import apply, invert, transform, transform_from_pose
 from services.twin.scene import Scene
 
 # Half extent of a solid along each axis of another frame; the rows of `A` are the axes of that

@@ -11,8 +11,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from dextouch.geometry.cameras import pinhole_matrix
-from dextouch.geometry.transforms import transform, transform_from_pose
+from dextouch.geometry import pinhole_matrix, transform, transform_from_pose
 from services.twin.scene import Scene
 from services.twin.simulation import Simulation
 

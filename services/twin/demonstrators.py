@@ -8,9 +8,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.interpolation import interpolate_linear, interpolate_poses
+from dextouch.geometry import interpolate_linear, interpolate_poses, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands.actions import HandTrajectory
 from services.twin.cameras import HEAD_HOME
 from services.twin.simulation import MODEL_RATE_HZ

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeStore
-from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
+from dextouch.geometry import pose_from_transform, transform_from_pose
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.cameras import CAMERAS
 from services.twin.demonstrators import NUM_GRID_STEPS

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import apply, transform
 from services.twin.hands import Domain, TwinHand, twin_hand
 from services.twin.mjcf import FINGER_STIFFNESS_NM_RAD
 

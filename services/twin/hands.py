@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import UnknownNameError
-from dextouch.geometry.transforms import apply
+from dextouch.geometry import apply
+from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.tactile.layout import FINGERS, PALM_PITCH_M, PALM_SHAPE, Side
 from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
 

@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion, Vector3
+from dextouch.hands import FingerTable, JointRow, Quaternion, Vector3
 
 # Base of each finger's metacarpal in the right wrist frame, metres.
 METACARPAL_BASES_M: Final[dict[str, np.ndarray]] = {

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from dextouch.hands.finger_table import JointRow
+from dextouch.hands import JointRow
 from dextouch.tactile.layout import FINGERS
 from services.twin.hands import PALM_THICKNESS_M, TwinHand
 

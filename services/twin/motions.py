@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands.actions import HandTrajectory
 from dextouch.tactile.layout import SIDES
 from services.twin.demonstrators import NUM_GRID_STEPS, HandPose, Waypoint, bent, follow, moved

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import invert, pose_from_transform, transform_from_pose
+from dextouch.geometry import invert, pose_from_transform, transform_from_pose
 
 _FREE: Final = int(mujoco.mjtJoint.mjJNT_FREE)
 _SINGLE: Final = (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE))

@@ -8,10 +8,10 @@ from typing import Final, cast
 import numpy as np
 from jaxtyping import Int64, Shaped
 
-from dextouch.geometry.transforms import transform_from_pose
+from dextouch.geometry import transform_from_pose
+from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.actions import ACTION_DIM, HandTrajectory
-from dextouch.hands.skeleton import NUM_KEYPOINTS
-from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.hands import HumanHand

@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry.transforms import transform
+from dextouch.geometry import transform
 from dextouch.hands.actions import (
     AnchorPoses,
     HandTrajectory,

@@ -4,10 +4,8 @@ from typing import Any
 
 from pydantic import Field
 
-from dextouch.serving.settings import load_settings, service_config
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, serve_worlds
-from dextouch.worlds.world import World
+from dextouch.serving import load_settings, service_config
+from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, serve_worlds
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 

@@ -12,8 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.interpolation import interpolate_poses
-from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
+from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from services.twin.mjcf import PHYSICS_RATE_HZ
 from services.twin.scene import Scene
 from services.twin.tactile import TactileReader

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import transform_from_pose
+from dextouch.geometry import transform_from_pose
 from dextouch.hands.actions import AnchorPoses, HandTrajectory
 from services.twin.cameras import CameraRig
 from services.twin.demonstrators import WaypointNoise, at_own_tempo, follow, head_sway

@@ -16,16 +16,9 @@ from dextouch.hands.actions import (
     check_actions,
     poses_from_actions,
 )
-from dextouch.streams.packing import pack, unpack
-from dextouch.worlds.world import (
-    EVERYTHING,
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    StartedRollout,
-    SteppedRollout,
-    WorldDescription,
-)
+from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
+from dextouch.streams import pack, unpack
+from dextouch.worlds import StartedRollout, SteppedRollout
 from services.twin.cameras import CAMERAS
 from services.twin.recorder import GridLog
 from services.twin.settings import TwinSettings

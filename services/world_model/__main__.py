@@ -10,8 +10,8 @@ from typing import Any
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 from dextouch.command_line import write_result
-from dextouch.serving.settings import load_settings
-from dextouch.worlds.serve import serve_worlds
+from dextouch.serving import load_settings
+from dextouch.worlds import serve_worlds
 from services.world_model.checkpoints import list_checkpoints, read_checkpoint
 from services.world_model.settings import (
     ShowCommand,

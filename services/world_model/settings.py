@@ -6,8 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from pydantic_settings import BaseSettings, CliImplicitFlag
 
 from dextouch.command_line import JSON_HELP
-from dextouch.serving.settings import service_config
-from dextouch.worlds.serve import WorldServiceSettings
+from dextouch.serving import service_config
+from dextouch.worlds import WorldServiceSettings
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.rendering.configuration import RendererConfig

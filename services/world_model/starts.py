@@ -9,7 +9,7 @@ from jaxtyping import Float32, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
-from dextouch.worlds.world import Observation, RolloutStart
+from dextouch.schemas import Observation, RolloutStart
 
 CAMERA: Final = "camera_head"
 # Larger values are mistakes of units or frames.

@@ -7,8 +7,8 @@ from jaxtyping import Float64, UInt8
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, check_actions
-from dextouch.streams.packing import pack, unpack
-from dextouch.worlds.world import ActionKind
+from dextouch.schemas import ActionKind
+from dextouch.streams import pack, unpack
 from services.world_model.dynamics.memory import memory_arrays, memory_from_arrays
 from services.world_model.dynamics.model import SceneMemory
 from services.world_model.network.inputs import ACTION_KINDS, check_reach

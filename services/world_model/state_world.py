@@ -20,16 +20,15 @@ from dextouch.hands.actions import (
     check_actions,
     poses_from_actions,
 )
-from dextouch.schemas.rollouts import Doubt
-from dextouch.worlds.world import (
+from dextouch.schemas import (
     EVERYTHING,
+    Doubt,
     Observation,
     ReturnSelector,
     RolloutStart,
-    StartedRollout,
-    SteppedRollout,
     WorldDescription,
 )
+from dextouch.worlds import StartedRollout, SteppedRollout
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT
 from services.world_model.dynamics.hand_motion import hand_motion
 from services.world_model.dynamics.memory import (
@@ -67,7 +66,7 @@ DOUBTED_HORIZONS, LAST_HORIZONS = 1.5, 4.0
 
 
 class StateWorld:
-    """Implements `dextouch.worlds.world.BatchWorld` with a state model.
+    """Implements `dextouch.worlds.BatchWorld` with a state model.
 
     Deterministic: the seeds of chunks have no effect.
 

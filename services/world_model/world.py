@@ -19,17 +19,16 @@ from dextouch.hands.actions import (
     poses_from_actions,
     reanchor,
 )
-from dextouch.streams.packing import pack, unpack
-from dextouch.worlds.world import (
+from dextouch.schemas import (
     EVERYTHING,
     ActionKind,
     Observation,
     ReturnSelector,
     RolloutStart,
-    StartedRollout,
-    SteppedRollout,
     WorldDescription,
 )
+from dextouch.streams import pack, unpack
+from dextouch.worlds import StartedRollout, SteppedRollout
 from services.world_model.checkpoints import Checkpoint, default_checkpoint, read_checkpoint
 from services.world_model.network.inputs import ACTION_KINDS, PredictionRequest, build_inputs
 from services.world_model.network.model import Precision, Prediction, stack_noise
@@ -57,7 +56,7 @@ class ModelState:
 
 
 class ModelWorld:
-    """Implements `dextouch.worlds.world.BatchWorld` with a trained model.
+    """Implements `dextouch.worlds.BatchWorld` with a trained model.
 
     Args:
         checkpoint: loaded, from `read_checkpoint`.

@@ -5,9 +5,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.hands.node_order import FINGER_METACARPALS, node_order
+from dextouch.hands import (
+    CHAINS,
+    FINGER_JOINTS,
+    FINGER_METACARPALS,
+    WRIST,
+    node_order,
+    solver_indices,
+)
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, THUMB_JOINTS, WRIST, solver_indices
+from dextouch.hands.skeleton import THUMB_JOINTS
 from services.alignment.retargeting.keypoint_axes import to_wrist_axes
 from services.alignment.retargeting.wrist_frame import wrist_frame
 

@@ -7,17 +7,16 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ClockFitError, InvalidInputError, NotFoundError
+from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import (
     quaternion_from_rotation,
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from dextouch.geometry.transforms import transform_from_pose
 from dextouch.hands.actions import HandTrajectory, actions_from_poses
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, StoredAnchor, matrix_rows
+from dextouch.streams import ClockCapabilities, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions

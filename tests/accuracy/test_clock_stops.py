@@ -14,8 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dextouch.clocks import OnlineClock, fit_clock
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream
 
 BASE_S = 0.002

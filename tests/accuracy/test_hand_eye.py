@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError
-from dextouch.geometry.transforms import invert, transform
+from dextouch.geometry import invert, transform
 from services.alignment.calibration.closed_form import park
 from services.alignment.calibration.hand_eye import (
     DegenerateMotionError,

@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from dextouch.geometry import invert, pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import invert, pose_from_transform, transform
 from services.acquisition.devices import load_calibration
 from services.alignment.calibration.board_views import project
 from services.alignment.calibration.hand_eye import mount_difference

@@ -7,7 +7,7 @@ from contextlib import closing
 
 import numpy as np
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.mocks.faults import DeviceFaults

@@ -6,8 +6,8 @@ import time
 import numpy as np
 import pytest
 
+from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from services.twin.hands import HumanHand
 

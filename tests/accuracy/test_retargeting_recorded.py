@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from dextouch.hands.skeleton import CHAINS
+from dextouch.hands import CHAINS
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from tests.accuracy.recorded_hand import (
     RATE_HZ,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import invert, transform
 from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.robot_base import RobotBaseNoise, solve_robot_base

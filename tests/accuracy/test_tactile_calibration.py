@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS, expand_taxels, raw_indices, select_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration

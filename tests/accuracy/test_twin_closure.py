@@ -10,7 +10,7 @@ from benchmarks.closure.methods import METHODS, OURS, retarget_take
 from benchmarks.closure.pictures import write_sheet
 from benchmarks.closure.replay import TASKS, close_take
 from dextouch.errors import InvalidInputError
-from dextouch.images.jpeg import jpeg_size
+from dextouch.images import jpeg_size
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dextouch.geometry.transforms import transform_from_pose
+from dextouch.geometry import transform_from_pose
 from dextouch.tactile.layout import NUM_TIP_TAXELS, PALM_PITCH_M, PALM_SHAPE, PALM_TAXEL_AREA_M2
 from services.twin.scene import compile_scene
 from services.twin.simulation import Command, Simulation

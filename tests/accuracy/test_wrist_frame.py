@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.hands.mean_hand import METACARPAL_NODES, PALM_NODES
+from dextouch.hands import METACARPAL_NODES, PALM_NODES
 from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,

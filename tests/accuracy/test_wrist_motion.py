@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DegenerateRotationError, NonFiniteError
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
-from dextouch.geometry.transforms import invert, transform
 from dextouch.hands.actions import (
     IDENTITY_POSE_9D,
     POSE_SLICES,

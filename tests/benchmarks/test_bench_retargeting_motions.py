@@ -13,8 +13,8 @@ from benchmarks.retargeting.pinches import (
 )
 from benchmarks.retargeting.scores import score_pinches, score_robot
 from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteError
+from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import NODE_INDEX
 from services.cli.simulated import hand_motions as sequences
 from services.cli.simulated.finger_contact import segment_distance_m, touching
 from services.cli.simulated.hand_motions import (

@@ -21,8 +21,8 @@ from benchmarks.world_model.rollouts import (
     rollout_error,
 )
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.rollouts import ReturnSelector
-from dextouch.worlds.baseline import CopyFirstWorld
+from dextouch.schemas import ReturnSelector
+from dextouch.worlds import CopyFirstWorld
 
 
 @pytest.fixture(scope="module")

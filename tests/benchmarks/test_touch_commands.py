@@ -16,7 +16,7 @@ from benchmarks.closure.touch_commands import (
 )
 from benchmarks.closure.wrist_transfer import MatchedPoints, robot_places_m
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.geometry.transforms import invert, transform
+from dextouch.geometry import invert, transform
 from dextouch.hands.robot_hand import RobotHand
 
 SIDES = ("left", "right")

@@ -15,10 +15,10 @@ from benchmarks.closure.wrist_transfer import (
     touch_offsets_m,
 )
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import apply, transform
+from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import NODE_INDEX
 from services.alignment.retargeting import HandRetargeter
 from services.twin.hands import HumanHand
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource

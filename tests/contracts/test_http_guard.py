@@ -12,8 +12,7 @@ import httpx
 import pytest
 
 from dextouch.serving.settings import ApiKey
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.settings import AlignmentSettings
 from services.cli.up import BUILDERS

@@ -7,7 +7,8 @@ import uuid
 import pytest
 
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
-from dextouch.serving.state import MemoryState, open_state
+from dextouch.serving import open_state
+from dextouch.serving.state import MemoryState
 
 
 @pytest.fixture(params=["memory", "redis"])

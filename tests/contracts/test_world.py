@@ -14,9 +14,9 @@ import torch
 
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.hands.actions import AnchorPoses
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import CopyFirstWorld, World
 from dextouch.worlds.admission import check_answer
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.world import Observation, ReturnSelector, RolloutStart, World
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinWorld
 from services.world_model.checkpoints import (

@@ -8,13 +8,12 @@ import httpx
 import numpy as np
 import pytest
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
-from dextouch.images.jpeg import decode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.images import decode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.station_camera.driver import CameraTiming
 from services.acquisition.devices.station_camera.mock import video_camera

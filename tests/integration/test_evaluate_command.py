@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from dextouch.clients import http_link
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
 from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings

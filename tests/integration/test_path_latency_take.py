@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition import path_latency
 from services.acquisition.clock import RealClock
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove

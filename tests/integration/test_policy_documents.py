@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from dextouch.hands import actions
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli import main
 from services.twin.serving import twin_worlds
 from services.twin.settings import TwinSettings

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.streams.packing import unpack
+from dextouch.streams import unpack
 from services.acquisition.app import create_app
 from services.acquisition.settings import AcquisitionSettings
 

@@ -8,7 +8,7 @@ import pytest
 
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from dextouch.metrics.image import psnr
-from dextouch.worlds.world import ReturnSelector, RolloutStart
+from dextouch.schemas import ReturnSelector, RolloutStart
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.tasks import TASK_NAMES

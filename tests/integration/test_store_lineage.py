@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import RecordingAttributes
 from services.alignment.synchronization.episode_builder import _episode_attributes
 
 

@@ -5,9 +5,8 @@ import pytest
 
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import LimitExceededError, StorageFullError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.uploader import Uploader
 
 GLOVE = StreamDescriptor(

@@ -7,7 +7,7 @@ import httpx
 import numpy as np
 import pytest
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError
 from services.acquisition.app import create_app as create_station

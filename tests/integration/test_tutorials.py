@@ -13,8 +13,8 @@ import time
 
 import pytest
 
-from dextouch.serving.settings import load_settings
-from dextouch.worlds.serve import create_world_app
+from dextouch.serving import load_settings
+from dextouch.worlds import create_world_app
 from services.alignment.retargeting import hand_retargeter
 from services.cli import up
 from services.twin.serving import TwinServiceSettings, twin_worlds

@@ -21,8 +21,8 @@ from dextouch.hands.actions import (
     POSE_SLICES,
     AnchorPoses,
 )
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams import StreamDescriptor
 from tests.system import take_source
 from tests.system.take_source import STREAM_NAMES
 

@@ -7,10 +7,9 @@ import numpy as np
 
 from dextouch.episodes.video import GopEncoder, VideoSettings
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import ClockCapabilities, StreamDescriptor, encoded_values
 from dextouch.tactile.layout import expand_taxels
 from services.twin.hands import HumanHand
 from tests.system.take_source import draw_images

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import structlog
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from services.acquisition.clock import VirtualClock
 from services.acquisition.memory import keep_for_life
 from services.acquisition.mock_links import MockLinks

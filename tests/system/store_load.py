@@ -11,12 +11,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.errors import LimitExceededError, StorageFullError, UnavailableError
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 from services.acquisition.uploader import batch_samples
 
 NUM_IMAGES = 16

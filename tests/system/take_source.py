@@ -11,10 +11,9 @@ from itertools import count
 import numpy as np
 
 from dextouch.episodes.video import GopEncoder, VideoSettings
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 
 HEIGHT, WIDTH, NUM_IMAGES = 240, 320, 96
 CAMERAS = ("camera_head", "camera_wrist_left", "camera_wrist_right")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import SumWorld
 from tests.unit.worlds.running import served
 

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.hands.actions import ACTION_DIM
 
 ROOT = Path(__file__).parents[2]

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from services.acquisition.uploader import Uploader, recover_spool

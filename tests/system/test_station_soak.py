@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
 from services.episode_store.app import create_app

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import NonFiniteError, ShapeError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands import actions as act
 from dextouch.hands.robot_hand import RobotHand
 

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, LimitExceededError
-from dextouch.streams.packing import pack, unpack
+from dextouch.streams import pack, unpack
 
 
 def test_round_trip():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import NonFiniteError, ShapeError
-from dextouch.tactile.pad_forces import pad_forces_n
+from dextouch.tactile import pad_forces_n
 
 
 def test_pressure_times_area_by_pad():

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from jaxtyping import Float64, TypeCheckError
 
-from dextouch.clients.policy import PolicyStart
-from dextouch.geometry.cameras import pinhole_matrix
+from dextouch.clients import PolicyStart
+from dextouch.geometry import pinhole_matrix
 from dextouch.hands.actions import AnchorPoses
 from tests.shape_checks import CHECKED_CALLS, begin_test, decorated
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import ShapeError, UnknownNameError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile import contact, heatmap, layout
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.replay import ReplayStream

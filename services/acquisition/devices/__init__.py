@@ -4,8 +4,7 @@ Other packages can provide further devices through the entry point `dextouch.dev
 docs/tutorials/add_a_device.md builds one.
 """
 
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.gloves import GloveSettings
 from services.acquisition.devices.kind import DeviceKind, DeviceSettings

@@ -7,7 +7,7 @@ from pathlib import Path
 from pydantic import TypeAdapter, ValidationError
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceSettings
 from services.acquisition.devices.registry import device_kind

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.packets import SOURCES, VERSION, DecoderStatistics, Packet

@@ -25,11 +25,16 @@ from dextouch.episodes.video import (
     is_keyframe,
 )
 from dextouch.errors import NotFoundError
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.checks import H264_UNIT
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, Sample, encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import Matrix
+from dextouch.streams import (
+    H264_UNIT,
+    NO_DEVICE_TIME,
+    NO_SEQUENCE,
+    Sample,
+    StreamDescriptor,
+    encoded_values,
+)
 
 ImageEncoding = Literal["rgb8", "jpeg", "h264"]
 MAX_WAITING_IMAGES = 8

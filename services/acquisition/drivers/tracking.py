@@ -14,8 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import SIDES
 from services.acquisition.drivers.packets import SOURCES
 from services.acquisition.drivers.reports import OrderFilter

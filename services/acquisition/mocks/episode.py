@@ -1,7 +1,7 @@
 """Streams of a stored episode, ready to be played by mock devices."""
 
 from dextouch.episodes import EpisodeReader
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.acquisition.mocks.replay import ReplayStream
 
 PLAYED_KINDS = ("tactile", "keypoints", "pose", "image", "robot_state")

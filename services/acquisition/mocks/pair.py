@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.replay import MockDevice
 

@@ -6,12 +6,11 @@ from itertools import pairwise
 import numpy as np
 from jaxtyping import Float32, Float64, Int64, UInt8
 
-from dextouch.geometry.cameras import pinhole_matrix
+from dextouch.geometry import pinhole_matrix
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.hands.mean_hand import mean_hand_m
-from dextouch.hands.skeleton import CHAINS, chain_indices
-from dextouch.schemas.episodes import Matrix, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.hands import CHAINS, chain_indices, mean_hand_m
+from dextouch.schemas import Matrix, matrix_rows
+from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side, join_pads
 from services.acquisition.mocks.replay import ReplayStream
 

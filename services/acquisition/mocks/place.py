@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Decoder, Driver

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.mocks.edits import (
     Edit,

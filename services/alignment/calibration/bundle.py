@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import invert
+from dextouch.geometry import invert
 from services.alignment.calibration.twists import adjoint, move, twist, twist_jacobian
 
 MAX_ROUNDS = 30

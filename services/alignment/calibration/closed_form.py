@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
-from dextouch.geometry.transforms import invert, transform
 from services.alignment.calibration.motion import MIN_VIEWS, check_turns, view_pairs
 from services.alignment.calibration.twists import nearest_pose, nearest_rotation
 

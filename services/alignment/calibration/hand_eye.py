@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.geometry import invert
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.geometry.transforms import invert
 from services.alignment.calibration.board_views import BoardViews, polish
 from services.alignment.calibration.bundle import (
     Bundle,

@@ -5,8 +5,8 @@ from collections.abc import Mapping
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import Matrix
+from dextouch.streams import StreamDescriptor
 
 
 def check_lenses(

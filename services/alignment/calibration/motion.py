@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import invert
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.geometry.transforms import invert
 
 MIN_VIEWS = 4
 MAX_PAIRS = 5000

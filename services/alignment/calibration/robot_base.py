@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import invert
+from dextouch.geometry import invert
 from services.alignment.calibration.bundle import (
     Bundle,
     pose_measurement,

@@ -7,12 +7,12 @@ own frame about its own origin and shifts it along its own axes.
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import (
     SERIES_ANGLE_RAD,
     rotation_from_vector,
     vector_from_rotation,
 )
-from dextouch.geometry.transforms import transform
 
 
 def hat(vectors: np.ndarray) -> Float64[np.ndarray, "*batch 3 3"]:

@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.errors import ShapeError
-from dextouch.hands.skeleton import CHAINS, NUM_KEYPOINTS, solver_indices
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, solver_indices
 
 _NODES = np.array([solver_indices(chain) for chain in CHAINS])
 
@@ -27,7 +27,7 @@ def finger_points(keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> F
     """Select the points of every finger from keypoints.
 
     Args:
-        keypoints_m: [T ≥ 1, 25, 3], order of `dextouch.hands.skeleton`; NaN or infinity marks a
+        keypoints_m: [T ≥ 1, 25, 3], order of `dextouch.hands.NODES`; NaN or infinity marks a
             missing node.
         valid: bool [T, 25], validity reported by the tracker; None trusts every finite node.
 

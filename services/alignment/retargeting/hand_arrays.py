@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.geometry.rotations import rotation_from_quaternion
+from dextouch.hands import solver_indices
 from dextouch.hands.robot_hand import HandModel
-from dextouch.hands.skeleton import solver_indices
 from services.alignment.retargeting.solver.arrays import HAND, MAX_JOINTS, MAX_STARTS
 
 NO_TURN = (1.0, 0.0, 0.0, 0.0)

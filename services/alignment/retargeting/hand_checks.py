@@ -13,14 +13,17 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands.mean_hand import (
+from dextouch.hands import (
+    CHAINS,
     KNUCKLE_NODES,
     METACARPAL_NODES,
+    NODE_INDEX,
+    NUM_KEYPOINTS,
     PALM_NODES,
     WRIST_NODE,
+    chain_indices,
     mean_hand_m,
 )
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, chain_indices
 
 # Many samples say no more about a shape than some hundred do.
 MAX_SAMPLES: Final = 300
@@ -114,7 +117,7 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> Ha
         name = _orders()[best][0]
         raise InvalidInputError(
             f"{where}: got nodes in another order: {name}; expected that of "
-            "dextouch.hands.skeleton (wrist, then thumb … little, each from the metacarpal to the "
+            "dextouch.hands.NODES (wrist, then thumb … little, each from the metacarpal to the "
             "tip); resolve nodes by chain and joint (dextouch.hands.node_order)",
             fault="node_order",
             found=name,

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands.skeleton import CHAINS
+from dextouch.hands import CHAINS
 
 NUM_FINGERS = 5
 # Proximal phalanx of an index finger, children to large adults and robots: outside, the unit is
@@ -124,6 +124,6 @@ def check_bone_unit(index_proximal_m: float, *, where: str) -> None:
         hint = "these look like millimetres" if looks else "check nodes"
         raise InvalidInputError(
             f"{where}: the index finger's proximal bone measures {index_proximal_m:.4g}, expected "
-            f"{low} … {high} m ({hint}); send metres in the order of dextouch.hands.skeleton",
+            f"{low} … {high} m ({hint}); send metres in the order of dextouch.hands.NODES",
             got=index_proximal_m,
         )

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import HandModel, RobotHand
-from dextouch.hands.skeleton import NUM_KEYPOINTS
 from services.alignment.retargeting.finger_points import checked_keypoints, finger_points
 from services.alignment.retargeting.hand_arrays import hand_arrays, joint_places
 from services.alignment.retargeting.hand_profile import HandProfile

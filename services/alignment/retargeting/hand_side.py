@@ -10,13 +10,14 @@ from typing import Final
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.hands.mean_hand import (
+from dextouch.hands import (
     FINGER_CHAINS,
     KNUCKLE_NODES,
+    NODE_INDEX,
     WRIST_NODE,
+    chain_indices,
     mean_hand_m,
 )
-from dextouch.hands.skeleton import NODE_INDEX, chain_indices
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import seen_samples
 

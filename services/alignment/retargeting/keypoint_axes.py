@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import apply, invert
 from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
-from dextouch.geometry.transforms import apply, invert
-from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.schemas import Matrix, matrix_rows
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import seen_nodes
 from services.alignment.retargeting.wrist import rigid_transform
@@ -83,7 +83,7 @@ def hand_axes_check(
     """Convert keypoints of one hand of a recording to wrist axes, and check them.
 
     Args:
-        keypoints_m: [T ≥ 1, 25, 3], metres, order of `dextouch.hands.skeleton`, in wrist axes or,
+        keypoints_m: [T ≥ 1, 25, 3], metres, order of `dextouch.hands.NODES`, in wrist axes or,
             where the calibration says how they are turned, in others that are fixed to the wrist;
             NaN where a node is not seen.
         side: which hand.

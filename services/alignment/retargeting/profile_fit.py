@@ -4,8 +4,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
+from dextouch.hands import CHAINS
 from dextouch.hands.robot_hand import HandModel
-from dextouch.hands.skeleton import CHAINS
 from services.alignment.retargeting.finger_points import FingerPoints
 from services.alignment.retargeting.hand_arrays import (
     hand_arrays,

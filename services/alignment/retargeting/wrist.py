@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import invert
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.geometry.transforms import invert
 
 # How far R Rᵀ of a stored transform may be from the identity.
 RIGID_TOLERANCE: Final = 1e-6

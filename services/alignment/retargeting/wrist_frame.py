@@ -12,15 +12,9 @@ import numpy as np
 from jaxtyping import Bool, Float64
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_angle
-from dextouch.geometry.transforms import transform
-from dextouch.hands.mean_hand import (
-    FINGER_CHAINS,
-    PALM_NODES,
-    WRIST_NODE,
-    mean_hand_m,
-)
-from dextouch.hands.skeleton import chain_indices
+from dextouch.hands import FINGER_CHAINS, PALM_NODES, WRIST_NODE, chain_indices, mean_hand_m
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import (
     MIN_PALM_NODES,
@@ -80,7 +74,7 @@ def wrist_frame(keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3] in axes that are fixed to the wrist, metres, order of
-            `dextouch.hands.skeleton`; NaN where a node is not seen. Up to 300 evenly spaced samples
+            `dextouch.hands.NODES`; NaN where a node is not seen. Up to 300 evenly spaced samples
             are used.
         side: which hand.
         where: stream and recording, for the message.

@@ -6,12 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import (
-    EpisodeAttributes,
-    LineageEntry,
-    StoredAnchor,
-)
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, LineageEntry, StoredAnchor
+from dextouch.streams import StreamDescriptor
 from services.alignment.calibration.lens_record import check_lenses
 from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization.episode_streams import (

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.hands.actions import AnchorPoses, HandTrajectory, actions_from_poses
-from dextouch.schemas.episodes import Domain, Matrix
+from dextouch.schemas import Domain, Matrix
 from dextouch.tactile.layout import SIDES
 from services.alignment.synchronization.hand_joints import retarget_hands
 from services.alignment.synchronization.recorded_streams import LoadedStream

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float64, UInt8
 
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from dextouch.tactile.layout import SIDES
 from services.alignment.retargeting.hand_profile import calibrated_profile
 from services.alignment.retargeting.hand_retargeter import (

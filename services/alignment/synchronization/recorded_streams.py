@@ -13,11 +13,9 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
-from dextouch.schemas.episodes import Matrix, matrix_rows
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.geometry import pose_from_transform, transform_from_pose
+from dextouch.schemas import Matrix, RecordingAttributes, matrix_rows
+from dextouch.streams import SampleBatch, StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS
 from services.alignment.calibration.tactile_baseline import (
     REASONS,

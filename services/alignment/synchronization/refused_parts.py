@@ -11,7 +11,7 @@ from typing import Literal, get_args
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
-from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.schemas import Matrix, matrix_rows
 from services.alignment.synchronization.resampling import runs_of
 
 # late_start, early_end: a stream that actions need begins later or ends earlier than the others;

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from dextouch.geometry.interpolation import bracket, interpolate_linear, interpolate_poses
-from dextouch.geometry.transforms import transform_from_pose
+from dextouch.geometry import bracket, interpolate_linear, interpolate_poses, transform_from_pose
 
 # How far beyond its first and last sample a stream may be continued, in nominal periods.
 EDGE_PERIODS = 1.5

@@ -10,13 +10,12 @@ from dextouch.clocks import (
     find_lost_samples,
     fit_clock,
     lateness_ns,
+    prefers_sequence,
     unwrap_counter,
 )
-from dextouch.clocks.counters import prefers_sequence
 from dextouch.errors import ClockFitError
-from dextouch.schemas.episodes import ClockMethod, ClockReport, ClockWarning
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
+from dextouch.schemas import ClockMethod, ClockReport, ClockWarning
+from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor
 
 NS_PER_MS = 1e6
 MIN_COUNTED_SAMPLES = 60

@@ -7,8 +7,8 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from dextouch.geometry import apply, invert
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.geometry.transforms import apply, invert
 from services.cli.calibrate.boards import BoardView, Lens, board_pose
 
 # With fewer views than this the focal length scatters by more than 0.3 % (docs/calibration.md).

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float32, Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from services.alignment.calibration.board_detection import (
     DICTIONARIES,
     CharucoBoard,

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams import SampleBatch
 from services.alignment.calibration.tactile_gain import TaxelPress
 from services.alignment.calibration.tactile_glove_calibration import pad_taxels
 from services.cli.calibrate.takes import read_stream

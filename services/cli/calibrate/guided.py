@@ -11,7 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, TypeVar, runtime_checkable
 
-from dextouch.clients.http_link import HttpLink, Reply
+from dextouch.clients import HttpLink, Reply
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_glove_calibration import calibrate_glove, pad_taxels

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NotFoundError, ShapeError, UnknownNameError
-from dextouch.geometry.transforms import invert, transform_from_pose
+from dextouch.geometry import invert, transform_from_pose
 from services.alignment.calibration.board_views import BoardViews
 from services.alignment.calibration.hand_eye import solve_hand_eye
 from services.cli.calibrate.advice import turn_coverage

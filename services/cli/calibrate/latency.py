@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.geometry.transforms import transform_from_pose
 from dextouch.tactile.layout import Side
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.tactile_baseline import TactileCalibration

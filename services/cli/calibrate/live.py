@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dextouch.clients.http_link import HttpLink
+from dextouch.clients import HttpLink
 from dextouch.errors import NotFoundError, StaleDataError
 from services.cli.calibrate.advice import camera_coverage
 from services.cli.calibrate.boards import Board, BoardView, find_board

@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from dextouch.tactile.heatmap import hand_canvas
+from dextouch.tactile import hand_canvas
 from dextouch.tactile.layout import select_taxels
 from services.alignment.calibration.tactile_faults import STATES
 from services.alignment.calibration.tactile_glove_calibration import GloveCalibration, filled_gain

@@ -17,8 +17,7 @@ from pydantic import TypeAdapter, ValidationError
 from dextouch import __version__
 from dextouch.episodes.files import replace_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NonFiniteError, NotFoundError
-from dextouch.schemas.episodes import Matrix, matrix_rows
-from dextouch.schemas.problems import first_problems
+from dextouch.schemas import Matrix, first_problems, matrix_rows
 
 MATRICES_FILE = "calibration.json"
 DETAILS_FILE = "calibration_details.json"

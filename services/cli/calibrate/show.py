@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dextouch.episodes.spool import read_attributes
-from dextouch.schemas.episodes import Matrix
+from dextouch.schemas import Matrix
 from services.cli.calibrate.record import Finding, judge, read_matrices
 
 EXIT_MISSING = 1

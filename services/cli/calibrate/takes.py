@@ -9,9 +9,8 @@ from jaxtyping import Int64, Shaped
 from dextouch.episodes import EpisodeStore, RecordingReader
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import NotFoundError
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import Matrix
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream
 
 

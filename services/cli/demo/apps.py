@@ -5,9 +5,7 @@ from typing import Any
 
 from fastapi import FastAPI
 
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
-from dextouch.worlds.world import World
+from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.alignment.app import create_app as create_alignment
 from services.alignment.settings import AlignmentSettings
 from services.episode_store.app import create_app as create_store

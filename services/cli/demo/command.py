@@ -12,8 +12,8 @@ from dextouch import __version__
 from dextouch.command_line import write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
-from dextouch.schemas.rollouts import WorldDescription
-from dextouch.serving.logs import configure_logging
+from dextouch.schemas import WorldDescription
+from dextouch.serving import configure_logging
 from services.cli.demo.apps import build_apps
 from services.cli.demo.background import served
 from services.cli.demo.judging import judge, ladder

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dextouch.clients.policy import Policy
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
 from services.cli.demo.models import Models
 from services.cli.demo.settings import TASKS, DemoPlan

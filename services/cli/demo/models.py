@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from dextouch.errors import ConflictError
-from dextouch.worlds.world import BatchWorld
+from dextouch.worlds import BatchWorld
 from services.cli import train
 from services.cli.demo.settings import TASKS
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy

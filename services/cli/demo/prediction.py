@@ -16,8 +16,8 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
-from dextouch.schemas.rollouts import Observation
-from dextouch.worlds.world import ReturnSelector, RolloutStart, World
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import World
 from services.cli.demo.models import TrainedOn
 from services.evaluation.camera_warp import warp_over_table
 from services.evaluation.reporting import PredictionPicture

@@ -12,13 +12,12 @@ from typing import Any
 import httpx
 import numpy as np
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.episodes.inspection import UPLOADS
 from dextouch.episodes.spool_reader import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
-from dextouch.schemas.problems import Problem, error_from_problem
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import Problem, RecordingAttributes, error_from_problem
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.episode import replay_calibration, replay_streams

@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import LimitExceededError
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import invert, transform
 from services.alignment.calibration.board_detection import CHESSBOARD, FoundBoards
 from services.alignment.calibration.board_views import BoardViews, project
 from services.alignment.calibration.twists import move

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float64
 from numpy.random import Generator
 
 from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.tactile.layout import Side
 from services.cli.simulated.finger_contact import touching
 from services.twin.hands import TwinHand, twin_hand
@@ -41,7 +41,7 @@ class Motion:
     Attributes:
         side: of the hand.
         joints_rad: the truth, firmware order.
-        keypoints_m: wrist coordinates, order of `dextouch.hands.skeleton`; NaN: not tracked.
+        keypoints_m: wrist coordinates, order of `dextouch.hands.NODES`; NaN: not tracked.
         tips_m: true fingertips, thumb … little, wrist coordinates.
     """
 

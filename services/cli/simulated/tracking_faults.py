@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy.random import Generator
 
-from dextouch.hands.skeleton import CHAINS, chain_indices
+from dextouch.hands import CHAINS, chain_indices
 from services.cli.simulated.hand_motions import Motion
 
 SAMPLE_RATE_HZ = 60

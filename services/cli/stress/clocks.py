@@ -4,7 +4,7 @@ import numpy as np
 
 from dextouch.clocks import OnlineClock, TickCounter, find_lost_samples, fit_clock, unwrap_counter
 from dextouch.errors import ClockFitError, ShapeError
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams import ClockCapabilities, StreamDescriptor
 from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("clocks")

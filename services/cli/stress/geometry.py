@@ -3,6 +3,7 @@
 import numpy as np
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import (
     quaternion_from_rotation,
     rotation_angle,
@@ -12,7 +13,6 @@ from dextouch.geometry.rotations import (
     rotation_to_6d,
     vector_from_rotation,
 )
-from dextouch.geometry.transforms import transform
 from dextouch.hands.actions import (
     IDENTITY_POSE_9D,
     HandTrajectory,

@@ -5,8 +5,8 @@ from functools import cache
 import numpy as np
 
 from dextouch.errors import InvalidInputError, NonFiniteError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from services.alignment.calibration.hand_eye import (
     DegenerateMotionError,
     HandEyeNoise,

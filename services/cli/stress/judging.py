@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 
 import services.evaluation
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.errors import DexTouchError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
-from dextouch.worlds.world import Observation
+from dextouch.schemas import Observation
 from services.cli.stress.cells import Check, StageCells
 from services.cli.stress.worlds import CAMERA, CHUNK_STEPS, NUM_CHUNKS, twin_start
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint

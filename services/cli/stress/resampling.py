@@ -3,8 +3,8 @@
 import numpy as np
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
+from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
-from dextouch.geometry.transforms import pose_from_transform, transform
 from services.alignment.synchronization.resampling import (
     GridPlacement,
     grid_times_ns,

@@ -8,11 +8,8 @@ import numpy as np
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import PacketError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.packing import pack, unpack
-from dextouch.streams.samples import SampleBatch
-from dextouch.streams.wire import decode_batch, encode_batch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor, decode_batch, encode_batch, pack, unpack
 from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("store")

@@ -3,8 +3,8 @@
 import numpy as np
 
 from dextouch.errors import NonFiniteError
+from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import NUM_TAXELS, raw_indices
-from dextouch.tactile.pad_forces import pad_forces_n
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.alignment.calibration.tactile_faults import SATURATED, STATES
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain

@@ -6,7 +6,8 @@ import numpy as np
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, WRIST_RIGHT
-from dextouch.worlds.world import Observation, RolloutStart, StartedRollout
+from dextouch.schemas import Observation, RolloutStart
+from dextouch.worlds import StartedRollout
 from services.cli.stress.cells import Check, StageCells
 from services.cli.stress.worlds import (
     NUM_CHUNKS,

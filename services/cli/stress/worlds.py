@@ -9,7 +9,8 @@ import numpy as np
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, actions_from_poses
-from dextouch.worlds.world import BatchWorld, Observation, ReturnSelector, RolloutStart
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import BatchWorld
 from services.cli.stress.cells import Check
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage

@@ -33,8 +33,7 @@ from dextouch.episodes.staged_group import (
     read_stage,
 )
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
-from dextouch.schemas.episodes import EpisodeSummary, json_ready
-from dextouch.schemas.recordings import RecordingSummary
+from dextouch.schemas import EpisodeSummary, RecordingSummary, json_ready
 from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
 from services.episode_store.commands.context import (
     EXIT_DAMAGED,

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query
 
-from dextouch.schemas.episodes import CatalogHours
+from dextouch.schemas import CatalogHours
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import EpisodeFilter
 from services.episode_store.routes.scopes import MAY_READ

@@ -4,7 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Query, Response
 
-from dextouch.schemas.episodes import EpisodeDetail, EpisodeList
+from dextouch.schemas import EpisodeDetail, EpisodeList
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import EpisodeQuery
 from services.episode_store.reading import SpanQuery, StoreReader, WindowQuery

@@ -4,14 +4,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header, Path, Query, Request, Response
 
-from dextouch.schemas.recordings import (
+from dextouch.schemas import (
     BatchReceipt,
     FinishRecording,
     RecordingAttributes,
     RecordingList,
     RecordingStatus,
 )
-from dextouch.serving.bodies import AS_SET, JSON, OCTETS, takes
+from dextouch.serving import AS_SET, JSON, OCTETS, takes
 from services.episode_store.catalog import Catalog
 from services.episode_store.filters import RecordingQuery
 from services.episode_store.intake import Intake

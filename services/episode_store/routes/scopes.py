@@ -2,7 +2,7 @@
 
 from fastapi import Depends
 
-from dextouch.serving.access import RequireScope
+from dextouch.serving import RequireScope
 
 MAY_READ = Depends(RequireScope("store_read"))
 MAY_WRITE = Depends(RequireScope("store_write"))

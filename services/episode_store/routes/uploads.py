@@ -4,7 +4,7 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query
 
-from dextouch.schemas.recordings import ExpireUploads, UploadList
+from dextouch.schemas import ExpireUploads, UploadList
 from services.episode_store.intake import Intake
 from services.episode_store.routes.scopes import MAY_READ, MAY_WRITE
 

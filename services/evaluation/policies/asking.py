@@ -10,7 +10,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM, check_actions
-from dextouch.schemas.rollouts import WorldDescription
+from dextouch.schemas import WorldDescription
 
 # Frames cut from tracebacks: this file and the import machinery.
 _OUR_FRAMES = (__file__, "<frozen importlib", importlib.__file__)

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float64, UInt8
 from pydantic import BaseModel, ConfigDict
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import (
     AnchorPoses,
@@ -17,7 +17,7 @@ from dextouch.hands.actions import (
     pose_to_9d,
     poses_from_actions,
 )
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.features import pad_features

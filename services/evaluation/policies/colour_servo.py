@@ -11,17 +11,17 @@ from typing import Final
 import numpy as np
 from jaxtyping import Bool, Float64, UInt8
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.geometry import apply, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import apply, transform
 from dextouch.hands.actions import (
     JOINTS_RIGHT,
     HandTrajectory,
     actions_from_poses,
     poses_from_actions,
 )
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16

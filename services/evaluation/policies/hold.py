@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 
 
 class HoldPolicy:

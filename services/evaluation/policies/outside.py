@@ -10,9 +10,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from dextouch.clients.policy import Policy, PolicyStart
+from dextouch.clients import Policy, PolicyStart
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 from services.evaluation.policies.asking import ask
 
 _SOURCE = re.compile(r"(?:(?P<name>[^=]+)=)?(?P<module>[A-Za-z_][\w.]*):(?P<factory>[A-Za-z_]\w*)")

@@ -5,10 +5,10 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.hands.actions import check_actions
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 from services.evaluation.demonstrations import Demonstration
 
 

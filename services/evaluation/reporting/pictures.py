@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.tactile import colour, hand_canvas
 from dextouch.tactile.layout import SIDES
 from services.evaluation.reporting.png import data_address
 

@@ -7,7 +7,7 @@ import zlib
 import numpy as np
 
 from dextouch.errors import ShapeError
-from dextouch.images.jpeg import encode_jpeg
+from dextouch.images import encode_jpeg
 
 # Larger images are embedded as JPEG.
 MAX_PNG_SIDE_PX = 256

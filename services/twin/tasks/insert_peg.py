@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.geometry import transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform, transform_from_pose
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp, opened, pressing
 from services.twin.hands import Domain, twin_hand

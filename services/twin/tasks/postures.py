@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.geometry.transforms import transform
+from dextouch.geometry import transform
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose
 from services.twin.hands import Domain, twin_hand

@@ -5,8 +5,8 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float64
 
+from dextouch.geometry import transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform, transform_from_pose
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise
 from services.twin.hands import Domain, twin_hand

@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Bool, Float32, Int64
 from torch import Tensor, nn
 
-from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import split_pads
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import (

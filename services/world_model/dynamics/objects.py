@@ -7,7 +7,7 @@ import torch
 from jaxtyping import Float32, Float64, Shaped
 from torch import Tensor
 
-from dextouch.geometry.transforms import pose_from_transform, transform, transform_from_pose
+from dextouch.geometry import pose_from_transform, transform, transform_from_pose
 from services.world_model.dynamics.configuration import MAX_OBJECTS
 
 # Objects farther than this from the world's origin count as absent.

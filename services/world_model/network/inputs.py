@@ -13,7 +13,7 @@ from jaxtyping import Float32, Float64, Int64, UInt8
 from torch import Tensor
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
-from dextouch.geometry.transforms import invert
+from dextouch.geometry import invert
 from dextouch.hands.actions import (
     IDENTITY_POSE_9D,
     JOINTS_LEFT,
@@ -23,8 +23,8 @@ from dextouch.hands.actions import (
     check_actions,
     pose_to_9d,
 )
+from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS
-from dextouch.worlds.world import ActionKind
 from services.world_model.network.configuration import FRAMES_PER_LATENT, NetworkConfig
 from services.world_model.network.instruction import hash_words
 from services.world_model.network.mirroring import (

@@ -9,8 +9,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Float32, Float64
 
-from dextouch.geometry.cameras import project
-from dextouch.geometry.transforms import apply, invert
+from dextouch.geometry import apply, invert, project
 from dextouch.hands.actions import CAMERA_HEAD as CAMERA
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, WRIST_LEFT, WRIST_RIGHT, pose_from_9d
 from dextouch.hands.robot_hand import RobotHand

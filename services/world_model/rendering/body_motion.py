@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
-from dextouch.geometry.transforms import apply, invert
+from dextouch.geometry import apply, invert
 from services.world_model.rendering.box_raster import box_corners, object_transforms
 from services.world_model.rendering.camera_motion import CameraMotion
 from services.world_model.rendering.hand_raster import MIN_DEPTH_M, base_points_world

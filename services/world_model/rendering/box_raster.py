@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
 
-from dextouch.geometry.transforms import invert, transform_from_pose
+from dextouch.geometry import invert, transform_from_pose
 
 # Minimum half size of a box; thinner boxes are drawn this thick.
 MIN_HALF_M = 1e-3

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Float64
 from torch import Tensor
 from torch.nn import functional
 
-from dextouch.geometry.transforms import invert
+from dextouch.geometry import invert
 
 FAR_M = 20.0
 # A camera nearer to the plane than this sees it edge-on.

@@ -10,7 +10,7 @@ from functools import cache
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 
-from dextouch.geometry.transforms import apply, invert
+from dextouch.geometry import apply, invert
 from services.world_model.network.pose_raster import hand_points_m
 from services.world_model.rendering.scene_states import SceneStates
 

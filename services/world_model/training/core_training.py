@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float16, Float32, Int64
 from torch import Tensor, nn
 from torch.nn import functional
 
-from dextouch.tactile.contact import CONTACT_THRESHOLD_KPA
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from services.world_model.dynamics.configuration import STEPS_PER_LATENT, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneFuture, SceneStart
 from services.world_model.dynamics.features import command_features

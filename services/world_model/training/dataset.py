@@ -17,7 +17,7 @@ from torch import Tensor
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses, poses_from_actions, reanchor
-from dextouch.worlds.world import ActionKind
+from dextouch.schemas import ActionKind
 from services.world_model.network.inputs import PredictionRequest
 
 

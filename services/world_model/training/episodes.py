@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.worlds.world import ActionKind
+from dextouch.schemas import ActionKind
 from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
 
 CAMERA = "camera_head"

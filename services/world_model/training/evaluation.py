@@ -12,7 +12,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import CAMERA_HEAD
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
-from dextouch.worlds.world import ActionKind
+from dextouch.schemas import ActionKind
 from services.world_model.network.inputs import PredictionRequest, build_inputs
 from services.world_model.network.model import JointWorldModel, stack_noise
 from services.world_model.network.visual_codec import to_uint8, to_unit

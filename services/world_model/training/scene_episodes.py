@@ -16,10 +16,8 @@ from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError
-from dextouch.geometry.interpolation import interpolate_poses
-from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
-from dextouch.schemas.episodes import Domain, EpisodeAttributes, Origin
-from dextouch.schemas.rollouts import ActionKind
+from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
+from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Origin
 
 CAMERA = "camera_head"
 TWIN_ONLY: tuple[Origin, ...] = ("twin",)

@@ -18,7 +18,7 @@ from torch.utils.data import DataLoader, Dataset
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
-from dextouch.worlds.world import ActionKind
+from dextouch.schemas import ActionKind
 from services.world_model.network.inputs import PredictionRequest
 from services.world_model.training.dataset import (
     EpisodeArrays,

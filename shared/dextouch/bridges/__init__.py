@@ -1,1 +1,8 @@
 """Import and export of episodes and recordings: LeRobot, MCAP, UMI and Rerun formats."""
+
+__all__ = [
+    "lerobot",
+    "mcap",
+    "rerun",
+    "umi",
+]

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 
 from dextouch.episodes import EpisodeReader, RecordingReader
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch
+from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor
 
 Reader = EpisodeReader | RecordingReader
 ENCODED_UNITS: Final = ("jpeg", "h264")

@@ -15,9 +15,9 @@ from dextouch.bridges.blocks import Block, Reader, blocks
 from dextouch.bridges.new_file import new_file
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import json_ready
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.tactile.heatmap import colour, hand_canvas
+from dextouch.schemas import json_ready
+from dextouch.streams import StreamDescriptor
+from dextouch.tactile import colour, hand_canvas
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, select_taxels
 
 APPLICATION: Final = "dextouch"

@@ -13,23 +13,23 @@ from pydantic import BaseModel, ValidationError
 from dextouch.episodes.window import StreamData, Window
 from dextouch.episodes.window_codec import decode_window
 from dextouch.errors import DexTouchError, UnavailableError
-from dextouch.schemas.episodes import CatalogHours, EpisodeDetail, EpisodeList
-from dextouch.schemas.problems import Problem, error_from_problem
-from dextouch.schemas.recordings import (
+from dextouch.schemas import (
+    ActionKind,
     BatchReceipt,
+    CatalogHours,
+    EpisodeDetail,
+    EpisodeList,
     ExpireUploads,
     FinishRecording,
     LedgerEntry,
+    Problem,
     RecordingAttributes,
     RecordingList,
     RecordingStatus,
     UploadList,
+    error_from_problem,
 )
-from dextouch.schemas.rollouts import ActionKind
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.packing import unpack
-from dextouch.streams.samples import SampleBatch
-from dextouch.streams.wire import encode_batch
+from dextouch.streams import SampleBatch, StreamDescriptor, encode_batch, unpack
 
 M = TypeVar("M", bound=BaseModel)
 Scalar = str | int | float | bool | datetime

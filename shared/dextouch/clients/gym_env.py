@@ -17,7 +17,7 @@ from gymnasium import spaces
 from dextouch.clients.rollouts import Rollout, RolloutClient
 from dextouch.errors import EndedError, InvalidInputError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, POSE_SLICES
-from dextouch.schemas.rollouts import Observation, WorldDescription
+from dextouch.schemas import Observation, WorldDescription
 
 # Bounds of the action space. They limit its samples, not what worlds accept.
 MAX_REACH_M = 2.0

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 from pydantic import ValidationError
 
 from dextouch.errors import InvalidInputError, UnavailableError
-from dextouch.schemas.problems import CLASS_OF_STATUS, Problem, error_from_problem
+from dextouch.schemas import CLASS_OF_STATUS, Problem, error_from_problem
 
 # Pauses before each new attempt after a lost connection.
 RETRY_PAUSES_S = (0.05, 0.2, 0.8)

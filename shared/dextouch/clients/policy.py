@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import Observation
+from dextouch.schemas import Observation
 
 
 @dataclass(frozen=True)

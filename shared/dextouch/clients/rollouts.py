@@ -19,24 +19,22 @@ from pydantic import BaseModel, ValidationError
 from dextouch.clients.http_link import HttpLink, Reply
 from dextouch.errors import DexTouchError, InvalidInputError, NotFoundError, UnavailableError
 from dextouch.hands.actions import AnchorPoses, check_actions
-from dextouch.schemas.problems import first_problems
-from dextouch.schemas.rollout_codec import (
-    Origin,
-    RolloutAnswer,
-    decode_answer,
-    encode_start,
-)
-from dextouch.schemas.rollouts import (
+from dextouch.schemas import (
     EVERYTHING,
     ActionKind,
     ForkRequest,
     Observation,
     ReturnSelector,
+    RolloutAnswer,
     RolloutInfo,
+    RolloutOrigin,
     RolloutStart,
     StartRequest,
     WorldDescription,
     WorldList,
+    decode_answer,
+    encode_start,
+    first_problems,
 )
 
 MSGPACK = "application/msgpack"
@@ -146,7 +144,9 @@ class Rollout:
         told: numbers that the world reports about the newest chunk.
     """
 
-    def __init__(self, link: HttpLink, query: str, answer: RolloutAnswer, origin: Origin) -> None:
+    def __init__(
+        self, link: HttpLink, query: str, answer: RolloutAnswer, origin: RolloutOrigin
+    ) -> None:
         self._link = link
         self._query = query
         self._origin = origin

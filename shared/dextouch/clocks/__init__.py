@@ -1,7 +1,7 @@
 """Clock models: counter unwrapping, and device time to host time, offline and online."""
 
 from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock, lateness_ns
-from dextouch.clocks.counters import TickCounter
+from dextouch.clocks.counters import TickCounter, prefers_sequence
 from dextouch.clocks.counting_clock import (
     CountedSample,
     CountedTake,
@@ -38,5 +38,6 @@ __all__ = [
     "find_lost_samples",
     "fit_clock",
     "lateness_ns",
+    "prefers_sequence",
     "unwrap_counter",
 ]

@@ -11,9 +11,7 @@ from itertools import accumulate, pairwise
 import numpy as np
 
 from dextouch.errors import CorruptDataError
-from dextouch.streams.checks import ENCODED_UNITS
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.streams import ENCODED_UNITS, SampleBatch, StreamDescriptor, encoded_values
 
 _STAMP_BYTES = 8
 

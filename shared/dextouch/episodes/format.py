@@ -9,9 +9,8 @@ from typing import Annotated, Any, Final, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
-from dextouch.schemas.episodes import ID_PATTERN
-from dextouch.streams.checks import H264_UNIT, JPEG_UNIT
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import ID_PATTERN
+from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor
 
 Kind = Literal["episode", "recording"]
 KINDS: tuple[Kind, ...] = ("episode", "recording")

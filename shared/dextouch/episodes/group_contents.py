@@ -30,8 +30,7 @@ from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.staged_group import read_stage
 from dextouch.errors import CorruptDataError, NotFoundError, StorageError
-from dextouch.schemas.episodes import EpisodeAttributes, Verification
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
 VERIFY_BYTES = 1 << 24

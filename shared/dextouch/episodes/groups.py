@@ -9,9 +9,8 @@ from dextouch.episodes.group_contents import CommittedGroup, GroupContents
 from dextouch.episodes.image_codecs import ImageChunks, transform_pixels
 from dextouch.episodes.video import FULL_FORM, ImageForm
 from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError, UnknownNameError
-from dextouch.schemas.episodes import EpisodeAttributes, Verification
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, Verification
+from dextouch.streams import StreamDescriptor
 
 A = TypeVar("A", EpisodeAttributes, RecordingAttributes)
 

@@ -15,7 +15,7 @@ import simplejpeg
 from dextouch.episodes.format import Codec
 from dextouch.episodes.video import ImageForm, decoder_of_this_thread
 from dextouch.errors import CorruptDataError
-from dextouch.images.jpeg import jpeg_size
+from dextouch.images import jpeg_size
 
 
 def pack_chunk(codec: Codec, images: Sequence[bytes]) -> bytes:

@@ -33,9 +33,8 @@ from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
 from dextouch.episodes.staged_group import kind_of, read_stage
 from dextouch.errors import CorruptDataError, StorageError
-from dextouch.images.jpeg import jpeg_size
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.images import jpeg_size
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 UPLOADS = ".uploads"
 STAGING = ".staging"

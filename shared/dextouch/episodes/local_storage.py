@@ -24,7 +24,7 @@ from dextouch.episodes.trash import put_into_trash, remove_for_good
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
-from dextouch.schemas.episodes import ID_PATTERN
+from dextouch.schemas import ID_PATTERN
 
 
 def local_folder(url: str | Path) -> Path:

@@ -26,11 +26,8 @@ from dextouch.episodes.format import (
 from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles
 from dextouch.errors import CorruptDataError, StorageError
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import JPEG_UNIT
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import encoded_values
+from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttributes
+from dextouch.streams import JPEG_UNIT, StreamDescriptor, encoded_values
 
 OLD_VERSION = 1
 BLOCK_SAMPLES = 256

@@ -19,10 +19,8 @@ from dextouch.episodes.window import (
 )
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.schemas.rollouts import ActionKind
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import ActionKind, EpisodeAttributes, RecordingAttributes
+from dextouch.streams import SampleBatch
 from dextouch.tactile.layout import NUM_TAXELS
 
 SIDES = ("left", "right")

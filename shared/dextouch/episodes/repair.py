@@ -55,8 +55,7 @@ from dextouch.errors import (
     InvalidInputError,
     StorageError,
 )
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttributes
 
 WHOLE, MENDED, SALVAGED, RECOVERED, LEFT = "whole", "mended", "salvaged", "recovered", "left"
 

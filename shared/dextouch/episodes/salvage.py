@@ -35,11 +35,8 @@ from dextouch.episodes.staged_group import Attributes, attributes_id, kind_of
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.schemas.recordings import LedgerEntry
-from dextouch.streams.checks import check_batch
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.schemas import EpisodeAttributes, LedgerEntry, LineageEntry
+from dextouch.streams import SampleBatch, StreamDescriptor, check_batch, encoded_values
 
 LOST = "lost_to_damage"
 # The rows of these streams correspond by index: the steps of the model grid.

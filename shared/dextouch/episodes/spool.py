@@ -21,10 +21,8 @@ from dextouch.episodes.spool_reader import (
     read_attributes,
 )
 from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.checks import check_batch, check_follows
-from dextouch.streams.descriptors import MAX_STREAMS
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import MAX_STREAMS, SampleBatch, check_batch, check_follows
 
 __all__ = [
     "RecoveryReport",

@@ -10,8 +10,8 @@ from dextouch.episodes.batch_bytes import batch_of_bytes
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.spool_log import read_bodies, read_records
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch
 
 RECORDING_FILE = "recording.json"
 CLOSED_FILE = "closed"

@@ -34,8 +34,7 @@ from dextouch.episodes.format import (
 )
 from dextouch.episodes.shard_writer import forget_journal
 from dextouch.errors import ConflictError, CorruptDataError
-from dextouch.schemas.episodes import EpisodeAttributes, json_ready
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
 
 STAGE_FILE = "stage.json"
 Attributes = EpisodeAttributes | RecordingAttributes

@@ -44,7 +44,7 @@ from dextouch.episodes.staged_group import (
 )
 from dextouch.episodes.zstd import content_bytes
 from dextouch.errors import CorruptDataError, DexTouchError, StorageError
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import RecordingAttributes
 
 IsTaken = Callable[[Kind, str], bool]
 

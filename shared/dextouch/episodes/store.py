@@ -23,8 +23,7 @@ from dextouch.episodes.trash import (
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError, UnknownNameError
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 _OBJECT_SCHEME = "s3://"
 

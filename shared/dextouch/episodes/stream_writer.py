@@ -19,9 +19,8 @@ from dextouch.episodes.shard_writer import ShardWriter
 from dextouch.episodes.video import GopEncoder, VideoSettings, check_video_size, is_keyframe
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, StorageError
-from dextouch.images.jpeg import DEFAULT_QUALITY, encode_jpeg
-from dextouch.streams.checks import check_encoded_image
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.images import DEFAULT_QUALITY, encode_jpeg
+from dextouch.streams import StreamDescriptor, check_encoded_image
 
 Stamps = Mapping[str, np.ndarray]
 

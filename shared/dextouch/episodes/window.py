@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, Shaped, UInt8
 
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import ActionKind
+from dextouch.schemas import ActionKind
 
 # Stamps of one instant may differ by rounding.
 SAME_INSTANT_NS = 1_000

@@ -7,8 +7,8 @@ import numpy as np
 from dextouch.episodes.window import Window
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import ActionKind
-from dextouch.streams.packing import pack, unpack
+from dextouch.schemas import ActionKind
+from dextouch.streams import pack, unpack
 
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
 

@@ -27,11 +27,14 @@ from dextouch.errors import (
     StorageError,
     UnknownNameError,
 )
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.recordings import LedgerEntry
-from dextouch.streams.checks import ENCODED_UNITS
-from dextouch.streams.descriptors import MAX_STREAMS, StreamDescriptor
-from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
+from dextouch.schemas import EpisodeAttributes, LedgerEntry
+from dextouch.streams import (
+    ENCODED_UNITS,
+    MAX_STREAMS,
+    NO_DEVICE_TIME,
+    NO_SEQUENCE,
+    StreamDescriptor,
+)
 
 DROPPED_IMAGES = "dropped_before_encoder"
 

@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_6d, rotation_to_6d
-from dextouch.geometry.transforms import invert, transform
 
 ACTION_DIM = 67
 POSE_DIM = 9

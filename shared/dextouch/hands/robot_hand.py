@@ -13,8 +13,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 
 from dextouch.errors import NonFiniteError, ShapeError, UnknownNameError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands.finger_table import FingerTable, check_fingers
 from dextouch.hands.wuji_hand_2 import LEFT_HAND, RIGHT_HAND
 

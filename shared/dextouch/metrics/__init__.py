@@ -1,1 +1,7 @@
 """Metrics of predicted images, touch and policy scores against ground truth."""
+
+__all__ = [
+    "image",
+    "policy",
+    "tactile",
+]

@@ -8,7 +8,7 @@ import numpy as np
 
 from dextouch.metrics.checks import checked_pair
 from dextouch.metrics.image import decibels
-from dextouch.tactile.contact import in_contact
+from dextouch.tactile import in_contact
 from dextouch.tactile.layout import NUM_TAXELS, split_pads
 
 # Reference pressure of PSNR and SSIM: the full scale of the heat maps.

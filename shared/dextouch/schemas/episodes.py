@@ -15,7 +15,7 @@ from pydantic import (
 )
 
 from dextouch.hands.actions import AnchorPoses
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 
 FORMAT_VERSION: Final = 1
 ID_PATTERN = r"^[a-z0-9][a-z0-9_-]{0,127}$"

@@ -11,7 +11,7 @@ from dextouch.schemas.episodes import (
     Matrix,
     StoreId,
 )
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 
 # Reason of the store's ConflictError when another recording has the id.
 ID_TAKEN = "id_taken"

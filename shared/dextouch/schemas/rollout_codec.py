@@ -19,7 +19,7 @@ from dextouch.schemas.rollouts import (
     StartRequest,
     check_observation_arrays,
 )
-from dextouch.streams.packing import pack, unpack
+from dextouch.streams import pack, unpack
 
 IMAGE_PREFIX = "image/"
 ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
@@ -58,7 +58,7 @@ class StartFields(BaseModel):
 
 
 @dataclass(frozen=True)
-class Origin:
+class RolloutOrigin:
     """Anchor poses and camera matrix of a rollout, given with its first observation."""
 
     anchor: AnchorPoses
@@ -72,7 +72,7 @@ class RolloutAnswer:
     rollout: RolloutInfo
     observation: Observation
     info: dict[str, float]
-    origin: Origin | None
+    origin: RolloutOrigin | None
 
 
 def encode_answer(
@@ -81,7 +81,7 @@ def encode_answer(
     *,
     tactile: bool = True,
     info: dict[str, float] | None = None,
-    origin: Origin | None = None,
+    origin: RolloutOrigin | None = None,
 ) -> bytes:
     """Encode an observation with the rollout's progress; without touch unless `tactile`."""
     arrays = _observation_arrays(observation)
@@ -130,7 +130,7 @@ def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
         if start.anchor is None or start.K_head is None:
             raise InvalidInputError("start: an observation needs anchor and K_head beside it")
         arrays = _observation_arrays(start.observation)
-        arrays |= _origin_arrays(Origin(start.anchor, start.K_head))
+        arrays |= _origin_arrays(RolloutOrigin(start.anchor, start.K_head))
         observation = _fields_of(start.observation)
     fields = StartFields(start=request, observation=observation)
     return pack(fields.model_dump(mode="json"), arrays)
@@ -152,7 +152,10 @@ def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutS
 
 
 def start_from(
-    request: StartRequest, *, observation: Observation | None = None, origin: Origin | None = None
+    request: StartRequest,
+    *,
+    observation: Observation | None = None,
+    origin: RolloutOrigin | None = None,
 ) -> RolloutStart:
     """Build the start from a request and an optional observation."""
     return RolloutStart(
@@ -186,7 +189,7 @@ def _observation_arrays(observation: Observation) -> dict[str, np.ndarray]:
     return arrays
 
 
-def _origin_arrays(origin: Origin) -> dict[str, np.ndarray]:
+def _origin_arrays(origin: RolloutOrigin) -> dict[str, np.ndarray]:
     return {
         **dict(zip(ANCHOR_NAMES, origin.anchor.as_tuple(), strict=True)),
         "K_head": origin.K_head,
@@ -223,7 +226,7 @@ def _observation_from(
     )
 
 
-def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> Origin:
+def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> RolloutOrigin:
     poses = []
     for name in ANCHOR_NAMES:
         T = _array(arrays, name, where=where)
@@ -241,7 +244,7 @@ def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> Origin:
     K_head = _array(arrays, "K_head", where=where)
     if K_head.shape != (3, 3) or K_head.dtype != np.float64 or not np.isfinite(K_head).all():
         raise ShapeError(f"{where}: K_head got {K_head.dtype} {K_head.shape}, expected [3, 3]")
-    return Origin(AnchorPoses(*poses), K_head)
+    return RolloutOrigin(AnchorPoses(*poses), K_head)
 
 
 def _array(arrays: Mapping[str, np.ndarray], name: str, *, where: str) -> np.ndarray:

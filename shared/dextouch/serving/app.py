@@ -13,11 +13,12 @@ from starlette.exceptions import HTTPException
 
 from dextouch import __version__
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
-from dextouch.schemas.health import Health, Readiness
-from dextouch.schemas.problems import (
+from dextouch.schemas import (
     CLASS_OF_STATUS,
     PROBLEM_MEDIA_TYPE,
+    Health,
     Problem,
+    Readiness,
     problem_from_error,
 )
 from dextouch.serving.access import AccessControl

@@ -20,7 +20,7 @@ from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsC
 
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.problems import first_problems
+from dextouch.schemas import first_problems
 
 MIN_KEY_CHARACTERS = 16
 # Keep-alive, so that a policy may take this long between two chunks.

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dextouch.errors import CorruptDataError, InvalidInputError, ShapeError
-from dextouch.images.jpeg import jpeg_size
+from dextouch.images import jpeg_size
 from dextouch.streams.descriptors import StreamDescriptor
 from dextouch.streams.samples import SampleBatch
 

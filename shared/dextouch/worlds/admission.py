@@ -14,7 +14,7 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.hands.actions import check_actions
-from dextouch.schemas.rollouts import (
+from dextouch.schemas import (
     EVERYTHING,
     Observation,
     ReturnSelector,

@@ -7,16 +7,16 @@ import numpy as np
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import check_actions
-from dextouch.schemas.rollout_codec import decode_observation, encode_observation
-from dextouch.worlds.world import (
+from dextouch.schemas import (
     EVERYTHING,
     Observation,
     ReturnSelector,
     RolloutStart,
-    StartedRollout,
-    SteppedRollout,
     WorldDescription,
+    decode_observation,
+    encode_observation,
 )
+from dextouch.worlds.world import StartedRollout, SteppedRollout
 
 MAX_SNAPSHOT_BYTES = 2**28
 

@@ -12,14 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import LimitExceededError, UnavailableError
-from dextouch.worlds.world import (
-    EVERYTHING,
-    BatchWorld,
-    ReturnSelector,
-    State,
-    SteppedRollout,
-    World,
-)
+from dextouch.schemas import EVERYTHING, ReturnSelector
+from dextouch.worlds.world import BatchWorld, State, SteppedRollout, World
 
 ResultT = TypeVar("ResultT")
 

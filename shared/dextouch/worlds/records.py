@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dextouch.errors import LimitExceededError, NotFoundError, StorageError, UnavailableError
-from dextouch.schemas.rollouts import RolloutInfo
-from dextouch.serving.state import StateStore
-from dextouch.streams.packing import pack, unpack
+from dextouch.schemas import RolloutInfo
+from dextouch.serving import StateStore
+from dextouch.streams import pack, unpack
 
 KEY_PREFIX = "rollout:"
 MAX_RECORD_BYTES = 2**30

@@ -24,15 +24,16 @@ from dextouch.errors import (
     LimitExceededError,
     UnknownNameError,
 )
-from dextouch.schemas.rollout_codec import Origin, encode_answer
-from dextouch.schemas.rollouts import (
+from dextouch.schemas import (
     MAX_SEED,
     ReturnSelector,
     RolloutInfo,
+    RolloutOrigin,
     RolloutStart,
     WorldDescription,
+    encode_answer,
 )
-from dextouch.serving.state import StateStore
+from dextouch.serving import StateStore
 from dextouch.worlds.admission import check_answer, check_chunk, check_selector, check_start
 from dextouch.worlds.batcher import StepJob, WorldWorker
 from dextouch.worlds.records import LastAnswer, RecordStore, RolloutRecord, StoredRecord
@@ -144,7 +145,7 @@ class RolloutService:
             version = await self._records.write(record, over_version=placed)
         self._live.put(info.id, version, started.state)
         logger.info("rollout_started", rollout_id=info.id, world=world, task=info.task)
-        origin = Origin(started.anchor, started.K_head)
+        origin = RolloutOrigin(started.anchor, started.K_head)
         shown = started.observation.selected(selector)
         return Answer(encode_answer(info, shown, tactile=selector.tactile, origin=origin))
 

@@ -12,20 +12,29 @@ from starlette.concurrency import run_in_threadpool
 
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands.actions import ACTION_DIM
-from dextouch.schemas.problems import first_problems
-from dextouch.schemas.rollout_codec import decode_start, start_from
-from dextouch.schemas.rollouts import (
+from dextouch.schemas import (
     ForkRequest,
     ReturnSelector,
     RolloutInfo,
     RolloutStart,
     StartRequest,
     WorldList,
+    decode_start,
+    first_problems,
+    start_from,
 )
-from dextouch.serving.access import RequireScope
-from dextouch.serving.bodies import AS_SET, JSON, KIB, MSGPACK, OCTETS, media_type, takes
-from dextouch.serving.middleware import timed
-from dextouch.streams.packing import unpack
+from dextouch.serving import (
+    AS_SET,
+    JSON,
+    KIB,
+    MSGPACK,
+    OCTETS,
+    RequireScope,
+    media_type,
+    takes,
+    timed,
+)
+from dextouch.streams import unpack
 from dextouch.worlds.rollouts import Answer, RolloutService
 
 SCOPE = "rollout"

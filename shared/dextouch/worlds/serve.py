@@ -7,10 +7,7 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic import Field
 
-from dextouch.serving.app import create_service_app
-from dextouch.serving.logs import configure_logging
-from dextouch.serving.settings import ServiceSettings, run
-from dextouch.serving.state import open_state
+from dextouch.serving import ServiceSettings, configure_logging, create_service_app, open_state, run
 from dextouch.worlds.rollouts import RolloutLimits, RolloutService
 from dextouch.worlds.routes import rollout_router
 from dextouch.worlds.world import World

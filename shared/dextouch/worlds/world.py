@@ -13,32 +13,15 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.rollouts import (
+from dextouch.schemas import (
     EVERYTHING,
-    ActionKind,
     Observation,
     ReturnSelector,
     RolloutStart,
     WorldDescription,
-    WorldKind,
 )
 
 State = TypeVar("State")
-
-__all__ = [
-    "EVERYTHING",
-    "ActionKind",
-    "BatchWorld",
-    "Observation",
-    "ReturnSelector",
-    "RolloutStart",
-    "StartedRollout",
-    "State",
-    "SteppedRollout",
-    "World",
-    "WorldDescription",
-    "WorldKind",
-]
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from dextouch.errors import DeviceError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.drivers.bridge_protocol import (
     MAX_HELLO_BYTES,

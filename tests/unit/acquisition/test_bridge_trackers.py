@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, PacketError, StaleDataError
+from dextouch.geometry import pose_from_transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from dextouch.geometry.transforms import pose_from_transform
-from dextouch.hands.skeleton import NODES
+from dextouch.hands import NODES
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource

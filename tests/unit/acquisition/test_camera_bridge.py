@@ -5,7 +5,7 @@ import pytest
 
 from dextouch.episodes.video import is_keyframe
 from dextouch.errors import DeviceError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.camera.driver import (

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.serving.settings import load_settings
+from dextouch.serving import load_settings
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import DeviceKind, build_drivers, device_kind, kind_names
 from services.acquisition.devices.registry import OWN_KINDS

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError, PacketError
-from dextouch.hands.skeleton import NODES
-from dextouch.images.jpeg import decode_jpeg, encode_jpeg
+from dextouch.hands import NODES
+from dextouch.images import decode_jpeg, encode_jpeg
 from services.acquisition.devices.camera.driver import ENCODING_CODES, PAYLOAD_HEADER, CameraDecoder
 from services.acquisition.devices.camera.driver import MAGIC as CAMERA_MAGIC
 from services.acquisition.devices.finger_tracker.driver import (

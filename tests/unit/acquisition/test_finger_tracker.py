@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, PacketError
-from dextouch.hands.skeleton import NODE_INDEX, NODES, NUM_KEYPOINTS
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.hands import NODE_INDEX, NODES, NUM_KEYPOINTS
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.finger_tracker.driver import (
     ALL_SEEN,

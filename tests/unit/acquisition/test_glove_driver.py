@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import RealClock
 from services.acquisition.devices.justfloat_glove.mock import mock_justfloat_glove
 from services.acquisition.devices.tactile_glove.commands import (

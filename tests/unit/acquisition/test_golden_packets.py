@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 import pytest
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
 from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from prometheus_client import CollectorRegistry, generate_latest
 
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.camera.driver import camera_descriptor
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.tactile_glove.packets import glove_descriptor
 from services.acquisition.health_blocks import Block
 from services.acquisition.health_clock import ClockJudge, CountingJudge

@@ -5,8 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels
 from services.acquisition.clock import VirtualClock
 from services.acquisition.counters import StreamCounters

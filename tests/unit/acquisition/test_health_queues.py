@@ -4,8 +4,7 @@ import threading
 
 import numpy as np
 
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.health_blocks import SampleBlocks
 
 POSE = StreamDescriptor(

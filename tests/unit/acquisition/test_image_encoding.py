@@ -6,8 +6,8 @@ import pytest
 from dextouch.episodes.format import GOP_IMAGES
 from dextouch.episodes.video import is_keyframe
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.images.jpeg import decode_jpeg
-from dextouch.streams.samples import Sample
+from dextouch.images import decode_jpeg
+from dextouch.streams import Sample
 from services.acquisition.devices.camera.driver import CameraDecoder
 from services.acquisition.drivers.image_encoding import (
     MAX_WAITING_IMAGES,

@@ -5,8 +5,8 @@ import pytest
 
 from dextouch.episodes.video import GopEncoder, VideoSettings
 from dextouch.errors import NotFoundError
-from dextouch.images.jpeg import decode_jpeg
-from dextouch.streams.samples import Sample, encoded_values
+from dextouch.images import decode_jpeg
+from dextouch.streams import Sample, encoded_values
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.devices.camera.settings import CameraSettings

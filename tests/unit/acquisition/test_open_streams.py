@@ -5,8 +5,7 @@ import pytest
 from pydantic import ValidationError
 
 from dextouch.errors import DeviceError, InvalidInputError, NotFoundError
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import CellLayout, DecoderStatistics, Driver, build_drivers
 from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder

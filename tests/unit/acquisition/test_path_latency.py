@@ -8,7 +8,7 @@ from structlog.testing import capture_logs
 from dextouch.clocks import PathLatency, RoundTrip
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.pose_tracker.mock import Jump, Occlusion, PoseTrackerSource
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.tracking import (

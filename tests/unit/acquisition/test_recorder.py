@@ -8,7 +8,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder

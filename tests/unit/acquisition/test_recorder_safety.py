@@ -11,7 +11,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, StorageFullError
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition import supervisor
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder

@@ -4,7 +4,7 @@ import pytest
 from pydantic import ValidationError
 
 from dextouch.errors import InvalidInputError, StorageError
-from dextouch.serving.settings import ServiceSettings, load_settings
+from dextouch.serving import ServiceSettings, load_settings
 from services.acquisition.app import create_app
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration

@@ -7,9 +7,8 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import ConflictError, StorageFullError, UnavailableError
-from dextouch.schemas.recordings import BatchReceipt, RecordingAttributes, RecordingStatus
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition import uploader as uploader_module
 from services.acquisition.uploader import (
     UPLOADED_FILE,

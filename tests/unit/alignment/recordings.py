@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor
 
 K_HEAD = ((60.0, 0.0, 32.0), (0.0, 60.0, 32.0), (0.0, 0.0, 1.0))
 POSE = np.array([0.1, 0.2, 0.3, 1.0, 0.0, 0.0, 0.0])

@@ -5,11 +5,10 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import pose_from_transform, transform, transform_from_pose
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import pose_from_transform, transform, transform_from_pose
-from dextouch.schemas.episodes import matrix_rows
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import RecordingAttributes, matrix_rows
+from dextouch.streams import StreamDescriptor
 from services.alignment.synchronization.recorded_streams import date_stream
 
 RNG = np.random.default_rng(4)

@@ -5,8 +5,8 @@ import pytest
 from scipy.optimize import approx_fprime, least_squares
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
-from dextouch.geometry.transforms import invert, transform
 from services.alignment.calibration.board_views import BoardViews, polish, project
 from services.alignment.calibration.bundle import (
     pose_measurement,

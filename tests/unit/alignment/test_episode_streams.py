@@ -7,7 +7,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.format import GOP_IMAGES
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.images import jpeg
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization import episode_streams, recorded_streams

@@ -5,10 +5,8 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.episodes import matrix_rows
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import RecordingAttributes, matrix_rows
+from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.acquisition.devices.justfloat_glove.mock import COUNTS_PER_KPA, JustFloatGloveSource
 from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder

@@ -5,8 +5,8 @@ import pytest
 
 from benchmarks.retargeting.pinches import people, pinch_motion
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX
 from services.alignment.retargeting import HandProfile, HandRetargeter, RetargetOptions
 from services.alignment.retargeting.hand_profile import calibrated_profile, profile_name
 from services.cli.simulated.hand_motions import robot_motion

@@ -5,7 +5,7 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.schemas.episodes import matrix_rows
+from dextouch.schemas import matrix_rows
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.retargeting.keypoint_axes import calibration_name

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
+from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import pose_from_transform, transform
-from dextouch.schemas.episodes import matrix_rows
+from dextouch.schemas import matrix_rows
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from tests.unit.alignment import recordings

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
+from dextouch.hands import chain_indices
 from dextouch.hands.hand_files import load_hand
-from dextouch.hands.skeleton import chain_indices
 from services.alignment import __main__ as command
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import StreamData
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams import StreamDescriptor
 from services.alignment.recording_error import NEAR_NS, match_samples
 
 PERIOD_NS = 10_000_000

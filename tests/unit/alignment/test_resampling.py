@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 from services.alignment.retargeting import RetargetStatus
 from services.alignment.synchronization.hand_joints import retarget_hands, status_on_grid
 from services.alignment.synchronization.recorded_streams import LoadedStream

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel, RobotHand
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from services.alignment.retargeting import HandRetargeter, RetargetOptions, RetargetStatus
 from services.alignment.retargeting.hand_arrays import hand_arrays
 from services.alignment.retargeting.profile_fit import robot_bone_m, unknown_person

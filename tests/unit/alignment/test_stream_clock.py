@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from dextouch.schemas.episodes import ClockReport
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import ClockReport
+from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.report import AlignmentReport
 from services.alignment.report_page import report_line, report_page
 from services.alignment.synchronization.stream_clock import time_stream

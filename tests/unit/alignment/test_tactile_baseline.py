@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from dextouch.schemas.episodes import matrix_rows
+from dextouch.schemas import matrix_rows
 from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.alignment.calibration.tactile_baseline import REASONS, TactileCalibration
 

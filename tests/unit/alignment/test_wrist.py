@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from services.alignment.retargeting.wrist import pose_difference, rigid_transform
 
 

@@ -6,15 +6,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.geometry import apply, invert
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
-from dextouch.geometry.transforms import apply, invert
-from dextouch.hands.mean_hand import (
-    KNUCKLE_NODES,
-    METACARPAL_NODES,
-    PALM_NODES,
-    WRIST_NODE,
-)
-from dextouch.hands.skeleton import NODE_INDEX
+from dextouch.hands import KNUCKLE_NODES, METACARPAL_NODES, NODE_INDEX, PALM_NODES, WRIST_NODE
 from services.alignment.retargeting.wrist_frame import calibrate_wrist, wrist_frame
 from tests.unit.alignment.tracked_hands import (
     any_rotation,

@@ -6,8 +6,14 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
-from dextouch.hands.mean_hand import METACARPAL_NODES, PALM_NODES, mean_hand_m
-from dextouch.hands.skeleton import CHAINS, NODE_INDEX, chain_indices
+from dextouch.hands import (
+    CHAINS,
+    METACARPAL_NODES,
+    NODE_INDEX,
+    PALM_NODES,
+    chain_indices,
+    mean_hand_m,
+)
 from services.alignment.retargeting.hand_checks import check_hand_shape
 from services.alignment.retargeting.hand_side import check_handedness
 from services.twin.hands import HumanHand

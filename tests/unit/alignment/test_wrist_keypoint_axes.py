@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
-from dextouch.hands.skeleton import NODE_INDEX
-from dextouch.schemas.episodes import matrix_rows
+from dextouch.hands import NODE_INDEX
+from dextouch.schemas import matrix_rows
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.retargeting import HandRetargeter
 from services.alignment.retargeting.keypoint_axes import (

@@ -3,7 +3,7 @@
 import numpy as np
 
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.hands.skeleton import CHAINS, chain_indices
+from dextouch.hands import CHAINS, chain_indices
 from services.twin.hands import HumanHand
 
 

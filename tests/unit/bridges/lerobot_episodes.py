@@ -4,11 +4,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands import actions as act
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, LineageEntry, StoredAnchor, matrix_rows
+from dextouch.streams import StreamDescriptor
 
 CAMERAS = ("camera_head", "camera_wrist_left")
 SIZE_PX = (48, 64)

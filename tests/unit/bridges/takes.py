@@ -4,14 +4,18 @@ from datetime import UTC, datetime
 
 import numpy as np
 
+from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import pose_from_transform, transform
 from dextouch.hands import actions as act
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.schemas.recordings import LedgerEntry, RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import (
+    EpisodeAttributes,
+    LedgerEntry,
+    RecordingAttributes,
+    StoredAnchor,
+    matrix_rows,
+)
+from dextouch.streams import StreamDescriptor, encoded_values
 
 K_HEAD = np.array([[60.0, 0, 32], [0, 61, 31.5], [0, 0, 1]])
 DISTORTION = (-0.1, 0.02, 0.001, -0.002, 0.003)

@@ -8,7 +8,7 @@ rr = pytest.importorskip("rerun", reason="rerun-sdk is not installed: pip instal
 from dextouch.bridges.rerun import entity_of, export_rrd, heat_map  # noqa: E402
 from dextouch.episodes import EpisodeStore  # noqa: E402
 from dextouch.errors import ConflictError, InvalidInputError  # noqa: E402
-from dextouch.geometry.transforms import transform_from_pose  # noqa: E402
+from dextouch.geometry import transform_from_pose  # noqa: E402
 from tests.unit.bridges.takes import (  # noqa: E402
     K_HEAD,
     descriptor,

@@ -3,8 +3,8 @@
 import cv2
 import numpy as np
 
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 
 # In DexTouch's pixels: the first one spans 0 … 1.
 K = np.array([[520.0, 0.0, 325.3], [0.0, 515.0, 236.8], [0.0, 0.0, 1.0]])

@@ -8,11 +8,10 @@ import pytest
 
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import InvalidInputError, NotFoundError, ShapeError
+from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import pose_from_transform, transform
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.devices import load_calibration
 from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.motion import DegenerateMotionError

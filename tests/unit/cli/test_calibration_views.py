@@ -13,8 +13,8 @@ from dextouch.errors import (
     StaleDataError,
     UnknownNameError,
 )
+from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import invert, transform
 from services.alignment.calibration.hand_eye import mount_difference
 from services.cli.calibrate import advice, boards, live
 from services.cli.calibrate.command import main

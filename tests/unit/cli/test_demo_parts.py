@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from fastapi import FastAPI
 
-from dextouch.clients.policy import PolicyStart
+from dextouch.clients import PolicyStart
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, UnavailableError
-from dextouch.schemas.episodes import LineageEntry
+from dextouch.schemas import LineageEntry
 from services.cli.demo.background import served
 from services.cli.demo.command import worst_errors
 from services.cli.demo.judging import ladder

@@ -6,12 +6,10 @@ import numpy as np
 import pytest
 
 from dextouch.errors import ConflictError, InvalidInputError
-from dextouch.geometry.cameras import pinhole_matrix
-from dextouch.geometry.transforms import transform
+from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
-from dextouch.schemas.rollouts import Observation
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.world import EVERYTHING, RolloutStart, SteppedRollout
+from dextouch.schemas import EVERYTHING, Observation, RolloutStart
+from dextouch.worlds import CopyFirstWorld, SteppedRollout
 from services.cli.demo.models import TrainedOn
 from services.cli.demo.prediction import Future, Scene, measure_scenes
 

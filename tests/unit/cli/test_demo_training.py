@@ -2,7 +2,7 @@
 
 import pytest
 
-from dextouch.serving.settings import load_settings
+from dextouch.serving import load_settings
 from services.cli import train
 from services.cli.demo import models
 from services.world_model.settings import TrainStateCommand

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from dextouch.clients.http_link import Reply
+from dextouch.clients import Reply
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration

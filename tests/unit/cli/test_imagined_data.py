@@ -6,9 +6,9 @@ import json
 import numpy as np
 import pytest
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
 from services.cli.imagined_data import WORLD, Choice, judged_steps, main, positive, seed_range
 from services.evaluation.endings import read_ending_episode

@@ -9,7 +9,7 @@ import websockets
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 
 from dextouch.errors import ConflictError, UnavailableError
-from dextouch.serving.settings import MAX_WEBSOCKET_BYTES
+from dextouch.serving import MAX_WEBSOCKET_BYTES
 from services.cli.servers import bind, serve_all
 
 

@@ -17,11 +17,10 @@ from dextouch.errors import (
     ShapeError,
     UnknownNameError,
 )
+from dextouch.geometry import invert, pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import invert, pose_from_transform, transform
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.devices import load_calibration
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.alignment.calibration.hand_eye import mount_difference

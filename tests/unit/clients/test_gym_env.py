@@ -4,11 +4,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from dextouch.clients import RolloutClient
 from dextouch.clients.gym_env import WorldEnv
-from dextouch.clients.rollouts import RolloutClient
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import K_HEAD, SumWorld, actions, anchor, observation
 from tests.unit.worlds.running import served
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.errors import (
     ConflictError,
     EndedError,
@@ -15,10 +15,9 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas.rollouts import ReturnSelector
-from dextouch.worlds.baseline import CopyFirstWorld
+from dextouch.schemas import ReturnSelector
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from dextouch.worlds.rollouts import RolloutLimits
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, SumWorld, actions, anchor, observation
 from tests.unit.worlds.running import served
 

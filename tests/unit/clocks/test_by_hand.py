@@ -10,8 +10,7 @@ from dextouch.clocks import OnlineClock, fit_clock
 from dextouch.clocks.counters import DeviceCounter
 from dextouch.clocks.lower_hull import LowerHull
 from dextouch.clocks.steps import find_steps, find_wrong_stamps
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams import ClockCapabilities, SampleBatch, StreamDescriptor
 from services.alignment.synchronization.stream_clock import time_stream
 
 PERIOD_NS = 10_000_000

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from dextouch.clocks import OnlineClock, find_lost_samples, fit_clock, unwrap_counter
 from dextouch.clocks.lower_hull import MAX_VERTICES, LowerHull
 from dextouch.errors import ClockFitError, InvalidInputError, ShapeError
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
+from dextouch.streams import ClockCapabilities, StreamDescriptor
 
 PERIOD_NS = 16_666_667
 

@@ -5,7 +5,7 @@ import numpy as np
 from fastapi import FastAPI, Response
 from fastapi.responses import JSONResponse
 
-from dextouch.streams.packing import pack
+from dextouch.streams import pack
 from services.dashboard import station_api
 from services.dashboard.upstream import Upstream
 

@@ -7,7 +7,7 @@ import httpx
 import numpy as np
 import pytest
 
-from dextouch.tactile.heatmap import hand_canvas
+from dextouch.tactile import hand_canvas
 
 KEY = "a-key-of-some-length"
 

@@ -10,8 +10,7 @@ import httpx
 import pytest
 import yaml
 
-from dextouch.serving.app import create_service_app
-from dextouch.serving.settings import ServiceSettings
+from dextouch.serving import ServiceSettings, create_service_app
 from services.acquisition.health_metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.schemas import StationHealth
 from services.cli.main import COMMANDS, INNER_COMMANDS

@@ -8,10 +8,9 @@ import httpx
 import numpy as np
 import pytest
 
-from dextouch.clients.episode_store import EpisodeStoreClient
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.clients import EpisodeStoreClient
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.episode_store.app import create_app
 from services.episode_store.settings import EpisodeStoreSettings
 

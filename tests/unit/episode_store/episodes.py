@@ -3,8 +3,8 @@
 import numpy as np
 
 from dextouch.hands.actions import IDENTITY_POSE_9D, pack_action
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes
+from dextouch.streams import StreamDescriptor
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
 POSES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")

@@ -6,7 +6,7 @@ from httpx import ASGITransport, AsyncClient
 
 from dextouch.episodes import EpisodeStore, ImageForm
 from dextouch.episodes.window_codec import decode_window
-from dextouch.streams.packing import unpack
+from dextouch.streams import unpack
 from services.episode_store import reading as reading_module
 from services.episode_store.app import create_app
 from services.episode_store.reading import is_known

@@ -9,9 +9,8 @@ from prometheus_client import generate_latest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import LimitExceededError, StorageFullError, UnavailableError
-from dextouch.schemas.problems import Problem
-from dextouch.schemas.recordings import BatchReceipt, FinishRecording
-from dextouch.streams.wire import encode_batch
+from dextouch.schemas import BatchReceipt, FinishRecording, Problem
+from dextouch.streams import encode_batch
 from services.episode_store import admission as admission_module
 from services.episode_store import ingest as ingest_module
 from services.episode_store.admission import Admission, DiskReserve

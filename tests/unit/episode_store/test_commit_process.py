@@ -7,8 +7,8 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, UnavailableError
-from dextouch.schemas.recordings import FinishRecording
-from dextouch.streams.wire import encode_batch
+from dextouch.schemas import FinishRecording
+from dextouch.streams import encode_batch
 from services.episode_store.commit_process import CommitProcess
 from services.episode_store.ingest import Ingest
 

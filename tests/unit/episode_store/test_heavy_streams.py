@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from httpx import ASGITransport, AsyncClient
 
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.episode_store.app import create_app
 
 HEAVY = StreamDescriptor(

@@ -7,7 +7,7 @@ import pytest
 from httpx import ASGITransport, AsyncClient
 from pydantic import SecretStr
 
-from dextouch.clients.episode_store import EpisodeStoreClient
+from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.window_codec import decode_window, encode_window
 from dextouch.errors import (
@@ -19,7 +19,7 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.geometry.transforms import transform
+from dextouch.geometry import transform
 from dextouch.serving.settings import ApiKey
 from services.episode_store import __main__ as command_line
 from services.episode_store.__main__ import main

@@ -17,9 +17,8 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas.recordings import FinishRecording, LedgerEntry
-from dextouch.streams.samples import SampleBatch
-from dextouch.streams.wire import encode_batch
+from dextouch.schemas import FinishRecording, LedgerEntry
+from dextouch.streams import SampleBatch, encode_batch
 from services.episode_store import ingest as ingest_module
 from services.episode_store import upload as upload_module
 from services.episode_store.ingest import Ingest

@@ -10,10 +10,8 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 from services.episode_store import __main__ as command_line
 from services.episode_store.commands.context import readable_size, seconds_of, table
 

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands import actions as act
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams import StreamDescriptor
 
 RATES_HZ = {"tactile": 60, "pose": 100, "image": 30, "robot_state": 15}
 

@@ -2,10 +2,9 @@
 
 import numpy as np
 
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 
 GLOVE = StreamDescriptor(
     name="glove_left",

@@ -12,8 +12,8 @@ from dextouch.episodes import WriteOptions
 from dextouch.episodes.format import array_metadata, canonical_json, decode_commit, stream_arrays
 from dextouch.episodes.shard_reader import with_crc
 from dextouch.errors import CorruptDataError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor
 from tests.unit.episodes.hostile_group import forge_record, memory_bound, shard_of, write_shard
 
 MEBIBYTE = 2**20

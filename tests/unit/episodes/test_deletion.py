@@ -12,10 +12,8 @@ from dextouch.episodes.repair import repair_group
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
-from dextouch.schemas.episodes import LineageEntry
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch
+from dextouch.schemas import LineageEntry, RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor
 
 MINE, OTHER = "op-1", "op-10"
 FORCE = StreamDescriptor(

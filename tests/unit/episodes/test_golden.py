@@ -10,10 +10,8 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.hands.actions import IDENTITY_POSE_9D
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import encoded_values
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
+from dextouch.streams import StreamDescriptor, encoded_values
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 FORCE = StreamDescriptor(

@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.episodes.shard_reader import with_crc
 from dextouch.errors import CorruptDataError, StorageError
-from dextouch.images.jpeg import encode_jpeg
+from dextouch.images import encode_jpeg
 from tests.unit.episodes.hostile_group import (
     ID,
     MEMORY_BYTES,

@@ -20,8 +20,8 @@ from dextouch.errors import (
     StorageError,
     StorageFullError,
 )
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor
 
 FORCE = StreamDescriptor(
     name="force", kind="scalar", shape=(2,), dtype="float32", unit="N", nominal_rate_hz=10

@@ -8,8 +8,8 @@ import pytest
 
 from dextouch.episodes.journal import read_payloads, read_rows
 from dextouch.errors import CorruptDataError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor
 
 PAYLOADS = [b"a" * 10, b"bc" * 6, b"defg" * 5]
 OFFSETS = [0, 10, 22]

@@ -26,8 +26,8 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor
 from tests.contracts.s3_server import CREDENTIALS, running_s3
 from tests.unit.episodes.conftest import episode_of
 

@@ -12,9 +12,8 @@ from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
 from dextouch.episodes.video import GopEncoder, VideoSettings
 from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import CorruptDataError
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values
 from tests.unit.episodes.hostile_group import flip
 
 FORCE = StreamDescriptor(

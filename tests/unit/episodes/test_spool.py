@@ -20,7 +20,7 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.streams import SampleBatch, encoded_values
 from tests.unit.episodes.spooled_batches import (
     ATTRIBUTES,
     CAMERA,

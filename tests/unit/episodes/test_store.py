@@ -21,9 +21,9 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.images.jpeg import decode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.images import decode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor
 
 
 def scalar_stream(name="force", **changes):

@@ -20,10 +20,9 @@ from dextouch.errors import (
     StorageFullError,
     UnknownNameError,
 )
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.recordings import RecordingAttributes
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import encoded_values
+from dextouch.images import encode_jpeg
+from dextouch.schemas import RecordingAttributes
+from dextouch.streams import StreamDescriptor, encoded_values
 
 HEIGHT, WIDTH, COUNT = 48, 64, 21
 FULL = ImageForm()

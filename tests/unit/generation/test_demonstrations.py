@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dextouch.clients.rollouts import RolloutClient
+from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
-from dextouch.worlds.world import EVERYTHING, SteppedRollout
+from dextouch.schemas import EVERYTHING
+from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode

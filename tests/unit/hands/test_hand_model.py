@@ -5,9 +5,8 @@ import pytest
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
-from dextouch.hands.finger_table import FingerTable, JointRow
+from dextouch.hands import CHAINS, FingerTable, JointRow
 from dextouch.hands.robot_hand import HandModel, RobotHand
-from dextouch.hands.skeleton import CHAINS
 from services.twin.hands import HumanHand
 
 

@@ -6,21 +6,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, ShapeError
-from dextouch.hands.node_order import (
+from dextouch.hands import (
+    CHAINS,
+    FINGER_JOINTS,
     FINGER_METACARPALS,
+    NODE_INDEX,
+    NODES,
+    NUM_KEYPOINTS,
+    WRIST,
     TreeNode,
     node_order,
     nodes_of_tree,
 )
-from dextouch.hands.skeleton import (
-    CHAINS,
-    FINGER_JOINTS,
-    NODE_INDEX,
-    NODES,
-    NUM_KEYPOINTS,
-    THUMB_JOINTS,
-    WRIST,
-)
+from dextouch.hands.skeleton import THUMB_JOINTS
 
 ORDERS = st.permutations(range(NUM_KEYPOINTS))
 LINUX_CHAINS = ("pinky", "thumb", "index", "ring", "middle")

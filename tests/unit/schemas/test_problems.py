@@ -3,7 +3,7 @@
 import pytest
 from pydantic import BaseModel, ValidationError, model_validator
 
-from dextouch.schemas.problems import first_problems
+from dextouch.schemas import first_problems
 
 
 class Rate(BaseModel):

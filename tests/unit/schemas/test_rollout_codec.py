@@ -9,8 +9,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
-from dextouch.schemas.rollout_codec import (
-    Origin,
+from dextouch.schemas import (
+    EVERYTHING,
+    Doubt,
+    Observation,
+    ReturnSelector,
+    RolloutInfo,
+    RolloutOrigin,
+    RolloutStart,
+    StartRequest,
     decode_answer,
     decode_observation,
     decode_start,
@@ -18,17 +25,8 @@ from dextouch.schemas.rollout_codec import (
     encode_observation,
     encode_start,
 )
-from dextouch.schemas.rollouts import (
-    EVERYTHING,
-    Doubt,
-    Observation,
-    ReturnSelector,
-    RolloutInfo,
-    RolloutStart,
-    StartRequest,
-    check_observation_arrays,
-)
-from dextouch.streams.packing import pack, unpack
+from dextouch.schemas.rollouts import check_observation_arrays
+from dextouch.streams import pack, unpack
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, anchor, observation
 
 GOLDEN = Path(__file__).parent / "golden"
@@ -100,7 +98,7 @@ def test_observations_come_back_exactly(num_steps, seed, first_step, success):
 
 
 def test_answers_come_back_with_info_and_origin():
-    seen, origin = observation(4), Origin(anchor(), K_HEAD)
+    seen, origin = observation(4), RolloutOrigin(anchor(), K_HEAD)
     data = encode_answer(INFO, seen, info={"contacts": 2.0}, origin=origin)
     answer = decode_answer(data, max_bytes=10**6)
     assert answer.rollout == INFO
@@ -192,7 +190,7 @@ def test_starts_come_back():
             lambda: encode_answer(
                 INFO.model_copy(update={"next_chunk": 0, "last_step": 0}),
                 dataclasses.replace(golden_observation().last(), first_step=0),
-                origin=Origin(anchor(), K_HEAD),
+                origin=RolloutOrigin(anchor(), K_HEAD),
             ),
         ),
         (

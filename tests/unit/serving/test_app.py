@@ -12,12 +12,18 @@ from httpx import ASGITransport, AsyncClient
 from pydantic import BaseModel, SecretStr
 
 from dextouch import __version__, errors
-from dextouch.schemas.problems import Problem, error_from_problem
-from dextouch.serving.access import RequireScope
-from dextouch.serving.app import create_service_app
-from dextouch.serving.bodies import AS_SET, JSON, OCTETS, takes
-from dextouch.serving.middleware import timed
-from dextouch.serving.settings import ApiKey, ServiceSettings
+from dextouch.schemas import Problem, error_from_problem
+from dextouch.serving import (
+    AS_SET,
+    JSON,
+    OCTETS,
+    RequireScope,
+    ServiceSettings,
+    create_service_app,
+    takes,
+    timed,
+)
+from dextouch.serving.settings import ApiKey
 
 CASES = [
     (errors.PacketError("bad"), 400),

@@ -6,7 +6,7 @@ import logging
 import pytest
 import structlog
 
-from dextouch.serving.logs import configure_logging
+from dextouch.serving import configure_logging
 
 
 @pytest.fixture

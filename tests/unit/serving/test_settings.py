@@ -7,7 +7,8 @@ import pytest
 from pydantic import BaseModel, ValidationError
 
 from dextouch.errors import InvalidInputError
-from dextouch.serving.settings import ServiceSettings, is_loopback, load_settings, service_config
+from dextouch.serving import ServiceSettings, load_settings, service_config
+from dextouch.serving.settings import is_loopback
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from dextouch.streams.samples import Sample, SampleBatch, encoded_values
+from dextouch.streams import Sample, SampleBatch, encoded_values
 
 VALUES = {
     "counts": np.arange(360, dtype="<u2"),

@@ -8,10 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dextouch.errors import InvalidInputError, LimitExceededError, PacketError
-from dextouch.streams import wire
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.packing import pack
-from dextouch.streams.samples import SampleBatch, encoded_values
+from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values, pack, wire
 
 GOLDEN = Path(__file__).parents[2] / "golden"
 POSE = StreamDescriptor(

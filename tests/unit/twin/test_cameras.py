@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.geometry.cameras import project
-from dextouch.geometry.transforms import apply, invert
+from dextouch.geometry import apply, invert, project
 from services.twin.cameras import CAMERAS, HEAD_HOME, CameraRig
 from services.twin.scene import compile_scene
 from services.twin.simulation import Command, Simulation

@@ -8,8 +8,7 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
-from dextouch.geometry.interpolation import interpolate_poses
-from dextouch.geometry.transforms import pose_from_transform, transform_from_pose
+from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.hands.actions import IDENTITY_POSE_9D
 from services.twin import __main__ as command_line
 from services.twin.episodes import record, write_episode

@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 
+from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.hands.skeleton import NODE_INDEX
 from dextouch.tactile.layout import FINGERS
 from services.twin.hands import DOMAINS, HumanHand, twin_hand
 from services.twin.scene import compile_scene

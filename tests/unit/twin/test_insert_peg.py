@@ -6,8 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from dextouch.geometry.cameras import project
-from dextouch.geometry.transforms import apply, invert, transform_from_pose
+from dextouch.geometry import apply, invert, project, transform_from_pose
 from services.twin.bounding_boxes import object_boxes_m
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.settings import TwinSettings

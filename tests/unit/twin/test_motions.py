@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.transforms import apply
+from dextouch.geometry import apply
 from services.twin import __main__ as command_line
 from services.twin.episodes import record
 from services.twin.hands import twin_hand

@@ -4,9 +4,8 @@ import mujoco
 import numpy as np
 import pytest
 
-from dextouch.geometry.cameras import project
-from dextouch.geometry.transforms import apply, invert
-from dextouch.worlds.world import RolloutStart
+from dextouch.geometry import apply, invert, project
+from dextouch.schemas import RolloutStart
 from services.twin.cameras import HEAD_HOME
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.worlds.world import ReturnSelector, RolloutStart
+from dextouch.schemas import ReturnSelector, RolloutStart
 from services.twin.cameras import CameraRig
 from services.twin.episodes import TakeOptions, record
 from services.twin.settings import TwinSettings

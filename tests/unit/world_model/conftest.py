@@ -9,12 +9,11 @@ import pytest
 import torch
 
 from dextouch.episodes import EpisodeStore
-from dextouch.geometry.cameras import pinhole_matrix, project
+from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import apply, invert, transform
 from dextouch.hands.actions import HandTrajectory, actions_from_poses
-from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
+from dextouch.streams import StreamDescriptor
 from services.world_model.checkpoints import (
     CheckpointMetadata,
     read_checkpoint,

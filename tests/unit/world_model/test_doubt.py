@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.worlds.world import ReturnSelector
+from dextouch.schemas import ReturnSelector
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.state_checkpoints import StateBounds

@@ -8,8 +8,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from dextouch.errors import InvalidInputError, NonFiniteError
-from dextouch.geometry.cameras import pinhole_matrix, project
-from dextouch.geometry.transforms import apply, invert, transform
+from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore, SceneStart

@@ -14,7 +14,7 @@ from dextouch.errors import (
     ShapeError,
     UnknownNameError,
 )
-from dextouch.geometry.transforms import transform
+from dextouch.geometry import transform
 from dextouch.hands.actions import AnchorPoses
 from dextouch.hands.robot_hand import RobotHand
 from services.world_model.network.conditioning import SceneEncoder

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.worlds.world import ReturnSelector
+from dextouch.schemas import ReturnSelector
 from services.world_model.dynamics.stillness import REST_LATENTS, stillness
 from services.world_model.state_world import StateWorld
 from tests.contracts.test_world import from_observation, untrained_state_checkpoint

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from httpx import ASGITransport, AsyncClient
 
-from dextouch.schemas.rollout_codec import decode_answer, encode_start
-from dextouch.schemas.rollouts import StartRequest
-from dextouch.worlds.serve import create_world_app
+from dextouch.schemas import StartRequest, decode_answer, encode_start
+from dextouch.worlds import create_world_app
 from services.world_model.settings import WorldModelSettings
 from services.world_model.world import ModelWorld
 from tests.unit.world_model.test_world import make_start

@@ -10,8 +10,7 @@ import torch
 from pydantic_settings import CliApp
 
 from dextouch.errors import InvalidInputError
-from dextouch.geometry.cameras import pinhole_matrix, project
-from dextouch.geometry.transforms import apply, invert, transform
+from dextouch.geometry import apply, invert, pinhole_matrix, project, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.core import RecurrentCore

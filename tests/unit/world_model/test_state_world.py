@@ -8,7 +8,7 @@ import torch
 
 from dextouch.errors import EndedError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.streams.packing import pack, unpack
+from dextouch.streams import pack, unpack
 from services.world_model.state_world import ABSENT_POSE, StateWorld
 from tests.contracts.test_world import from_observation, hold, move, untrained_state_checkpoint
 

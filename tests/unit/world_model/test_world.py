@@ -14,7 +14,8 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.worlds.world import BatchWorld, Observation, ReturnSelector, RolloutStart, World
+from dextouch.schemas import Observation, ReturnSelector, RolloutStart
+from dextouch.worlds import BatchWorld, World
 from services.world_model import world as world_module
 from services.world_model.network.inputs import build_inputs
 from services.world_model.training.dataset import cut_window

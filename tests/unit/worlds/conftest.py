@@ -2,7 +2,7 @@
 
 import pytest
 
-from dextouch.serving.state import open_state
+from dextouch.serving import open_state
 from tests.contracts.redis_server import running_redis
 
 

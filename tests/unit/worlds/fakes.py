@@ -6,16 +6,9 @@ import numpy as np
 
 from dextouch.errors import EndedError, InvalidInputError
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses, check_actions
-from dextouch.streams.packing import pack, unpack
-from dextouch.worlds.world import (
-    EVERYTHING,
-    Observation,
-    ReturnSelector,
-    RolloutStart,
-    StartedRollout,
-    SteppedRollout,
-    WorldDescription,
-)
+from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
+from dextouch.streams import pack, unpack
+from dextouch.worlds import StartedRollout, SteppedRollout
 
 CAMERAS = ("camera_head", "camera_wrist_left")
 SIZE_PX = 8

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableError
+from dextouch.schemas import EVERYTHING, ReturnSelector
 from dextouch.worlds.batcher import StepJob, WorldWorker
-from dextouch.worlds.world import EVERYTHING, ReturnSelector
 from tests.unit.worlds.fakes import BatchSumWorld, SumState, SumWorld, actions
 
 

@@ -18,8 +18,7 @@ from dextouch.errors import (
     UnavailableError,
     UnknownNameError,
 )
-from dextouch.schemas.rollout_codec import decode_answer
-from dextouch.schemas.rollouts import MAX_SEED, ReturnSelector, RolloutStart
+from dextouch.schemas import MAX_SEED, ReturnSelector, RolloutStart, decode_answer
 from dextouch.serving.state import MemoryState
 from dextouch.worlds.rollouts import RolloutLimits, RolloutService, chunk_seed
 from tests.unit.worlds.fakes import (

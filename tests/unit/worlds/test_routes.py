@@ -12,12 +12,16 @@ from httpx import ASGITransport, AsyncClient
 from hypothesis import HealthCheck, given, settings
 from pydantic import SecretStr
 
-from dextouch.schemas.problems import Problem
-from dextouch.schemas.rollout_codec import decode_answer, encode_start
-from dextouch.schemas.rollouts import RolloutInfo, RolloutStart, StartRequest
+from dextouch.schemas import (
+    Problem,
+    RolloutInfo,
+    RolloutStart,
+    StartRequest,
+    decode_answer,
+    encode_start,
+)
 from dextouch.serving.settings import ApiKey
-from dextouch.worlds.baseline import CopyFirstWorld
-from dextouch.worlds.serve import WorldServiceSettings, create_world_app
+from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, SumWorld, actions, anchor, observation
 
 MSGPACK = {"content-type": "application/msgpack"}

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS
+from dextouch.hands import NODES, NUM_KEYPOINTS
 from services.acquisition.devices.finger_tracker import driver as finger_tracker
 from services.acquisition.devices.pose_tracker import packets as pose_tracker
 from services.acquisition.devices.tactile_glove import packets as tactile_glove

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.errors import DeviceError
-from dextouch.streams.samples import NO_DEVICE_TIME
+from dextouch.streams import NO_DEVICE_TIME
 from services.acquisition.devices.station_camera.settings import StationCameraSettings
 from services.acquisition.devices.station_camera.stamps import MAX_AHEAD_NS
 from tests.vm.guest import kernel_devices

@@ -6,10 +6,14 @@ import numpy as np
 
 from dextouch.episodes.format import GOP_IMAGES
 from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError
-from dextouch.images.jpeg import decode_jpeg, jpeg_size
-from dextouch.streams.checks import check_encoded_image
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample, encoded_values
+from dextouch.images import decode_jpeg, jpeg_size
+from dextouch.streams import (
+    ClockCapabilities,
+    Sample,
+    StreamDescriptor,
+    check_encoded_image,
+    encoded_values,
+)
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings, check_packet
 from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups

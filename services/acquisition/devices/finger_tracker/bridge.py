@@ -4,8 +4,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from dextouch.errors import DeviceError, PacketError
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.devices.finger_tracker.driver import MAGIC as FINGER_MAGIC
 from services.acquisition.devices.finger_tracker.driver import PAYLOAD_BYTES as FINGER_BYTES

@@ -8,10 +8,8 @@ import numpy as np
 from jaxtyping import Float32, Int64
 
 from dextouch.errors import DeviceError, InvalidInputError, PacketError
-from dextouch.hands.node_order import NO_KEYPOINT, node_order
-from dextouch.hands.skeleton import CHAINS, FINGER_JOINTS, NUM_KEYPOINTS, WRIST
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.hands import CHAINS, FINGER_JOINTS, NO_KEYPOINT, NUM_KEYPOINTS, WRIST, node_order
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings, check_packet

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.hands.skeleton import NODES, NUM_KEYPOINTS, chain_indices
+from dextouch.hands import NODES, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import Side
 from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.driver import (

@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from dextouch.errors import DeviceError, InvalidInputError
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.drivers.base import CellLayout, Readings, hand_name
 from services.acquisition.drivers.frames import DecoderStatistics, PortionedSearch

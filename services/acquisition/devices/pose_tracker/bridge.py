@@ -5,8 +5,7 @@ import struct
 from enum import IntEnum
 
 from dextouch.errors import PacketError
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.drivers.base import Readings, check_packet
 from services.acquisition.drivers.bridge_protocol import BridgeConnection, FreshnessGate
 from services.acquisition.drivers.packets import DecoderStatistics, Packet, PacketDecoder

@@ -3,8 +3,7 @@
 import math
 import struct
 
-from dextouch.streams.descriptors import StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.drivers.base import Readings, check_packet
 from services.acquisition.drivers.packets import DecoderStatistics, Packet, PacketDecoder
 from services.acquisition.drivers.reports import ReportReassembler

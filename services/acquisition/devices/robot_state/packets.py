@@ -7,8 +7,7 @@ from typing import Literal
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor, StreamKind
-from dextouch.streams.samples import Sample
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor, StreamKind
 from services.acquisition.drivers.base import Readings, check_packet
 from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
 

@@ -8,9 +8,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from dextouch.errors import DeviceError
-from dextouch.schemas.episodes import Matrix
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import NO_DEVICE_TIME
+from dextouch.schemas import Matrix
+from dextouch.streams import NO_DEVICE_TIME, ClockCapabilities, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.station_camera.capture import (
     NS_PER_MS,

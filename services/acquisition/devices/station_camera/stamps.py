@@ -1,7 +1,7 @@
 """Judgement of the stamps of a camera's kernel driver: which are times, which images are new."""
 
 from dextouch.errors import DeviceError
-from dextouch.streams.samples import NO_DEVICE_TIME, NO_SEQUENCE
+from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE
 from services.acquisition.drivers.packets import DecoderStatistics
 
 # How old the first image's stamp may be to be one of this host's clock; later ones may have waited.

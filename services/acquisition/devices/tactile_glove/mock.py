@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 
 from dextouch.errors import ShapeError
-from dextouch.schemas.episodes import Matrix, matrix_rows
+from dextouch.schemas import Matrix, matrix_rows
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.tactile_glove.driver import TactileGlove

@@ -4,8 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from dextouch.streams.descriptors import ClockCapabilities, StreamDescriptor
-from dextouch.streams.samples import Sample
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
 from services.acquisition.devices.tactile_glove.commands import MAX_REPLY, MIN_REPLY, REPLY_MAGIC
 from services.acquisition.drivers.base import Readings, check_packet, hand_name

@@ -18,13 +18,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.files import disk_errors
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
-from dextouch.schemas.episodes import (
-    Domain,
-    EpisodeAttributes,
-    LineageEntry,
-    Matrix,
-    StoredAnchor,
-)
+from dextouch.schemas import Domain, EpisodeAttributes, LineageEntry, Matrix, StoredAnchor
 
 
 @dataclass(frozen=True)

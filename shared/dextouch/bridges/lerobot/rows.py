@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float32, Int64, UInt8
 from dextouch.episodes import EpisodeReader
 from dextouch.episodes.window import mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, NotFoundError
-from dextouch.geometry.interpolation import bracket, interpolate_linear, interpolate_poses
+from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
 from dextouch.hands.actions import (
     ACTION_DIM,
     AnchorPoses,
@@ -18,8 +18,8 @@ from dextouch.hands.actions import (
     actions_from_poses,
     poses_from_actions,
 )
-from dextouch.images.jpeg import decode_jpeg
-from dextouch.schemas.rollouts import ActionKind
+from dextouch.images import decode_jpeg
+from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
 Grid = Literal["model", "camera", "uniform"]

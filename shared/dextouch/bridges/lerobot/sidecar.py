@@ -10,8 +10,7 @@ from dextouch.bridges.lerobot.layout import SIDECAR_PATH, confined, fill_path
 from dextouch.bridges.lerobot.rows import Grid
 from dextouch.episodes.files import disk_errors
 from dextouch.errors import CorruptDataError
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.rollouts import ActionKind
+from dextouch.schemas import ActionKind, EpisodeAttributes
 
 MAX_SIDECAR_BYTES: Final = 1 << 22
 

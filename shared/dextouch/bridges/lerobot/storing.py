@@ -13,9 +13,8 @@ from dextouch.bridges.lerobot.rows import BLOCK_IMAGES
 from dextouch.bridges.lerobot.video_reader import read_images, read_units
 from dextouch.episodes import EpisodeStore, EpisodeWriter
 from dextouch.episodes.format import GOP_IMAGES
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.streams.descriptors import StreamDescriptor, StreamKind
-from dextouch.streams.samples import encoded_values
+from dextouch.schemas import EpisodeAttributes
+from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
 from dextouch.tactile.layout import SIDES
 
 ImageUnit = Literal["h264", "jpeg", "rgb8"]

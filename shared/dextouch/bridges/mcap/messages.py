@@ -24,7 +24,7 @@ from dextouch.bridges.mcap.schemas import (
     raw_encoding,
 )
 from dextouch.errors import CorruptDataError
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 
 _NS_PER_S = 1_000_000_000
 

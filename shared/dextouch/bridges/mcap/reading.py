@@ -15,8 +15,7 @@ from dextouch.bridges.mcap.records import records
 from dextouch.bridges.mcap.writing import ABOUT, ATTRIBUTES_FILE, BRIDGE_VERSION, COUNTS
 from dextouch.episodes import EpisodeStore, EpisodeWriter, WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
-from dextouch.schemas.episodes import EpisodeAttributes
-from dextouch.schemas.recordings import RecordingAttributes
+from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 MAX_ATTRIBUTES_BYTES: Final = 1 << 24
 _BLOCK_BYTES: Final = 1 << 24

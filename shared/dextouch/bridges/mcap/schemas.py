@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 
 from dextouch.bridges.mcap.protobuf import Field, Table
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.streams import StreamDescriptor
 
 T_DEVICE: Final = "dextouch_t_device_ns"
 SEQUENCE: Final = "dextouch_sequence"

@@ -17,9 +17,9 @@ from dextouch.bridges.mcap.schemas import CALIBRATION, TABLE, raw_encoding
 from dextouch.bridges.new_file import new_file
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
-from dextouch.images.jpeg import encode_jpeg
-from dextouch.schemas.episodes import json_ready
-from dextouch.streams.descriptors import StreamDescriptor
+from dextouch.images import encode_jpeg
+from dextouch.schemas import json_ready
+from dextouch.streams import StreamDescriptor
 
 PROFILE: Final = "dextouch"
 BRIDGE_VERSION: Final = "1"

@@ -21,10 +21,10 @@ from dextouch.bridges.umi.layout import (
 from dextouch.bridges.umi.zarr_zip import ZarrZipReader
 from dextouch.episodes import EpisodeStore, EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, StorageError
-from dextouch.geometry.transforms import pose_from_transform
+from dextouch.geometry import pose_from_transform
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
-from dextouch.schemas.episodes import EpisodeAttributes, LineageEntry
-from dextouch.streams.descriptors import StreamDescriptor, StreamKind
+from dextouch.schemas import EpisodeAttributes, LineageEntry
+from dextouch.streams import StreamDescriptor, StreamKind
 
 MAX_EPISODES: Final = 1_000_000
 MAX_STEPS: Final = 100_000

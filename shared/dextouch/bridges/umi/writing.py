@@ -24,7 +24,7 @@ from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import vector_from_rotation
 from dextouch.hands.actions import HandTrajectory, poses_from_actions
-from dextouch.schemas.episodes import json_ready
+from dextouch.schemas import json_ready
 
 BLOCK_STEPS = 32
 

@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.geometry import apply, invert, transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from dextouch.geometry.transforms import apply, invert, transform
 from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion, Vector3
 from dextouch.hands.hand_files.mapping import FingerMapping, TipMapping
 from dextouch.hands.hand_files.model_file import Joint, Link, ModelFile

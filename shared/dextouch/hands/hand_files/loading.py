@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.geometry.transforms import invert, transform
+from dextouch.geometry import invert, transform
 from dextouch.hands.finger_table import FingerTable
 from dextouch.hands.hand_files.chains import finger_table, fixed_links
 from dextouch.hands.hand_files.elements import Element, read_elements

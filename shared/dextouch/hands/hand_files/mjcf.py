@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from dextouch.geometry.transforms import apply
+from dextouch.geometry import apply
 from dextouch.hands.finger_table import Vector3
 from dextouch.hands.hand_files.elements import Element
 from dextouch.hands.hand_files.mjcf_settings import MAIN_CLASS, MjcfSettings

@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 
 from dextouch.errors import UnknownNameError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands.hand_files.elements import Element
 
 MAIN_CLASS: Final = "main"

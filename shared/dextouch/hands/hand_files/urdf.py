@@ -7,8 +7,8 @@ from typing import Final
 
 import numpy as np
 
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from dextouch.hands.finger_table import Vector3
 from dextouch.hands.hand_files.elements import Element
 from dextouch.hands.hand_files.model_file import Joint, Link

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dextouch.geometry.transforms import transform
+from dextouch.geometry import transform
 from services.world_model.rendering.clips import SceneClip
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.inputs import Scenes

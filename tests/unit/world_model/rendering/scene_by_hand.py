@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dextouch.geometry.cameras import pinhole_matrix
+from dextouch.geometry import pinhole_matrix, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from services.world_model.rendering.scene_states import SceneState
 
 # Looks straight down: x of the image is x of the world, y of the image is -y.

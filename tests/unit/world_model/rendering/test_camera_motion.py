@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from dextouch.geometry.cameras import project
+from dextouch.geometry import apply, invert, project, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import apply, invert, transform
 from services.world_model.rendering.camera_motion import CameraMotion, is_inside, sample_images
 from tests.unit.world_model.rendering.scene_by_hand import DOWN, K
 

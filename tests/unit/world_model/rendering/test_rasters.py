@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from dextouch.geometry.transforms import transform
 from services.world_model.rendering.box_raster import (
     BoxHits,
     cast_boxes,

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
+from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
-from dextouch.geometry.transforms import transform
 from services.world_model.rendering.camera_motion import CameraMotion, sample_images
 from services.world_model.rendering.configuration import RendererConfig
 from services.world_model.rendering.network import RendererNetwork
