@@ -30,4 +30,6 @@ autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
 autodoc_default_options = {"members": True}
 # Packages of the extras export, s3 and rerun, which the site does without.
-autodoc_mock_imports = ["mcap", "obstore", "pyarrow", "rerun"]
+autodoc_mock_imports = [
+    "foxglove_schemas_protobuf", "google", "mcap", "obstore", "pyarrow", "rerun",
+]  # fmt: skip

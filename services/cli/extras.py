@@ -32,6 +32,7 @@ EXTRA_OF = {
     "gymnasium": "gym",
     "pyarrow": "export",
     "mcap": "export",
+    "foxglove_schemas_protobuf": "export",
     "numcodecs": "export",
     "rerun": "rerun",
     "obstore": "s3",

@@ -1,16 +1,31 @@
-"""Protobuf message types of the streams in MCAP.
+"""Protobuf messages of the streams in MCAP: Foxglove's for images and poses, arrays for the rest.
 
-Images and poses use the public Foxglove messages (https://docs.foxglove.dev/docs/sdk/schemas),
-everything else an array message of our own. Fields 1001 and 1002 are our extension of every
-message: the device stamp and counter of a recorded sample, for which MCAP's own fields are too
-narrow.
+Every message has two more fields than its public schema (https://docs.foxglove.dev/docs/sdk/schemas):
+the device stamp and counter of a recorded sample, for which MCAP's own fields are too narrow.
 """
 
-from typing import Final
+from functools import cache
+from typing import Any, Final
 
 import numpy as np
+from foxglove_schemas_protobuf import (
+    CameraCalibration_pb2,
+    CompressedImage_pb2,
+    CompressedVideo_pb2,
+    FrameTransform_pb2,
+    PosesInFrame_pb2,
+    RawImage_pb2,
+)
+from google.protobuf.descriptor import FileDescriptor
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+from google.protobuf.descriptor_pool import DescriptorPool
+from google.protobuf.message_factory import GetMessageClass
 
-from dextouch.bridges.mcap.protobuf import Field, Table
 from dextouch.streams import StreamDescriptor
 
 T_DEVICE: Final = "dextouch_t_device_ns"
@@ -21,86 +36,21 @@ COMPRESSED_VIDEO: Final = "foxglove.CompressedVideo"
 RAW_IMAGE: Final = "foxglove.RawImage"
 FRAME_TRANSFORM: Final = "foxglove.FrameTransform"
 POSES_IN_FRAME: Final = "foxglove.PosesInFrame"
-# The message and wire type of each dtype; all are packed, so that a row is copied verbatim.
+# The message, element type and dtype on the wire for each dtype of a stream.
 ARRAYS: Final = {
-    "float32": ("dextouch.Float32Array", "float"),
-    "float64": ("dextouch.Float64Array", "double"),
-    "int64": ("dextouch.Int64Array", "sfixed64"),
-    "uint16": ("dextouch.UInt16Array", "fixed32"),
-    "uint8": ("dextouch.UInt8Array", "fixed32"),
+    "float32": ("dextouch.Float32Array", "float", "<f4"),
+    "float64": ("dextouch.Float64Array", "double", "<f8"),
+    "int64": ("dextouch.Int64Array", "sfixed64", "<i8"),
+    "uint16": ("dextouch.UInt16Array", "fixed32", "<u4"),
+    "uint8": ("dextouch.UInt8Array", "fixed32", "<u4"),
 }
+# Any of ARRAYS with `values` as raw bytes. A packed repeated field has the same encoding, so a row
+# is copied verbatim: the lists of the typed messages lose the payload of a NaN and are slow.
+PACKED_ARRAY: Final = "dextouch.PackedArray"
 RAW_ENCODINGS: Final = {("uint8", 3): "rgb8", ("uint8", 2): "mono8", ("uint16", 2): "mono16"}
 
-_TIME = Field(1, "timestamp", "google.protobuf.Timestamp")
-_OURS = (Field(1001, T_DEVICE, "sfixed64"), Field(1002, SEQUENCE, "sfixed64"))
-
-
-def _array(kind: str) -> tuple[Field, ...]:
-    return (
-        _TIME,
-        Field(2, "frame_id", "string"),
-        Field(3, "shape", "fixed32", repeated=True),
-        Field(4, "values", kind, repeated=True),
-        *_OURS,
-    )
-
-
-TABLE: Final[Table] = {
-    "google.protobuf.Timestamp": (Field(1, "seconds", "int64"), Field(2, "nanos", "int32")),
-    "foxglove.Vector3": tuple(Field(n, axis, "double") for n, axis in enumerate("xyz", 1)),
-    "foxglove.Quaternion": tuple(Field(n, axis, "double") for n, axis in enumerate("xyzw", 1)),
-    "foxglove.Pose": (
-        Field(1, "position", "foxglove.Vector3"),
-        Field(2, "orientation", "foxglove.Quaternion"),
-    ),
-    FRAME_TRANSFORM: (
-        _TIME,
-        Field(2, "parent_frame_id", "string"),
-        Field(3, "child_frame_id", "string"),
-        Field(4, "translation", "foxglove.Vector3"),
-        Field(5, "rotation", "foxglove.Quaternion"),
-        *_OURS,
-    ),
-    POSES_IN_FRAME: (
-        _TIME,
-        Field(2, "frame_id", "string"),
-        Field(3, "poses", "foxglove.Pose", repeated=True),
-        *_OURS,
-    ),
-    COMPRESSED_IMAGE: (
-        _TIME,
-        Field(4, "frame_id", "string"),
-        Field(2, "data", "bytes"),
-        Field(3, "format", "string"),
-        *_OURS,
-    ),
-    COMPRESSED_VIDEO: (
-        _TIME,
-        Field(2, "frame_id", "string"),
-        Field(3, "data", "bytes"),
-        Field(4, "format", "string"),
-        *_OURS,
-    ),
-    RAW_IMAGE: (
-        _TIME,
-        Field(7, "frame_id", "string"),
-        Field(2, "width", "fixed32"),
-        Field(3, "height", "fixed32"),
-        Field(4, "encoding", "string"),
-        Field(5, "step", "fixed32"),
-        Field(6, "data", "bytes"),
-        *_OURS,
-    ),
-    CALIBRATION: (
-        _TIME,
-        Field(9, "frame_id", "string"),
-        Field(2, "width", "fixed32"),
-        Field(3, "height", "fixed32"),
-        Field(4, "distortion_model", "string"),
-        *(Field(n, name, "double", repeated=True) for n, name in enumerate("DKRP", 5)),
-    ),
-    **{message: _array(kind) for message, kind in ARRAYS.values()},
-}
+_TIMESTAMP_FILE = "google/protobuf/timestamp.proto"
+_ONE, _MANY = FieldDescriptorProto.LABEL_OPTIONAL, FieldDescriptorProto.LABEL_REPEATED
 
 
 def message_of(descriptor: StreamDescriptor) -> str:
@@ -138,3 +88,90 @@ def parent_of(descriptor: StreamDescriptor) -> str:
 def num_elements(descriptor: StreamDescriptor) -> int:
     """Number of elements of one sample."""
     return int(np.prod(descriptor.shape, dtype=np.int64))
+
+
+def new_message(name: str) -> Any:  # noqa: ANN401 - protobuf makes its fields at run time
+    """An empty message of a full name."""
+    return GetMessageClass(_pool().FindMessageTypeByName(name))()
+
+
+def descriptor_set(name: str) -> bytes:
+    """A serialized `FileDescriptorSet` of one message and all that it needs, dependencies first."""
+    needed: dict[str, FileDescriptorProto] = {}
+
+    def add(file: str) -> None:
+        for dependency in _files()[file].dependency:
+            add(dependency)
+        needed[file] = _files()[file]
+
+    add(_pool().FindFileContainingSymbol(name).name)
+    return FileDescriptorSet(file=needed.values()).SerializeToString()
+
+
+@cache
+def _pool() -> Any:  # noqa: ANN401 - not an instance of the class that makes it
+    """A pool beside the default one, whose messages of the same names lack our fields."""
+    pool = DescriptorPool()
+    for file in _files().values():
+        pool.Add(file)
+    return pool
+
+
+@cache
+def _files() -> dict[str, FileDescriptorProto]:
+    """All files by name, dependencies first."""
+    files: dict[str, FileDescriptorProto] = {}
+
+    def add(file: FileDescriptor) -> None:
+        for dependency in file.dependencies:
+            add(dependency)
+        if file.name not in files:
+            file.CopyToProto(files.setdefault(file.name, FileDescriptorProto()))
+
+    add(CameraCalibration_pb2.DESCRIPTOR)
+    for module in (
+        CompressedImage_pb2,
+        CompressedVideo_pb2,
+        FrameTransform_pb2,
+        PosesInFrame_pb2,
+        RawImage_pb2,
+    ):
+        add(module.DESCRIPTOR)
+        _add_device_fields(files[module.DESCRIPTOR.name].message_type[0])
+    for message, element, _ in ARRAYS.values():
+        files[message] = _array_file(message, element, repeated=True)
+    files[PACKED_ARRAY] = _array_file(PACKED_ARRAY, "bytes", repeated=False)
+    return {file.name: file for file in files.values()}
+
+
+def _add_device_fields(message: DescriptorProto) -> None:
+    for number, name in ((1001, T_DEVICE), (1002, SEQUENCE)):
+        message.field.add(name=name, number=number, label=_ONE, type=_type("sfixed64"))
+
+
+def _array_file(name: str, element: str, *, repeated: bool) -> FileDescriptorProto:
+    package, short = name.split(".")
+    file = FileDescriptorProto(
+        name=f"{package}/{short}.proto",
+        package=package,
+        dependency=[_TIMESTAMP_FILE],
+        syntax="proto3",
+    )
+    message = file.message_type.add(name=short)
+    message.field.add(
+        name="timestamp",
+        number=1,
+        label=_ONE,
+        type=_type("message"),
+        type_name=".google.protobuf.Timestamp",
+    )
+    message.field.add(name="frame_id", number=2, label=_ONE, type=_type("string"))
+    message.field.add(name="shape", number=3, label=_MANY, type=_type("fixed32"))
+    values = message.field.add(name="values", number=4, type=_type(element))
+    values.label = _MANY if repeated else _ONE
+    _add_device_fields(message)
+    return file
+
+
+def _type(name: str) -> FieldDescriptorProto.Type.ValueType:
+    return FieldDescriptorProto.Type.Value(f"TYPE_{name.upper()}")

@@ -12,8 +12,7 @@ from mcap.writer import CompressionType, Writer
 from dextouch import __version__
 from dextouch.bridges.blocks import Reader, blocks, is_encoded
 from dextouch.bridges.mcap.messages import MessageCodec, Sent, calibration_message
-from dextouch.bridges.mcap.protobuf import descriptor_set
-from dextouch.bridges.mcap.schemas import CALIBRATION, TABLE, raw_encoding
+from dextouch.bridges.mcap.schemas import CALIBRATION, descriptor_set, raw_encoding
 from dextouch.bridges.new_file import new_file
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
@@ -149,7 +148,7 @@ class _Export:
     def _channel(self, topic: str, message: str, metadata: dict[str, str]) -> int:
         if message not in self._schema_ids:
             self._schema_ids[message] = self._writer.register_schema(
-                name=message, encoding="protobuf", data=descriptor_set(TABLE, message)
+                name=message, encoding="protobuf", data=descriptor_set(message)
             )
         return self._writer.register_channel(
             topic=topic,
