@@ -11,7 +11,6 @@ EXTRA_OF = {
     "serial": "station",
     "fastcrc": "station",
     "hid": "station",
-    "usb": "station",
     "cv2": "station",
     "fastapi": "serve",
     "uvicorn": "serve",
