@@ -5,7 +5,7 @@ polling, keep their order, and some are lost. The truth is known, so that every 
 scored.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int64
@@ -57,10 +57,6 @@ class Scene:
     late_path_ms: float = 0.0
     wrong_stamps: float = 0.0
     tick_ns: int = 1
-
-    def without_drops(self) -> "Scene":
-        """The same path without loss."""
-        return replace(self, drops=0.0)
 
 
 @dataclass(frozen=True)

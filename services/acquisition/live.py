@@ -80,10 +80,6 @@ class LiveView:
             select_taxels(sigma_counts.astype(np.float64), side=side),
         )
 
-    def tactile_streams(self) -> list[str]:
-        """Names of the gloves' streams whose calibration makes pressures of their readings."""
-        return sorted(self._gloves)
-
     def pressures_kpa(self, now_ns: int) -> dict[str, Float32[np.ndarray, "320"]]:
         """Newest pressures by stream, of gloves heard within the last 0.5 s; never older ones.
 

@@ -11,7 +11,7 @@ from jaxtyping import Float32, UInt8
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Observation
-from services.evaluation.demonstrations import CAMERA, Demonstration
+from services.evaluation.demonstrations import CAMERA
 from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import start_digest
 
@@ -121,28 +121,6 @@ class EndingEpisode:
             return None
         now_s = (step + 0.5) * self.step_s
         return [times.get(name, np.inf) <= now_s for name in milestones]
-
-    @classmethod
-    def of(cls, item: Demonstration) -> "EndingEpisode":
-        """Endings of an episode in memory."""
-        last = item.num_steps - 1
-        steps = {last, last - 1, *EARLY_ENDS, *MIDDLE_ENDS} & set(range(2, item.num_steps))
-        return cls(
-            item.episode_id,
-            item.task,
-            item.instruction,
-            item.seed,
-            item.success,
-            item.start_digest,
-            last,
-            {step: final_ending(item, step) for step in sorted(steps)},
-        )
-
-
-def final_ending(item: Demonstration, end: int) -> Ending:
-    """The three steps of an episode up to and including step `end`."""
-    steps = slice(end - NUM_SEEN_STEPS + 1, end + 1)
-    return Ending(item.images[steps], item.tactile_kpa[steps], item.task)
 
 
 def read_ending_episode(reader: EpisodeReader) -> EndingEpisode:

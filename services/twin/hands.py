@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import UnknownNameError
-from dextouch.geometry import apply
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import RobotHand
-from dextouch.tactile.layout import FINGERS, PALM_PITCH_M, PALM_SHAPE, Side
+from dextouch.tactile.layout import PALM_PITCH_M, PALM_SHAPE, Side
 from services.twin.human_hand import METACARPAL_BASES_M, human_fingers
 
 Domain = Literal["robot", "human"]
@@ -125,14 +124,6 @@ class TwinHand:
         points[..., 1] = self.palm_sign * skin * reach[:, None] * np.cos(around)
         points[..., 2] = along[:, None]
         return points
-
-    def skin_wrist_m(self, joints_rad: np.ndarray) -> Float64[np.ndarray, "time 5 4 4 3"]:
-        """Fingertip taxel centres in wrist coordinates for joint angles [T, 20]."""
-        frames = self.kinematics.joint_frames(joints_rad)[:, :, 3]
-        local = np.stack([self.tip_skin_m(index).reshape(16, 3) for index in range(len(FINGERS))])
-        return apply(frames, np.broadcast_to(local, (len(frames), *local.shape))).reshape(
-            len(frames), len(FINGERS), 4, 4, 3
-        )
 
 
 @lru_cache(maxsize=4)

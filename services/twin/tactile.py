@@ -69,13 +69,6 @@ class TactileReader:
         self._pads.append(pad)
         return pad
 
-    def taxel_positions_m(
-        self, data: mujoco.MjData, *, side_index: int
-    ) -> Float64[np.ndarray, "320 3"]:
-        """World positions of the taxels of one hand, in anatomical order."""
-        pads = [pad for pad in self._pads if pad.side_index == side_index]
-        return np.concatenate([self._skin_world_m(data, pad) for pad in pads])
-
     @staticmethod
     def _skin_world_m(data: mujoco.MjData, pad: _Pad) -> Float64[np.ndarray, "taxels 3"]:
         R_world_skin = data.geom_xmat[pad.skin_geom].reshape(3, 3)

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from dextouch.errors import InvalidInputError, UnknownNameError
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
 from services.world_model.weights import half_weights, load_strictly, read_weights, write_weights
@@ -72,24 +71,6 @@ def read_checkpoint(path: Path) -> Checkpoint:
     model = JointWorldModel(metadata.network)
     load_strictly({"": model}, tensors, where=f"checkpoint {path.name}", later=LATER_STATISTICS)
     return Checkpoint(model, metadata, digest)
-
-
-def find_checkpoint(folder: Path, digest: str) -> Path:
-    """Path of the file in `folder` whose SHA-256 is, or begins with, `digest` (at least 8 digits).
-
-    Raises:
-        UnknownNameError: no file matches; the message lists the digests found.
-        InvalidInputError: fewer than eight digits, or the prefix is ambiguous.
-    """
-    if len(digest) < 8:
-        raise InvalidInputError(f"digest: got {digest!r}, expected at least 8 hexadecimal digits")
-    digests = list_checkpoints(folder)
-    found = [path for path, known in digests.items() if known.startswith(digest.lower())]
-    if not found:
-        raise UnknownNameError("checkpoint digest", digest, [d[:12] for d in digests.values()])
-    if len({digests[path] for path in found}) > 1:
-        raise InvalidInputError(f"digest {digest!r} fits {len(found)} checkpoints; give more of it")
-    return found[0]
 
 
 def list_checkpoints(folder: Path) -> dict[Path, str]:

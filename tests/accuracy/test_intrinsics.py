@@ -23,7 +23,6 @@ from services.alignment.calibration.intrinsics import (
     Chessboard,
     calibrate_camera,
     calibrate_found,
-    leave_one_out_rms_px,
     unseen_parts,
 )
 from services.cli.simulated import board_scenes as scenes
@@ -124,6 +123,19 @@ def test_real_charuco_board_is_found_but_one_view_is_not_enough():
     found = find_boards([photo], board)
     assert found.pattern == EITHER_CHARUCO
     assert len(found.pixels_px[0]) >= 20
+
+
+def leave_one_out_rms_px(found):
+    """Error of each photo, RMS in pixels, when only the board's pose is fitted to the photo."""
+    left = []
+    for index, (points, pixels) in enumerate(zip(found.points_board, found.pixels_px, strict=True)):
+        others = calibrate_found(found.only([k for k in range(len(found.photos)) if k != index]))
+        camera = others.K, others.distortion
+        _, turn, shift = cv2.solvePnP(points, pixels, *camera)
+        projected, _ = cv2.projectPoints(points, turn, shift, *camera)
+        error = np.asarray(projected, dtype=np.float64).reshape(-1, 2) - pixels
+        left.append(np.sqrt(np.square(error).sum(axis=1).mean()))
+    return np.array(left)
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason="no recordings in ../shared/data")

@@ -10,9 +10,9 @@ from dextouch.episodes import EpisodeStore
 from services.cli.data_mix import LADDER_M, MIXES
 from services.cli.training_data import Scope, make_training_data
 from services.evaluation.demonstrations import read_demonstrations
-from services.evaluation.endings import final_ending
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
+from tests.unit.evaluation.shown_endings import final_ending
 
 pytestmark = pytest.mark.slow
 # Far from the seeds of training and of the checkpoint's own held-out set.

@@ -17,7 +17,7 @@ from services.alignment.calibration.board_detection import (
 from services.alignment.calibration.motion import DegenerateMotionError
 
 __all__ = ["CameraCalibration", "CharucoBoard", "Chessboard", "calibrate_camera"]
-__all__ += ["calibrate_found", "leave_one_out_rms_px", "unseen_parts"]
+__all__ += ["calibrate_found", "unseen_parts"]
 
 MIN_VIEWS = 5
 # Views from one direction alone cannot tell focal length from distance.
@@ -131,32 +131,6 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
         image_size_px=found.image_size_px,
         used_images=found.photos,
     )
-
-
-def leave_one_out_rms_px(found: FoundBoards) -> Float64[np.ndarray, " n"]:
-    """Leave-one-out reprojection error of each photo, RMS in pixels.
-
-    Only the board's pose is fitted to the photo itself; unlike `rms_px` the figure grows where
-    the other photos do not determine the camera.
-
-    Raises:
-        InvalidInputError: too few photos, or a photo without a pose.
-        DegenerateMotionError: without some photo the views do not show the focal length.
-    """
-    import cv2
-
-    left = []
-    for index, photo in enumerate(found.photos):
-        others = calibrate_found(found.only([k for k in range(len(found.photos)) if k != index]))
-        points, pixels = found.points_board[index], found.pixels_px[index]
-        camera = others.K, others.distortion
-        ok, turn, shift = cv2.solvePnP(points, pixels, *camera)
-        if not ok:
-            raise InvalidInputError(f"photo {photo}: no pose of the board fits; leave it out")
-        projected, _ = cv2.projectPoints(points, turn, shift, *camera)
-        error = np.asarray(projected, dtype=np.float64).reshape(-1, 2) - pixels
-        left.append(np.sqrt(np.square(error).sum(axis=1).mean()))
-    return np.array(left)
 
 
 def unseen_parts(

@@ -12,7 +12,6 @@ from dextouch.episodes.spool import read_attributes
 from dextouch.schemas import Matrix
 from services.cli.calibrate.record import Finding, judge, read_matrices
 
-EXIT_MISSING = 1
 # Alignment refuses takes without these, or without those of the recorded gloves.
 NEEDED = ("K_head",)
 _STYLES = {"OK": "green", "WARN": "yellow", "ERROR": "bold red"}

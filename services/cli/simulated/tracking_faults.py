@@ -10,7 +10,6 @@ from numpy.random import Generator
 from dextouch.hands import CHAINS, chain_indices
 from services.cli.simulated.hand_motions import Motion
 
-SAMPLE_RATE_HZ = 60
 DROPOUT_SAMPLES = 60
 # Maximum duration of the other faults, and of the clean samples after each.
 MAX_FAULT_SAMPLES = 8

@@ -58,15 +58,6 @@ class SampleBatch:
             np.stack([s.values for s in samples]),
         )
 
-    def to_samples(self) -> list[Sample]:
-        """Split into single samples (for tests and small batches)."""
-        return [
-            Sample(int(host), value, int(device), int(sequence))
-            for host, device, sequence, value in zip(
-                self.t_host_ns, self.t_device_ns, self.sequence, self.values, strict=True
-            )
-        ]
-
 
 def encoded_values(images: Sequence[bytes]) -> Shaped[np.ndarray, " n"]:
     """Pack encoded images into the `values` of a batch of a `jpeg` or `h264` stream."""

@@ -317,7 +317,7 @@ def test_a_station_starts_with_half_a_calibration_of_a_glove(known):
     decoder = TactileGloveDecoder("left")
     driver = Driver("g", transport=PtyPort("a").transport, decoder=decoder, clock=VirtualClock(1))
     live = LiveView([driver], calibration)
-    assert (live.glove("tactile_left"), live.tactile_streams()) == (None, [])
+    assert (live.glove("tactile_left"), live._gloves) == (None, {})
     (finding,) = CalibrationJudge(driver.descriptors, calibration).judge(0).findings
     assert finding.code == "calibration_missing"
     assert all(f"tactile_left_{name}" not in finding.message for name in known)

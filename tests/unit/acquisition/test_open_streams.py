@@ -93,7 +93,7 @@ def test_a_calibration_of_another_glove_is_refused(small_glove):
         LiveView([small_glove], calibration([0, 1]))
     incomplete = calibration([0] * 320)
     del incomplete["tactile_left_cells"]
-    assert LiveView([small_glove], incomplete).tactile_streams() == []
+    assert LiveView([small_glove], incomplete)._gloves == {}
 
 
 def test_other_places_and_cameras_are_settings():

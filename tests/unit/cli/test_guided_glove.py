@@ -285,6 +285,6 @@ def test_a_station_starts_before_its_gloves_are_calibrated(bench):
     live = LiveView(drivers, {})
     assert live.glove("tactile_left") is None
     tare = {"tactile_left_tare_counts": ((1.0,) * 360,)}
-    assert LiveView(drivers, tare).tactile_streams() == []
+    assert LiveView(drivers, tare)._gloves == {}
     with pytest.raises(NotFoundError, match=r"tactile_left_gain.*got 3 numbers"):
         LiveView(drivers, tare | {"tactile_left_gain_counts_per_kpa": ((1.0,) * 3,)})

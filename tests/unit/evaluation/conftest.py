@@ -3,10 +3,10 @@
 import pytest
 import torch
 
-from services.evaluation.endings import EndingEpisode
 from services.evaluation.policies.cloning_training import CloningSettings, train_cloned_policy
 from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
 from tests.unit.evaluation import toy
+from tests.unit.evaluation.shown_endings import ending_episode
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -38,7 +38,7 @@ def _probe(demonstrations, num_steps):
         num_training_steps=num_steps, batch_size=32, shift_px=1, learning_rate=3e-3
     )
     return train_success_probe(
-        [EndingEpisode.of(d) for d in demonstrations], settings, command="a test"
+        [ending_episode(d) for d in demonstrations], settings, command="a test"
     )
 
 

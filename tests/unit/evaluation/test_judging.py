@@ -21,6 +21,7 @@ from services.evaluation.success_probe_training import (
     train_success_probe,
 )
 from tests.unit.evaluation import toy
+from tests.unit.evaluation.shown_endings import ending_episode
 
 NEAR_M = 0.02
 
@@ -43,7 +44,7 @@ def _episode(task: str, seed: int, *, imagined: bool) -> EndingEpisode:
     """A toy episode with poses and a milestone; an imagined one has blurred images."""
     shown = _demonstration(task, seed)
     hands = shown.commanded[:, :2]
-    plain = EndingEpisode.of(shown)
+    plain = ending_episode(shown)
     noise = np.random.default_rng([7, seed]).normal(size=(3, 64, 3)) * 10 if imagined else 0.0
     endings = {
         step: replace(
@@ -202,7 +203,7 @@ def test_an_ending_of_an_observation():
 
 
 def test_milestones_are_known_where_somebody_noted_them():
-    plain = EndingEpisode.of(toy.demonstration("reach", 0))
+    plain = ending_episode(toy.demonstration("reach", 0))
     assert plain.reached(("there",), 80) is None
     noted = replace(plain, event_times_s={"there": 2.0, "begun": 0.0})
     assert noted.reached(("begun", "there", "never"), 30) == [True, True, False]

@@ -7,16 +7,17 @@ from scipy.stats import mannwhitneyu
 
 from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
 from services.evaluation.demonstrations import split_by_seed
-from services.evaluation.endings import EndingEpisode, endings_hash, final_ending
+from services.evaluation.endings import endings_hash
 from services.evaluation.judge_network import ProbeShape
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_data import labelled_endings
 from services.evaluation.success_probe_training import ProbeSettings, train_success_probe
 from tests.unit.evaluation import toy
+from tests.unit.evaluation.shown_endings import ending_episode, final_ending
 
 
 def _episodes(demonstrations):
-    return [EndingEpisode.of(d) for d in demonstrations]
+    return [ending_episode(d) for d in demonstrations]
 
 
 def test_held_out_accuracy_is_kept_in_the_checkpoint(trained_probe):

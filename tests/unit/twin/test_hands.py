@@ -3,6 +3,7 @@
 import mujoco
 import numpy as np
 
+from dextouch.geometry import apply
 from dextouch.hands import NODE_INDEX
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import FINGERS
@@ -22,8 +23,11 @@ def test_simulated_hands_are_where_forward_kinematics_says():
             data.qpos[scene.wrist_qpos[index]] = [0, 0, 0, 1, 0, 0, 0]
             data.qpos[scene.joint_qpos[index]] = joints
             mujoco.mj_forward(scene.model, data)
-            expected = hand.skin_wrist_m(joints[None])[0].reshape(-1, 3)
-            taxels = skin.taxel_positions_m(data, side_index=index)
+            frames = hand.kinematics.joint_frames(joints[None])[0, :, 3]
+            local = [hand.tip_skin_m(finger).reshape(16, 3) for finger in range(len(FINGERS))]
+            expected = apply(frames, np.stack(local)).reshape(-1, 3)
+            pads = [pad for pad in skin._pads if pad.side_index == index]
+            taxels = np.concatenate([skin._skin_world_m(data, pad) for pad in pads])
             np.testing.assert_allclose(taxels[:80], expected, atol=1e-6)
             np.testing.assert_allclose(taxels[80:], hand.palm_skin_m().reshape(-1, 3), atol=1e-6)
             tips = hand.kinematics.fingertips_m(joints[None])[0]
