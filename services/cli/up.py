@@ -5,30 +5,37 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from fastapi import FastAPI
-from pydantic import AliasChoices, Field
+from pydantic import AliasChoices, Field, ValidationError
 from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from dextouch.command_line import write_result
 from dextouch.data_folder import data_folder
-from dextouch.errors import ConflictError, UnknownNameError
+from dextouch.errors import ConflictError, InvalidInputError, UnknownNameError
+from dextouch.schemas import first_problems
 from dextouch.serving import configure_logging, load_settings
 from services.cli.extras import missing_package
 from services.cli.servers import Place, bind, serve_all, stop_on_signals
 
+if TYPE_CHECKING:
+    from services.acquisition.settings import AcquisitionSettings
+
 LOOPBACK = "127.0.0.1"
 PORT = "0 for any free one"
-# Settings and the addresses of all services in, one service out.
+# Makes the app of one service from the settings and the addresses of all services.
 Builder = Callable[["UpSettings", Mapping[str, str]], FastAPI]
 
 
 class UpSettings(BaseSettings):
-    """Run every service in one process, with a dashboard and mock devices.
+    """Run every service in one process, with a dashboard and mock or real devices.
 
     An explicit port must be free; a default port in use is replaced by a free one. All data is
-    stored in one folder. Mock devices play an episode of its store, or a synthetic pattern.
+    stored in one folder. Mock devices play an episode of its store, or a synthetic pattern; with
+    --no-mock the station has the devices of DEXTOUCH_ACQUISITION_DEVICES. Every service takes its
+    other settings from the same variables as alone (DEXTOUCH_ALIGNMENT_…, see `dextouch align
+    serve --help`).
 
     Example:
       dextouch up --data runs/station --without twin,world_model
@@ -48,6 +55,7 @@ class UpSettings(BaseSettings):
     station: str = Field(
         default="mock station", min_length=1, max_length=64, description="name of the station"
     )
+    mock: bool = Field(default=True, description="simulate the station's devices")
     mock_episode_id: str | None = Field(
         default=None, description="episode of the store that the mock devices play"
     )
@@ -120,6 +128,8 @@ def _bind(name: str, settings: UpSettings) -> Place:
 def _build(name: str, settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     try:
         return BUILDERS[name](settings, urls)
+    except ValidationError as error:
+        raise InvalidInputError(f"settings of {name}: {first_problems(error)}") from error
     except ModuleNotFoundError as error:
         otherwise = f", or leave this service out with --without {name}"
         refusal = missing_package(error, otherwise if name in _optional() else "")
@@ -176,18 +186,26 @@ def _alignment(settings: UpSettings, _: Mapping[str, str]) -> FastAPI:
 
 def _acquisition(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     from services.acquisition.app import create_app
+
+    return create_app(_station(settings, episode_store_url=urls["episode_store"]))
+
+
+def _station(settings: UpSettings, **given: object) -> "AcquisitionSettings":
     from services.acquisition.settings import AcquisitionSettings
 
-    return create_app(
-        AcquisitionSettings(
-            station=settings.station,
-            spool=settings.data / "spool",
-            mock=True,
-            mock_store=_store_url(settings) if settings.mock_episode_id else None,
-            mock_episode_id=settings.mock_episode_id,
-            episode_store_url=urls["episode_store"],
-        )
+    if settings.mock or "station" in settings.model_fields_set:
+        given["station"] = settings.station
+    if settings.mock_episode_id is not None:
+        given |= {"mock_store": _store_url(settings), "mock_episode_id": settings.mock_episode_id}
+    station = AcquisitionSettings.model_validate(
+        {"spool": settings.data / "spool", "mock": settings.mock} | given
     )
+    if not station.mock and not station.devices:
+        raise InvalidInputError(
+            "up: got --no-mock and no devices, expected them in DEXTOUCH_ACQUISITION_DEVICES "
+            "(docs/stations.md)"
+        )
+    return station
 
 
 def _twin(_: UpSettings, __: Mapping[str, str]) -> FastAPI:
@@ -212,8 +230,9 @@ def _dashboard(settings: UpSettings, urls: Mapping[str, str]) -> FastAPI:
     from services.dashboard.app import create_app
     from services.dashboard.settings import DashboardSettings
 
+    station = _station(settings).station
     upstreams = {f"{name}_url": url for name, url in urls.items() if name != "dashboard"}
-    return create_app(DashboardSettings.model_validate({"station": settings.station} | upstreams))
+    return create_app(DashboardSettings.model_validate({"station": station} | upstreams))
 
 
 def _store_url(settings: UpSettings) -> str:

@@ -175,3 +175,26 @@ async def test_without_worlds(tmp_path):
     assert set(urls) == {"episode_store", "alignment", "acquisition", "dashboard"}
     stop.set()
     assert await running == 0
+
+
+def test_each_service_reads_its_own_variables_too(tmp_path, monkeypatch):
+    camera = {"kind": "camera", "stream": "camera_wrist_left", "port": 9200}
+    monkeypatch.setenv("DEXTOUCH_ACQUISITION_DEVICES", json.dumps([camera]))
+    monkeypatch.setenv("DEXTOUCH_ACQUISITION_FLUSH_PERIOD_S", "0.25")
+    monkeypatch.setenv("DEXTOUCH_ACQUISITION_STATION", "bench 3")
+    station = up._station(up.UpSettings(data=tmp_path, mock=False))
+    assert (station.station, station.mock, station.flush_period_s) == ("bench 3", False, 0.25)
+    assert [device.kind for device in station.devices] == ["camera"]
+    named = up._station(up.UpSettings(data=tmp_path, mock=False, station="bench 4"))
+    assert named.station == "bench 4"
+
+
+def test_a_wrong_variable_is_named(tmp_path, monkeypatch):
+    monkeypatch.setenv("DEXTOUCH_ALIGNMENT_PORT", "far")
+    with pytest.raises(InvalidInputError, match="settings of alignment: port: Input should be a"):
+        up._build("alignment", up.UpSettings(data=tmp_path), {})
+
+
+def test_a_station_without_devices_is_refused(tmp_path):
+    with pytest.raises(InvalidInputError, match="--no-mock and no devices, expected them in DEXT"):
+        up._station(up.UpSettings(data=tmp_path, mock=False))
