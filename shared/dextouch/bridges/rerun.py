@@ -14,6 +14,7 @@ from rerun.components import ImageFormat
 from dextouch.bridges.blocks import Block, Reader, blocks
 from dextouch.bridges.new_file import new_file
 from dextouch.episodes import EpisodeReader
+from dextouch.episodes.video import is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
 from dextouch.streams import StreamDescriptor
@@ -25,8 +26,6 @@ HEAD_CAMERA: Final = "camera_head"
 FULL_SCALE_KPA: Final = 40.0
 AXIS_LENGTH_M: Final = 0.05
 POINT_RADIUS_M: Final = 0.004
-_ANNEX_B = b"\0\0\1"
-_KEY_UNIT = 5
 
 
 def export_rrd(reader: Reader, path: Path, *, overwrite: bool = False) -> int:
@@ -166,7 +165,8 @@ class _Export:
                 entity,
                 block,
                 rr.VideoStream.columns(
-                    sample=list(block.values), is_keyframe=[_is_key(unit) for unit in block.values]
+                    sample=list(block.values),
+                    is_keyframe=[is_keyframe(unit) for unit in block.values],
                 ),
             )
         if descriptor.dtype != "uint8" or descriptor.shape[2:] != (3,):
@@ -259,12 +259,6 @@ def _side(descriptor: StreamDescriptor) -> Side | None:
         return descriptor.side
     sides: tuple[Side, Side] = ("left", "right")
     return next((side for side in sides if descriptor.name.endswith(f"_{side}")), None)
-
-
-def _is_key(access_unit: bytes) -> bool:
-    """Whether an Annex B access unit contains an IDR picture."""
-    units = access_unit.split(_ANNEX_B)[1:]
-    return any(unit and unit[0] & 31 == _KEY_UNIT for unit in units)
 
 
 def _id_of(reader: Reader) -> str:

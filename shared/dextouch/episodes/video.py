@@ -89,19 +89,28 @@ def check_video_size(height: int, width: int) -> None:
 
 
 class GopEncoder:
-    """Persistent encoder of one camera; every GOP_IMAGES-th access unit begins a group.
+    """Persistent encoder of one camera; every `group_images`-th access unit begins a group.
 
     Args:
         height: of the images, even.
         width: of the images, even.
         rate_hz: nominal, for players of the stream.
         settings: quality and speed.
+        group_images: of the store by default, which takes no others.
 
     Raises:
         InvalidInputError: an invalid size or invalid settings.
     """
 
-    def __init__(self, height: int, width: int, *, rate_hz: float, settings: VideoSettings) -> None:
+    def __init__(
+        self,
+        height: int,
+        width: int,
+        *,
+        rate_hz: float,
+        settings: VideoSettings,
+        group_images: int = GOP_IMAGES,
+    ) -> None:
         import av
         from av.video.reformatter import VideoReformatter
 
@@ -112,9 +121,9 @@ class GopEncoder:
         self._context.pix_fmt = "yuv420p"
         rate = Fraction(rate_hz).limit_denominator(1001)
         self._context.framerate, self._context.time_base = rate, 1 / rate
-        self._context.gop_size = GOP_IMAGES
+        self._context.gop_size = group_images
         x264 = (
-            f"keyint={GOP_IMAGES}:min-keyint={GOP_IMAGES}:scenecut=0:open-gop=0:bframes=0"
+            f"keyint={group_images}:min-keyint={group_images}:scenecut=0:open-gop=0:bframes=0"
             # Half-pixel motion: a seventh fewer bytes for a tenth more time, and faster decoding.
             ":threads=1:sliced-threads=0:subme=1"
         )
@@ -129,7 +138,7 @@ class GopEncoder:
         except av.FFmpegError as error:
             raise InvalidInputError(f"H.264 encoder: {settings} refused ({error})") from error
         self._reformatter = VideoReformatter()
-        self.description = f"libx264 {settings.preset} crf {settings.crf} gop {GOP_IMAGES}"
+        self.description = f"libx264 {settings.preset} crf {settings.crf} gop {group_images}"
 
     def encode(self, image: np.ndarray) -> bytes:
         """Encode the next image, uint8 [h, w, 3] RGB, to an access unit."""

@@ -8,18 +8,12 @@ import pytest
 
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
 from dextouch.bridges.lerobot.exporting import stored_units
-from dextouch.bridges.lerobot.h264 import (
-    decode_entry_points,
-    encode_images,
-    holds_idr,
-    is_entry_point,
-    nal_units,
-    parameter_sets,
-)
+from dextouch.bridges.lerobot.h264 import decode_entry_points, encode_images
 from dextouch.bridges.lerobot.rows import frames_of
 from dextouch.bridges.lerobot.video import CameraVideo
 from dextouch.bridges.lerobot.video_reader import VideoSpan, read_images, read_units
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeStore, VideoSettings
+from dextouch.episodes.video import is_keyframe
 from dextouch.errors import CorruptDataError, ShapeError
 from tests.unit.bridges.lerobot_episodes import SIZE_PX, make_episode, pictures
 
@@ -32,9 +26,13 @@ def store(tmp_path):
     return EpisodeStore(tmp_path / "store")
 
 
-def encoded(count, **changes):
-    options = {"fps": 15, "crf": 20, "group": 2} | changes
-    return list(encode_images(pictures(count), **options))
+def encoded(count, *, crf=20, group=2):
+    settings = VideoSettings(crf=crf, preset="veryfast")
+    return encode_images(pictures(count), fps=15, settings=settings, group=group)
+
+
+def decoded_alone(units):
+    return list(decode_entry_points(units, (*SIZE_PX, 3), where="x"))
 
 
 def write_video(path, images, *, codec="libx264", b_frames=0):
@@ -54,22 +52,10 @@ def span(path, count, *, first=0, shape=(*SIZE_PX, 3)):
     return VideoSpan(path, first / 15, count, 15, shape)
 
 
-def test_units_of_an_access_unit():
-    data = b"\0\0\0\1\x67ab\0\0\1\x68c\0\0\0\1\x65\0\0\3\1d"
-    assert nal_units(data) == [b"\x67ab", b"\x68c", b"\x65\0\0\3\1d"]
-    assert parameter_sets(data) == (b"\x67ab", b"\x68c")
-    assert is_entry_point(data)
-    assert not is_entry_point(b"\0\0\1\x65d")
-    assert holds_idr(b"\0\0\1\x65d")
-    assert not holds_idr(b"\0\0\1\x41d")
-    assert nal_units(b"") == nal_units(b"abc") == []
-
-
 def test_encoding_gives_one_unit_an_image_in_closed_groups():
     units = encoded(7, group=3)
-    assert [is_entry_point(data) for data in units] == [True, False, False] * 2 + [True]
-    assert [holds_idr(data) for data in units] == [is_entry_point(data) for data in units]
-    images = list(decode_entry_points(units[::3], where="x"))
+    assert [is_keyframe(data) for data in units] == [True, False, False] * 2 + [True]
+    images = decoded_alone(units[::3])
     assert np.abs(np.array(images).astype(int) - pictures(7)[::3]).mean() < 3
 
 
@@ -78,7 +64,7 @@ def test_a_better_quality_is_nearer_and_larger():
     for crf in (10, 40):
         units = encoded(4, crf=crf, group=1)
         sizes.append(sum(map(len, units)))
-        decoded = np.array(list(decode_entry_points(units, where="x")))
+        decoded = np.array(decoded_alone(units))
         errors.append(np.abs(decoded.astype(int) - pictures(4)).mean())
     assert sizes[0] > sizes[1]
     assert errors[0] < errors[1]
@@ -88,7 +74,7 @@ def test_damaged_entry_points_are_refused():
     data = encoded(1)[0]
     for bad in (data[:20], b"\0\0\0\1\x65", b"x"):
         with pytest.raises(CorruptDataError, match="entry point 0"):
-            list(decode_entry_points([bad], where="x"))
+            decoded_alone([bad])
 
 
 def test_units_are_muxed_as_they_are_and_spans_found_again(tmp_path):

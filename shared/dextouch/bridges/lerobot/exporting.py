@@ -11,20 +11,19 @@ from typing import Literal
 import numpy as np
 
 from dextouch.bridges.lerobot.dataset import DatasetWriter
-from dextouch.bridges.lerobot.h264 import (
-    decode_entry_points,
-    encode_images,
-    is_entry_point,
-)
+from dextouch.bridges.lerobot.h264 import decode_entry_points, encode_images
 from dextouch.bridges.lerobot.layout import IMAGES
 from dextouch.bridges.lerobot.rows import frames_of, images_at
 from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
-from dextouch.episodes import EpisodeReader
+from dextouch.episodes import EpisodeReader, VideoSettings
 from dextouch.episodes.files import disk_errors
+from dextouch.episodes.video import is_keyframe
 from dextouch.errors import ConflictError, InvalidInputError
 
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
+
+VIDEO = VideoSettings(crf=23, preset="veryfast")
 
 
 @dataclass(frozen=True)
@@ -33,13 +32,13 @@ class ExportOptions:
 
     `fps`: frames a second, a whole number; without it the model rate of the first episode.
     `cameras`: whose images go along, the first of them setting the frames' times when `fps` is its
-    own rate; without it all image streams of the first episode, the head's first. `crf`, `group`:
-    quality (0 … 51) and distance of IDR pictures of video that has to be encoded.
+    own rate; without it all image streams of the first episode, the head's first. `video`, `group`:
+    encoder settings and distance of IDR pictures of video that has to be encoded.
     """
 
     fps: int | None = None
     cameras: tuple[str, ...] | None = None
-    crf: int = 23
+    video: VideoSettings = VIDEO
     group: int = 2
     robot_type: str = "dextouch"
 
@@ -153,19 +152,17 @@ def _add_episode(
         videos[camera] = (
             stored
             if stored is not None
-            else list(
-                encode_images(
-                    images_at(reader, camera, frames.image_indices[camera]),
-                    fps=dataset.fps,
-                    crf=options.crf,
-                    group=options.group,
-                )
+            else encode_images(
+                images_at(reader, camera, frames.image_indices[camera]),
+                fps=dataset.fps,
+                settings=options.video,
+                group=options.group,
             )
         )
-        entries = [data for data in videos[camera] if is_entry_point(data)]
+        entries = [data for data in videos[camera] if is_keyframe(data)]
         sampled = [entries[place] for place in sample_places(len(entries))]
         statistics[IMAGES + camera] = image_statistics(
-            decode_entry_points(sampled, where=f"{where}: {camera!r}")
+            decode_entry_points(sampled, reader.streams[camera].shape, where=f"{where}: {camera!r}")
         )
     sidecar = Sidecar(
         episode_index=dataset.num_episodes,
@@ -188,4 +185,4 @@ def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> lis
     if reader.streams[camera].unit != "h264" or not consecutive:
         return None
     units = reader.encoded_images(camera, int(indices[0]), int(indices[-1]) + 1)
-    return units if is_entry_point(units[0]) else None
+    return units if is_keyframe(units[0]) else None

@@ -8,11 +8,11 @@ import numpy as np
 from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.content import CameraContent, EpisodeContent
-from dextouch.bridges.lerobot.h264 import holds_idr
 from dextouch.bridges.lerobot.rows import BLOCK_IMAGES
 from dextouch.bridges.lerobot.video_reader import read_images, read_units
 from dextouch.episodes import EpisodeStore, EpisodeWriter
 from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes.video import is_keyframe
 from dextouch.schemas import EpisodeAttributes
 from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
 from dextouch.tactile.layout import SIDES
@@ -114,4 +114,4 @@ def _kept(
 
 def _in_groups(units: list[bytes]) -> bool:
     """Whether access units form the closed groups that the store requires."""
-    return all(holds_idr(data) == (index % GOP_IMAGES == 0) for index, data in enumerate(units))
+    return all(is_keyframe(data) == (index % GOP_IMAGES == 0) for index, data in enumerate(units))

@@ -10,9 +10,9 @@ import av
 from av.container import OutputContainer
 from av.video.stream import VideoStream
 
-from dextouch.bridges.lerobot.h264 import holds_idr, is_entry_point, parameter_sets
 from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, file_place, fill_path
 from dextouch.episodes.files import disk_errors
+from dextouch.episodes.video import is_keyframe, parameter_sets
 from dextouch.errors import CorruptDataError, ShapeError
 
 
@@ -52,7 +52,7 @@ class CameraVideo:
         self._file_bytes = file_bytes
         self._file_number = -1
         self._num_images = self._num_bytes = 0
-        self._parameters: tuple[bytes, ...] = ()
+        self._parameters = b""
         self._output: OutputContainer | None = None
         self._stream: VideoStream | None = None
 
@@ -68,10 +68,10 @@ class CameraVideo:
             ShapeError: images of another size.
             StorageError: the write failed.
         """
-        if not access_units or not is_entry_point(access_units[0]):
+        parameters = parameter_sets(access_units[0]) if access_units else b""
+        if not parameters:
             raise CorruptDataError(f"{where}: does not begin with an IDR image and its headers")
         size = sum(map(len, access_units))
-        parameters = parameter_sets(access_units[0])
         full = self._num_bytes + size > self._file_bytes
         if self._output is None or full or parameters != self._parameters:
             self._start_file(access_units[0], where=where)
@@ -121,6 +121,6 @@ class CameraVideo:
         packet.pts = packet.dts = self._num_images
         packet.duration = 1
         packet.time_base = Fraction(1, self._fps)
-        packet.is_keyframe = holds_idr(data)
+        packet.is_keyframe = is_keyframe(data)
         self._output.mux(packet)
         self._num_images += 1

@@ -13,7 +13,7 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
-from dextouch.bridges.lerobot.h264 import TO_RGB, is_entry_point
+from dextouch.episodes.video import is_keyframe
 from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError
 
 MAX_SIDE_PX: Final = 8192
@@ -52,7 +52,7 @@ def read_images(span: VideoSpan) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
                     f"{span.path}: got an image of {frame.height} x {frame.width} pixels, "
                     f"expected {span.shape[0]} x {span.shape[1]}"
                 )
-            yield frame.to_ndarray(format="rgb24", interpolation=TO_RGB)
+            yield frame.to_ndarray(format="rgb24", interpolation="BICUBIC")
             done += 1
             if done == span.count:
                 return
@@ -81,7 +81,7 @@ def read_units(span: VideoSpan) -> list[bytes] | None:
             if place < len(units):
                 continue
             _check_place(span, place, len(units))
-            if times[0] != times[1] or (not units and not is_entry_point(data)):
+            if times[0] != times[1] or (not units and not is_keyframe(data)):
                 return None
             units.append(data)
             if len(units) == span.count:
