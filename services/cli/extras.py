@@ -27,6 +27,7 @@ EXTRA_OF = {
     "numba": "align",
     "torch": "model",
     "safetensors": "model",
+    "PIL": "model",
     "mujoco": "twin",
     "gymnasium": "gym",
     "pyarrow": "export",

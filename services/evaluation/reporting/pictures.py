@@ -1,14 +1,20 @@
 """Image and array data of a report: head images, taxel maps, residuals and actions."""
 
+import base64
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
+from PIL import Image
 
+from dextouch.images import encode_jpeg
 from dextouch.tactile import colour, hand_canvas
 from dextouch.tactile.layout import SIDES
-from services.evaluation.reporting.png import data_address
+
+# Photographs larger than this are embedded as JPEG.
+MAX_PNG_SIDE_PX = 256
 
 
 @dataclass(frozen=True)
@@ -70,6 +76,15 @@ def moments(times_s: np.ndarray, images: np.ndarray, tactile_kpa: np.ndarray) ->
         Moment(f"{time:.2f} s", data_address(image), data_address(touch_image(taxels)))
         for time, image, taxels in zip(times_s, images, tactile_kpa, strict=True)
     ]
+
+
+def data_address(image: UInt8[np.ndarray, "h w channels"]) -> str:
+    """Data URL of an image: RGB, or RGBA with opacity."""
+    if image.shape[2] == 3 and max(image.shape[:2]) > MAX_PNG_SIDE_PX:
+        return "data:image/jpeg;base64," + base64.b64encode(encode_jpeg(image)).decode()
+    png = io.BytesIO()
+    Image.fromarray(image).save(png, "PNG")
+    return "data:image/png;base64," + base64.b64encode(png.getvalue()).decode()
 
 
 def touch_image(tactile_kpa: np.ndarray, *, scale: int = 3) -> UInt8[np.ndarray, "h w 4"]:

@@ -3,7 +3,10 @@
 Storage chunks are zstd, zip entries are uncompressed
 (https://zarr-specs.readthedocs.io/en/latest/v2/v2.0.html). The reader does not trust the file:
 names, sizes and shapes are checked before anything is allocated, and a missing storage chunk is an
-error, never zeros.
+error, never zeros. Equal content gives equal bytes.
+
+zarr's own `ZipStore` (3.1.6) gives none of this: it dates entries by the clock, writes the metadata
+of an array that grows again under the same name, and reads a missing storage chunk as zeros.
 """
 
 import json
