@@ -19,7 +19,7 @@ from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sa
 from dextouch.episodes import EpisodeReader, VideoSettings
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.video import is_keyframe
-from dextouch.errors import ConflictError, InvalidInputError
+from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
@@ -66,6 +66,7 @@ def export_lerobot(
         InvalidInputError: no episodes, a rate that is not an integer, or episodes that cannot share
             one dataset.
         UnknownNameError: a camera that an episode does not have.
+        ShapeError: images with an odd side.
         CorruptDataError: a damaged episode.
         StorageError: the write failed.
     """
@@ -135,6 +136,13 @@ def _check_cameras(reader: EpisodeReader, cameras: Sequence[str]) -> None:
             f"episode {reader.attributes.episode_id!r}: has no camera {missing}, only {images}; "
             "choose cameras that all episodes have"
         )
+    for name in cameras:
+        height_px, width_px = reader.streams[name].shape[:2]
+        if height_px % 2 or width_px % 2:
+            raise ShapeError(
+                f"camera {name!r}: got images of {height_px} x {width_px} pixels, expected even "
+                "sides; LeRobot's players need 4:2:0 video"
+            )
 
 
 def _add_episode(
