@@ -9,8 +9,7 @@ import numpy as np
 
 from benchmarks.store.our_design import arrivals, descriptors
 from benchmarks.store.workload import Workload
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.write_options import WriteOptions
+from dextouch.episodes import EpisodeStore, WriteOptions
 from dextouch.schemas import RecordingAttributes
 
 SPEED = 4.0

@@ -6,7 +6,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration

@@ -10,7 +10,7 @@ from secrets import token_hex
 import structlog
 
 from dextouch.clocks import PathLatency
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError
 from dextouch.schemas import Matrix, RecordingAttributes

@@ -11,8 +11,8 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.episodes.files import disk_errors
-from dextouch.episodes.spool_log import LOG_FILE
+from dextouch.episodes import disk_errors
+from dextouch.episodes.spool import LOG_FILE
 from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
 from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter

@@ -10,7 +10,7 @@ from typing import Protocol, runtime_checkable
 import structlog
 from pydantic import ValidationError
 
-from dextouch.episodes.files import disk_errors, replace_file
+from dextouch.episodes import disk_errors, replace_file
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.errors import (
     ConflictError,

@@ -17,7 +17,7 @@ import google_crc32c
 import structlog
 from pydantic import ValidationError
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,

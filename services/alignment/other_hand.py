@@ -6,8 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64, UInt8
 
-from dextouch.episodes import EpisodeReader
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import EpisodeReader, disk_errors
 from dextouch.errors import NotFoundError
 from dextouch.hands.robot_hand import HandModel
 from services.alignment.retargeting.hand_profile import calibrated_profile

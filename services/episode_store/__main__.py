@@ -5,8 +5,7 @@ import sys
 from collections.abc import Callable, Sequence
 
 from dextouch.command_line import STANDARD_OUTPUT, CommandParser, add_json, write_result
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.trash import TRASH_KINDS
+from dextouch.episodes import TRASH_KINDS, EpisodeStore
 from dextouch.errors import DexTouchError
 from dextouch.serving import configure_logging, load_settings, run
 from services.episode_store.app import create_app

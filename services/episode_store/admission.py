@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import LimitExceededError, StorageFullError
 
 BUSY_RETRY_S = 1

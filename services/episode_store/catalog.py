@@ -10,8 +10,7 @@ from typing import Generic, TypeVar
 
 import structlog
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
-from dextouch.episodes.format import Kind
+from dextouch.episodes import EpisodeReader, EpisodeStore, Kind, RecordingReader
 from dextouch.errors import NotFoundError, StorageError
 from dextouch.schemas import (
     CatalogHours,

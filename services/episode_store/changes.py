@@ -4,9 +4,7 @@ import os
 import re
 import time
 
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.files import disk_errors
-from dextouch.episodes.format import COMMIT_FILE, Kind
+from dextouch.episodes import COMMIT_FILE, EpisodeStore, Kind, disk_errors
 from dextouch.schemas import ID_PATTERN
 
 # Stamps of a file system can be this coarse: another change may get the same stamp.

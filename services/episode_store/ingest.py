@@ -10,8 +10,7 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.format import check_id
+from dextouch.episodes import EpisodeStore, check_id
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import structlog
 
-from dextouch.episodes.files import disk_errors, folder_bytes
+from dextouch.episodes import disk_errors, folder_bytes
 from dextouch.episodes.spool import read_attributes
 from dextouch.errors import NotFoundError, StorageError, StorageFullError
 from dextouch.schemas import RecordingAttributes, UploadList, UploadSummary

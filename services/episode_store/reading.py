@@ -7,8 +7,7 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader
-from dextouch.episodes.window_codec import encode_window
+from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader, encode_window
 from dextouch.errors import LimitExceededError
 from dextouch.schemas import ActionKind, EpisodeDetail, RecordingAttributes
 from dextouch.streams import pack

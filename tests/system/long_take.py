@@ -5,7 +5,7 @@ Motion repeats every minute; noise, jitter and lost samples do not. Images are r
 
 import numpy as np
 
-from dextouch.episodes.video import GopEncoder, VideoSettings
+from dextouch.episodes import GopEncoder, VideoSettings
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.images import encode_jpeg
 from dextouch.schemas import RecordingAttributes

@@ -10,7 +10,7 @@ from itertools import count
 
 import numpy as np
 
-from dextouch.episodes.video import GopEncoder, VideoSettings
+from dextouch.episodes import GopEncoder, VideoSettings
 from dextouch.images import encode_jpeg
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values

@@ -15,9 +15,9 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import UInt8
 
-from dextouch.episodes.format import GOP_IMAGES
-from dextouch.episodes.video import (
+from dextouch.episodes import (
     FULL_FORM,
+    GOP_IMAGES,
     GopEncoder,
     VideoSettings,
     check_video_size,

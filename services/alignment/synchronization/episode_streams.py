@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes import GOP_IMAGES
 from dextouch.streams import ENCODED_UNITS, H264_UNIT, StreamDescriptor, encoded_values
 from services.alignment.synchronization.recorded_streams import Block, DatedStream
 from services.alignment.synchronization.resampling import EDGE_PERIODS

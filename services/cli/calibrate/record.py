@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from dextouch import __version__
-from dextouch.episodes.files import replace_file
+from dextouch.episodes import replace_file
 from dextouch.errors import CorruptDataError, InvalidInputError, NonFiniteError, NotFoundError
 from dextouch.schemas import Matrix, first_problems, matrix_rows
 

@@ -14,8 +14,8 @@ import numpy as np
 
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.episodes.inspection import UPLOADS
-from dextouch.episodes.spool_reader import SpoolReader
+from dextouch.episodes.care import UPLOADS
+from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
 from dextouch.schemas import Problem, RecordingAttributes, error_from_problem
 from services.acquisition.clock import VirtualClock

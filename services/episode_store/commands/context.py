@@ -7,9 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.format import KINDS, Kind, check_id
-from dextouch.episodes.local_storage import local_folder
+from dextouch.episodes import KINDS, EpisodeStore, Kind, check_id, local_folder
 from dextouch.errors import InvalidInputError, NotFoundError
 
 EXIT_DAMAGED = 1

@@ -5,8 +5,8 @@ from dataclasses import asdict
 from datetime import UTC, datetime
 from pathlib import Path
 
-from dextouch.episodes.deletion import DeletionRequest, delete_for_good, plan_deletion
-from dextouch.episodes.trash import TrashKind
+from dextouch.episodes import TrashKind
+from dextouch.episodes.care import DeletionRequest, delete_for_good, plan_deletion
 from dextouch.errors import InvalidInputError
 from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome, readable_size
 

@@ -11,29 +11,35 @@ from typing import Any
 
 import numpy as np
 
-from dextouch.episodes import EpisodeReader, RecordingReader
-from dextouch.episodes.format import KINDS, Kind, shard_path, stream_arrays
-from dextouch.episodes.inspection import (
+from dextouch.episodes import (
+    KINDS,
+    EpisodeReader,
+    GroupFiles,
+    Kind,
+    LocalGroup,
+    RecordingReader,
+    shard_path,
+    stream_arrays,
+)
+from dextouch.episodes.care import (
     Finding,
     ItemReport,
     Progress,
     inspect_group,
     inspect_stage,
     inspect_upload,
-    is_held,
+    interrupted_takes,
     open_contents,
-    unfinished,
-)
-from dextouch.episodes.sources import GroupFiles, LocalGroup
-from dextouch.episodes.staged_group import (
-    STAGE_FILE,
-    Attributes,
-    attributes_id,
-    kind_of,
-    read_stage,
+    unfinished_folders,
 )
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
-from dextouch.schemas import EpisodeSummary, RecordingSummary, json_ready
+from dextouch.schemas import (
+    EpisodeAttributes,
+    EpisodeSummary,
+    RecordingAttributes,
+    RecordingSummary,
+    json_ready,
+)
 from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
 from services.episode_store.commands.context import (
     EXIT_DAMAGED,
@@ -99,32 +105,19 @@ def _list_recordings(context: Context, catalog: Catalog) -> tuple[dict[str, Any]
     return json_ready(found), catalog.recordings(RecordingFilter(), limit=1).num_matching
 
 
-def _outcome(row: EpisodeSummary | RecordingSummary | Attributes) -> str:
+def _outcome(
+    row: EpisodeSummary | RecordingSummary | EpisodeAttributes | RecordingAttributes,
+) -> str:
     return _OUTCOMES[row.success] + "  recovered" * row.recovered
 
 
 def _list_interrupted(context: Context, root: Path) -> list[str]:
     """List interrupted takes, whose stages `recover` can complete; returns their names."""
     names = []
-    for place, folder in unfinished(root):
-        if place == "stage" and (folder / STAGE_FILE).is_file() and not is_held(folder):
-            kind, name = _stage_name(folder)
-            names.append(name)
-            context.say(f"{name}  {kind}  interrupted; `dextouch store repair` completes it")
+    for kind, name in interrupted_takes(root):
+        names.append(name)
+        context.say(f"{name}  {kind}  interrupted; `dextouch store repair` completes it")
     return names
-
-
-def _stage_name(folder: Path) -> tuple[str, str]:
-    try:
-        attributes = read_stage(folder)
-    except StorageError:
-        attributes = None
-    # A damaged one is listed by its folder name.
-    return (
-        ("stage", folder.name)
-        if attributes is None
-        else (kind_of(attributes), attributes_id(attributes))
-    )
 
 
 def _list_trash(context: Context) -> Outcome:
@@ -209,7 +202,7 @@ def verify(context: Context) -> Outcome:
             files = _files(context, kind, item_id)
             reports.append(inspect_group(files, kind, progress=progress))
     if not context.options.ids and root is not None:
-        for what, folder in unfinished(root):
+        for what, folder in unfinished_folders(root):
             reports.append(_inspect_unfinished(what, folder))
     for report in reports:
         _say_report(context, report)

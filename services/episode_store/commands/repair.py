@@ -2,10 +2,8 @@
 
 from dataclasses import asdict
 
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.format import Kind
-from dextouch.episodes.repair import LEFT, RepairReport, repair_group, repair_unfinished
-from dextouch.episodes.sources import GroupFiles
+from dextouch.episodes import EpisodeStore, GroupFiles, Kind
+from dextouch.episodes.care import LEFT, RepairReport, repair_group, repair_unfinished
 from dextouch.errors import InvalidInputError, NotFoundError, StorageError
 from services.episode_store.commands.context import EXIT_DAMAGED, Context, Outcome
 

@@ -13,8 +13,7 @@ from rerun.components import ImageFormat
 
 from dextouch.bridges.blocks import Block, Reader, blocks
 from dextouch.bridges.new_file import new_file
-from dextouch.episodes import EpisodeReader
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import EpisodeReader, is_keyframe
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import json_ready
 from dextouch.streams import StreamDescriptor

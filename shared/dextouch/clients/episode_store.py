@@ -10,8 +10,7 @@ import httpx
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from dextouch.episodes.window import StreamData, Window
-from dextouch.episodes.window_codec import decode_window
+from dextouch.episodes import StreamData, Window, decode_window
 from dextouch.errors import DexTouchError, UnavailableError
 from dextouch.schemas import (
     ActionKind,

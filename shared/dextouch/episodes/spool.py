@@ -13,7 +13,13 @@ from types import TracebackType
 from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
 from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
-from dextouch.episodes.spool_log import RecordBody, SpoolLogWriter, read_bodies, read_records
+from dextouch.episodes.spool_log import (
+    LOG_FILE,
+    RecordBody,
+    SpoolLogWriter,
+    read_bodies,
+    read_records,
+)
 from dextouch.episodes.spool_reader import (
     CLOSED_FILE,
     RECORDING_FILE,
@@ -25,6 +31,7 @@ from dextouch.schemas import RecordingAttributes
 from dextouch.streams import MAX_STREAMS, SampleBatch, check_batch, check_follows
 
 __all__ = [
+    "LOG_FILE",
     "RecoveryReport",
     "SpoolReader",
     "SpoolWriter",

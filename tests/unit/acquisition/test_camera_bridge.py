@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import RealClock

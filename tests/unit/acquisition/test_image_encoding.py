@@ -3,8 +3,7 @@ import threading
 import numpy as np
 import pytest
 
-from dextouch.episodes.format import GOP_IMAGES
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import GOP_IMAGES, is_keyframe
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import decode_jpeg
 from dextouch.streams import Sample

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.episodes.video import GopEncoder, VideoSettings
+from dextouch.episodes import GopEncoder, VideoSettings
 from dextouch.errors import NotFoundError
 from dextouch.images import decode_jpeg
 from dextouch.streams import Sample, encoded_values

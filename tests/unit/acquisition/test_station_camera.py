@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices import build_drivers

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes import GOP_IMAGES, EpisodeStore
 from dextouch.episodes.image_codecs import ImageChunks
 from dextouch.images import jpeg
 from dextouch.streams import StreamDescriptor

@@ -12,8 +12,7 @@ from dextouch.bridges.lerobot.h264 import decode_entry_points, encode_images
 from dextouch.bridges.lerobot.rows import frames_of
 from dextouch.bridges.lerobot.video import CameraVideo
 from dextouch.bridges.lerobot.video_reader import VideoSpan, read_images, read_units
-from dextouch.episodes import EpisodeStore, VideoSettings
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import EpisodeStore, VideoSettings, is_keyframe
 from dextouch.errors import CorruptDataError, ShapeError
 from tests.unit.bridges.lerobot_episodes import SIZE_PX, make_episode, pictures
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from httpx import ASGITransport, AsyncClient
 
-from dextouch.episodes import EpisodeStore, ImageForm
-from dextouch.episodes.window_codec import decode_window
+from dextouch.episodes import EpisodeStore, ImageForm, decode_window
 from dextouch.streams import unpack
 from services.episode_store import reading as reading_module
 from services.episode_store.app import create_app

@@ -8,8 +8,7 @@ from httpx import ASGITransport, AsyncClient
 from pydantic import SecretStr
 
 from dextouch.clients import EpisodeStoreClient
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.window_codec import decode_window, encode_window
+from dextouch.episodes import EpisodeStore, decode_window, encode_window
 from dextouch.errors import (
     AccessDeniedError,
     CorruptDataError,

@@ -8,8 +8,8 @@ import pytest
 import zarr
 from pydantic import ValidationError
 
-from dextouch.episodes import WriteOptions
-from dextouch.episodes.format import array_metadata, canonical_json, decode_commit, stream_arrays
+from dextouch.episodes import WriteOptions, stream_arrays
+from dextouch.episodes.format import array_metadata, canonical_json, decode_commit
 from dextouch.episodes.shard_reader import with_crc
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import RecordingAttributes

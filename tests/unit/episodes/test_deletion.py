@@ -6,11 +6,15 @@ import struct
 import numpy as np
 import pytest
 
-from dextouch.episodes import deletion
-from dextouch.episodes.deletion import DeletionRequest, delete_for_good, plan_deletion
-from dextouch.episodes.repair import repair_group
+from dextouch.episodes import WriteOptions
+from dextouch.episodes.care import (
+    DeletionRequest,
+    delete_for_good,
+    deletion,
+    plan_deletion,
+    repair_group,
+)
 from dextouch.episodes.spool import SpoolWriter
-from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 from dextouch.schemas import LineageEntry, RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor

@@ -5,11 +5,9 @@ import shutil
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.format import CHUNK_SECONDS, GOP_IMAGES
-from dextouch.episodes.inspection import inspect_group
-from dextouch.episodes.repair import repair_group
-from dextouch.episodes.sources import LocalGroup
+from dextouch.episodes import GOP_IMAGES, EpisodeStore, LocalGroup
+from dextouch.episodes.care import inspect_group, repair_group
+from dextouch.episodes.format import CHUNK_SECONDS
 from dextouch.errors import ConflictError, CorruptDataError
 from tests.unit.episodes.hostile_group import flip
 
@@ -224,7 +222,7 @@ def test_an_interrupted_repair_makes_no_second_copy(store, folder, truth, monkey
         raise KeyboardInterrupt
 
     damage_chunk(folder, TOUCH, 1)
-    monkeypatch.setattr("dextouch.episodes.repair.put_into_trash", die)
+    monkeypatch.setattr("dextouch.episodes.care.repair.put_into_trash", die)
     with pytest.raises(KeyboardInterrupt):
         repair_group(store.root, "episode", ID)
     monkeypatch.undo()

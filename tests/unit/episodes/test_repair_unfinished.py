@@ -5,12 +5,10 @@ import shutil
 import numpy as np
 import pytest
 
-from dextouch.episodes.inspection import inspect_stage, inspect_upload
-from dextouch.episodes.repair import repair_unfinished
+from dextouch.episodes import GopEncoder, VideoSettings, WriteOptions
+from dextouch.episodes.care import inspect_stage, inspect_upload, repair_unfinished
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.episodes.spool_log import HEADER_BYTES, LOG_FILE, LOG_MAGIC
-from dextouch.episodes.video import GopEncoder, VideoSettings
-from dextouch.episodes.write_options import WriteOptions
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, encoded_values

@@ -7,11 +7,18 @@ import threading
 import numpy as np
 import pytest
 
-from dextouch.episodes import EpisodeStore, ImageForm, VideoSettings, WriteOptions
+from dextouch.episodes import (
+    GOP_IMAGES,
+    EpisodeStore,
+    GopEncoder,
+    ImageForm,
+    VideoSettings,
+    WriteOptions,
+    is_keyframe,
+)
 from dextouch.episodes.files import make_held_folder
-from dextouch.episodes.format import GOP_IMAGES
 from dextouch.episodes.image_codecs import ImageChunks, pack_chunk, transform_pixels
-from dextouch.episodes.video import GopDecoder, GopEncoder, is_keyframe
+from dextouch.episodes.video import GopDecoder
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,

@@ -6,7 +6,7 @@ import simplejpeg
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.episodes.window import mean_over_ranges, nearest_indices, step_ranges
+from dextouch.episodes import mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands import actions as act
 

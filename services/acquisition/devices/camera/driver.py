@@ -4,7 +4,7 @@ import struct
 
 import numpy as np
 
-from dextouch.episodes.format import GOP_IMAGES
+from dextouch.episodes import GOP_IMAGES
 from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError
 from dextouch.images import decode_jpeg, jpeg_size
 from dextouch.streams import (

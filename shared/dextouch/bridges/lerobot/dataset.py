@@ -13,7 +13,7 @@ from dextouch.bridges.lerobot.sidecar import Sidecar, write_sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, combine, value_statistics
 from dextouch.bridges.lerobot.tables import DataFiles, EpisodeRows, write_tasks
 from dextouch.bridges.lerobot.video import CameraVideo
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import InvalidInputError
 
 

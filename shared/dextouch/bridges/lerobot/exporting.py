@@ -16,9 +16,7 @@ from dextouch.bridges.lerobot.layout import IMAGES
 from dextouch.bridges.lerobot.rows import frames_of, images_at
 from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
-from dextouch.episodes import EpisodeReader, VideoSettings
-from dextouch.episodes.files import disk_errors
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors, is_keyframe
 from dextouch.errors import ConflictError, InvalidInputError, ShapeError
 
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")

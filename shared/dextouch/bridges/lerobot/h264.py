@@ -5,8 +5,7 @@ from collections.abc import Iterable, Iterator
 import numpy as np
 from jaxtyping import UInt8
 
-from dextouch.episodes import VideoSettings
-from dextouch.episodes.video import FULL_FORM, GopEncoder, decoder_of_this_thread
+from dextouch.episodes import FULL_FORM, GopEncoder, VideoSettings, decoder_of_this_thread
 from dextouch.errors import CorruptDataError
 
 

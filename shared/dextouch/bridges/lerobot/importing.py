@@ -14,8 +14,7 @@ from dextouch.bridges.lerobot.mapping import FeatureMap, map_features
 from dextouch.bridges.lerobot.sidecar import Sidecar, read_sidecar
 from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
 from dextouch.bridges.lerobot.storing import ImageUnit, store_episode
-from dextouch.episodes import EpisodeStore
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import EpisodeStore, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas import Domain, EpisodeAttributes, LineageEntry, Matrix, StoredAnchor

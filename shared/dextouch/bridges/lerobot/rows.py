@@ -7,8 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
-from dextouch.episodes import EpisodeReader
-from dextouch.episodes.window import mean_over_ranges, nearest_indices, step_ranges
+from dextouch.episodes import EpisodeReader, mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
 from dextouch.hands.actions import (

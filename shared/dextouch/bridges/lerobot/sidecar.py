@@ -8,7 +8,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from dextouch.bridges.lerobot.layout import SIDECAR_PATH, confined, fill_path
 from dextouch.bridges.lerobot.rows import Grid
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import ActionKind, EpisodeAttributes
 

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.tables import column_values, read_table, table_rows
 from dextouch.bridges.lerobot.video_reader import VideoSpan
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
 MAX_INFO_BYTES: Final = 1 << 24

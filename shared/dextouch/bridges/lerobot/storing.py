@@ -10,9 +10,7 @@ from jaxtyping import UInt8
 from dextouch.bridges.lerobot.content import CameraContent, EpisodeContent
 from dextouch.bridges.lerobot.rows import BLOCK_IMAGES
 from dextouch.bridges.lerobot.video_reader import read_images, read_units
-from dextouch.episodes import EpisodeStore, EpisodeWriter
-from dextouch.episodes.format import GOP_IMAGES
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import GOP_IMAGES, EpisodeStore, EpisodeWriter, is_keyframe
 from dextouch.schemas import EpisodeAttributes
 from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
 from dextouch.tactile.layout import SIDES

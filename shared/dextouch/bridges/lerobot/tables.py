@@ -16,7 +16,7 @@ from dextouch.bridges.lerobot.layout import (
     file_place,
     fill_path,
 )
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError
 
 MAX_TABLE_BYTES = 1 << 31

@@ -11,8 +11,7 @@ from av.container import OutputContainer
 from av.video.stream import VideoStream
 
 from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, file_place, fill_path
-from dextouch.episodes.files import disk_errors
-from dextouch.episodes.video import is_keyframe, parameter_sets
+from dextouch.episodes import disk_errors, is_keyframe, parameter_sets
 from dextouch.errors import CorruptDataError, ShapeError
 
 

@@ -13,7 +13,7 @@ from av.container import InputContainer
 from av.video.stream import VideoStream
 from jaxtyping import UInt8
 
-from dextouch.episodes.video import is_keyframe
+from dextouch.episodes import is_keyframe
 from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError
 
 MAX_SIDE_PX: Final = 8192

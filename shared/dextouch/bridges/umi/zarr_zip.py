@@ -23,7 +23,7 @@ import zstandard
 from jaxtyping import Shaped
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes import disk_errors
 from dextouch.errors import (
     CorruptDataError,
     InvalidInputError,

@@ -31,7 +31,7 @@ from dextouch.episodes.shard_reader import decode_rows
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
-from dextouch.episodes.staged_group import kind_of, read_stage
+from dextouch.episodes.staged_group import STAGE_FILE, attributes_id, kind_of, read_stage
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.images import jpeg_size
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
@@ -284,10 +284,30 @@ def is_held(folder: Path) -> bool:
     return False
 
 
-def unfinished(root: Path) -> Iterator[tuple[str, Path]]:
+def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:
     """Kind and folder of every upload and stage below a store's folder."""
     for kind, name in (("upload", UPLOADS), ("stage", STAGING)):
         folder = root / name
         with disk_errors(f"list {name}"):
             paths = sorted(folder.iterdir()) if folder.is_dir() else []
         yield from ((kind, path) for path in paths)
+
+
+def interrupted_takes(root: Path) -> Iterator[tuple[str, str]]:
+    """Kind and id of each take that a repair can complete: its stage is held by no writer.
+
+    A damaged one has kind "stage" and the name of its folder.
+    """
+    for what, folder in unfinished_folders(root):
+        if what == "stage" and (folder / STAGE_FILE).is_file() and not is_held(folder):
+            yield _take_in(folder)
+
+
+def _take_in(stage: Path) -> tuple[str, str]:
+    try:
+        attributes = read_stage(stage)
+    except StorageError:
+        attributes = None
+    if attributes is None:
+        return "stage", stage.name
+    return kind_of(attributes), attributes_id(attributes)

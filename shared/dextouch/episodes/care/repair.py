@@ -11,6 +11,21 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
+from dextouch.episodes.care.inspection import (
+    STAGING,
+    UPLOADS,
+    ItemReport,
+    inspect_group,
+    inspect_upload,
+    open_contents,
+)
+from dextouch.episodes.care.salvage import (
+    SalvagedStream,
+    group_streams,
+    spool_streams,
+    stage_streams,
+    write_salvaged,
+)
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
 from dextouch.episodes.format import (
     ATTRIBUTES_KEY,
@@ -27,21 +42,6 @@ from dextouch.episodes.format import (
     with_rows,
 )
 from dextouch.episodes.group_contents import CommittedGroup, get_metadata
-from dextouch.episodes.inspection import (
-    STAGING,
-    UPLOADS,
-    ItemReport,
-    inspect_group,
-    inspect_upload,
-    open_contents,
-)
-from dextouch.episodes.salvage import (
-    SalvagedStream,
-    group_streams,
-    spool_streams,
-    stage_streams,
-    write_salvaged,
-)
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_reader import read_attributes
 from dextouch.episodes.staged_group import Attributes, attributes_id, kind_of, read_stage

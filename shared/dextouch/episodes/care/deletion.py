@@ -15,9 +15,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from dextouch.episodes.care.store_facts import PLACES, Facts, Wanted, all_facts, small_files
 from dextouch.episodes.files import disk_errors, replace_file
 from dextouch.episodes.format import sha256_hex
-from dextouch.episodes.store_facts import PLACES, Facts, Wanted, all_facts, small_files
 from dextouch.episodes.trash import HOMES, TRASH, TrashKind, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 

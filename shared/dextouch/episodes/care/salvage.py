@@ -13,6 +13,7 @@ import google_crc32c
 import numpy as np
 
 from dextouch.episodes.batch_bytes import batch_of_bytes
+from dextouch.episodes.care.inspection import STAGING, hashed_bytes
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     GOP_IMAGES,
@@ -25,7 +26,6 @@ from dextouch.episodes.format import (
     with_rows,
 )
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.inspection import STAGING, hashed_bytes
 from dextouch.episodes.journal import JOURNAL_MAGIC, JOURNAL_ROW, journal_path, part_path
 from dextouch.episodes.shard_index import salvaged_index
 from dextouch.episodes.shard_reader import ShardReader, decode_rows

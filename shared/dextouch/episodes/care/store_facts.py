@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dextouch.episodes.care.inspection import STAGING, UPLOADS
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
-from dextouch.episodes.inspection import STAGING, UPLOADS
 from dextouch.episodes.spool_reader import RECORDING_FILE
 from dextouch.episodes.staged_group import STAGE_FILE
 from dextouch.episodes.trash import TRASH
