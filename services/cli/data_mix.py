@@ -1,4 +1,4 @@
-"""How the episodes of a data set differ from each other: `--mix` of `dextouch train data`."""
+"""Composition of training data sets, selected by `--mix` of `dextouch train data`."""
 
 import zlib
 from dataclasses import asdict, dataclass, replace
@@ -10,11 +10,11 @@ from dextouch.errors import InvalidInputError
 from services.twin.motions import MOTION_KINDS, Motion, MotionKind
 from services.twin.take_options import TakeOptions
 
-# Success is decided within about 5 mm, so the ladder is dense there.
+# Success is decided within about 5 mm, so the levels are dense there.
 LADDER_M: Final = (0.0, 0.0025, 0.005, 0.0075, 0.010, 0.015, 0.020, 0.030, 0.040)
-# Largest errors; each take draws its own standard deviation evenly between 0 and this.
+# Largest noise; each take draws its own standard deviation uniformly between 0 and this.
 NOISE_RANGES_M: Final = {"fine": 0.012, "medium": 0.025, "coarse": 0.040}
-# From which steps (the last not included) things happen; before step 8 nothing has been reached.
+# Ranges of the first step of a deviation (end excluded); nothing is reached before step 8.
 _FROM_STEPS: Final = {
     "frozen": (8, 70),
     "retreat": (5, 70),
@@ -22,9 +22,9 @@ _FROM_STEPS: Final = {
     "push": (8, 55),
     "wander": (8, 55),
 }
-# Of the pushes and wanders, those that begin at once, without anything of the script.
+# Share of pushes and wanders that replace the script from the first step on.
 _AT_ONCE: Final = 0.7
-# Seeds of one purpose (training, development, evaluation) lie in blocks of this many.
+# Seeds of one purpose (training, development, evaluation) form blocks of this size.
 _SEED_BLOCK: Final = 10_000
 _SUM_TOLERANCE: Final = 1e-9
 _HOLD: Final = TakeOptions(frozen_from_step=0)
@@ -32,13 +32,13 @@ _HOLD: Final = TakeOptions(frozen_from_step=0)
 
 @dataclass(frozen=True)
 class Mix:
-    """Which share of the episodes is made how; the shares sum to 1.
+    """Shares of the kinds of takes in a data set; they sum to 1.
 
-    Scripts: `exact`, with errors of up to 12 (`fine`), 25 (`medium`) or 40 mm (`coarse`) standard
-    deviation, or with `LADDER_M` in turn of the seeds (`ladder`). The others have the errors of a
-    script: `miss` has its objects elsewhere; `frozen` stops midway and `hold` never begins;
-    `retreat`, `push`, `slip` and `wander` are motions of `services.twin.motions`; `other_scene`
-    plays what is done for another seed.
+    Scripts: `exact`, with noise of up to 12 (`fine`), 25 (`medium`) or 40 mm (`coarse`) standard
+    deviation, or with the levels `LADDER_M` in turn of the seeds (`ladder`). The other kinds have
+    the noise of a script: `miss` has displaced objects; `frozen` stops midway and `hold` never
+    starts; `retreat`, `push`, `slip` and `wander` are motions of `services.twin.motions`;
+    `other_scene` plays the actions of another seed.
     """
 
     exact: float = 0.0
@@ -71,10 +71,10 @@ class Mix:
             )
 
     def changed(self, *, miss: float | None = None, still: float | None = None) -> "Mix":
-        """The same with other shares of misses, and of takes that stop (half) or never begin.
+        """Copy with another share of misses, or of takes that stop (half) or never start.
 
         Raises:
-            InvalidInputError: shares outside 0 … 1, or nothing left for anything else.
+            InvalidInputError: shares outside 0 … 1, or none left for other kinds.
         """
         given = {} if miss is None else {"miss": miss}
         if still is not None:
@@ -102,7 +102,7 @@ MIXES: Final[dict[str, Mix]] = {
 
 
 def options_of(task: str, seed: int, mix: Mix) -> TakeOptions:
-    """How the episode of a task and seed is made; the same every time.
+    """Options of the take of a task and seed; deterministic.
 
     Raises:
         InvalidInputError: a negative seed.
@@ -130,7 +130,7 @@ def _with_motion(kind: str, noise_m: float, draw: np.random.Generator) -> TakeOp
     motions: dict[str, MotionKind] = {kind: kind for kind in MOTION_KINDS}
     motion = Motion(motions[kind], int(draw.integers(*_FROM_STEPS[kind])))
     if kind in {"push", "wander"} and draw.random() < _AT_ONCE:
-        # Nothing is left of the script, and so of its error.
+        # Without a script there is no script noise.
         return TakeOptions(motion=replace(motion, from_step=0))
     return TakeOptions(noise_m, motion=motion)
 
@@ -146,12 +146,12 @@ def _noise_m(script: str, seed: int, draw: np.random.Generator) -> float:
         return LADDER_M[seed % len(LADDER_M)]
     if script == "exact":
         return 0.0
-    # To a tenth of a millimetre: it is in the episode's name.
+    # Rounded to a tenth of a millimetre, since it is part of the episode's name.
     return float(np.round(draw.uniform(0, NOISE_RANGES_M[script]), 4))
 
 
 def _another_seed(seed: int, draw: np.random.Generator) -> int:
-    """A seed of the same block, so that nothing of the evaluation's scenes is trained on."""
+    """Another seed of the same block, so that no evaluation scene is trained on."""
     first = seed - seed % _SEED_BLOCK
     step = int(draw.integers(1, _SEED_BLOCK))
     return first + (seed - first + step) % _SEED_BLOCK

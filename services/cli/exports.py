@@ -27,8 +27,8 @@ _EXPORT_HELP = """\
 formats:
   lerobot  a LeRobotDataset v3.0 folder: episodes on a frame grid, video, parquet
   umi      one zip with a Zarr v2 replay buffer: episodes on the model grid
-  mcap     one file an episode or recording, every sample; opens in Foxglove
-  rrd      one file an episode or recording, every sample; opens in Rerun (cannot be imported)
+  mcap     one file per episode or recording, every sample; opens in Foxglove
+  rrd      one file per episode or recording, every sample; opens in Rerun (cannot be imported)
 
 examples:
   dextouch export --format mcap stand-bottle-0003 --to take.mcap
@@ -134,7 +134,7 @@ def _ids(store: EpisodeStore, options: argparse.Namespace) -> list[str]:
     if not found:
         raise NotFoundError(
             f"{options.store}: no {options.kind} matches {wanted or 'anything'}; "
-            "`dextouch store list` says what is there"
+            "`dextouch store list` shows its contents"
         )
     return found
 
@@ -243,7 +243,7 @@ def _export_parser() -> argparse.ArgumentParser:
     parser = _parser("export", "Write episodes or recordings for other tools.", _EXPORT_HELP)
     parser.add_argument("ids", nargs="*", metavar="ID", help="default: all that match the filters")
     parser.add_argument(
-        "--format", required=True, choices=sorted([*_SINGLE, *_JOINT]), help="of what is written"
+        "--format", required=True, choices=sorted([*_SINGLE, *_JOINT]), help="output format"
     )
     parser.add_argument(
         "--to", required=True, type=Path, metavar="PATH", help="file; mcap and rrd: or a folder"
@@ -252,11 +252,11 @@ def _export_parser() -> argparse.ArgumentParser:
         "--kind",
         choices=("episode", "recording"),
         default="episode",
-        help="what the ids name (%(default)s)",
+        help="kind of the ids (%(default)s)",
     )
-    parser.add_argument("--task", metavar="TASK", help="only of this task")
-    parser.add_argument("--domain", choices=("human", "robot"), help="only of this domain")
-    parser.add_argument("--operator", metavar="P", help="only of this operator")
+    parser.add_argument("--task", metavar="TASK", help="only episodes of this task")
+    parser.add_argument("--domain", choices=("human", "robot"), help="only episodes of this domain")
+    parser.add_argument("--operator", metavar="P", help="only items of this operator")
     parser.add_argument("--force", action="store_true", help="replace existing files")
     parser.add_argument(
         "--jpeg-quality",
@@ -265,7 +265,7 @@ def _export_parser() -> argparse.ArgumentParser:
         help="mcap: encode rgb8 images as JPEG (default: lossless)",
     )
     parser.add_argument(
-        "--fps", type=int, metavar="N", help="lerobot: frames a second (the model rate)"
+        "--fps", type=int, metavar="N", help="lerobot: frames per second (default: model rate)"
     )
     parser.add_argument(
         "--repo-id",
@@ -280,7 +280,7 @@ def _import_parser() -> argparse.ArgumentParser:
     parser = _parser("import", "Read files of other tools into a store.", _IMPORT_HELP)
     parser.add_argument("path", type=Path, metavar="PATH", help="file or folder to read")
     parser.add_argument(
-        "--format", required=True, choices=("lerobot", "mcap", "umi"), help="of what is read"
+        "--format", required=True, choices=("lerobot", "mcap", "umi"), help="input format"
     )
     parser.add_argument(
         "--id-prefix", default="", metavar="TEXT", help="lerobot: prefix of every id"

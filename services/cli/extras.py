@@ -2,7 +2,7 @@
 
 from dextouch.errors import DexTouchError, UnavailableError
 
-# By import name; the most relevant one of several extras.
+# By import name; if several extras provide a package, the most relevant one.
 EXTRA_OF = {
     "zarr": "store",
     "zstandard": "store",
@@ -48,8 +48,8 @@ def missing_package(error: ModuleNotFoundError, otherwise: str = "") -> DexTouch
     """Error for a missing package; None if no extra provides it.
 
     Args:
-        error: of the import.
-        otherwise: an alternative to mention.
+        error: error of the import.
+        otherwise: alternative to mention in the message.
     """
     package = (error.name or "").partition(".")[0]
     if package not in EXTRA_OF:

@@ -1,9 +1,8 @@
-"""Imagine the robot episodes of a store with the world model.
+"""Imagination of the robot episodes of a store by the world model.
 
-Their outcome is that of the same actions in the twin. The success probe is trained on them beside
-true episodes, so that its probabilities hold for what is imagined, and measured on those of other
-seeds to see how far imagined endings can be trusted. A state model draws only the images that the
-probe looks at.
+The outcome of each is that of the same actions in the twin. The success probe is trained on them as
+well as on true episodes, so that its probabilities hold for imagined endings, and is evaluated on
+those of other seeds. A state model draws only the images that the probe uses.
 """
 
 import argparse
@@ -33,9 +32,9 @@ WORLD = "world_model"
 
 @dataclass(frozen=True)
 class Choice:
-    """Which episodes of a store are imagined: of these tasks and seeds; None takes all.
+    """Selection of episodes of a store by task and seed; None takes all.
 
-    Of these, a process takes those whose seed leaves the remainder `part` when divided by
+    Each process takes the selected episodes whose seed has the remainder `part` when divided by
     `num_parts`.
     """
 
@@ -45,7 +44,7 @@ class Choice:
     num_parts: int = 1
 
     def takes(self, task: str, seed: int | None) -> bool:
-        """Whether an episode of this task and seed is one of them."""
+        """Whether an episode of this task and seed is selected."""
         of_task = self.tasks is None or task in self.tasks
         of_part = (seed or 0) % self.num_parts == self.part
         return of_task and of_part and (self.seeds is None or seed in self.seeds)
@@ -57,13 +56,13 @@ EVERYTHING = Choice()
 def imagine_all(
     episodes: str, output: str, checkpoint: Path, choice: Choice = EVERYTHING
 ) -> dict[str, int]:
-    """Imagine robot episodes of a store; those that are there are kept.
+    """Imagine robot episodes of a store; existing results are kept.
 
     Args:
         episodes: store to read.
         output: store to write.
-        checkpoint: of a world model of either form.
-        choice: which of the episodes.
+        checkpoint: checkpoint of a world model of either kind.
+        choice: episodes to imagine.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
@@ -83,28 +82,28 @@ def imagine_all(
 def imagine_in_parts(
     episodes: str, output: str, checkpoint: Path, choice: Choice, num_jobs: int
 ) -> dict[str, int]:
-    """Imagine episodes in several processes; arguments and result as of `imagine_all`."""
+    """Imagine episodes in several processes; arguments and result as in `imagine_all`."""
     if num_jobs == 1:
         return imagine_all(episodes, output, checkpoint, choice)
     parts = [replace(choice, part=part, num_parts=num_jobs) for part in range(num_jobs)]
-    # A fresh interpreter: a forked one would share the threads of torch.
+    # Fresh interpreters: forked ones would share the threads of torch.
     with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
         running = [pool.submit(imagine_all, episodes, output, checkpoint, one) for one in parts]
         return {"imagined": sum(done.result()["imagined"] for done in running)}
 
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
-    """The steps of an episode whose images a judge of success looks at."""
+    """Steps of an episode whose images the success probe uses."""
     seed, last = episode.attributes.seed or 0, episode.num_steps - 1
     ends = (early_step(seed), middle_step(seed), last - 1, last)
     return {step for end in ends for step in range(end - NUM_SEEN_STEPS + 1, end + 1)}
 
 
 def seed_range(text: str) -> range:
-    """Seeds written as FIRST:LAST+1.
+    """Parse seeds given as FIRST:LAST+1.
 
     Raises:
-        ArgumentTypeError: anything else.
+        ArgumentTypeError: invalid text.
     """
     first, _, stop = text.partition(":")
     if not (first.isdecimal() and stop.isdecimal() and int(first) < int(stop)):
@@ -113,10 +112,10 @@ def seed_range(text: str) -> range:
 
 
 def positive(text: str) -> int:
-    """A number of processes.
+    """Parse a number of processes.
 
     Raises:
-        ArgumentTypeError: none, or no number.
+        ArgumentTypeError: not a positive number.
     """
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"got {text!r}, expected a number of at least 1")
@@ -124,24 +123,27 @@ def positive(text: str) -> int:
 
 
 def main(argv: Sequence[str]) -> int:
-    """`dextouch train imagined`."""
+    """Run `dextouch train imagined`."""
     parser = CommandParser(
         prog="dextouch train imagined",
         description=__doc__,
         epilog="example:\n  dextouch train imagined --episodes runs/episodes --store runs/imagined",
     )
-    parser.add_argument("--episodes", required=True, help="folder of the store to imagine")
-    parser.add_argument("--store", required=True, help="folder of the store for the result")
+    parser.add_argument("--episodes", required=True, help="store of the episodes to imagine")
+    parser.add_argument("--store", required=True, help="store for the imagined episodes")
     parser.add_argument(
         "--checkpoint",
         type=Path,
         default=default_checkpoint(),
-        help="of either form (the package's)",
+        help="world model (default: the package's)",
     )
-    parser.add_argument("--tasks", help="with commas (all)")
-    parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (all)")
+    parser.add_argument("--tasks", help="comma-separated tasks (default: all)")
+    parser.add_argument("--seeds", type=seed_range, help="FIRST:LAST+1 (default: all)")
     parser.add_argument(
-        "--jobs", type=positive, default=os.cpu_count() or 1, help="processes (one a core)"
+        "--jobs",
+        type=positive,
+        default=os.cpu_count() or 1,
+        help="processes (default: one per core)",
     )
     add_json(parser)
     arguments = parser.parse_args(list(argv))

@@ -14,7 +14,7 @@ from services.cli.extras import missing_package
 class Command(NamedTuple):
     """A command: the module whose `main(argv)` runs it, and its summary.
 
-    `before` are words inserted before the arguments.
+    `before` holds words inserted before the arguments.
     """
 
     module: str
@@ -43,7 +43,9 @@ COMMANDS = {
     "align": Command("services.alignment.__main__", "turn recordings into synchronized episodes"),
     "train": Command("services.cli.train", "train the world model, a policy or the success probe"),
     "checkpoint": Command(
-        "services.world_model.__main__", "show where a world model comes from", ("show",)
+        "services.world_model.__main__",
+        "show the provenance and accuracy of a world model",
+        ("show",),
     ),
     "serve": Command(
         "services.world_model.__main__", "serve the world model's rollouts", ("serve",)
@@ -78,11 +80,11 @@ def usage() -> str:
             "usage: dextouch COMMAND [options]",
             "       dextouch GROUP COMMAND [options]",
             "",
-            "Collect human and robot touch, learn a world model from it, judge policies inside it.",
+            "Collect human and robot touch, train a world model on it, evaluate policies in it.",
             "",
             *rows,
             "",
-            "Every command explains itself with --help; those that end write their result with",
+            "Every command has --help; commands that terminate write their result with",
             "--json PATH, or --json - for standard output. A service (serve, station serve, …)",
             "takes its flags as variables too. All commands: docs/command_line.md",
             "",
@@ -102,7 +104,7 @@ def group_usage(group: str) -> str:
             "",
             *rows,
             "",
-            f"Each explains itself, such as: dextouch {group} {next(iter(inner))} --help",
+            f"Help for one of them: dextouch {group} {next(iter(inner))} --help",
         ]
     )
 
@@ -111,8 +113,8 @@ def find_command(name: str, rest: Sequence[str]) -> tuple[str, Command, list[str
     """Resolve a command.
 
     Args:
-        name: of `COMMANDS`.
-        rest: the remaining arguments.
+        name: name in `COMMANDS`.
+        rest: remaining arguments.
 
     Returns:
         Full name of the command, the command, and its arguments.

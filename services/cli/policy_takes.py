@@ -1,4 +1,4 @@
-"""What a policy does in the twin, as the actions of an episode: `dextouch train data --policy`."""
+"""Rollouts of a policy in the twin as episodes, for `dextouch train data --policy`."""
 
 import hashlib
 import json
@@ -27,24 +27,24 @@ _MAX_LABEL = 32
 
 @dataclass(frozen=True)
 class PolicyChoice:
-    """A policy by its address, as evaluation takes it, and its factory's arguments as JSON."""
+    """A policy's address, as in `dextouch evaluate`, and its factory's arguments as JSON."""
 
     address: str
     arguments: str = "{}"
 
     @classmethod
     def parse(cls, address: str, arguments: Mapping[str, Any]) -> "PolicyChoice":
-        """A choice whose address was checked.
+        """Validate the address and create a choice.
 
         Raises:
-            InvalidInputError: an address that is none.
+            InvalidInputError: an invalid address.
         """
         PolicySource.parse(address)
         return cls(address, json.dumps(arguments, sort_keys=True))
 
     @property
     def label(self) -> str:
-        """Its name in the ids of episodes: another address or other arguments differ."""
+        """Name used in episode ids; it depends on the address and the arguments."""
         name = re.sub(r"[^a-z0-9]+", "_", PolicySource.parse(self.address).name.lower()).strip("_")
         digest = hashlib.sha256(f"{self.address} {self.arguments}".encode()).hexdigest()
         return f"{name[:_MAX_LABEL]}_{digest[:6]}"
@@ -61,12 +61,12 @@ def _policy(choice: PolicyChoice) -> Policy:
 
 
 def played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
-    """The actions of a policy that acts in a closed loop in the twin, from a seed's start.
+    """Closed-loop actions of a policy in the twin, from the start of a seed.
 
-    The twin repeats itself to the last bit, so an episode with these actions is the rollout.
+    The twin is deterministic, so that an episode with these actions is the rollout.
 
     Raises:
-        InvalidInputError, ShapeError, NonFiniteError: the policy failed; its traceback is told.
+        InvalidInputError, ShapeError, NonFiniteError: the policy failed; includes its traceback.
     """
     world, policy, task = _world(), _policy(choice), stage.task
     start = RolloutStart(task=task.name, seed=seed, instruction=task.instruction)
@@ -75,7 +75,7 @@ def played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
     where = f"policy {choice.address!r}, task {task.name!r}, seed {seed}"
     told = PolicyStart(task.name, task.instruction, seed, begun.anchor, begun.K_head)
     ask(policy.reset, told, where=f"{where}: reset")
-    # Row 0 is the start itself.
+    # Row 0 is the start.
     rows = [seen.action_reached[:1]]
     while (left := NUM_GRID_STEPS - sum(map(len, rows))) > 0:
         chunk = action_chunk(ask(policy.act, seen, where=f"{where}: act"), world.description,

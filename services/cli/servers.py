@@ -115,7 +115,7 @@ async def serve_all(
 
 
 def stop_on_signals(stop: asyncio.Event) -> None:
-    """SIGINT and SIGTERM set `stop`; a second one ends the process at once."""
+    """Set `stop` on SIGINT or SIGTERM; a second signal ends the process at once."""
     loop = asyncio.get_running_loop()
 
     def on_signal(number: signal.Signals) -> None:

@@ -1,10 +1,10 @@
-"""Command line of `dextouch train`: recording episodes and training checkpoints of every kind."""
+"""Command line of `dextouch train`: records training data and trains all checkpoints."""
 
 import importlib
 import sys
 from collections.abc import Sequence
 
-# What is trained: the module that does it, and the words put before the arguments.
+# Module of each command, and arguments inserted before the user's.
 TRAINERS: dict[str, tuple[str, tuple[str, ...]]] = {
     "data": ("services.cli.training_data", ()),
     "world-model": ("services.world_model.__main__", ("train",)),
@@ -17,15 +17,15 @@ TRAINERS: dict[str, tuple[str, tuple[str, ...]]] = {
 
 USAGE = """usage: dextouch train COMMAND [options]
 
-  data         record the mixed twin episodes that everything is trained on
-  world-model  the joint visuo-tactile flow-matching model
-  state        the state model: start readers and recurrent cores on whole episodes
-  imagined     those episodes as the world model imagines them
-  policy       a closed-loop policy that imitates the demonstrations
-  probe        the judge of imagined success, from true and imagined episodes
-  direct-judge its rival, which imagines nothing: for `python -m benchmarks evaluator --direct`
+  data         record the twin episodes that all training uses
+  world-model  train the joint visuo-tactile flow-matching model
+  state        train the state model: start readers and recurrent cores
+  imagined     imagine these episodes with the world model
+  policy       train a closed-loop policy on the demonstrations
+  probe        train the success probe on true and imagined episodes
+  direct-judge train its baseline, for `python -m benchmarks evaluator --direct`
 
-Each explains itself with --help and writes its figures with --json PATH. `dextouch demo --train`
+Every command has --help and writes its results with --json PATH. `dextouch demo --train`
 trains a small state model, a policy and a probe; docs/evaluation.md has the commands.
 
 example:
@@ -33,7 +33,7 @@ example:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Train one thing; 2 for a word that is none."""
+    """Run one command; returns its exit status (2 for an unknown command)."""
     word, *rest = list(argv) or ["--help"]
     if word in {"-h", "--help"}:
         print(USAGE)

@@ -1,10 +1,9 @@
-"""Record twin episodes that networks are trained and tested on.
+"""Record twin episodes for training and testing networks.
 
-What decides success must be in the data: errors around the few millimetres that decide, misses,
-takes that stop or never begin, retreats, pushes, grasps that slip, hands that wander, and what is
-done for another scene. `--mix` says how much of each. With `--policy` every episode is a rollout
-of that policy in the twin instead. Interrupted runs go on where they were: what is in the store is
-kept.
+The data set covers the factors that decide success: errors of a few millimetres, misses, takes that
+stop or never start, retreats, pushes, slipping grasps, wandering hands, and actions of another
+scene. `--mix` selects their shares. With `--policy` every episode is a rollout of that policy in
+the twin instead. Interrupted runs resume: existing episodes are kept.
 """
 
 import argparse
@@ -38,9 +37,10 @@ DEFAULT_MIX = "evaluator"
 
 @dataclass(frozen=True)
 class Scope:
-    """What is recorded: of which tasks and hands, how many of the images, and which streams.
+    """Tasks, domains, images and streams to record.
 
-    Images show the grid steps (15 Hz) that are multiples of `image_every`, and the last three.
+    Images are recorded at the grid steps (15 Hz) that are multiples of `image_every`, and at the
+    last three.
     """
 
     tasks: tuple[str, ...] = TASK_NAMES
@@ -59,7 +59,7 @@ class Scope:
 
 @dataclass(frozen=True)
 class _Order:
-    """One episode to make, in whatever process."""
+    """One episode to record, in any process."""
 
     task: str
     domain: Domain
@@ -76,7 +76,7 @@ class _Order:
 
 @dataclass(frozen=True)
 class _Answer:
-    """What became of an order: its success, None where another process was faster, or why not."""
+    """Result of an order: success, None if another process was faster, or a refusal."""
 
     episode_id: str
     success: bool | None = None
@@ -85,7 +85,7 @@ class _Answer:
 
 @lru_cache(maxsize=12)
 def _stage(task: str, domain: Domain) -> Stage:
-    """Each process compiles each scene once."""
+    """Stage of a task, compiled once per process."""
     return Stage(task, domain, TwinSettings())
 
 
@@ -114,22 +114,22 @@ def make_training_data(
     scope: Scope | None = None,
     policy: PolicyChoice | None = None,
 ) -> dict[str, int]:
-    """Record one episode a seed, task and domain; what the store has already is kept.
+    """Record one episode per seed, task and domain; existing episodes are kept.
 
     Args:
         store: folder of the store.
-        seeds: of the scenes.
-        mix: how the takes are made.
-        num_jobs: processes; one a core by default.
+        seeds: seeds of the scenes.
+        mix: kinds of takes.
+        num_jobs: processes; default: one per core.
         scope: tasks, domains and streams.
-        policy: acts instead of the scripts; the mix is not used then.
+        policy: policy that acts instead of the scripts; `mix` is then ignored.
 
     Returns:
-        How many episodes were `made`, `kept` or `refused` (the physics diverged, or the policy
-        failed), and how many of those made `succeeded`.
+        Numbers of episodes `made`, `kept` and `refused` (the physics diverged, or the policy
+        failed), and of those made, how many `succeeded`.
 
     Raises:
-        InvalidInputError: no seeds, tasks or domains, or a policy with the hands of a human.
+        InvalidInputError: no seeds, tasks or domains, or a policy with human hands.
     """
     scope = scope or Scope()
     if not seeds or not scope.tasks or not scope.domains or (num_jobs is not None and num_jobs < 1):
@@ -140,7 +140,7 @@ def make_training_data(
     if policy is not None and scope.domains != ("robot",):
         raise InvalidInputError("training data: got a policy for human hands; it moves the robot's")
     target = EpisodeStore(store)
-    # What a killed run left half-written; stages of running writers are not touched.
+    # Remove partial episodes of killed runs; those of running writers are not touched.
     target.sweep()
     present = set(target.list())
     orders = list(_orders(store, seeds, mix, scope, policy))
@@ -178,7 +178,7 @@ def _orders(
 
 
 def _answers(orders: Sequence[_Order], num_jobs: int) -> Iterator[_Answer]:
-    """Answers as they come."""
+    """Answers in the order of completion."""
     if num_jobs == 1 or len(orders) < 2:
         yield from map(_make, orders)
         return
@@ -187,14 +187,14 @@ def _answers(orders: Sequence[_Order], num_jobs: int) -> Iterator[_Answer]:
         pool = stack.enter_context(
             ProcessPoolExecutor(min(num_jobs, len(orders)), multiprocessing.get_context("spawn"))
         )
-        # When the caller stops, what has not begun is given up.
+        # If the caller stops, pending orders are cancelled.
         stack.callback(pool.shutdown, wait=False, cancel_futures=True)
         for future in as_completed([pool.submit(_make, order) for order in orders]):
             yield future.result()
 
 
 def _words(choices: Sequence[str]) -> Callable[[str], tuple[str, ...]]:
-    """Reads names with commas between them."""
+    """Parser of comma-separated names."""
 
     def read(text: str) -> tuple[str, ...]:
         names = tuple(name for name in text.split(",") if name)
@@ -224,44 +224,54 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--store", required=True, help="folder of the episode store")
     parser.add_argument("--first", type=int, default=0, help="first seed (%(default)s)")
-    parser.add_argument("--count", type=int, default=130, help="seeds a task (%(default)s)")
+    parser.add_argument("--count", type=int, default=130, help="seeds per task (%(default)s)")
     parser.add_argument(
-        "--tasks", type=_words(TASK_NAMES), default=TASK_NAMES, help="with commas (all)"
+        "--tasks",
+        type=_words(TASK_NAMES),
+        default=TASK_NAMES,
+        help="comma-separated (default: all)",
     )
     parser.add_argument(
         "--domains", type=_words(DOMAINS), default=("robot",), help="robot,human (robot)"
     )
     mixes = parser.add_mutually_exclusive_group()
     mixes.add_argument(
-        "--mix", choices=list(MIXES), default=DEFAULT_MIX, help="which takes (%(default)s)"
+        "--mix", choices=list(MIXES), default=DEFAULT_MIX, help="kinds of takes (%(default)s)"
     )
     for name, told in (("exact", "no errors"), ("ladder", "errors of 0 … 40 mm in turn")):
         mixes.add_argument(
-            f"--{name}", dest="mix", action="store_const", const=name, help=f"{told}, and no others"
+            f"--{name}",
+            dest="mix",
+            action="store_const",
+            const=name,
+            help=f"{told}, no other kinds",
         )
-    parser.add_argument("--miss-fraction", type=float, help="share of misses (as in the mix)")
+    parser.add_argument("--miss-fraction", type=float, help="share of misses (default: the mix's)")
     parser.add_argument(
-        "--still-fraction", type=float, help="share of takes that stop or never begin"
+        "--still-fraction", type=float, help="share of takes that stop or never start"
     )
     parser.add_argument(
         "--policy", metavar="[NAME=]MODULE:FACTORY", help="record rollouts of this policy instead"
     )
     parser.add_argument(
-        "--policy-arguments", type=_keywords, default={}, help="of the factory, as a JSON object"
+        "--policy-arguments",
+        type=_keywords,
+        default={},
+        help="arguments of the factory, as a JSON object",
     )
     parser.add_argument(
-        "--images", type=int, default=1, metavar="N", help="of every N-th step (%(default)s)"
+        "--images", type=int, default=1, metavar="N", help="images of every N-th step (%(default)s)"
     )
     parser.add_argument(
         "--streams", choices=STREAM_CHOICES, default="training", help="(%(default)s)"
     )
-    parser.add_argument("--jobs", type=int, help="processes (one a core)")
+    parser.add_argument("--jobs", type=int, help="processes (default: one per core)")
     add_json(parser)
     return parser
 
 
 def main(argv: Sequence[str]) -> int:
-    """`dextouch train data`; 1 if an episode could not be made."""
+    """Run `dextouch train data`; returns 1 if an episode could not be recorded."""
     arguments = _parser().parse_args(list(argv))
     seeds = range(arguments.first, arguments.first + max(0, arguments.count))
     mix = MIXES[arguments.mix].changed(miss=arguments.miss_fraction, still=arguments.still_fraction)

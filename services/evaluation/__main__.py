@@ -170,7 +170,7 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
     names += [*settings.scripts, *settings.builtin]
     if repeated := sorted({name for name in names if names.count(name) > 1}):
         raise InvalidInputError(
-            f"policies: {repeated[0]!r} is there twice; name yours, --policy NAME=MODULE:FACTORY"
+            f"policies: {repeated[0]!r} is given twice; rename one, --policy NAME=MODULE:FACTORY"
         )
     policies = {s.name: s.load(settings.policy_arguments.get(s.name, {})) for s in sources}
     for name, url in settings.scripts.items():

@@ -236,7 +236,7 @@ class _Study:
             rollout.close()
             raise ConflictError(
                 f"world {address.world!r}: task {start.task!r} with seed {start.seed} began "
-                "differently than before; matched starts need a world that repeats itself"
+                "differently than before; matched starts need a deterministic world"
             )
         return rollout
 

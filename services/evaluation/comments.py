@@ -62,13 +62,13 @@ def _mean_error(bias: float, world: str) -> str:
     start = "On these starts"
     if bias >= NOTABLE_BIAS:
         return (
-            f"{start} {world} flatters: its success rates are {bias:.2f} above the real ones "
-            "on average."
+            f"{start} {world} is too optimistic: its success rates are {bias:.2f} above the "
+            "real ones on average."
         )
     if bias <= -NOTABLE_BIAS:
         return (
-            f"{start} {world} is too strict: its success rates are {-bias:.2f} below the real "
-            "ones on average."
+            f"{start} {world} is too pessimistic: its success rates are {-bias:.2f} below "
+            "the real ones on average."
         )
     return f"{start} the success rates of {world} are {bias:+.2f} from the real ones on average."
 

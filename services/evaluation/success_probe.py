@@ -140,10 +140,10 @@ class SuccessProbe:
         likely = probability >= self.threshold
         reason = None
         if ending.doubted is not None:
-            reason = f"the world doubts what it shows: {ending.doubted}"
+            reason = f"the world flags its prediction: {ending.doubted}"
         elif band > 0 and abs(probability - self.threshold) <= band:
             reason = (
-                f"its probability is within {band:.2f} of {self.threshold:g}, where the judge "
+                f"its probability is within {band:.2f} of {self.threshold:g}, where the probe "
                 "errs too often"
             )
         decided: Decision = "success" if likely else "failure"

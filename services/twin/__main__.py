@@ -82,8 +82,10 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", required=True, metavar="{record,serve}")
     does = "record episodes of a scripted demonstrator with true values"
     make = commands.add_parser("record", help=does, description=does.capitalize(), epilog=EXAMPLE)
-    make.add_argument("--task", required=True, choices=TASK_NAMES, help="what is demonstrated")
-    make.add_argument("--seeds", required=True, type=_seed_range, metavar="A:B", help="without B")
+    make.add_argument("--task", required=True, choices=TASK_NAMES, help="task to demonstrate")
+    make.add_argument(
+        "--seeds", required=True, type=_seed_range, metavar="A:B", help="seeds A … B-1"
+    )
     make.add_argument("--domain", default="robot", choices=DOMAINS, help="hands (%(default)s)")
     make.add_argument(
         "--noise",
@@ -97,17 +99,17 @@ def _parser() -> argparse.ArgumentParser:
         default=0.0,
         type=float,
         metavar="SHARE",
-        help="of takes that miss the objects (%(default)s)",
+        help="share of takes that miss (%(default)s)",
     )
     make.add_argument(
-        "--freeze-from", type=int, metavar="STEP", help="freeze commands from there (0 … 80)"
+        "--freeze-from", type=int, metavar="STEP", help="freeze commands from a step on (0 … 80)"
     )
     make.add_argument("--motion", choices=MOTION_KINDS, help="replace the script by this motion")
     make.add_argument(
-        "--motion-from", type=int, default=0, metavar="STEP", help="of the motion (%(default)s)"
+        "--motion-from", type=int, default=0, metavar="STEP", help="its first step (%(default)s)"
     )
     make.add_argument(
-        "--actions-of", type=int, metavar="SEED", help="play the actions of this seed instead"
+        "--actions-of", type=int, metavar="SEED", help="play the actions of another seed instead"
     )
     make.add_argument("--cameras", nargs="*", default=list(CAMERAS), choices=CAMERAS, help="(all)")
     make.add_argument(
@@ -117,7 +119,7 @@ def _parser() -> argparse.ArgumentParser:
         help="record images of every n-th step instead of at 30 Hz",
     )
     make.add_argument(
-        "--streams", default="all", choices=STREAM_CHOICES, help="which (%(default)s)"
+        "--streams", default="all", choices=STREAM_CHOICES, help="streams to record (%(default)s)"
     )
     make.add_argument(
         "--store",

@@ -76,13 +76,13 @@ def record(
 
     Args:
         stage: a task with the hands of a domain.
-        seed: of the scene and of all random numbers.
-        options: of the take; they determine the commands unless `played` is given.
+        seed: seed of the scene and of all random numbers.
+        options: options of the take; they determine the commands unless `played` is given.
         played: actions from another source.
     """
     plan = stage.plan(seed, noise_m=options.noise_m, miss=options.miss)
     anchor = stage.start(plan)
-    # Commands are converted to 67-D and back, so that the take follows exactly its
+    # Commands are converted to 67-D and back, so that the take exactly follows its
     # `action_commanded`.
     if played is None:
         actions_commanded = _commanded(stage, seed, options, plan, anchor)
@@ -118,7 +118,7 @@ def _commanded(
     """Commanded 67-D actions, relative to the measured poses at the start."""
     if options.actions_of_seed is not None:
         other = stage.plan(options.actions_of_seed, noise_m=options.noise_m).commands
-        # As measured at the start of that take, where the hands are at the first command.
+        # Measured at the start of that take, where the hands are at the first command.
         Ts = transform_from_pose(pose_from_transform(np.stack(other.anchor(0).as_tuple())))
         return actions_from_poses(other, AnchorPoses(*Ts))
     commands = plan.commands

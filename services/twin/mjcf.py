@@ -151,7 +151,7 @@ def scene_xml(hands: tuple[TwinHand, ...], objects: str) -> str:
     """MJCF of the scene: table, a shelf behind the viewer for removed objects, hands and objects.
 
     Args:
-        hands: left and right, or any of them.
+        hands: hands to simulate, left before right.
         objects: MJCF bodies; geoms of class "object".
     """
     bodies = "".join(_hand(hand) for hand in hands)

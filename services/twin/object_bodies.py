@@ -119,7 +119,7 @@ class ObjectBodies:
             elif not np.allclose(T_root, placed[row], rtol=0.0, atol=_SAME_PLACE):
                 raise InvalidInputError(
                     f"twin: got pose {poses[index].tolist()} for {self._names[index]!r}, expected "
-                    "the one that it has with its joint at rest on the thing it hangs on"
+                    "its pose on the object it is attached to, with joints at rest"
                 )
 
     def poses(self, data: mujoco.MjData) -> Float64[np.ndarray, "objects 7"]:

@@ -19,7 +19,7 @@ class TwinServiceSettings(WorldServiceSettings):
 
     model_config = service_config("twin", "dextouch twin serve")
 
-    scene: TwinSettings = Field(default=TwinSettings(), description="cameras and objects")
+    scene: TwinSettings = Field(default=TwinSettings(), description="settings of the scene")
 
 
 def twin_worlds(scene: TwinSettings) -> dict[str, World[Any]]:

@@ -13,10 +13,10 @@ class TwinSettings(BaseModel):
 
     cameras: tuple[str, ...] = Field(
         default=("camera_head", "camera_wrist_left", "camera_wrist_right"),
-        description="rendered ones; each takes half as long as the physics",
+        description="cameras to render; each takes half as long as the physics",
     )
-    image_height_px: int = Field(default=64, ge=16, le=512, description="of every camera")
-    image_width_px: int = Field(default=64, ge=16, le=512, description="of every camera")
+    image_height_px: int = Field(default=64, ge=16, le=512, description="height of every image")
+    image_width_px: int = Field(default=64, ge=16, le=512, description="width of every image")
     settle_s: float = Field(
         default=0.2, ge=0.0, le=2.0, description="seconds that objects settle before a take"
     )

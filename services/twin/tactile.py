@@ -136,8 +136,8 @@ def elastic_layer(
 
     Args:
         depths_m: 0 or more, at least one of them positive.
-        force_n: what the forces sum to.
-        stiffness_n_m: of one taxel.
+        force_n: sum of the forces.
+        stiffness_n_m: stiffness of one taxel.
     """
     touched = depths_m > 0.0
     deepest_first = np.sort(depths_m[touched])[::-1]

@@ -125,9 +125,9 @@ def episode_id(
 
     Args:
         task: name of the task.
-        domain: whose hands.
-        seed: of the scene.
-        options: of the take.
+        domain: robot or human hands.
+        seed: seed of the scene.
+        options: options of the take.
         played: name of the `PlayedActions`, if there are any.
     """
     parts = ["twin", task, domain, f"{seed:06d}"]

@@ -52,7 +52,7 @@ class TwinWorld:
     treated as commands. The physics has no noise, so the seed of a step has no effect.
 
     Args:
-        settings: of the cameras.
+        settings: cameras and their image size.
 
     Raises:
         UnknownNameError: an unknown camera.
@@ -91,11 +91,11 @@ class TwinWorld:
 
     @property
     def description(self) -> WorldDescription:
-        """See World."""
+        """See `World`."""
         return self._description
 
     def reset(self, start: RolloutStart) -> StartedRollout[TwinState]:
-        """See World; hands and objects are placed by the seed."""
+        """See `World`; the seed determines the poses of hands and objects."""
         if start.observation is not None:
             raise InvalidInputError(
                 "world twin: got a start with an observation; it begins from task and seed only"
@@ -118,7 +118,7 @@ class TwinWorld:
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[TwinState]:
-        """See World; wrists, fingers and head follow the actions."""
+        """See `World`; wrists, fingers and head follow the actions."""
         del seed
         checked = check_actions(actions, where="world twin: actions")
         commands = poses_from_actions(checked, state.anchor)
@@ -143,7 +143,7 @@ class TwinWorld:
         return SteppedRollout(after, seen)
 
     def snapshot(self, state: TwinState) -> bytes:
-        """See World."""
+        """See `World`."""
         fields = {
             "world": self._description.digest,
             "task": state.task,
@@ -153,7 +153,7 @@ class TwinWorld:
         return pack(fields, {"physics": state.physics, "anchor": np.stack(state.anchor.as_tuple())})
 
     def restore(self, data: bytes) -> TwinState:
-        """See World."""
+        """See `World`."""
         fields, arrays = unpack(data, max_bytes=MAX_SNAPSHOT_BYTES)
         if set(fields) != {"world", "task", "seed", "step"} or set(arrays) != {"physics", "anchor"}:
             raise InvalidInputError(

@@ -89,7 +89,7 @@ def rollout_from_bytes(data: bytes, metadata: StateMetadata, digest: str) -> Sta
     check_geometry(anchor, K_head)
     memory = memory_from_arrays(arrays, config, metadata.num_members)
     if int(memory.start[0].task[0]) != config.tasks.index(name):
-        raise InvalidInputError(f"snapshot: its memory is not of task {name!r}")
+        raise InvalidInputError(f"snapshot: its memory belongs to another task than {name!r}")
     first_reached = check_actions(arrays["first_reached"][None], where="snapshot")
     check_reach(first_reached)
     return StateRollout(

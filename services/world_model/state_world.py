@@ -351,5 +351,5 @@ def _refuse_non_finite(imagined: ImaginedSteps) -> None:
     ):
         if not torch.isfinite(values).all():
             raise UnavailableError(
-                f"state model: its {what} hold NaN or infinity; the rollout stands where it stood"
+                f"state model: its {what} hold NaN or infinity; the rollout did not advance"
             )

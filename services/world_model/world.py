@@ -323,5 +323,5 @@ def _refuse_non_finite(future: Prediction) -> None:
     for what, values in (("image", future.images), ("touch", future.tactile_kpa)):
         if not torch.isfinite(values).all():
             raise UnavailableError(
-                f"world model: its {what} holds NaN or infinity; the rollout stands where it stood"
+                f"world model: its {what} holds NaN or infinity; the rollout did not advance"
             )

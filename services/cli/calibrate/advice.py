@@ -71,9 +71,9 @@ def camera_coverage(
     """Coverage of the image by positions, tilts and sizes of the board.
 
     Args:
-        views: with a detected board.
+        views: views with a detected board.
         size_px: width and height of the photos.
-        lens: of the camera; a default guess if not yet known.
+        lens: lens of the camera; a default guess if unknown.
     """
     width_px, height_px = size_px
     lens = lens or Lens.guessed(width_px, height_px)

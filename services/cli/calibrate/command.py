@@ -231,13 +231,20 @@ def _word(
 
 def _add_common(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--to", type=Path, required=True, metavar="FOLDER", help="of the calibration; made if new"
+        "--to",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="calibration folder; created if new",
     )
 
 
 def _add_cameras(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "--camera", required=True, choices=("head", "wrist_left", "wrist_right"), help="which one"
+        "--camera",
+        required=True,
+        choices=("head", "wrist_left", "wrist_right"),
+        help="camera to calibrate",
     )
     parser.add_argument("--check", action="store_true", help="only report what is missing")
 
@@ -245,7 +252,9 @@ def _add_cameras(parser: argparse.ArgumentParser) -> None:
 def _add_camera(parser: argparse.ArgumentParser) -> None:
     _add_common(parser)
     _add_cameras(parser)
-    parser.add_argument("--photos", type=Path, required=True, metavar="FOLDER", help="of photos")
+    parser.add_argument(
+        "--photos", type=Path, required=True, metavar="FOLDER", help="folder of photos"
+    )
     parser.add_argument("--board", required=True, metavar="BOARD", help=BOARD_HELP)
     parser.add_argument("--watch", action="store_true", help="watch the folder for new photos")
     parser.add_argument("--url", metavar="URL", help="take photos from this running station")
@@ -261,30 +270,30 @@ def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--intrinsics", type=Path, metavar="FOLDER", help="calibration with K (default: --to)"
     )
-    parser.add_argument("--invert", choices=("tracker", "board"), help="turn this side's poses")
+    parser.add_argument("--invert", choices=("tracker", "board"), help="invert these poses")
 
 
 def _add_glove(parser: argparse.ArgumentParser) -> None:
     _add_common(parser)
     parser.add_argument("--side", required=True, choices=("left", "right"), help="hand")
-    parser.add_argument("--url", metavar="URL", help="this running station records the takes now")
+    parser.add_argument("--url", metavar="URL", help="running station that records the takes")
     parser.add_argument("--key", metavar="KEY", help="API key of the station")
     parser.add_argument(
         "--spool",
         type=Path,
         default=default_spool(),
         metavar="FOLDER",
-        help="the station's takes, with --url (%(default)s)",
+        help="spool of the station, with --url (%(default)s)",
     )
-    parser.add_argument("--rest", metavar="TAKE", help="10 s without contact")
+    parser.add_argument("--rest", metavar="TAKE", help="take of 10 s without contact")
     parser.add_argument("--presses", type=Path, metavar="CSV", help="list of takes under pressure")
-    parser.add_argument("--store", metavar="URL", help="where recordings named by id are")
+    parser.add_argument("--store", metavar="URL", help="store of recordings given by id")
     parser.add_argument(
         "--pressure-sigma",
         type=float,
         default=0.02,
         metavar="RATIO",
-        help="sigma of pressures without sigma_kpa, as a part of them (%(default)s)",
+        help="relative sigma of pressures without sigma_kpa (%(default)s)",
     )
     parser.add_argument(
         "--full-scale",
@@ -300,7 +309,7 @@ def _add_take(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--take", required=True, metavar="TAKE", help="spool folder, or id of a recording"
     )
-    parser.add_argument("--store", metavar="URL", help="where recordings named by id are")
+    parser.add_argument("--store", metavar="URL", help="store of recordings given by id")
 
 
 def _add_hand(parser: argparse.ArgumentParser) -> None:
@@ -318,10 +327,10 @@ def _add_robot_base(parser: argparse.ArgumentParser) -> None:
 
 def _add_latency(parser: argparse.ArgumentParser) -> None:
     _add_take(parser)
-    parser.add_argument("--stream", required=True, metavar="STREAM", help="to be calibrated")
+    parser.add_argument("--stream", required=True, metavar="STREAM", help="stream to calibrate")
     parser.add_argument(
         "--reference",
         required=True,
         metavar="STREAM",
-        help="whose latency is known, or counts as 0",
+        help="stream of known latency, or of latency 0 by definition",
     )

@@ -5,7 +5,7 @@ from html import escape
 
 import numpy as np
 
-# Checked at run time under tests, where an int is no float.
+# Both types: the run-time checks of the tests do not accept an int as a float.
 Px = int | float
 INK, LINE, GOOD, BAD, FAINT = "#1e293b", "#cbd5e1", "#0f766e", "#c2410c", "#94a3b8"
 

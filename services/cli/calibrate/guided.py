@@ -54,7 +54,7 @@ class StationTakes:
     """Records takes with a running station and locates them.
 
     Args:
-        link: to the station.
+        link: connection to the station.
         spool: the station's spool, if accessible from this machine.
         has_store: whether takes may be read from the store that the station uploads to.
         wait: sleeps.

@@ -33,8 +33,8 @@ class Session:
     """Growing set of views of one camera, with its coverage picture.
 
     Args:
-        board: to detect.
-        folder: of the calibration, also for the picture.
+        board: board to detect.
+        folder: calibration folder, also for the picture.
         camera: name of the camera.
     """
 

@@ -44,7 +44,7 @@ def read_stream(take: str, name: str, store: str | None) -> TakenStream:
 
     Args:
         take: path of a spool folder, or id of a recording.
-        name: of the stream.
+        name: name of the stream.
         store: URL of the store that has the recording; None for folders only.
 
     Raises:

@@ -18,8 +18,8 @@ def build_apps(store: str, jobs_folder: Path, world_model: World[Any]) -> dict[s
     """Create store, alignment, the twin as the real world, and the imagined worlds.
 
     Args:
-        store: for recordings and episodes.
-        jobs_folder: of alignment jobs.
+        store: store of recordings and episodes.
+        jobs_folder: folder of alignment jobs.
         world_model: served beside the copy-first baseline.
     """
     imagined: dict[str, World[Any]] = {

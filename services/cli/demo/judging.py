@@ -45,10 +45,10 @@ def judge(
     """Roll out all policies from matched starts in the twin, the model and the copy baseline.
 
     Args:
-        urls: of the services `twin` and `imagined`.
-        policies: by name.
+        urls: URLs of the services `twin` and `imagined`.
+        policies: policies by name.
         models: with the success probe; training scenes are excluded.
-        plan: seeds.
+        plan: plan of the run, with the seeds.
 
     Returns:
         `policies`, `agreement` and other entries of `report.json`.

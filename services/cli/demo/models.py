@@ -21,7 +21,7 @@ from services.world_model.world import open_world
 DEMONSTRATIONS = ("--mix", "demonstrations")
 # Exact demonstrations for the policy: seeds that nothing else uses, no noise, no misses.
 EXACT_DATA = ("--first", "1000", "--count", "120", "--exact")
-# Endings near the border of success for world model and probe, and others to measure it on.
+# Endings near the boundary of success for world model and probe, and others for evaluation.
 ENDINGS = (
     "--ladder", "--first", "2000", "--count", "315",
     "--miss-fraction", "0.1", "--still-fraction", "0.1",
@@ -43,7 +43,7 @@ class TrainedOn:
 
     @classmethod
     def of(cls, checkpoint: Path) -> "TrainedOn":
-        """Read it from a checkpoint of either form."""
+        """Read it from a checkpoint of either kind."""
         if not is_state_checkpoint(checkpoint):
             return cls(fingerprints=read_checkpoint(checkpoint).metadata.train_fingerprints)
         ranges = read_state_checkpoint(checkpoint).metadata.training_seeds
@@ -61,13 +61,13 @@ class TrainedOn:
             if trained:
                 raise ConflictError(
                     f"world model: trained on {task!r} with seeds {low} … {high}, and the demo "
-                    f"judges on seed {trained[0]}; train it on seeds below 20000"
+                    f"evaluates on seed {trained[0]}; train it on seeds below 20000"
                 )
 
 
 @dataclass(frozen=True)
 class Models:
-    """World model of either form, closed-loop policy and success probe."""
+    """World model of either kind, closed-loop policy and success probe."""
 
     world_model: BatchWorld[Any]
     trained_on: TrainedOn
@@ -87,10 +87,10 @@ def committed_models() -> Models:
 def train_models(folder: Path) -> Models:
     """Record training episodes and train a small state model, a policy and a success probe.
 
-    The probe learns from true endings and from those imagined by the state model.
+    The probe is trained on true endings and on those imagined by the state model.
 
     Args:
-        folder: for episodes and checkpoints; existing episodes are reused.
+        folder: folder of episodes and checkpoints; existing episodes are reused.
     """
     episodes, exact, endings, unseen, imagined = (
         str(folder / name) for name in ("episodes", "exact", "endings", "unseen", "imagined")
@@ -112,7 +112,7 @@ def train_models(folder: Path) -> Models:
 
 
 def use_one_thread() -> None:
-    """Limit torch to one thread, since more slow down small networks beside busy services."""
+    """Limit torch to one thread; more slow down small networks beside busy services."""
     torch.set_num_threads(1)
 
 

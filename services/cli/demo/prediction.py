@@ -1,6 +1,6 @@
 """Prediction errors of a world on held-out episodes, beside simple baselines.
 
-Only the `World` interface is used, so every form of the world model is measured alike: over whole
+Only the `World` interface is used, so that all kinds of world models are measured alike: over whole
 open-loop rollouts, from the first observed step to the last.
 """
 
@@ -63,9 +63,9 @@ def measure_prediction(
     """Errors over whole rollouts of held-out episodes with commanded actions.
 
     Args:
-        world: starts from observations.
-        store: of the episodes.
-        episode_ids: held out from training.
+        world: world that starts from observations.
+        store: store of the episodes.
+        episode_ids: episodes held out from training.
         trained_on: training data of the world.
 
     Returns:
@@ -91,7 +91,7 @@ def measure_scenes(world: World[Any], scenes: Sequence[Scene]) -> PredictionResu
         - _copy repeats the first step; tactile_mse_zero predicts no touch.
         - psnr_warp is the first image, warped by the known camera motion over the table.
         - _other_take is the world given the actions of another held-out scene of the same task.
-        - _hold is the world given actions in which nothing moves; in _hands_still the head does.
+        - _hold is the world given actions in which nothing moves; in _hands_still the head moves.
 
     Raises:
         InvalidInputError: no scene.

@@ -8,7 +8,7 @@ from dextouch.command_line import CommandParser, add_json
 from dextouch.data_folder import default_store
 
 TASKS = ("stand_bottle", "stack_bowls")
-# Nothing is trained or tuned on seeds from 30000 on; the evaluator's benchmark takes the first.
+# No training or tuning uses seeds from 30000 on; the evaluator benchmark takes the first ones.
 FIRST_HELD_OUT_SEED = 31_000
 
 
@@ -52,7 +52,7 @@ def parse(argv: Sequence[str]) -> DemoPlan:
         type=Path,
         default=Path("demo"),
         metavar="FOLDER",
-        help="of the results (%(default)s)",
+        help="folder of the results (%(default)s)",
     )
     add_json(parser)
     parser.add_argument(

@@ -27,12 +27,12 @@ def show(report: Mapping[str, Any]) -> None:
     console.print(_policies(report["policies"]))
     accuracy = report["success_probe"]["held_out_accuracy"]
     console.print(
-        f"Imagined success is judged by a small network, right on {accuracy:.0%} of the true"
+        f"Imagined success is classified by a probe that is correct on {accuracy:.0%} of the true"
     )
     console.print(
-        "endings it was measured on; endings that the model imagines wrongly mislead it. Endings"
+        "held-out endings; endings that the model predicts wrongly mislead it. Endings that the"
     )
-    console.print("that the judge or the model itself doubts count by the likelier outcome.\n")
+    console.print("probe or the model flags as uncertain count with the more likely outcome.\n")
     console.print(_agreement(report["agreement"]))
     for task, comments in report["comments"].items():
         console.print(f"\n{task}", style="bold")
@@ -88,7 +88,7 @@ def _policies(rows: list[dict[str, Any]]) -> Table:
         "task",
         "real",
         "imagined",
-        "of these doubted",
+        "of these uncertain",
     )
     for row in rows:
         doubted = str(row.get("imagined_undecided", ""))

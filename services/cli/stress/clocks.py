@@ -9,7 +9,7 @@ from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("clocks")
 _PERIOD_NS = 16_666_667
-# Shares of a full turn of a counter for which a device was silent.
+# Silence of the device as a share of the counter's period.
 _PAUSES = (0.3, 0.5, 0.9, 1.0, 1.5, 3.7, 1000.25)
 
 
@@ -141,7 +141,7 @@ STAGE.does_not_apply(
 
 
 def _take(num_samples: int, skew_ppm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Device stamps at 60 Hz and their arrivals, 1 ms later or a little more."""
+    """Device timestamps at 60 Hz and their arrivals, 1 ms or slightly more later."""
     device = np.arange(num_samples, dtype=np.int64) * _PERIOD_NS
     delay_ns = np.random.default_rng(num_samples).exponential(300_000, num_samples)
     delay_ns[::7] = 0.0
@@ -150,7 +150,7 @@ def _take(num_samples: int, skew_ppm: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _truth(device: np.ndarray, skew_ppm: float) -> np.ndarray:
-    """Arrivals of samples that nothing delays."""
+    """Arrival times without any delay."""
     return np.rint(device * (1 + skew_ppm * 1e-6)).astype(np.int64) + 1_000_000
 
 
@@ -167,5 +167,5 @@ def _descriptor(bits: int, tick_ns: int) -> StreamDescriptor:
 
 
 def _off(got: np.ndarray, expected: np.ndarray) -> int:
-    """Largest difference, both counted from their first."""
+    """Largest difference, with both series relative to their first value."""
     return int(np.abs((got - got[0]) - (expected - expected[0])).max())

@@ -25,7 +25,7 @@ from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("geometry")
 CHUNK_STEPS, NUM_CHUNKS = 16, 63
-# A mixed axis, and those that Shepperd's method changes its divisor on.
+# A general axis, and those at which Shepperd's method switches its divisor.
 _AXES = np.array([[0.6, 0.0, 0.8], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [-0.36, 0.48, 0.8]])
 _SMALL_RAD = (0.0, 5e-324, 1e-300, 1e-12, 1e-8, 9.99e-4, 1e-3, 1.001e-3, 2e-3)
 _TURNS_RAD = (0.1, 1.0, 3.0, np.pi - 1e-3, np.pi - 1e-8, np.pi)
@@ -38,7 +38,7 @@ def _rotations(check: Check) -> None:
     vectors = (angles[:, None, None] * _AXES).reshape(-1, 3)
     R = rotation_from_vector(vectors)
     found = vector_from_rotation(R)
-    # At π both signs of the axis are the same turn.
+    # At π both signs of the axis are the same rotation.
     apart = np.minimum(
         np.linalg.norm(found - vectors, axis=1),
         np.where(
@@ -170,7 +170,7 @@ STAGE.does_not_apply(
 
 
 def _circling(num_steps: int) -> HandTrajectory:
-    """Wrists and head on circles, turning about a skew axis: every pose in closed form."""
+    """Wrists and head on circles, rotating about a skew axis: closed-form poses."""
     phase = np.linspace(0.0, 20.0, num_steps)
     axis = np.array([0.48, -0.6, 0.64])
 

@@ -24,7 +24,7 @@ from services.cli.simulated.board_scenes import (
 from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("hand-eye")
-# What the tests of accuracy allow of 20 views with 0.3 px of noise.
+# Bounds of the accuracy tests for 20 views with 0.3 px of noise.
 _MAX_RAD, _MAX_M = 0.005, 0.003
 
 
@@ -143,6 +143,6 @@ def _mount(Ts_world_tracker: np.ndarray, Ts_camera_board: np.ndarray) -> np.ndar
 
 
 def _bfloat16(values: np.ndarray) -> np.ndarray:
-    """Values cut down to bfloat16's eight bits of mantissa."""
+    """Truncate values to bfloat16's eight bits of mantissa."""
     bits = values.astype(np.float32).view(np.uint32) & np.uint32(0xFFFF0000)
     return bits.view(np.float32)

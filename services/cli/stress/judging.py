@@ -22,7 +22,7 @@ from services.evaluation.success_probe import SuccessProbe
 
 STAGE = StageCells("judging")
 _PRETRAINED = Path(services.evaluation.__file__).parent / "pretrained"
-# A chunk lasts a second: no hand should be sent further, whatever is felt.
+# A chunk lasts about a second: no touch may send a hand farther.
 _MAX_REACH_M, _MAX_JOINT_RAD = 0.6, 3.0
 _PX = 64
 
@@ -130,7 +130,7 @@ def _long_run(check: Check) -> None:
     for chunk in range(NUM_CHUNKS):
         actions = policy.act(seen)
         _command_is_bounded(check, actions)
-        # What is commanded is reached.
+        # Commands are reached exactly.
         seen = replace(
             _seen(CHUNK_STEPS), first_step=1 + CHUNK_STEPS * chunk, action_reached=actions
         )
@@ -186,7 +186,7 @@ def _policy_start() -> PolicyStart:
 
 @cache
 def _seen(num_steps: int = 1) -> Observation:
-    """The first observation of a demonstration, as if it lasted for some steps."""
+    """The first observation of a demonstration, repeated for some steps."""
     observation = twin_start(_PX)[0].observation
     if observation is None:
         raise InvalidInputError("stress: the twin's start has no observation")

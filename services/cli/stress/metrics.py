@@ -95,7 +95,7 @@ def _ends(check: Check) -> None:
                 "Wilson's interval inside 0 … 1 and holds the rate",
                 0 <= found.low <= wins / trials <= found.high <= 1,
             )
-    # Wilson's upper bound for no success of n: z² / (n + z²).
+    # Wilson's upper bound for 0 successes of n: z² / (n + z²).
     z2 = 1.959963984540054**2
     check.at_most("bound of 0 of 20 off", abs(wilson_interval(0, 20).high - z2 / (20 + z2)), 1e-12)
     ties = np.full(5, 0.5)

@@ -88,7 +88,7 @@ def _touch(check: Check) -> None:
     inside = (grid >= 0) & (grid <= _T_NS[-1])
     check.at_most("largest inside", got[inside].max(), 650.0, "kPa")
     check.at_most("most below zero inside", -got[inside].min(), 0.0, "kPa")
-    # Past the edges values are extrapolated linearly, for at most 1.5 periods.
+    # Beyond the edges values are extrapolated linearly, for at most 1.5 periods.
     check.at_most("past the edges", np.abs(got).max(), 2.5 * 650.0, "kPa")
 
 

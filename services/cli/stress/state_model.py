@@ -1,4 +1,4 @@
-"""Stress of the world model in state form, opened through `open_world`.
+"""Stress of the state model, opened through `open_world`.
 
 A small model with random weights stands in for a trained one: the checks must hold for any weights.
 """
@@ -127,7 +127,7 @@ def _checkpoint() -> StateCheckpoint:
 
 
 def _written(folder: Path) -> Path:
-    """A small state model of random weights in a file."""
+    """Write a small state model with random weights to a file."""
     generator = torch.Generator().manual_seed(0)
     config = DynamicsConfig(tasks=(TASK,), num_objects=(1,), image_px=_PX, width=16)
     with torch.random.fork_rng(devices=[]):

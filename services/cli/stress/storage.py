@@ -121,7 +121,7 @@ def _batch_of(values: np.ndarray, t_host_ns: np.ndarray | None = None) -> Sample
 
 
 def _stored(batches: list[SampleBatch]) -> np.ndarray:
-    """What a recording of these batches holds."""
+    """Values read back from a recording of these batches."""
     with tempfile.TemporaryDirectory() as folder:
         store = EpisodeStore(Path(folder))
         with store.writer(kind="recording", attributes=_ATTRIBUTES) as writer:

@@ -125,7 +125,7 @@ STAGE.does_not_apply(
 
 
 def _take(pressure_kpa: float, num: int = 600) -> np.ndarray:
-    """Readings of a glove with zero 500 counts and gain 100 counts/kPa, noise of 2 counts."""
+    """Readings of a glove with zero 500 counts, gain 100 counts/kPa and noise of 2 counts."""
     noise = np.random.default_rng(round(pressure_kpa * 1000)).normal(scale=2.0, size=(num, 360))
     return np.asarray(np.rint(_TARE + _GAIN * pressure_kpa + noise))
 

@@ -143,7 +143,7 @@ STAGE.does_not_apply(
 
 @cache
 def _episode() -> EpisodeArrays:
-    """A scene of the twin that stands still, with a moving hand and some touch."""
+    """A static scene of the twin with a moving hand and some touch."""
     start, actions = twin_start(_PX)
     observation = start.observation
     if observation is None or start.anchor is None or start.K_head is None:
@@ -166,7 +166,7 @@ def _episode() -> EpisodeArrays:
 
 
 def _run(episode: EpisodeArrays, max_steps: int = 1) -> TrainingRun:
-    """A small network at the start of its training."""
+    """A small network before its first training step."""
     settings = TrainSettings(
         episodes="stress",
         output=Path(gettempdir()) / "stress.safetensors",

@@ -1,4 +1,4 @@
-"""Stress of the world model in the paper's form: joint flow matching, chunk after chunk."""
+"""Stress of the joint flow-matching model, chunk after chunk."""
 
 from functools import cache
 
@@ -16,9 +16,9 @@ from services.world_model.network.model import JointWorldModel
 from services.world_model.world import ModelWorld
 
 STAGE = StageCells("world-model")
-# What the present model may be off in bfloat16; its own error in touch is larger.
+# Bounds of the current model in bfloat16; its own touch error is larger.
 _BFLOAT16_KPA, _BFLOAT16_LEVELS = 5.0, 12
-# Target of the roadmap: hands that stand still with nothing near feel nothing.
+# Target of the roadmap: hands that stand still without contact feel nothing.
 _STILL_KPA = 2.0
 
 

@@ -1,4 +1,4 @@
-"""Stress checks common to all forms of the world model, and their start."""
+"""Stress checks shared by all kinds of world models, and their rollout start."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -18,7 +18,7 @@ from services.twin.world import TwinWorld
 
 CAMERA = "camera_head"
 CHUNK_STEPS, NUM_CHUNKS = 16, 63
-# Of the twin; nothing is trained on it.
+# Seed of the twin; not used in training.
 SEED = 30_001
 TASK = "stand_bottle"
 TOUCH_ONLY = ReturnSelector(cameras=())
@@ -26,14 +26,14 @@ TOUCH_ONLY = ReturnSelector(cameras=())
 
 @dataclass(frozen=True)
 class Subject:
-    """A world, a start that it takes, and the commanded actions of a demonstration from there."""
+    """A world, a start for it, and the commanded actions of a demonstration from there."""
 
     world: BatchWorld[Any]
     start: RolloutStart
     actions: np.ndarray
 
     def still(self, num_steps: int = CHUNK_STEPS) -> np.ndarray:
-        """Commands to stay where the rollout begins."""
+        """Commands that hold the initial pose."""
         observation = self.start.observation
         if observation is None:
             raise InvalidInputError("stress: a world model starts from an observation")
@@ -48,14 +48,14 @@ class Subject:
         return replace(self.start, observation=replace(observation, tactile_kpa=tactile_kpa))
 
     def step(self, actions: np.ndarray, start: RolloutStart | None = None) -> Observation:
-        """What the world answers to the first chunk."""
+        """Observation after the first chunk."""
         state = self.world.reset(start or self.start).state
         return self.world.step(state, actions, seed=1).observation
 
 
 @cache
 def twin_start(image_px: int) -> tuple[RolloutStart, np.ndarray]:
-    """The first observation of a demonstration of the twin, and its commanded actions."""
+    """First observation of a twin demonstration, and its commanded actions."""
     settings = TwinSettings(cameras=(CAMERA,), image_height_px=image_px, image_width_px=image_px)
     world, stage = TwinWorld(settings), Stage(TASK, "robot", settings)
     begun = world.reset(RolloutStart(TASK, SEED, stage.task.instruction))
@@ -71,7 +71,7 @@ def twin_start(image_px: int) -> tuple[RolloutStart, np.ndarray]:
 
 
 def check_rotations(check: Check, subject: Subject) -> None:
-    """Commands whose rotation is nearly lost, and turns by π."""
+    """Commands with nearly degenerate rotations, and rotations by π."""
     for sine, is_taken in ((2e-6, True), (5e-7, False)):
         actions = subject.still()
         actions[5, WRIST_LEFT.start + 3 : WRIST_LEFT.stop] = [1.0, 0.0, 0.0, 1.0, sine, 0.0]
@@ -114,7 +114,7 @@ def check_non_finite(check: Check, subject: Subject) -> None:
 
 
 def check_touch(check: Check, subject: Subject, trained_kpa: float) -> None:
-    """Zero, negative and saturated touch: never more comes out than went in or was trained."""
+    """Zero, negative and saturated touch; output is bounded by input and training peak."""
     for pressure_kpa in (0.0, -5.0, 2.0, 650.0, 99_999.0):
         observation = subject.step(subject.still(), subject.touching(pressure_kpa))
         check_answer(check, observation)
@@ -124,7 +124,7 @@ def check_touch(check: Check, subject: Subject, trained_kpa: float) -> None:
 
 
 def check_chunk_ends(check: Check, subject: Subject) -> None:
-    """The shortest and longest chunks, and those beyond."""
+    """The shortest and longest chunks, and invalid lengths."""
     about = subject.world.description
     for num in (about.chunk_multiple, about.max_chunk_steps):
         observation = subject.step(subject.still(num))
@@ -134,7 +134,7 @@ def check_chunk_ends(check: Check, subject: Subject) -> None:
 
 
 def check_batch(check: Check, subject: Subject, *, max_kpa: float) -> None:
-    """Three rollouts at once and alone, one of them with saturated touch."""
+    """Three rollouts in a batch and alone, one of them with saturated touch."""
     starts = [subject.start, subject.touching(650.0), subject.start]
     chunks = np.stack([subject.actions[:16], subject.still(), subject.still()])
     states = [subject.world.reset(start).state for start in starts]
@@ -149,7 +149,7 @@ def check_batch(check: Check, subject: Subject, *, max_kpa: float) -> None:
 
 
 def still_peaks_kpa(subject: Subject) -> list[float]:
-    """Largest pressure of each of 63 chunks while hands that nothing touches stand still."""
+    """Peak pressure of each of 63 chunks in which untouched hands stand still."""
     state = subject.world.reset(subject.touching(0.0)).state
     peaks = []
     for chunk in range(NUM_CHUNKS):
@@ -160,7 +160,7 @@ def still_peaks_kpa(subject: Subject) -> list[float]:
 
 
 def there_and_back(actions: np.ndarray) -> Sequence[np.ndarray]:
-    """63 chunks of a demonstration, forth and back again and again."""
+    """63 chunks that play a demonstration forward and backward repeatedly."""
     whole = actions[: len(actions) // CHUNK_STEPS * CHUNK_STEPS]
     rounds = np.concatenate([whole, whole[::-1]])
     wanted = np.arange(NUM_CHUNKS * CHUNK_STEPS) % len(rounds)
@@ -168,7 +168,7 @@ def there_and_back(actions: np.ndarray) -> Sequence[np.ndarray]:
 
 
 def check_answer(check: Check, observation: Observation) -> None:
-    """An answer of finite numbers, with pressures of 0 or more."""
+    """Check that an observation is finite, with pressures of 0 or more."""
     check.finite("touch", observation.tactile_kpa)
     check.at_most("pressure below zero", -float(observation.tactile_kpa.min()), 0.0, "kPa")
     check.true("images are whole", observation.images[CAMERA].dtype == np.uint8)

@@ -91,7 +91,7 @@ def _is_inserted(poses: Float64[np.ndarray, "2 7"]) -> bool:
 
 
 class InsertPeg:
-    """Take the standing peg from the side, lift it over the block, push it in, let go."""
+    """Grasp the standing peg from the side, lift it over the block, push it in, let go."""
 
     name = "insert_peg"
     instruction = "Pick up the peg and insert it into the hole of the block."

@@ -41,7 +41,7 @@ def _is_nested(poses: Float64[np.ndarray, "2 7"]) -> bool:
 
 
 class StackBowls:
-    """Take the left bowl between both palms, carry it over the right one, nest it, let go."""
+    """Squeeze the left bowl between both palms, carry it over the right one, nest it, let go."""
 
     name = "stack_bowls"
     instruction = "Lift the left bowl with both hands and stack it into the right bowl."

@@ -60,9 +60,9 @@ class Task(Protocol):
         """Waypoints of the demonstrator.
 
         Args:
-            object_poses: assumed by the demonstrator.
-            domain: whose hands.
-            generator: of variations between takes that are independent of `noise`.
+            object_poses: poses assumed by the demonstrator.
+            domain: robot or human hands.
+            generator: source of variations between takes that are independent of `noise`.
             noise: errors at the first (grasp) and second (place) location. The first waypoint has
                 none.
         """

@@ -92,8 +92,8 @@ def load_scene_episodes(
     """
     if "imagined" in origins:
         raise InvalidInputError(
-            "scene episodes: got origins with 'imagined', expected 'twin' or 'recorded': what was "
-            "imagined is no truth to train on"
+            "scene episodes: got origins with 'imagined', expected 'twin' or 'recorded'; "
+            "imagined episodes are not ground truth"
         )
     store = EpisodeStore(url)
     taken: list[SceneEpisode] = []

@@ -74,15 +74,16 @@ def test_a_world_that_calls_everything_a_success_is_not_perfect():
     found = whole["agreement"]["stand"]
     assert found["mmrv"] == pytest.approx((1 + 1 / 6 + 0) / 3)
     assert found["mmrv_interval"][1] > 0.3
-    size, step, flatters, overrated, undefined = whole["comments"]["stand"]
+    size, step, optimistic, overrated, undefined = whole["comments"]["stand"]
     assert size == (
         "Agreement rests on 6 of 6 starts, those that ended in both worlds (real and dream) for "
         "every policy."
     )
     assert step == "One rollout moves a real success rate by 0.17 (N = 6 for each policy)."
     # By hand: (0 + 5/6 + 1) / 3 = 0.61.
-    assert flatters == (
-        "On these starts dream flatters: its success rates are 0.61 above the real ones on average."
+    assert optimistic == (
+        "On these starts dream is too optimistic: its success rates are 0.61 above the real ones "
+        "on average."
     )
     assert "overrates 2 of 3 policies" in overrated
     assert "'c': 0.00 real, 1.00 imagined" in overrated
@@ -95,7 +96,7 @@ def test_a_world_that_calls_everything_a_success_is_not_perfect():
 def test_comments_on_strict_and_fair_worlds():
     strict = {"real": ALL_ONE["dream"], "dream": ALL_ONE["real"]}
     sentences = " ".join(report(strict).to_report()["comments"]["stand"])
-    assert "On these starts dream is too strict: its success rates are 0.61 below" in sentences
+    assert "On these starts dream is too pessimistic: its success rates are 0.61 below" in sentences
     assert "underrates 2 of 3 policies" in sentences
     assert "same success rate (1.00) in the real world" in sentences
     fair = report({"real": ALL_ONE["real"], "dream": ALL_ONE["real"]}).to_report()
