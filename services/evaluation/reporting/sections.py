@@ -220,8 +220,8 @@ def tiles(report: Mapping[str, Any]) -> list[Tile]:
     rivals = [model[k] for k in IMAGE_RIVALS if is_number(model.get(k))]
     if is_number(model.get("psnr")) and rivals:
         gain = model["psnr"] - max(rivals)
-        note = "PSNR over the best simple rival"
-        found.append(Tile("images foreseen", f"{gain:+.1f} dB", note))
+        note = "PSNR over the best baseline"
+        found.append(Tile("images predicted", f"{gain:+.1f} dB", note))
     if is_number(model.get("tactile_mse")):
         best = min(
             (model[k] for k in ("tactile_mse_zero", "tactile_mse_copy") if is_number(model.get(k))),
@@ -229,7 +229,7 @@ def tiles(report: Mapping[str, Any]) -> list[Tile]:
         )
         if best > 0:
             ratio = model["tactile_mse"] / best
-            found.append(Tile("touch foreseen", f"{ratio:.0%}", "of the best baseline's error"))
+            found.append(Tile("touch predicted", f"{ratio:.0%}", "of the best baseline's error"))
     defined = [a["pearson"] for a in agreement.values() if is_number(a.get("pearson"))]
     if agreement:
         value = figure(sum(defined) / len(defined)) if defined else UNDEFINED

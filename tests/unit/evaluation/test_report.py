@@ -166,8 +166,8 @@ def test_headlines():
         "from bytes to score": "52.5 s",
         "worst clock": "1.70 ms",
         "touch recorded": "0.991",
-        "images foreseen": "+0.9 dB",
-        "touch foreseen": "50%",
+        "images predicted": "+0.9 dB",
+        "touch predicted": "50%",
         "worlds agree": "undefined",
     }
 
