@@ -73,8 +73,8 @@ def played_by(choice: PolicyChoice, stage: Stage, seed: int) -> PlayedActions:
     begun = world.reset(start)
     state, seen = begun.state, begun.observation
     where = f"policy {choice.address!r}, task {task.name!r}, seed {seed}"
-    told = PolicyStart(task.name, task.instruction, seed, begun.anchor, begun.K_head)
-    ask(policy.reset, told, where=f"{where}: reset")
+    policy_start = PolicyStart(task.name, task.instruction, seed, begun.anchor, begun.K_head)
+    ask(policy.reset, policy_start, where=f"{where}: reset")
     # Row 0 is the start.
     rows = [seen.action_reached[:1]]
     while (left := NUM_GRID_STEPS - sum(map(len, rows))) > 0:

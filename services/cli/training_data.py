@@ -238,13 +238,13 @@ def _parser() -> argparse.ArgumentParser:
     mixes.add_argument(
         "--mix", choices=list(MIXES), default=DEFAULT_MIX, help="kinds of takes (%(default)s)"
     )
-    for name, told in (("exact", "no errors"), ("ladder", "errors of 0 … 40 mm in turn")):
+    for name, effect in (("exact", "no errors"), ("ladder", "errors of 0 … 40 mm in turn")):
         mixes.add_argument(
             f"--{name}",
             dest="mix",
             action="store_const",
             const=name,
-            help=f"{told}, no other kinds",
+            help=f"{effect}, no other kinds",
         )
     parser.add_argument("--miss-fraction", type=float, help="share of misses (default: the mix's)")
     parser.add_argument(

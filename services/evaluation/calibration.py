@@ -68,10 +68,10 @@ def expected_calibration_error(
     Raises:
         InvalidInputError: no endings, or arrays of different lengths.
     """
-    told, came = _pair(probabilities, success)
-    bins = np.minimum((told * num_bins).astype(int), num_bins - 1)
-    gaps = np.bincount(bins, weights=told - came, minlength=num_bins)
-    return float(np.abs(gaps).sum() / len(told))
+    predicted, outcomes = _pair(probabilities, success)
+    bins = np.minimum((predicted * num_bins).astype(int), num_bins - 1)
+    gaps = np.bincount(bins, weights=predicted - outcomes, minlength=num_bins)
+    return float(np.abs(gaps).sum() / len(predicted))
 
 
 def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
@@ -80,8 +80,8 @@ def brier(probabilities: np.ndarray, success: np.ndarray) -> float:
     Raises:
         InvalidInputError: no endings, or arrays of different lengths.
     """
-    told, came = _pair(probabilities, success)
-    return float(np.mean((told - came) ** 2))
+    predicted, outcomes = _pair(probabilities, success)
+    return float(np.mean((predicted - outcomes) ** 2))
 
 
 def fit_calibration(
@@ -101,16 +101,17 @@ def fit_calibration(
     Raises:
         InvalidInputError: only one outcome, or a risk outside 0 … 1.
     """
-    odds, came = np.asarray(log_odds, dtype=np.float64), np.asarray(success, dtype=bool)
-    if odds.shape != came.shape or came.all() or not came.any() or not 0 < risk < 1:
+    odds, outcomes = np.asarray(log_odds, dtype=np.float64), np.asarray(success, dtype=bool)
+    if odds.shape != outcomes.shape or outcomes.all() or not outcomes.any() or not 0 < risk < 1:
         raise InvalidInputError(
-            f"calibration: got {odds.shape} log odds, {came.sum()} successes of {came.shape} and "
-            f"risk {risk}; expected one each, both outcomes and a risk between 0 and 1"
+            f"calibration: got {odds.shape} log odds, {outcomes.sum()} successes of "
+            f"{outcomes.shape} and risk {risk}; expected one each, both outcomes and "
+            "a risk between 0 and 1"
         )
-    slope, bias = _platt(odds, came)
+    slope, bias = _platt(odds, outcomes)
     fitted = Calibration(temperature=1 / slope, bias=bias)
     return fitted.model_copy(
-        update={"band": undecided_band(fitted.probabilities(odds), came, risk=risk)}
+        update={"band": undecided_band(fitted.probabilities(odds), outcomes, risk=risk)}
     )
 
 
@@ -120,12 +121,12 @@ def undecided_band(probabilities: np.ndarray, success: np.ndarray, *, risk: floa
     One error more than observed is assumed, as in conformal risk control, so that few endings give
     a wide band. The half width is capped at 0.45, even if the risk is then exceeded.
     """
-    told, came = _pair(probabilities, success)
-    sureness = np.abs(told - 0.5)
-    wrong = (told >= 0.5) != (came > 0.5)
+    predicted, outcomes = _pair(probabilities, success)
+    sureness = np.abs(predicted - 0.5)
+    wrong = (predicted >= 0.5) != (outcomes > 0.5)
     # Just below a half width of 0 all are decided; each step excludes the least certain one.
     for width in np.concatenate([[0.0], np.sort(sureness)]):
-        decided = sureness > width if width else np.ones(len(told), dtype=bool)
+        decided = sureness > width if width else np.ones(len(predicted), dtype=bool)
         if width >= _WIDEST_BAND:
             break
         if (wrong[decided].sum() + 1) / (decided.sum() + 1) <= risk:
@@ -133,19 +134,19 @@ def undecided_band(probabilities: np.ndarray, success: np.ndarray, *, risk: floa
     return _WIDEST_BAND
 
 
-def _platt(odds: np.ndarray, came: np.ndarray) -> tuple[float, float]:
+def _platt(odds: np.ndarray, outcomes: np.ndarray) -> tuple[float, float]:
     """Slope and bias that minimize the cross entropy to Platt's targets (Newton's method)."""
-    wins, losses = int(came.sum()), int((~came).sum())
-    target = np.where(came, (wins + 1) / (wins + 2), 1 / (losses + 2))
+    wins, losses = int(outcomes.sum()), int((~outcomes).sum())
+    target = np.where(outcomes, (wins + 1) / (wins + 2), 1 / (losses + 2))
     design = np.stack([odds, np.ones_like(odds)], axis=1)
     # In units of the odds' own spread, so that the prior does not depend on the network's scale.
     pull = np.diag([np.mean(odds**2), 1.0]) * _PRIOR_ENDINGS / 4
     own = np.array([1.0, 0.0])
     fitted = own.copy()
     for _ in range(_MAX_NEWTON_STEPS):
-        told = sigmoid(design @ fitted)
-        gradient = design.T @ (told - target) + pull @ (fitted - own)
-        curvature = (design * (told * (1 - told))[:, None]).T @ design + pull
+        predicted = sigmoid(design @ fitted)
+        gradient = design.T @ (predicted - target) + pull @ (fitted - own)
+        curvature = (design * (predicted * (1 - predicted))[:, None]).T @ design + pull
         step = np.linalg.solve(curvature, gradient)
         fitted -= step * min(1.0, 1.0 / max(float(np.abs(step).max()), 1e-12))
         if np.abs(step).max() < 1e-9:
@@ -155,10 +156,10 @@ def _platt(odds: np.ndarray, came: np.ndarray) -> tuple[float, float]:
 
 
 def _pair(probabilities: np.ndarray, success: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    told, came = np.asarray(probabilities, np.float64), np.asarray(success, np.float64)
-    if told.shape != came.shape or told.ndim != 1 or len(told) == 0:
+    predicted, outcomes = np.asarray(probabilities, np.float64), np.asarray(success, np.float64)
+    if predicted.shape != outcomes.shape or predicted.ndim != 1 or len(predicted) == 0:
         raise InvalidInputError(
-            f"calibration: got {told.shape} probabilities and {came.shape} outcomes, expected one "
-            "each, at least one"
+            f"calibration: got {predicted.shape} probabilities and {outcomes.shape} outcomes, "
+            "expected one each, at least one"
         )
-    return told, came
+    return predicted, outcomes

@@ -137,11 +137,11 @@ class ObjectFinder(nn.Module):
         strength = (weight * maps).sum((2, 3)).tanh()
         T = views.T_world_camera
         camera = torch.cat([T[:, :3, 3], T[:, :3, 2], T[:, :3, 0]], dim=1)
-        told = self.head(torch.cat([*points, strength, self.task(views.task), camera], dim=1))
-        told = told.unflatten(1, (MAX_OBJECTS, _PER_OBJECT))
-        height_m = self.height_m[views.task] + 0.05 * told[..., 2]
-        pixel = (told[..., :2] + 1) * self._size_px / 2
-        return Objects(_at_height(pixel, height_m, views), told[..., 3:].unflatten(-1, (2, 3)))
+        outputs = self.head(torch.cat([*points, strength, self.task(views.task), camera], dim=1))
+        outputs = outputs.unflatten(1, (MAX_OBJECTS, _PER_OBJECT))
+        height_m = self.height_m[views.task] + 0.05 * outputs[..., 2]
+        pixel = (outputs[..., :2] + 1) * self._size_px / 2
+        return Objects(_at_height(pixel, height_m, views), outputs[..., 3:].unflatten(-1, (2, 3)))
 
 
 def _at_height(
@@ -189,8 +189,8 @@ class DirectNetwork(nn.Module):
         known = self.task(task)
         steps = known[:, None].expand(-1, features.shape[1], -1)
         states, _ = self.recurrent(self.entry(torch.cat([features, steps], dim=-1)))
-        told = self.head(torch.cat([states[:, -1], states.amax(dim=1), commands.touch], dim=-1))
-        return torch.as_tensor(told[:, 0])
+        outputs = self.head(torch.cat([states[:, -1], states.amax(dim=1), commands.touch], dim=-1))
+        return torch.as_tensor(outputs[:, 0])
 
 
 def command_features(

@@ -178,14 +178,14 @@ def _calibrated(checkpoint: Checkpoint, apart: Sequence[LabelledAttempt]) -> Che
     metrics = dict(metadata.metrics)
     for task in metadata.tasks:
         mine = [item for item in apart if item.task == task]
-        came = np.array([item.success for item in mine], dtype=bool)
-        if min(came.sum(), (~came).sum()) < MIN_OUTCOMES:
+        outcomes = np.array([item.success for item in mine], dtype=bool)
+        if min(outcomes.sum(), (~outcomes).sum()) < MIN_OUTCOMES:
             continue
         odds = judge.log_odds([item.attempt for item in mine])
-        calibration[task] = fit_calibration(odds, came)
-        metrics[f"development_auc_{task}"] = area_under_roc(odds, came)
-        told = calibration[task].probabilities(odds)
-        metrics[f"development_ece_{task}"] = expected_calibration_error(told, came)
+        calibration[task] = fit_calibration(odds, outcomes)
+        metrics[f"development_auc_{task}"] = area_under_roc(odds, outcomes)
+        predicted = calibration[task].probabilities(odds)
+        metrics[f"development_ece_{task}"] = expected_calibration_error(predicted, outcomes)
     added = {"calibration": {task: one.model_dump() for task, one in calibration.items()}}
     settings = {**metadata.settings, **added}
     return replace(
@@ -207,12 +207,12 @@ def _train_finder(
         noise = torch.randn(views.image.shape, generator=generator) * settings.image_noise
         light = torch.randn((len(index), 1, 1, 1), generator=generator) * settings.brightness
         image = views.image.float() / 255 - 0.5 + noise + light
-        told = finder.find(image, views, bfloat16=settings.bfloat16)
+        predicted = finder.find(image, views, bfloat16=settings.bfloat16)
         position = functional.smooth_l1_loss(
-            told.position_m / _UNIT_M, learned.seen.position_m[index] / _UNIT_M,
+            predicted.position_m / _UNIT_M, learned.seen.position_m[index] / _UNIT_M,
             beta=0.1, reduction="none",
         ).sum(-1)  # fmt: skip
-        axes = (told.axes - learned.seen.axes[index]).square().sum((-1, -2))
+        axes = (predicted.axes - learned.seen.axes[index]).square().sum((-1, -2))
         return ((position + axes) * there).sum() / there.sum()
 
     budget_s = settings.max_cpu_s * settings.finder_share

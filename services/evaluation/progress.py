@@ -21,11 +21,11 @@ class Progress:
         columns = (
             TextColumn(title),
             BarColumn(),
-            TextColumn("{task.fields[told]}"),
+            TextColumn("{task.fields[text]}"),
             TimeRemainingColumn(),
         )
         self._bar = RichProgress(*columns, console=console, disable=not console.is_terminal)
-        self._task = self._bar.add_task(title, total=total, told="")
+        self._task = self._bar.add_task(title, total=total, text="")
 
     def __enter__(self) -> "Progress":
         self._bar.start()
@@ -41,12 +41,12 @@ class Progress:
 
     def advance(self, **figures: float) -> None:
         """Complete one step; the figures are shown beside the bar."""
-        told = "  ".join(f"{name} {value:.3g}" for name, value in figures.items())
-        self._bar.update(self._task, advance=1, told=told)
+        text = "  ".join(f"{name} {value:.3g}" for name, value in figures.items())
+        self._bar.update(self._task, advance=1, text=text)
         tenths = self._done * 10 // self._total
         self._done += 1
         if not self._console.is_terminal and self._done * 10 // self._total > tenths:
             self._console.print(
-                f"   {self._title} {self._done} of {self._total}  {told}".rstrip(),
+                f"   {self._title} {self._done} of {self._total}  {text}".rstrip(),
                 highlight=False,
             )

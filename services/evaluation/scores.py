@@ -93,9 +93,9 @@ class ClosedLoopReport:
         scores = {(s.policy, s.seed): s for s in self._of(world, task)}
         failed = {(f.policy, f.seed) for f in self._failed(world, task)}
         seeds = list(dict.fromkeys(r.seed for r in self.rollouts if r.task == task))
-        asked = {(policy, seed) for policy in self.policies for seed in seeds}
+        expected = {(policy, seed) for policy in self.policies for seed in seeds}
         digests = {(s.seed, s.start_digest) for s in scores.values()}
-        if set(scores) | failed != asked or len(digests) != len(dict(digests)):
+        if set(scores) | failed != expected or len(digests) != len(dict(digests)):
             raise InvalidInputError(
                 f"scores of {world!r} in {task!r}: the policies began from different starts"
             )

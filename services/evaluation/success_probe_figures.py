@@ -56,9 +56,9 @@ def milestone_areas(
             continue
         odds = probe.log_odds([_as_seen(e.final, TRUE) for e in mine])
         for index, name in enumerate(names):
-            came = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
-            if min(came.sum(), (~came).sum()) >= MIN_OUTCOMES:
-                areas[task, name] = area_under_roc(odds[:, 1 + index], came)
+            outcomes = np.array([bool((e.reached(names, e.last_step) or [])[index]) for e in mine])
+            if min(outcomes.sum(), (~outcomes).sum()) >= MIN_OUTCOMES:
+                areas[task, name] = area_under_roc(odds[:, 1 + index], outcomes)
     return areas
 
 
@@ -94,13 +94,13 @@ def _figures(
     probe: SuccessProbe, endings: Sequence[Ending], success: np.ndarray, name: str
 ) -> Figures:
     verdicts = probe.verdicts(endings)
-    told = np.array([v.probability for v in verdicts])
+    probabilities = np.array([v.probability for v in verdicts])
     likely = np.array([v.likely_success for v in verdicts])
     decided = np.array([v.decision != "cannot tell" for v in verdicts])
     before = Reliability.of(sigmoid(probe.log_odds(endings)[:, 0]), success)
-    after = Reliability.of(told, success)
+    after = Reliability.of(probabilities, success)
     found: Figures = {
-        "auc": area_under_roc(told, success),
+        "auc": area_under_roc(probabilities, success),
         "balanced_accuracy": balanced_accuracy(likely, success),
         "ece": after.expected_calibration_error,
         "ece_uncalibrated": before.expected_calibration_error,

@@ -185,8 +185,8 @@ class StateWorld:
         selectors: Sequence[ReturnSelector] | None = None,
     ) -> list[SteppedRollout[StateRollout]]:
         """`step` for several rollouts; results differ from single calls by rounding only."""
-        asked = [EVERYTHING] * len(states) if selectors is None else list(selectors)
-        counts = (len(states), len(actions), len(seeds), len(asked))
+        requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+        counts = (len(states), len(actions), len(seeds), len(requested))
         if len(set(counts)) != 1 or len(states) == 0:
             raise ShapeError(
                 f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
@@ -209,7 +209,7 @@ class StateWorld:
                 ),
                 chunks[index],
                 (imagined, index),
-                asked[index],
+                requested[index],
             )
             for index, state in enumerate(states)
         ]

@@ -84,8 +84,8 @@ def read_weights(
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except SafetensorError as error:
         raise CorruptDataError(f"{where}: no safetensors file ({error})") from error
-    told = _history(notes.get(key), history, key, where)
-    return tensors, told, hashlib.sha256(path.read_bytes()).hexdigest()
+    parsed = _history(notes.get(key), history, key, where)
+    return tensors, parsed, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _history(text: str | None, history: type[History], key: str, where: str) -> History:

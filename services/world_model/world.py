@@ -149,8 +149,8 @@ class ModelWorld:
         Images of the last latent are always decoded, since the next chunk starts from the last of
         them; the others only on request.
         """
-        asked = [EVERYTHING] * len(states) if selectors is None else list(selectors)
-        counts = (len(states), len(actions), len(seeds), len(asked))
+        requested = [EVERYTHING] * len(states) if selectors is None else list(selectors)
+        counts = (len(states), len(actions), len(seeds), len(requested))
         if len(set(counts)) != 1 or len(states) == 0:
             raise ShapeError(
                 f"chunks: got {counts[0]} states, {counts[1]} action chunks, {counts[2]} seeds and "
@@ -162,7 +162,7 @@ class ModelWorld:
         noise = stack_noise(
             [self._model.noise(inputs.num_steps, _generator(seed)) for seed in seeds]
         )
-        wanted = any(one.steps == "all" and one.wants(CAMERA) for one in asked)
+        wanted = any(one.steps == "all" and one.wants(CAMERA) for one in requested)
         future = self._model.predict(
             inputs,
             noise,
@@ -175,7 +175,7 @@ class ModelWorld:
         return [
             _advance(state, chunk, imagined, selector)
             for state, chunk, imagined, selector in zip(
-                states, chunks, zip(images, touches, strict=True), asked, strict=True
+                states, chunks, zip(images, touches, strict=True), requested, strict=True
             )
         ]
 

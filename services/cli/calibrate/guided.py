@@ -196,11 +196,11 @@ class _Guide:
             except (InvalidInputError, UnknownNameError) as error:
                 print(error.message)
                 continue
-            told = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
-            self._answer(f"Put {told}. Enter records {PRESS_S:g} s, once it holds still: ")
+            target = f"{wanted.pressure_kpa:.4g} kPa on {wanted.pads}"
+            self._answer(f"Put {target}. Enter records {PRESS_S:g} s, once it holds still: ")
             try:
                 take, press = self._record(
-                    f"{told}, held still", PRESS_S, partial(self._press, tare, wanted)
+                    f"{target}, held still", PRESS_S, partial(self._press, tare, wanted)
                 )
             except InvalidInputError as error:
                 print(f"Not used: {error.message}")

@@ -132,8 +132,8 @@ def glove_picture(found: GloveCalibration) -> str:
         colours = [
             [_STATE_COLOURS[STATES[0 if np.isnan(v) else int(v)]] for v in row] for row in canvas
         ]
-        told = ", ".join(f"{n} {name}" for name, n in found.num_by_state().items())
-        parts.append(group(16 + 260 * 3, 60, cells(canvas, colours, size=9, title=told)))
+        legend = ", ".join(f"{n} {name}" for name, n in found.num_by_state().items())
+        parts.append(group(16 + 260 * 3, 60, cells(canvas, colours, size=9, title=legend)))
         for index, name in enumerate(found.num_by_state()):
             y = 330 + 16 * index
             parts.append(rectangle((796, y, 10, 10), fill=_STATE_COLOURS[name], stroke=LINE))

@@ -210,8 +210,8 @@ def _judge_one(name: str, matrices: Mapping[str, Matrix], now: datetime) -> Find
     if any(reason.startswith("ERROR ") for reason in reasons):
         level = "ERROR"
     shape = "x".join(str(n) for n in np.shape(matrices[name]))
-    told = tuple(reason.removeprefix("ERROR ") for reason in reasons)
-    return Finding(name, shape, made_at, age_days, sigma, level, told)
+    stated = tuple(reason.removeprefix("ERROR ") for reason in reasons)
+    return Finding(name, shape, made_at, age_days, sigma, level, stated)
 
 
 def _where_from(name: str) -> str:
@@ -261,11 +261,11 @@ def _plain_sigma(found: Mapping[str, np.ndarray]) -> str:
 def _pose_sigma(
     rotation_rad: float, translation_m: float, limits: tuple[float, float]
 ) -> tuple[str, list[str]]:
-    told = f"{np.rad2deg(rotation_rad):.3f}°, {translation_m * 1e3:.2f} mm"
+    stated = f"{np.rad2deg(rotation_rad):.3f}°, {translation_m * 1e3:.2f} mm"
     max_deg, max_mm = limits
     good = np.rad2deg(rotation_rad) <= max_deg and translation_m * 1e3 <= max_mm
     reason = f"expected {max_deg:g}° and {max_mm:g} mm; add views, turned further"
-    return told, [] if good else [reason]
+    return stated, [] if good else [reason]
 
 
 def _gain_sigma(

@@ -99,8 +99,8 @@ def _policies(rows: list[dict[str, Any]]) -> Table:
 def rate(row: Mapping[str, Any], world: str) -> str:
     """A success rate with its 95 % interval, if the report has one."""
     interval = row.get(f"{world}_interval")
-    told = f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else ""
-    return f"{row[world]:.2f}{told}"
+    interval_text = f" ({interval[0]:.2f} … {interval[1]:.2f})" if interval else ""
+    return f"{row[world]:.2f}{interval_text}"
 
 
 def _agreement(agreement: Mapping[str, Mapping[str, Any]]) -> Table:

@@ -190,8 +190,8 @@ def run_cell(cell: Cell | Exemption) -> Finding:
         check.true(f"expected: {type(error).__name__}: {text[:200]}", holds=False)
     verdict: Verdict = "held" if check.held else "failed"
     elapsed_s = time.perf_counter() - begin_s
-    told = check.came_out or "nothing was checked"
-    return Finding(cell.stage, cell.hazard, cell.fed, told, verdict, check.figures, elapsed_s)
+    outcome = check.came_out or "nothing was checked"
+    return Finding(cell.stage, cell.hazard, cell.fed, outcome, verdict, check.figures, elapsed_s)
 
 
 def not_run(cell: Cell) -> Finding:

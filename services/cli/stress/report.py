@@ -44,8 +44,8 @@ def to_markdown(findings: Sequence[Finding]) -> str:
     lines += ["", summary(findings) + ".", "", "| stage | hazard | fed | came out | verdict |"]
     lines.append("|---" * 5 + "|")
     for one in findings:
-        told = (one.stage, one.hazard, one.fed, one.came_out, one.verdict)
-        lines.append(f"| {' | '.join(text.replace('|', '/') for text in told)} |")
+        columns = (one.stage, one.hazard, one.fed, one.came_out, one.verdict)
+        lines.append(f"| {' | '.join(text.replace('|', '/') for text in columns)} |")
     return "\n".join(lines)
 
 

@@ -151,10 +151,10 @@ class RecurrentCore(nn.Module):
     def _decoded(
         self, hidden: Float32[Tensor, "batch latents width"], start: SceneStart
     ) -> SceneFuture:
-        told = self.objects(hidden).unflatten(-1, (MAX_OBJECTS, 3, 3))
-        position = start.objects.position_m[:, None] + MOVE_M * told[..., 0, :]
+        outputs = self.objects(hidden).unflatten(-1, (MAX_OBJECTS, 3, 3))
+        position = start.objects.position_m[:, None] + MOVE_M * outputs[..., 0, :]
         present = start.objects.present[:, None].expand(-1, hidden.shape[1], -1)
-        axes = start.objects.axes[:, None] + told[..., 1:, :]
+        axes = start.objects.axes[:, None] + outputs[..., 1:, :]
         steps = (STEPS_PER_LATENT, 2, self.config.touch_channels)
         return SceneFuture(
             ObjectPoses(position, axes, present),

@@ -82,14 +82,14 @@ class StartReader(nn.Module):
         """`forward` for an image in −0.5 … 0.5 instead of bytes; optionally in bfloat16."""
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=bfloat16):
             maps = self.eye(image)
-        told = self.head(self._known(maps.float(), first)).unflatten(1, (MAX_OBJECTS, 10))
-        pixel = (told[..., :2] * 0.5 + 0.5) * self.config.image_px
-        height_m = self.height_mean[first.task] + 0.05 * told[..., 2]
+        outputs = self.head(self._known(maps.float(), first)).unflatten(1, (MAX_OBJECTS, 10))
+        pixel = (outputs[..., :2] * 0.5 + 0.5) * self.config.image_px
+        height_m = self.height_mean[first.task] + 0.05 * outputs[..., 2]
         counts = torch.tensor(self.config.num_objects)[first.task]
         used = torch.arange(MAX_OBJECTS) < counts[:, None]
-        present = told[..., 9].sigmoid() * used
+        present = outputs[..., 9].sigmoid() * used
         position = ray_at_height(pixel, height_m, first.K_head, first.T_world_camera)
-        return ObjectPoses(position, told[..., 3:9].unflatten(-1, (2, 3)), present)
+        return ObjectPoses(position, outputs[..., 3:9].unflatten(-1, (2, 3)), present)
 
     def _known(
         self, maps: Float32[Tensor, "batch points rows columns"], first: FirstStep

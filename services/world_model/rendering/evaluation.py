@@ -67,14 +67,14 @@ def evaluate_drawing(
         raise InvalidInputError("renderer evaluation: got no clips, expected at least one")
     sums = _Sums()
     for number, clip in enumerate(clips):
-        told = clip.states if states_of is None else states_of(number, clip)
+        given = clip.states if states_of is None else states_of(number, clip)
         later = np.arange(1, len(clip))
         scenes, _ = gather(clips, np.array([[number, 0]]))
         for rows in np.split(later, range(_BATCH, len(later), _BATCH)):
             sums.num_images += len(rows)
             chunks = (clip.steps[rows] - clip.steps[0] - 1) // chunk_steps
             true = clip.images[rows].astype(np.float64)
-            images, region = _drawn(network, scenes, clip.states.take(rows), told.take(rows))
+            images, region = _drawn(network, scenes, clip.states.take(rows), given.take(rows))
             for method, guesses in {"copy": scenes.images, **images}.items():
                 guessed = np.broadcast_to(guesses, true.shape).astype(np.float64)
                 sums.add(method, chunks, _rows(guessed, true, region))
@@ -113,14 +113,14 @@ def _figures(rows: Float64[np.ndarray, "n 5"]) -> DrawingFigures:
 
 
 def _drawn(
-    network: RendererNetwork, scenes: Scenes, true: SceneStates, told: SceneStates
+    network: RendererNetwork, scenes: Scenes, true: SceneStates, given: SceneStates
 ) -> tuple[dict[str, np.ndarray], Bool[np.ndarray, "n h w"]]:
     """Warped and drawn images, and the true regions of objects."""
     owner = np.zeros(len(true), dtype=np.int64)
     with torch.inference_mode():
-        inputs = drawing_inputs(scenes, told, owner, network.config)
+        inputs = drawing_inputs(scenes, given, owner, network.config)
         images = {"warp": inputs.fine[:, :3], "drawn": network(inputs)}
-        shown = inputs if told is true else drawing_inputs(scenes, true, owner, network.config)
+        shown = inputs if given is true else drawing_inputs(scenes, true, owner, network.config)
     rounded = {
         method: (planes * 255.0).round().clamp(0, 255).permute(0, 2, 3, 1).numpy()
         for method, planes in images.items()

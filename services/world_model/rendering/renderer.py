@@ -85,13 +85,15 @@ class Renderer:
 
     def _drawn(self, inputs: DrawingInputs) -> Float32[Tensor, "n 3 h w"]:
         """Images in 0 … 1; the network runs only where something changed."""
-        asked = inputs.change.flatten(1).amax(dim=1) > 0
-        if bool(asked.all()):
+        changed = inputs.change.flatten(1).amax(dim=1) > 0
+        if bool(changed.all()):
             return self._network(inputs)
         images = inputs.fine[:, :3].clone()
-        if bool(asked.any()):
-            some = DrawingInputs(inputs.fine[asked], inputs.coarse[asked], inputs.change[asked])
-            images[asked] = self._network(some)
+        if bool(changed.any()):
+            some = DrawingInputs(
+                inputs.fine[changed], inputs.coarse[changed], inputs.change[changed]
+            )
+            images[changed] = self._network(some)
         return images
 
     def _prepared(self, scenes: Scenes) -> PreparedScenes:

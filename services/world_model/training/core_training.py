@@ -267,14 +267,14 @@ def _stand(objects: ObjectPoses, held: Bool[Tensor, " batch"]) -> ObjectPoses:
 
 
 def _object_error(
-    told: ObjectPoses, true: ObjectPoses, seen: Float32[Tensor, "batch objects"]
+    predicted: ObjectPoses, true: ObjectPoses, seen: Float32[Tensor, "batch objects"]
 ) -> Float32[Tensor, ""]:
     """Errors of positions (twice) and axes of objects present now and seen at the start."""
     weight = true.present * (seen > 0.5)[:, None]
     position = functional.smooth_l1_loss(
-        told.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.2, reduction="none"
+        predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.2, reduction="none"
     ).sum(-1)
-    axes = (told.axes - true.axes).square().sum((-1, -2))
+    axes = (predicted.axes - true.axes).square().sum((-1, -2))
     return ((2.0 * position + axes) * weight).sum() / weight.sum().clamp_min(1.0)
 
 

@@ -101,15 +101,15 @@ def _loss(
     image = first.image.permute(0, 3, 1, 2).float() / 255 - 0.5
     brightness = torch.randn((len(rows), 1, 1, 1), generator=generator) * 0.03
     image = image + brightness + torch.randn(image.shape, generator=generator) * 0.01
-    told = reader.read(image, first, bfloat16=bfloat16)
+    predicted = reader.read(image, first, bfloat16=bfloat16)
     there = true.present
     used = torch.arange(MAX_OBJECTS) < torch.tensor(reader.config.num_objects)[first.task][:, None]
     position = functional.smooth_l1_loss(
-        told.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.1, reduction="none"
+        predicted.position_m / _UNIT_M, true.position_m / _UNIT_M, beta=0.1, reduction="none"
     ).sum(-1)
-    axes = (told.axes - true.axes).square().sum((-1, -2))
+    axes = (predicted.axes - true.axes).square().sum((-1, -2))
     presence = functional.binary_cross_entropy(
-        told.present.clamp(1e-4, 1 - 1e-4), there, reduction="none"
+        predicted.present.clamp(1e-4, 1 - 1e-4), there, reduction="none"
     )
     return ((position + axes) * there).sum() / there.sum().clamp_min(1.0) + 0.3 * (
         presence * used
@@ -132,7 +132,7 @@ def read_objects(reader: StartReader, table: SceneTable, step: int) -> ObjectPos
 
 def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str, ReaderError]:
     """Errors by task at one step of held-out episodes; tasks without objects are omitted."""
-    told, errors = read_objects(reader, table, step), {}
+    predicted, errors = read_objects(reader, table, step), {}
     rows = torch.arange(len(table))
     true = table.objects_at(rows, step)
     for index, task in enumerate(reader.config.tasks):
@@ -140,11 +140,11 @@ def reader_errors(reader: StartReader, table: SceneTable, step: int) -> dict[str
         there = (true.present > 0) & of_task[:, None]
         if not there.any():
             continue
-        off_mm = 1e3 * (told.position_m - true.position_m)[there]
+        off_mm = 1e3 * (predicted.position_m - true.position_m)[there]
         lateral = off_mm[:, :2].norm(dim=-1)
-        cosine = functional.normalize(told.axes[there][:, 0], dim=-1) * true.axes[there][:, 0]
+        cosine = functional.normalize(predicted.axes[there][:, 0], dim=-1) * true.axes[there][:, 0]
         used = (torch.arange(MAX_OBJECTS) < reader.config.num_objects[index]) & of_task[:, None]
-        right = (told.present > 0.5) == (true.present > 0)
+        right = (predicted.present > 0.5) == (true.present > 0)
         errors[task] = ReaderError(
             lateral_mm=float(lateral.median()),
             lateral_90_mm=float(lateral.quantile(0.9)),

@@ -233,13 +233,17 @@ class TrainingRun:
         Raises:
             ConflictError: the checkpoint has other network settings; they are named.
         """
-        asked = self.settings.network.model_dump()
+        requested = self.settings.network.model_dump()
         there = checkpoint.metadata.network.model_dump()
-        others = {name: (there[name], asked[name]) for name in asked if there[name] != asked[name]}
+        others = {
+            name: (there[name], requested[name])
+            for name in requested
+            if there[name] != requested[name]
+        }
         if others:
             raise ConflictError(
-                "training: the checkpoint to start from has other network settings (its own, "
-                f"asked for): {others}; ask for its own"
+                "training: the checkpoint to start from has other network settings (stored, "
+                f"requested): {others}; request the stored ones"
             )
         self.model.load_state_dict(checkpoint.model.state_dict())
         self.averaged.load_state_dict(checkpoint.model.state_dict())
