@@ -12,6 +12,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.geometry import nearest_index
 from dextouch.hands.actions import HandTrajectory, poses_from_actions
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
+from dextouch.metrics import tactile
 from dextouch.schemas import EpisodeAttributes
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile import in_contact
@@ -165,21 +166,20 @@ def _pair(mine: StreamData, true: StreamData, shift_ns: int) -> Match:
 def _taxel_errors(
     episode: Episode, truth: Episode, matches: Mapping[str, Match]
 ) -> dict[str, float | None]:
-    both = either = total = 0
-    absolute_kpa = 0.0
-    for name, match in matches.items():
-        if episode.streams[name].kind != "tactile":
-            continue
-        mine = episode.read(name).values[match.index].astype(np.float64)
-        true = truth.read(name).values[match.true_index].astype(np.float64)
-        both += int((in_contact(mine) & in_contact(true)).sum())
-        either += int((in_contact(mine) | in_contact(true)).sum())
-        absolute_kpa += float(np.abs(mine - true).sum())
-        total += mine.size
-    return {
-        "taxel_iou": both / either if either else None,
-        "taxel_mae_kpa": absolute_kpa / total if total else None,
-    }
+    pairs = [
+        (
+            episode.read(name).values[match.index].astype(np.float64),
+            truth.read(name).values[match.true_index].astype(np.float64),
+        )
+        for name, match in matches.items()
+        if episode.streams[name].kind == "tactile"
+    ]
+    if not pairs:
+        return {"taxel_iou": None, "taxel_mae_kpa": None}
+    mine, true = (np.concatenate(arrays) for arrays in zip(*pairs, strict=True))
+    touched = bool((in_contact(mine) | in_contact(true)).any())
+    iou = tactile.contact_iou(predicted_kpa=mine, true_kpa=true) if touched else None
+    return {"taxel_iou": iou, "taxel_mae_kpa": tactile.mae(predicted_kpa=mine, true_kpa=true)}
 
 
 def _pose_errors(episode: Episode, truth: Episode, origin_ns: int) -> dict[str, float]:

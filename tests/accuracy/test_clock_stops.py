@@ -169,6 +169,46 @@ def test_single_wrong_stamps_move_nothing(wrong_ms, bound_ms):
         assert rms_ms(times_ns, take) <= bound_ms
 
 
+@pytest.mark.parametrize("noise_ms", [0.3, 1.0])
+def test_stamps_that_err_both_ways_are_no_steps(noise_ms, capsys):
+    """The estimators assume that delays only add; such stamps make some look early."""
+    ratios = []
+    for seed in range(3):
+        take = simulate("exponential", [], seed=seed, seconds=90)
+        noise_ns = np.random.default_rng(seed + 200).normal(0, noise_ms * 1e6, len(take.true_ns))
+        noisy = replace(take, device_ns=take.device_ns + np.rint(noise_ns).astype(np.int64))
+        times_ns, model = offline(noisy)
+        assert model.num_steps == 0
+        rival = rms_ms(oracle(noisy), take)
+        ratios.append((rms_ms(times_ns, take) / rival, rms_ms(online(noisy), take) / rival))
+    after, live = np.max(ratios, axis=0)
+    with capsys.disabled():
+        sys.stdout.write(
+            f"\nstamps ± {noise_ms} ms   {after:.2f} times the error of least squares, bound 1.2 | "
+            f"online {live:.2f}, bound 1.4"
+        )
+    assert after <= 1.2
+    assert live <= 1.4
+
+
+@pytest.mark.parametrize("quicker_ms", [1.0, 1.5])
+def test_a_path_that_gets_quicker_costs_less_than_the_change(quicker_ms, capsys):
+    """No stamp tells a quicker path from a slower clock: the error is bounded by the change."""
+    found = []
+    for seed in range(3):
+        take = simulate("exponential", [("late", 40.0, -quicker_ms * 1e-3)], seed=seed, seconds=90)
+        times_ns, model = offline(take)
+        assert model.num_steps == 0
+        assert abs(model.skew_ppm - 50) < 60
+        found += [rms_ms(times_ns, take), rms_ms(online(take), take)]
+        # Nothing is dated later than it arrived, nor before the quickest path would allow.
+        assert (times_ns <= take.host_ns).all()
+        assert (times_ns - take.true_ns).min() >= (BASE_S * 1e3 - quicker_ms) * 1e6 - 1e4
+    with capsys.disabled():
+        sys.stdout.write(f"\npath quicker by {quicker_ms} ms   {max(found):.3f} ms")
+    assert max(found) <= quicker_ms
+
+
 @pytest.mark.parametrize("slower", [1.0006, 1.006, 1.02, 2.0])
 @pytest.mark.parametrize("at_s", [120, 160])
 def test_a_rate_that_changes_is_no_stop(slower, at_s, capsys):

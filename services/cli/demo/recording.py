@@ -5,6 +5,7 @@ the uploader sends over HTTP, the alignment service creates the episode.
 """
 
 import shutil
+import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -27,8 +28,10 @@ from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.uploader import Uploader
 from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
 from services.alignment.schemas import AlignmentJob
+from services.cli.demo.calibrating import measure_gloves
 
-ALIGNMENT_TIMEOUT_S = 300.0
+# The first alignment on a machine compiles the solver, which takes minutes where others use it too.
+ALIGNMENT_TIMEOUT_S = 1800.0
 UPLOAD_PERIOD_S = 1.0
 STATION = "demo"
 
@@ -49,18 +52,22 @@ def record_take(
 ) -> tuple[MockTake, list[dict[str, Any]]]:
     """Replay the truth through all mock devices, with the faults of an ordinary station.
 
+    The gloves are calibrated first, by a take of their own.
+
     Returns:
         The take in the spool, and for every device the mock's ledger beside the health counters.
     """
-    attributes = truth.attributes
+    attributes, streams = truth.attributes, replay_streams(truth)
+    with tempfile.TemporaryDirectory(prefix="dextouch-calibration-") as folder:
+        gloves = measure_gloves(streams, Path(folder), seed=seed)
     with MockStation(
-        replay_streams(truth),
+        streams,
         FaultScript.first_light(),
         seed,
         VirtualClock(),
         spool_root=spool_root,
         name=STATION,
-        calibration=replay_calibration(truth),
+        calibration={**replay_calibration(truth), **gloves},
     ) as mock:
         take = mock.run_take(
             TakePrompt(
@@ -135,14 +142,20 @@ def align(alignment_url: str, recording_id: str) -> AlignmentJob:
 
     Raises:
         DexTouchError: what the service refused, with its reason.
+        UnavailableError: it does not answer.
     """
-    answer = httpx.post(
-        f"{alignment_url}/v1/alignments",
-        params={"wait": "true"},
-        json={"recording_id": recording_id},
-        timeout=ALIGNMENT_TIMEOUT_S,
-        trust_env=False,
-    )
+    try:
+        answer = httpx.post(
+            f"{alignment_url}/v1/alignments",
+            params={"wait": "true"},
+            json={"recording_id": recording_id},
+            timeout=ALIGNMENT_TIMEOUT_S,
+            trust_env=False,
+        )
+    except httpx.TransportError as error:
+        raise UnavailableError(
+            f"alignment of {recording_id}: no answer within {ALIGNMENT_TIMEOUT_S:.0f} s ({error!r})"
+        ) from error
     if answer.is_error:
         raise error_from_problem(Problem.model_validate_json(answer.content))
     return AlignmentJob.model_validate_json(answer.content)

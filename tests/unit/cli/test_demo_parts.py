@@ -16,10 +16,11 @@ from dextouch.schemas import LineageEntry
 from services.cli.demo.background import served
 from services.cli.demo.command import worst_errors
 from services.cli.demo.judging import ladder
-from services.cli.demo.recording import forget_take
+from services.cli.demo.recording import align, forget_take
 from services.cli.demo.settings import FIRST_HELD_OUT_SEED, parse
 from services.cli.demo.table import rate, show
 from services.cli.demo.timing import Stages
+from services.cli.servers import bind
 from tests.unit.bridges.takes import write_episode, write_recording
 from tests.unit.worlds.fakes import anchor, observation
 
@@ -55,6 +56,14 @@ def test_a_take_of_another_station_is_never_replaced(tmp_path):
     with pytest.raises(ConflictError, match="bench-2"):
         forget_take(store, "demo-robot")
     assert half_sent.exists()
+
+
+def test_an_alignment_that_does_not_answer_is_named():
+    place = bind("alignment", host="127.0.0.1", port=0)
+    url = place.url
+    place.socket.close()
+    with pytest.raises(UnavailableError, match="alignment of demo-human"):
+        align(url, "demo-human")
 
 
 def errors(scale):

@@ -1,0 +1,52 @@
+"""The demo's gloves are calibrated by a take, not by what the mocks know of themselves."""
+
+import numpy as np
+import pytest
+
+from dextouch.episodes import EpisodeStore
+from dextouch.episodes.spool_reader import SpoolReader
+from services.acquisition.devices.tactile_glove.mock import GloveCalibration
+from services.acquisition.mocks.pattern import pattern_streams
+from services.cli.demo import calibrating, recording
+from tests.unit.bridges.takes import write_episode
+
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def measured(tmp_path_factory):
+    streams = pattern_streams(1.0)
+    return calibrating.measure_gloves(streams, tmp_path_factory.mktemp("spool"), seed=SEED)
+
+
+@pytest.mark.parametrize("side", ["left", "right"])
+def test_tare_and_gain_are_close_to_the_gloves_own_but_measured(measured, side):
+    (tare,) = np.array(measured[f"tactile_{side}_tare_counts"])
+    (gain,) = np.array(measured[f"tactile_{side}_gain_counts_per_kpa"])
+    truth = GloveCalibration.seeded(side, SEED)
+    wired = slice(0, 320)  # The last two rows of the scan are not connected.
+    # Whole counts: half a count at most.
+    assert 0 < np.abs(tare - truth.tare_counts).max() <= 0.5
+    errors = gain[wired] / truth.gain_counts_per_kpa[wired] - 1
+    # The pressures were known to 1 %, and are the same for all taxels.
+    assert 0 < abs(errors.mean()) <= 3 * calibrating.PRESSURE_SIGMA
+    assert errors.std() <= 0.002
+
+
+def test_without_gloves_nothing_is_measured(tmp_path):
+    streams = [s for s in pattern_streams(1.0) if s.descriptor.kind != "tactile"]
+    assert calibrating.measure_gloves(streams, tmp_path, seed=SEED) == {}
+
+
+def test_the_take_carries_what_was_measured_and_not_the_gloves_own(tmp_path, monkeypatch):
+    truth = write_episode(EpisodeStore(tmp_path / "truth"), num_steps=3)
+    streams = [s for s in pattern_streams(1.0) if s.descriptor.kind == "tactile"]
+    monkeypatch.setattr(recording, "replay_streams", lambda _: streams)
+    take, _ = recording.record_take(truth, tmp_path / "spool", seed=SEED)
+    kept = SpoolReader(take.spool_path).attributes.calibration
+    for side in ("left", "right"):
+        own = GloveCalibration.seeded(side, SEED)
+        (tare,) = np.array(kept[f"tactile_{side}_tare_counts"])
+        (gain,) = np.array(kept[f"tactile_{side}_gain_counts_per_kpa"])
+        assert (tare == np.rint(own.tare_counts)).all()
+        assert not np.isclose(gain, own.gain_counts_per_kpa, rtol=1e-6).any()
