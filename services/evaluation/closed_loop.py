@@ -251,9 +251,10 @@ class _Study:
             answer = ask(actor.act, rollout.observation, where=acting)
             chunk = action_chunk(answer, description, where=acting)[:left]
             if looks == "last" and len(chunk) < left:
-                rollout.step(chunk, selector=ReturnSelector(cameras=cameras, steps="last"))
+                shown = ReturnSelector(cameras=cameras, steps="last")
+                rollout.step(chunk, selector=shown, validated=True)
             elif looks and looks != "last":
-                rollout.step(chunk)
+                rollout.step(chunk, validated=True)
             else:
                 _step_unseen(rollout, chunk, left, description)
         last = rollout.observation
@@ -280,6 +281,6 @@ def _step_unseen(
     shown = -(-NUM_SEEN_STEPS // multiple) * multiple if len(chunk) == left else 0
     unseen = max(len(chunk) - shown, 0)
     if unseen:
-        rollout.step(chunk[:unseen], selector=ReturnSelector(cameras=()))
+        rollout.step(chunk[:unseen], selector=ReturnSelector(cameras=()), validated=True)
     if unseen < len(chunk):
-        rollout.step(chunk[unseen:])
+        rollout.step(chunk[unseen:], validated=True)

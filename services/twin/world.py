@@ -13,7 +13,6 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.hands.actions import (
     AnchorPoses,
     actions_from_poses,
-    check_actions,
     poses_from_actions,
 )
 from dextouch.schemas import EVERYTHING, Observation, ReturnSelector, RolloutStart, WorldDescription
@@ -120,22 +119,21 @@ class TwinWorld:
     ) -> SteppedRollout[TwinState]:
         """See `World`; wrists, fingers and head follow the actions."""
         del seed
-        checked = check_actions(actions, where="world twin: actions")
-        commands = poses_from_actions(checked, state.anchor)
+        commands = poses_from_actions(actions, state.anchor, where="world twin: actions")
         stage = self.stage(state.task)
         stage.simulation.set_state(state.physics, step_index=state.step * STEPS_PER_GRID)
         log = _StepLog(stage, tuple(filter(selector.wants, self._settings.cameras)))
-        for row in range(len(checked)):
+        for row in range(len(actions)):
             for step_index in stage.simulation.advance(command_row(commands, row)):
                 if step_index % STEPS_PER_TACTILE == 0:
                     log.touch()
             log.step()
-            if selector.steps == "all" or row == len(checked) - 1:
+            if selector.steps == "all" or row == len(actions) - 1:
                 log.draw()
         after = TwinState(
             state.task,
             state.seed,
-            state.step + len(checked),
+            state.step + len(actions),
             stage.simulation.state(),
             state.anchor,
         )

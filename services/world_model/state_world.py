@@ -195,7 +195,10 @@ class StateWorld:
         for state in states:
             self._refuse_ended(state)
         chunks = [self._checked_chunk(chunk) for chunk in actions]
-        motions = [hand_motion(chunk, s.anchor) for chunk, s in zip(chunks, states, strict=True)]
+        motions = [
+            hand_motion(chunk, state.anchor, validated=True)
+            for chunk, state in zip(chunks, states, strict=True)
+        ]
         memory = stack_memories([state.memory for state in states])
         following, imagined = self._dynamics.advance(memory, Commands.of(motions))
         _refuse_non_finite(imagined)
@@ -327,7 +330,8 @@ def _scene_states(
     anchor: AnchorPoses,
     poses: Float32[np.ndarray, "n objects 7"],
 ) -> list[SceneState]:
-    hands = poses_from_actions(actions, anchor)
+    """Scenes to draw; the actions were validated when they came."""
+    hands = poses_from_actions(actions, anchor, validated=True)
     Ts_world_wrist = np.stack([hands.Ts_world_wrist_left, hands.Ts_world_wrist_right], axis=1)
     joints_rad = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
     there = poses[..., 2] > ABSENT_POSE[2]

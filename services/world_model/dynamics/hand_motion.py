@@ -46,17 +46,20 @@ def _hand(side: str) -> RobotHand:
     return RobotHand(side)
 
 
-def hand_motion(actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses) -> HandMotion:
+def hand_motion(
+    actions: Float64[np.ndarray, "n 67"], anchor: AnchorPoses, *, validated: bool = False
+) -> HandMotion:
     """Motion of both hands under the given actions.
 
     Args:
         actions: relative to `anchor`.
         anchor: T_world poses that the actions are relative to.
+        validated: `check_actions` has returned these actions, and they need no second look.
 
     Raises:
         DegenerateRotationError: the actions hold a degenerate rotation.
     """
-    poses = poses_from_actions(actions, anchor)
+    poses = poses_from_actions(actions, anchor, validated=validated)
     Ts = np.stack([poses.Ts_world_wrist_left, poses.Ts_world_wrist_right], axis=1)
     joints = np.stack([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
     tips = np.stack(

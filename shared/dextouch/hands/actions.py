@@ -182,9 +182,26 @@ def _relative_9d(T_world_anchor: np.ndarray, Ts_world_x: np.ndarray) -> Float64[
     return relative
 
 
-def poses_from_actions(actions: np.ndarray, anchor: AnchorPoses) -> HandTrajectory:
-    """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`."""
-    checked = check_actions(actions)
+def poses_from_actions(
+    actions: np.ndarray,
+    anchor: AnchorPoses,
+    *,
+    where: str = "actions",
+    validated: bool = False,
+) -> HandTrajectory:
+    """Absolute poses and joint angles of actions [T, 67]; inverse of `actions_from_poses`.
+
+    Args:
+        actions: [T, 67].
+        anchor: poses that they are relative to.
+        where: what gave the actions, for messages.
+        validated: `check_actions` has returned these actions, and they need no second look.
+
+    Raises:
+        ShapeError, NonFiniteError: as `check_actions`, whose messages begin with `where`.
+        DegenerateRotationError: a 6-D rotation that is none.
+    """
+    checked = actions if validated else check_actions(actions, where=where)
     Ts_world_x = np.stack(anchor.as_tuple()) @ _poses(checked)
     return HandTrajectory(
         Ts_world_x[:, 0],

@@ -13,7 +13,7 @@ from dextouch.errors import (
     ShapeError,
     UnknownNameError,
 )
-from dextouch.hands.actions import check_actions
+from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import (
     EVERYTHING,
     Observation,
@@ -56,14 +56,17 @@ def check_start(start: RolloutStart, description: WorldDescription) -> RolloutSt
 def check_chunk(
     actions: np.ndarray, description: WorldDescription
 ) -> Float64[np.ndarray, "steps 67"]:
-    """Validate an action chunk and return it as float64.
+    """Validate the length of an action chunk and return it as float64.
+
+    Its numbers are validated by the world, which every `World` does before it changes anything.
 
     Raises:
         ShapeError: not [K, 67], or K is not a multiple of the world's chunk.
-        NonFiniteError: NaN or infinity.
         LimitExceededError: longer than the world's maximum.
     """
-    checked = check_actions(actions, where="chunk")
+    checked = np.asarray(actions, dtype=np.float64)
+    if checked.ndim != 2 or checked.shape[1] != ACTION_DIM or len(checked) == 0:
+        raise ShapeError(f"chunk: got shape {checked.shape}, expected [K ≥ 1, {ACTION_DIM}]")
     if len(checked) % description.chunk_multiple:
         raise ShapeError(
             f"chunk: got {len(checked)} steps, expected a multiple of {description.chunk_multiple}",

@@ -69,7 +69,7 @@ class World(Protocol[State]):
         seed: int,
         selector: ReturnSelector = EVERYTHING,
     ) -> SteppedRollout[State]:
-        """Advance by one validated action chunk.
+        """Advance by one action chunk, which the world validates (`check_actions`).
 
         Args:
             state: from `reset`, `step` or `restore`; it is not changed.
@@ -82,6 +82,8 @@ class World(Protocol[State]):
                 not depend on it.
 
         Raises:
+            InvalidInputError: wrong shape, NaN, infinity, or what this world cannot reach; nothing
+                has changed.
             EndedError: the world cannot continue from this state, for the given reason; the state
                 remains valid for `snapshot`.
         """
