@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dextouch.episodes.spool_reader import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.acquisition.mocks.pattern import pattern_streams
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from tests.integration.tutorial_page import ROOT, TutorialPage

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.episodes.spool_reader import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.acquisition.clock import VirtualClock

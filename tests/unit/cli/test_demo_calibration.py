@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from dextouch.episodes.spool_reader import SpoolReader
+from dextouch.episodes.spool import SpoolReader
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
 from services.acquisition.mocks.pattern import pattern_streams
 from services.cli.demo import calibrating, recording
