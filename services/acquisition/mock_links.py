@@ -21,7 +21,7 @@ class MockLinks(BaseModel):
         gloves: the kind of both gloves, ours (`dextouch`, `wuji` and `justfloat` are short for
             them) or one that another package brings. Each says what a calibrated station knows of
             it.
-        trackers: finger and pose trackers by HID, or behind an SDK's bridge.
+        trackers: finger and pose trackers by HID, by USB, or behind an SDK's bridge.
         cameras: images over a socket, or from a camera on the station's own bus.
         wrists: whether a robot or pose trackers give the wrists where there is a robot's state; its
             packets hold them in any case.
@@ -33,7 +33,7 @@ class MockLinks(BaseModel):
     gloves: str = Field(
         default="tactile_glove", description="kind of both gloves, ours or of another package"
     )
-    trackers: Literal["hid", "bridge"] = Field(
+    trackers: Literal["hid", "usb", "bridge"] = Field(
         default="hid", description="how finger and pose trackers are connected"
     )
     wrists: Literal["robot", "trackers"] = Field(

@@ -1,5 +1,6 @@
 """Command `dextouch doctor`: checks what DexTouch can do on this machine."""
 
+import ctypes.util
 import importlib.util
 import os
 import platform
@@ -26,6 +27,7 @@ _PACKAGES = {
     "zstandard": "episodes",
     "serial": "gloves over serial",
     "hid": "trackers over HID",
+    "usb": "trackers over USB",
     "cv2": "cameras and calibration",
     "fastapi": "HTTP services",
     "redis": "rollouts kept in Redis",
@@ -55,6 +57,8 @@ def examine() -> list[Finding]:
     )
     redis = shutil.which("redis-server")
     findings.append(Finding("redis-server (optional)", redis or "no: rollouts are kept in memory"))
+    libusb = ctypes.util.find_library("usb-1.0")
+    findings.append(Finding("libusb (optional)", libusb or "no: trackers by link usb need it"))
     for pattern in ("ttyACM*", "ttyUSB*", "hidraw*", "video*"):
         found = [_with_access(path) for path in sorted(Path("/dev").glob(pattern))]
         findings.append(Finding(f"devices {pattern}", ", ".join(found) or "none"))

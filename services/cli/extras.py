@@ -11,6 +11,7 @@ EXTRA_OF = {
     "serial": "station",
     "fastcrc": "station",
     "hid": "station",
+    "usb": "station",
     "cv2": "station",
     "fastapi": "serve",
     "uvicorn": "serve",

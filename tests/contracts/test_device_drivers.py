@@ -175,15 +175,17 @@ def poses(links):
     return from_factory("pose_tracker_wrist_left", "pose_tracker_wrist_right", links=links)
 
 
-HID, BRIDGE = (MockLinks(trackers=link) for link in ("hid", "bridge"))
+HID, USB, BRIDGE = (MockLinks(trackers=link) for link in ("hid", "usb", "bridge"))
 SUBJECTS = {
     "glove by serial": from_factory("glove_left", "glove_right"),
     "wuji glove by serial": from_factory(
         "glove_left", "glove_right", links=MockLinks(gloves="wuji")
     ),
     "fingers by hid": fingers(HID),
+    "fingers by usb": fingers(USB),
     "fingers by bridge": fingers(BRIDGE),
     "pose by hid": poses(HID),
+    "pose by usb": poses(USB),
     "pose by bridge": poses(BRIDGE),
     "camera by bridge": from_factory("camera_head"),
     "camera of the station": station_camera,

@@ -33,7 +33,7 @@ STREAM_OF = {
 NEIGHBOR = "head"
 WRAP = 2**32 - 40
 OURS = MockLinks()
-BRIDGE = MockLinks(trackers="bridge")
+USB, BRIDGE = MockLinks(trackers="usb"), MockLinks(trackers="bridge")
 WUJI, JUSTFLOAT = MockLinks(gloves="wuji"), MockLinks(gloves="justfloat")
 OWN_CAMERA = MockLinks(cameras="station")
 
@@ -142,6 +142,9 @@ SCRIPTS = {
     "not running": not_running(OURS),
     "jumps": jumping(OURS),
     "thumb hidden": thumb_hidden(OURS),
+    "drops, usb": dropped(TRACKER, USB),
+    "unplug, usb": unplugged(FINGERS, USB),
+    "wrong side, usb": from_1_s(TRACKER, "wrong_side", "wrong_side", USB),
     "duplicates, bridge": repeated(TRACKER, BRIDGE),
     "reordering, bridge": reordered(TRACKER, BRIDGE),
     "half, bridge": halved(FINGERS, BRIDGE),

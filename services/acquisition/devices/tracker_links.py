@@ -1,4 +1,4 @@
-"""Trackers by HID or the bridge to their SDK: the settings of the link, and its transport."""
+"""Trackers by HID, USB or the bridge to their SDK: the settings of the link, and its transport."""
 
 from typing import Literal
 
@@ -6,22 +6,25 @@ from pydantic import Field, model_validator
 
 from dextouch.errors import InvalidInputError
 from services.acquisition.devices.kind import DeviceSettings
+from services.acquisition.transports.base import Transport
 from services.acquisition.transports.hid import HidTransport, hid_opener
 from services.acquisition.transports.socket import (
     SocketTransport,
     tcp_connector,
     unix_connector,
 )
+from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 
 class TrackerSettings(DeviceSettings):
     """How a tracker is reached.
 
-    By `hid` it is found by its ids and, where several are alike, its serial number; by `bridge` it
-    is asked for at the socket of its SDK's process: `path` of a local socket, or `host` and `port`.
+    By `hid` or `usb` it is found by its ids and, where several are alike, its serial number; by
+    `bridge` it is asked for at the socket of its SDK's process: `path` of a local socket, or `host`
+    and `port`.
     """
 
-    link: Literal["hid", "bridge"] = "hid"
+    link: Literal["hid", "usb", "bridge"] = "hid"
     vendor_id: int | None = Field(default=None, ge=0, le=0xFFFF)
     product_id: int | None = Field(default=None, ge=0, le=0xFFFF)
     serial_number: str | None = None
@@ -36,14 +39,14 @@ class TrackerSettings(DeviceSettings):
         if (num_ids, num_ends) != ((0, 1) if self.link == "bridge" else (2, 0)):
             raise ValueError(
                 f"link {self.link!r}: got vendor_id {self.vendor_id}, product_id "
-                f"{self.product_id}, port {self.port}, path {self.path}; expected both ids (hid), "
-                "or else a port or a path (bridge)"
+                f"{self.product_id}, port {self.port}, path {self.path}; expected both ids (hid, "
+                "usb), or else a port or a path (bridge)"
             )
         return self
 
 
-def report_transport(settings: TrackerSettings) -> HidTransport:
-    """The link to a tracker that sends HID reports, not opened.
+def report_transport(settings: TrackerSettings) -> Transport:
+    """The link to a tracker that sends reports by HID or USB, not opened.
 
     Raises:
         InvalidInputError: without vendor and product id.
@@ -52,13 +55,16 @@ def report_transport(settings: TrackerSettings) -> HidTransport:
         raise InvalidInputError(
             f"{settings.kind} by {settings.link}: set its vendor_id and product_id"
         )
+    address = UsbAddress(settings.vendor_id, settings.product_id, settings.serial_number)
+    if settings.link == "usb":
+        return UsbTransport(address)
     return HidTransport(
         hid_opener(
             vendor_id=settings.vendor_id,
             product_id=settings.product_id,
             serial_number=settings.serial_number,
         ),
-        address=f"{settings.vendor_id:04x}:{settings.product_id:04x}",
+        address=str(address),
         serial_number=settings.serial_number,
     )
 

@@ -10,12 +10,15 @@ from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.bridge_sources import BridgeSource, sign_of_life
 from services.acquisition.mocks.faults import DeviceFaults, Schedule
 from services.acquisition.mocks.pair import MockPair
+from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import (
     SEQUENCE_MODULUS,
     MockDevice,
 )
+from services.acquisition.mocks.usb_backend import UsbPort
 
-TrackerLink = Literal["hid", "bridge"]
+TrackerLink = Literal["hid", "usb", "bridge"]
+REPORT_PORTS = {"hid": HidPort, "usb": UsbPort}
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import at_rate
 from services.acquisition.schemas import TakePrompt
 from services.acquisition.settings import AcquisitionSettings
-from services.acquisition.transports.hid import HidTransport
+from services.acquisition.transports.usb import UsbTransport
 from tests.integration.recording_streams import human_streams, robot_streams
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
@@ -51,9 +51,9 @@ def test_each_link_has_the_driver_of_a_real_station():
     trackers = ("keypoints_left", "head")
     _, drivers = build(trackers, trackers="bridge")
     assert [type(driver) for driver in drivers] == [BridgeDriver, BridgeDriver]
-    _, drivers = build(trackers, trackers="hid")
+    _, drivers = build(trackers, trackers="usb")
     assert isinstance(drivers[0], FingerTracker)
-    assert all(isinstance(d.transport._transport, HidTransport) for d in drivers)
+    assert all(isinstance(d.transport._transport, UsbTransport) for d in drivers)
     _, (camera,) = build(("camera_head",), images="h264")
     assert (type(camera), camera.descriptors[0].unit) == (CameraDriver, "h264")
     _, (camera,) = build(("camera_head",), cameras="station", images="jpeg")
@@ -85,7 +85,7 @@ def test_gloves_of_others_come_without_our_calibration(gloves, num_values):
 @pytest.mark.parametrize(
     "links",
     [
-        MockLinks(gloves="wuji", trackers="hid", cameras="station", images="jpeg"),
+        MockLinks(gloves="wuji", trackers="usb", cameras="station", images="jpeg"),
         MockLinks(gloves="justfloat", trackers="bridge", images="h264"),
     ],
 )

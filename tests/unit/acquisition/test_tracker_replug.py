@@ -16,6 +16,7 @@ from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
+from services.acquisition.mocks.usb_backend import UsbPort
 from services.acquisition.supervisor import DeviceSupervisor
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.
@@ -41,7 +42,7 @@ class Rig:
                 "pose", transport=self.port.transport, decoder=decoder, clock=clock
             )
         else:
-            self.port = HidPort("LHR-left")
+            self.port = (UsbPort if link == "usb" else HidPort)("LHR-left")
             decoder = PoseTrackerDecoder("wrist_left")
             driver = Driver("pose", transport=self.port.transport, decoder=decoder, clock=clock)
         self.sequences = []
@@ -63,7 +64,7 @@ class Rig:
             assert self.arrived.wait_for(lambda: last in self.sequences, 60.0)
 
 
-@pytest.fixture(params=["hid", "bridge"])
+@pytest.fixture(params=["hid", "usb", "bridge"])
 def rig(request, monkeypatch):
     # A busy machine may be slower with the next sample than a bridge may be silent.
     monkeypatch.setattr("services.acquisition.drivers.bridge_driver.SILENCE_NS", 10**10)

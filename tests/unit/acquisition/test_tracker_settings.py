@@ -9,11 +9,13 @@ from services.acquisition.settings import AcquisitionSettings
 IDS = {"vendor_id": 0x28DE, "product_id": 0x2300, "serial_number": "LHR-1"}
 LINKS = {
     "hid": {"link": "hid", **IDS},
+    "usb": {"link": "usb", **IDS},
     "bridge at a port": {"link": "bridge", "port": 4711, "serial_number": "LHR-1"},
     "bridge at a path": {"link": "bridge", "path": "/run/openvr.sock"},
 }
 ADDRESSES = {
     "hid": "hid 28de:2300",
+    "usb": "usb 28de:2300",
     "bridge at a port": "socket 127.0.0.1:4711",
     "bridge at a path": "socket /run/openvr.sock",
 }
@@ -36,8 +38,7 @@ def test_each_link_makes_a_driver(device, link):
     "link",
     [
         {},
-        {"link": "hid", "vendor_id": 1},
-        {"link": "usb", **IDS},
+        {"link": "usb", "vendor_id": 1},
         {"link": "hid", **IDS, "port": 4711},
         {"link": "bridge"},
         {"link": "bridge", "port": 1, "path": "/run/a"},

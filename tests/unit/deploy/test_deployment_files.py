@@ -123,7 +123,7 @@ def test_udev_rules_parse_and_name_devices_once():
 
 def test_container_and_unit_let_in_the_same_devices():
     # Fixed by the kernel (admin-guide/devices.txt); that of hidraw is not.
-    majors = {"ttyACM": "166", "ttyUSB": "188", "video4linux": "81"}
+    majors = {"ttyACM": "166", "ttyUSB": "188", "usb_device": "189", "video4linux": "81"}
     devices = yaml.safe_load((ROOT / "deploy/compose.devices.yml").read_text())
     rules = devices["services"]["acquisition"]["device_cgroup_rules"]
     numbers = set(re.findall(r"^c (\d+):", "\n".join(rules), re.M))

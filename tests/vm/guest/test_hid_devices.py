@@ -90,14 +90,15 @@ def pass_poses(gadget, send, driver, first, count):
         sender.join(PATIENCE_S)
 
 
-def test_a_tracker_on_usb_survives_being_replugged(plug, opened, send, measured):
+@pytest.mark.parametrize("link", ["hid", "usb"])
+def test_a_tracker_on_usb_survives_being_replugged(plug, opened, send, measured, link):
     gadget = plug(kernel_devices.hid_gadget, ids=IDS, serial_number=SERIAL)
     gadget.plug()
-    driver = opened(SETTINGS)
+    driver = opened(SETTINGS.model_copy(update={"link": link}))
     pass_poses(gadget, send, driver, 0, 100)
     flagged_s = seconds_until_refused(driver, gadget.unplug)
     back_s = seconds_until_back(driver, gadget.plug)
     pass_poses(gadget, send, driver, 150, 50)
-    measured("pose tracker, USB gadget", *replug_row(flagged_s, back_s))
+    measured(f"pose tracker, USB gadget by {link}", *replug_row(flagged_s, back_s))
     assert flagged_s <= MAX_FLAGGED_S
     assert back_s <= MAX_BACK_S

@@ -36,9 +36,8 @@ from services.acquisition.mocks.bridge_sources import (
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
-from services.acquisition.mocks.tracker_place import TrackerPlace, bridged_pair
+from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
 
 # What an occluded tracker does not see.
 _HIDDEN = chain_indices("thumb")
@@ -194,7 +193,7 @@ def mock_finger_tracker(side: Side, stream: ReplayStream, place: TrackerPlace) -
     source = FingerTrackerSource(
         stream, side=side, noise_m=faults.position_noise_m, rng=rng, faults=faults
     )
-    port = HidPort(name, answer=source.answer)
+    port = REPORT_PORTS[place.link](name, answer=source.answer)
     driver = FingerTracker(name, side, transport=port.transport, clock=place.clock)
     device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)
     return MockPair(device, driver)

@@ -37,9 +37,8 @@ from services.acquisition.mocks.bridge_sources import (
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.pair import MockPair
-from services.acquisition.mocks.ports import HidPort
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
-from services.acquisition.mocks.tracker_place import TrackerPlace, bridged_pair
+from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
 
 POSE_INDEX = 3
 RESULTS = {
@@ -258,7 +257,7 @@ def mock_pose_tracker(stream: ReplayStream, place: TrackerPlace) -> MockPair:
         bridge = BridgePoseSource(stream, faults=faults, rng=rng)
         return bridged_pair(name, bridge, BridgePoseTrackerDecoder(where), place)
     source = PoseTrackerSource(stream, faults=faults, rng=rng)
-    port = HidPort(name)
+    port = REPORT_PORTS[place.link](name)
     decoder = PoseTrackerDecoder(where)
     driver = Driver(name, transport=port.transport, decoder=decoder, clock=place.clock)
     device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)
