@@ -101,6 +101,17 @@ STAGES = {
         "Reports processor time, errors against the truth and how honest our sigmas are; ends with "
         "what calibration promises and whether it holds.",
     ),
+    "alignment": StageEntry(
+        "benchmarks.alignment.benchmark",
+        "align takes from the spool to the episode: ours, arrival stamps",
+        "Records takes of a simulated station (two gloves, keypoints of both hands, three poses "
+        "and a camera; clocks that drift, paths that delay and lose; gloves calibrated by a "
+        "take of their own), stores and aligns each in several ways, in turns: with fitted clocks "
+        "as the alignment service does, and by arrival stamps, interpolated or with the nearest "
+        "sample. Reports processor time by step (storing, clock fits, calibration, resampling, "
+        "retargeting, writing) and errors against the truth in times of samples, wrists, "
+        "fingertips and pressures; ends with what alignment promises and whether it holds.",
+    ),
     "retargeting": StageEntry(
         "benchmarks.retargeting.benchmark",
         "follow hands with the robot: ours, dex-retargeting, dexi-rs",

@@ -1,0 +1,90 @@
+"""Entry point of the benchmark stage `alignment`."""
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+
+from benchmarks.alignment.compare import compare
+from benchmarks.alignment.recordings import RecordedTake, record
+from benchmarks.alignment.tables import panels, requirements, tables
+from benchmarks.machine import describe_machine
+from benchmarks.report import StageReport
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+from services.alignment.retargeting.hand_retargeter import warm_up
+
+PACKAGES = ("numpy", "numba", "scipy", "zstandard")
+QUICK_SECONDS, USUAL_SECONDS = "3", "10,60"
+QUICK_ROUNDS, USUAL_ROUNDS = 1, 5
+# Shorter takes have no stretch of 17 steps.
+MIN_SECONDS = 2.0
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument(
+        "--seconds",
+        metavar="A,B",
+        help=f"lengths of the takes ({USUAL_SECONDS}; quick {QUICK_SECONDS})",
+    )
+    parser.add_argument(
+        "--rounds", type=int, help=f"rounds a take ({USUAL_ROUNDS}; quick {QUICK_ROUNDS})"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of motions and faults (%(default)s)")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Record takes, then align each with every method in turns.
+
+    Raises:
+        InvalidInputError: a take that is too short, or no round.
+    """
+    lengths_s = _lengths_s(options)
+    num_rounds = options.rounds
+    if num_rounds is None:
+        num_rounds = QUICK_ROUNDS if options.quick else USUAL_ROUNDS
+    if num_rounds < 1:
+        raise InvalidInputError(f"--rounds: got {num_rounds}, expected at least 1")
+    takes = _record(lengths_s, options.seed, folder, bar)
+    warm_up()
+    results = [compare(take, num_rounds, folder, bar=bar) for take in takes]
+    longest = results[-1]
+    return StageReport(
+        stage="alignment",
+        machine=describe_machine(PACKAGES),
+        options={"seconds": lengths_s, "rounds": num_rounds, "seed": options.seed},
+        tables=tables(results),
+        panels=panels(longest),
+        requirements=requirements(longest),
+        data={"takes": [{name: asdict(one) for name, one in found.items()} for found in results]},
+        notes=[
+            "processor time of all threads, so times of real time are those of one core; the clock "
+            "fits are timed apart, right after the alignment, and taken off the calibration; "
+            "arrivals need none",
+            "gloves are calibrated by a take under known pressures, path delays wrong by 0.2 ms "
+            "(sigma); the transfer over HTTP is not in these times",
+        ],
+    )
+
+
+def _record(lengths_s: list[float], seed: int, folder: Path, bar: Bar) -> list[RecordedTake]:
+    takes = []
+    with bar("recording", len(lengths_s)) as step:
+        for seconds in lengths_s:
+            step(f"{seconds:g} s")
+            takes.append(record(seconds, seed, folder / f"take_{seconds:g}s"))
+    return takes
+
+
+def _lengths_s(options: argparse.Namespace) -> list[float]:
+    text = options.seconds or (QUICK_SECONDS if options.quick else USUAL_SECONDS)
+    words = [word.strip() for word in text.split(",")]
+    try:
+        lengths_s = sorted({float(word) for word in words})
+    except ValueError:
+        lengths_s = []
+    if not lengths_s or not MIN_SECONDS <= lengths_s[0] <= lengths_s[-1] < float("inf"):
+        raise InvalidInputError(
+            f"--seconds: got {text!r}, expected lengths of at least {MIN_SECONDS:g} s, like 10,60"
+        )
+    return lengths_s

@@ -1,0 +1,230 @@
+"""Alignment of recorded takes by the product and by arrival stamps, timed by steps."""
+
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+
+from benchmarks.alignment.recordings import RecordedTake
+from benchmarks.figures import Figure
+from benchmarks.rounds import interleaved
+from benchmarks.stages import Bar
+from dextouch.episodes import EpisodeStore, RecordingReader
+from dextouch.episodes.spool import SpoolReader
+from dextouch.schemas import ClockReport, EpisodeAttributes, StoredAnchor
+from dextouch.streams import StreamDescriptor
+from services.alignment.jobs import align_recording
+from services.alignment.options import AlignmentOptions
+from services.alignment.synchronization.episode_streams import cut_stream, made_stream
+from services.alignment.synchronization.grid_actions import (
+    REQUIRED,
+    GriddedStreams,
+    make_actions,
+    place_streams,
+)
+from services.alignment.synchronization.progress import STAGES
+from services.alignment.synchronization.recorded_streams import DatedStream, date_stream
+from services.alignment.synchronization.resampling import grid_times_ns
+from services.alignment.synchronization.stream_clock import TimedStream, time_stream
+from services.cli.demo.recording import measure
+from services.episode_store.committing import commit_spool
+
+OURS, LINEAR, NEAREST = "ours", "arrivals, interpolated", "arrivals, nearest sample"
+METHODS = (OURS, LINEAR, NEAREST)
+STORING, FITS, CALIBRATION = "storing the upload", "clock fits", "calibration"
+STEPS = (STORING, FITS, CALIBRATION, "resampling", "retargeting", "writing")
+OPTIONS = AlignmentOptions()
+# Arrival stamps are interpolated across every gap.
+ANY_GAP_NS = 10**12
+
+OnStage = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method on one take: processor seconds by step, wall time, errors against the truth.
+
+    `alignment_s` is all but the storing; `wall_s` is the wall time of the same.
+    """
+
+    method: str
+    take_s: float
+    steps_s: dict[str, Figure]
+    alignment_s: Figure
+    wall_s: Figure
+    errors: dict[str, float]
+
+    @property
+    def speed(self) -> Figure:
+        """Seconds of recording that are stored and aligned in a second of processor time."""
+        steps = [figure.values for figure in self.steps_s.values()]
+        return Figure.of([sum(values) for values in zip(*steps, strict=True)]).inverse(self.take_s)
+
+
+@dataclass(frozen=True)
+class _Run:
+    steps_s: dict[str, float]
+    wall_s: float
+    errors: dict[str, float]
+
+
+def compare(
+    take: RecordedTake, num_rounds: int, folder: Path, *, bar: Bar
+) -> dict[str, MethodResult]:
+    """Align a take with every method in turns, each time in a new store.
+
+    Args:
+        take: in the spool.
+        num_rounds: at least 1; errors are those of the first round.
+        folder: for the stores; they are removed.
+        bar: opens a progress bar.
+    """
+    subjects = {name: partial(_run, take, name, folder / "store") for name in METHODS}
+    with bar(f"take of {take.seconds:g} s", num_rounds * len(subjects)) as step:
+        found = interleaved(subjects, num_rounds, on_step=step)
+    return {name: _result(name, take, runs) for name, runs in found.items()}
+
+
+def _result(name: str, take: RecordedTake, runs: Sequence[_Run]) -> MethodResult:
+    steps = {step: Figure.of([run.steps_s[step] for run in runs]) for step in STEPS}
+    alignment = [sum(run.steps_s.values()) - run.steps_s[STORING] for run in runs]
+    walls = Figure.of([run.wall_s for run in runs])
+    return MethodResult(name, take.seconds, steps, Figure.of(alignment), walls, runs[0].errors)
+
+
+def _run(recorded: RecordedTake, method: str, folder: Path, round_index: int) -> _Run:
+    recording_id = recorded.take.recording_id
+    store = EpisodeStore(folder)
+    begin_s = time.process_time()
+    spool = recorded.take.spool_path
+    commit_spool(store, spool, SpoolReader(spool).attributes)
+    storing_s = time.process_time() - begin_s
+    marks: dict[str, float] = {}
+    wall_s = time.perf_counter()
+    begin_s = time.process_time()
+
+    def on_stage(stage: str) -> None:
+        marks.setdefault(stage, time.process_time())
+
+    if method == OURS:
+        report = align_recording(store, recording_id, OPTIONS, lambda at: on_stage(at.stage))
+        episode_id = report.episode_id
+    else:
+        episode_id = align_by_arrivals(store, recording_id, on_stage, nearest=method == NEAREST)
+    end_s, wall_s = time.process_time(), time.perf_counter() - wall_s
+    # After the alignment, when the same files were just read.
+    fits_s = _clock_fits_s(store.recording(recording_id))
+    edges = [begin_s, *(marks[stage] for stage in STAGES[1:]), end_s]
+    dating_s, *others_s = np.diff(edges).tolist()
+    times = [storing_s, fits_s if method == OURS else 0.0, max(dating_s - fits_s, 0.0), *others_s]
+    errors = {} if round_index else _errors(store, recorded, episode_id)
+    shutil.rmtree(folder)
+    return _Run(dict(zip(STEPS, times, strict=True)), wall_s, errors)
+
+
+def _clock_fits_s(recording: RecordingReader) -> float:
+    """Processor time of reading the stamps of all streams and fitting their clocks."""
+    begin_s = time.process_time()
+    for name, descriptor in recording.streams.items():
+        time_stream(recording.stamps(name), descriptor)
+    return time.process_time() - begin_s
+
+
+def align_by_arrivals(
+    store: EpisodeStore, recording_id: str, on_stage: OnStage, *, nearest: bool
+) -> str:
+    """Align a recording as if every sample had been taken when it arrived.
+
+    There is no clock model, no path delay and no gap: values are converted and hands retargeted as
+    in the product. Returns the episode's id.
+
+    Args:
+        store: of recording and episode.
+        recording_id: of a take of a person.
+        on_stage: called at the beginning of each stage.
+        nearest: steps take the nearest sample instead of interpolating.
+    """
+    recording = store.recording(recording_id)
+    # The clock fits inside are timed apart and taken off again.
+    streams = {name: _by_arrival(date_stream(recording, name)) for name in recording.streams}
+    on_stage("placing")
+    start_ns, gridded = _on_grid(streams, nearest=nearest)
+    on_stage("retargeting")
+    source = recording.attributes
+    actions = make_actions(gridded, "human", source.calibration)
+    on_stage("writing")
+    after_start_ns = start_ns - (source.started_t_host_ns or 0)
+    attributes = EpisodeAttributes(
+        episode_id=f"{recording_id}-arrivals",
+        task=source.task,
+        instruction=source.instruction,
+        domain="human",
+        origin="recorded",
+        anchor=StoredAnchor.from_poses(actions.anchor),
+        K_head=source.calibration["K_head"],
+        quality={"origin_after_start_ns": float(after_start_ns)},
+    )
+    action = StreamDescriptor(
+        name="action",
+        kind="robot_state",
+        shape=(67,),
+        dtype="float64",
+        unit="action",
+        nominal_rate_hz=OPTIONS.model_rate_hz,
+    )
+    last_ns = int(gridded.grid_ns[-1])
+    made = [made_stream(action, gridded.grid_ns, actions.measured)]
+    with store.writer(kind="episode", attributes=attributes) as writer:
+        for stream in (*made, *(cut_stream(one, start_ns, last_ns) for one in streams.values())):
+            writer.add_stream(stream.descriptor)
+            for block in stream.blocks():
+                writer.append(stream.descriptor.name, values=block.values, t_ref_ns=block.t_ns)
+    return attributes.episode_id
+
+
+def _by_arrival(stream: DatedStream) -> DatedStream:
+    """The stream with arrival stamps as times."""
+    arrival_ns = stream.recording.stamps(stream.name).t_host_ns
+    kept = first_arrivals(arrival_ns)
+    report = ClockReport(stream=stream.name, method="arrival", num_samples=len(kept))
+    return replace(stream, timing=TimedStream(kept, arrival_ns[kept], report, 0, "arrival"))
+
+
+def first_arrivals(arrival_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " k"]:
+    """Indices of the samples that arrived after the one before: times must grow."""
+    return np.flatnonzero(np.diff(arrival_ns, prepend=arrival_ns[0] - 1) > 0)
+
+
+def _on_grid(streams: dict[str, DatedStream], *, nearest: bool) -> tuple[int, GriddedStreams]:
+    parts = {name: streams[name].load() for name in REQUIRED["human"]}
+    start_ns = max(int(part.t_ns[0]) for part in parts.values())
+    stop_ns = min(int(part.t_ns[-1]) for part in parts.values())
+    num_steps = int((stop_ns - start_ns) * 1e-9 * OPTIONS.model_rate_hz) + 1
+    moved = {name: replace(part, t_ns=part.t_ns - start_ns) for name, part in parts.items()}
+    grid_ns = grid_times_ns(num_steps, OPTIONS.model_rate_hz)
+    gridded = place_streams(moved, grid_ns, max_gap_ns=ANY_GAP_NS)
+    if nearest:
+        at = {name: replace(at, weight=np.rint(at.weight)) for name, at in gridded.at.items()}
+        gridded = replace(gridded, at=at)
+    return start_ns, gridded
+
+
+def _errors(store: EpisodeStore, recorded: RecordedTake, episode_id: str) -> dict[str, float]:
+    found = measure(store, recorded.truth, recorded.take, episode_id, devices=[]).errors
+    rms, left = found["clock_rms_ms"], found["latency_error_ms"]
+    times = [float(np.hypot(rms[name], left[name])) for name in rms]
+    return {
+        "time of samples, worst stream (ms)": max(times),
+        "time of samples, median stream (ms)": float(np.median(times)),
+        "scatter of times, worst stream (ms)": max(rms.values()),
+        "wrists (mm)": found["wrist_error_mm"],
+        "wrists (deg)": found["wrist_error_deg"],
+        "fingertips (mm)": found["fingertip_error_mm"],
+        "pressure, mean (kPa)": found["taxel_mae_kpa"],
+        "contact, 1 - IoU": 1.0 - found["taxel_iou"],
+    }
