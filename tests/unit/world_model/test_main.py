@@ -30,7 +30,7 @@ def test_train_then_show(toy_store, tmp_path, capsys):
     assert shown[0]["digest"] == written["digest"]
     assert shown[0]["metrics"] == written["metrics"]
     assert "--episodes=store --" in shown[0]["command"]
-    assert "--network.video_width=16" in shown[0]["command"]
+    assert "--network.video-width=16" in shown[0]["command"]
     assert str(tmp_path) not in json.dumps(shown)
 
 
