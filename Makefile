@@ -30,7 +30,7 @@ demo: $(VENV)/.runtime   ## record, align, imagine and score, on this machine
 	$(BIN)/dextouch demo
 
 # Bytecode is kept, since tests start many processes that would each compile all modules anew.
-test: $(VENV)/.dev       ## the default test run (seven to nine minutes on two cores)
+test: $(VENV)/.dev       ## the default test run (seven to eight minutes on two cores)
 	PYTHONDONTWRITEBYTECODE= $(BIN)/python -m pytest -q -n logical --dist loadfile
 
 slow: $(VENV)/.dev       ## the long tests
