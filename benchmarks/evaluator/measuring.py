@@ -3,7 +3,7 @@
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float64
 
 from benchmarks.evaluator.plan import CHUNK_STEPS
 from benchmarks.evaluator.playing import ImaginedRollout, TrueRollout
@@ -13,7 +13,6 @@ from dextouch.metrics.image import PEAK, decibels
 from dextouch.metrics.tactile import mse
 from dextouch.tactile import in_contact
 from services.evaluation.camera_warp import warp_over_table
-from services.world_model.rendering.evaluation import sharpness
 
 # Pixels about an object's box that belong to its region too.
 _MARGIN_PX: Final = 1
@@ -116,3 +115,11 @@ def sharpness_of_chunks(real: TrueRollout, imagined: ImaginedRollout) -> list[li
     """Mean absolute Laplacian [imagined, true] of the image at the end of every chunk."""
     pair = (imagined.images_of_chunks, real.images_of_chunks)
     return np.stack([sharpness(one.astype(np.float64)) for one in pair], axis=1).tolist()
+
+
+def sharpness(images: Float64[np.ndarray, "n h w 3"]) -> Float64[np.ndarray, " n"]:
+    """Mean absolute Laplacian (five points) of images, inside their border."""
+    centre = images[:, 1:-1, 1:-1]
+    across = images[:, 1:-1, 2:] + images[:, 1:-1, :-2]
+    down = images[:, 2:, 1:-1] + images[:, :-2, 1:-1]
+    return np.asarray(np.abs(across + down - 4.0 * centre).mean(axis=(1, 2, 3)))

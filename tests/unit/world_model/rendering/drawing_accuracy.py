@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Bool, Float64
 from torch.nn import functional
 
+from benchmarks.evaluator.measuring import sharpness
 from dextouch.errors import InvalidInputError
 from dextouch.metrics.image import PEAK, decibels
 from services.world_model.rendering.clips import SceneClip, gather
@@ -147,22 +148,3 @@ def _rows(images: np.ndarray, true: np.ndarray, region: np.ndarray) -> Float64[n
         ],
         axis=1,
     )
-
-
-def sharpness(images: Float64[np.ndarray, "n h w 3"]) -> Float64[np.ndarray, " n"]:
-    """Mean absolute Laplacian (five points) of images, inside their border."""
-    centre = images[:, 1:-1, 1:-1]
-    across = images[:, 1:-1, 2:] + images[:, 1:-1, :-2]
-    down = images[:, 2:, 1:-1] + images[:, :-2, 1:-1]
-    return np.asarray(np.abs(across + down - 4.0 * centre).mean(axis=(1, 2, 3)))
-
-
-def summary_lines(report: DrawingReport) -> list[str]:
-    """One line per method: PSNR of all / of objects / sharpness, chunk by chunk."""
-    return [
-        f"{method:<6}"
-        + "  ".join(
-            f"{one.psnr_db:.1f}/{one.psnr_objects_db:.1f}/{one.sharpness:.2f}" for one in chunks
-        )
-        for method, chunks in report.chunks.items()
-    ]
