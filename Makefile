@@ -10,7 +10,7 @@ DOCS_VENV ?= .venv-docs
 SITE := build/docs
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: demo test check slow vm fuzz mutants fix clean docs bench bench-lerobot check-lerobot-export wheel-test \
+.PHONY: demo test check slow vm fuzz mutants fix clean docs bench stress bench-lerobot check-lerobot-export wheel-test \
 	reproduce-checkpoints
 .DEFAULT_GOAL := demo
 
@@ -58,6 +58,9 @@ bench: $(VENV)/.dev      ## time the stages against their errors, one after anot
 	@missed=; for stage in $(STAGE); do echo "== $$stage"; \
 	$(BIN)/python -m benchmarks $$stage --out runs/bench $(ARGS) || missed="$$missed $$stage"; done; \
 	if [ -n "$$missed" ]; then echo "make bench: failed:$$missed" >&2; exit 1; fi
+
+stress: $(VENV)/.dev     ## check every stage against numerical hazards; ARGS="--quick", or names of stages
+	$(BIN)/python -m benchmarks stress $(ARGS)
 
 # Every step goes on where it was broken off. The last one says which bounds are met, and which figures are those of docs/evaluator.json.
 reproduce-checkpoints: $(VENV)/.runtime   ## record, train and measure the state model, its judge and the cloned policies anew, in runs/reproduce

@@ -18,6 +18,8 @@ from dextouch.command_line import CommandParser, add_json
 from dextouch.errors import UnknownNameError
 
 EXIT_MISSED = 1
+# Columns of the tables without a terminal.
+WIDTH = 200
 DESCRIPTION = (
     "Time a stage of the platform against its error, beside its rivals. All designs are measured "
     "in turns in one run, so that a busy machine is busy for all of them; figures are medians "
@@ -94,7 +96,8 @@ def stage_parser(name: str) -> argparse.ArgumentParser:
 
 def publish(report: StageReport, options: argparse.Namespace) -> None:
     """Print the report; write JSON and chart on request."""
-    show(report, Console())
+    console = Console()
+    show(report, console if console.is_terminal else Console(width=WIDTH))
     if options.json is not None:
         write_json(report, options.json)
     if options.out is not None:

@@ -16,11 +16,15 @@ from dextouch.command_line import write_json_text
 
 @dataclass(frozen=True)
 class ResultTable:
-    """Rows of text under a title; the first column names them."""
+    """Rows of text under a title; the first column names them, and the others hold numbers.
+
+    `num_text_columns` is the number of columns from the left that hold words instead.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: Sequence[tuple[str, ...]]
+    num_text_columns: int = 1
 
 
 @dataclass(frozen=True)
@@ -63,13 +67,12 @@ class StageReport:
 
 def show(report: StageReport, console: Console) -> None:
     """Print the machine, the tables and the requirements."""
-    console.print(_table("Machine", ("", ""), list(report.machine.items())))
+    console.print(_table(ResultTable("Machine", ("", ""), list(report.machine.items()))))
     for table in report.tables:
-        console.print(_table(table.title, table.columns, table.rows))
+        console.print(_table(table))
     for note in report.notes:
         console.print(f"Note: {note}", markup=False, highlight=False)
-    verdicts = _acceptance(report)
-    console.print(_table(verdicts.title, verdicts.columns, verdicts.rows))
+    console.print(_table(_acceptance(report)))
 
 
 def to_markdown(report: StageReport) -> str:
@@ -101,11 +104,11 @@ def write_json(report: StageReport, path: Path) -> None:
     write_json_text(path, report.to_json())
 
 
-def _table(title: str, columns: Sequence[str], rows: Sequence[tuple[str, ...]]) -> Table:
-    table = Table(title=title, title_justify="left", header_style="bold")
-    table.show_header = any(columns)
-    for index, column in enumerate(columns):
-        table.add_column(column, justify="left" if index == 0 else "right")
-    for row in rows:
+def _table(shown: ResultTable) -> Table:
+    table = Table(title=shown.title, title_justify="left", header_style="bold")
+    table.show_header = any(shown.columns)
+    for index, column in enumerate(shown.columns):
+        table.add_column(column, justify="left" if index < shown.num_text_columns else "right")
+    for row in shown.rows:
         table.add_row(*row)
     return table

@@ -150,6 +150,14 @@ STAGES = {
         "images that are asked for and the rollouts that step together. Reports processor time a "
         "chunk and errors of images and touch over whole rollouts.",
     ),
+    "stress": StageEntry(
+        "benchmarks.stress.benchmark",
+        "check every stage of the platform against numerical hazards",
+        "Checks every stage of the platform with inputs that break numerical code (near-singular "
+        "rotations, clock steps, NaN, saturated touch, 1000 steps, …) and reports the outcome: a "
+        "named refusal, a bounded answer or a figure against its bound. Exits with status 1 if a "
+        "cell fails, also without --check; --quick skips slow cells (docs/stress.md).",
+    ),
 }
 
 

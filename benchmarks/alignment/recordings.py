@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float64, Int64
 
+from benchmarks.simulated.hand_motions import RATE_HZ as HAND_RATE_HZ
+from benchmarks.simulated.hand_motions import robot_motion
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.geometry import transform_from_pose
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
@@ -16,8 +18,6 @@ from dextouch.streams import StreamDescriptor, StreamKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 from services.acquisition.mock_station import MockTake
 from services.cli.demo.recording import record_take
-from services.cli.simulated.hand_motions import RATE_HZ as HAND_RATE_HZ
-from services.cli.simulated.hand_motions import robot_motion
 
 POSE_RATE_HZ, GLOVE_RATE_HZ, IMAGE_RATE_HZ = 100.0, 60.0, 30.0
 IMAGE_PX = 64

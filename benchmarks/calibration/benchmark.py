@@ -12,9 +12,9 @@ from benchmarks.calibration.refusals import try_scenes
 from benchmarks.calibration.tables import panels, tables
 from benchmarks.machine import describe_machine
 from benchmarks.report import StageReport
+from benchmarks.simulated.board_scenes import Motion, make_scene
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
-from services.cli.simulated.board_scenes import Motion, make_scene
 
 PACKAGES = ("numpy", "scipy", "opencv-contrib-python-headless")
 USUAL = {"seeds": 100, "camera_seeds": 20, "scenes": 20, "healthy": 50}

@@ -11,12 +11,12 @@ import numpy as np
 from benchmarks.calibration.rivals import METHODS, Method
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
+from benchmarks.simulated.board_scenes import Scene
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert
 from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.twists import twist
-from services.cli.simulated.board_scenes import Scene
 
 
 @dataclass(frozen=True)

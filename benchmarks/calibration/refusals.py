@@ -7,10 +7,10 @@ import numpy as np
 
 from benchmarks.calibration.compare import score
 from benchmarks.calibration.rivals import METHODS, OURS, Method
+from benchmarks.simulated.board_scenes import TURN_AXES, Motion, Scene, make_scene
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from services.alignment.calibration.motion import DegenerateMotionError
-from services.cli.simulated.board_scenes import TURN_AXES, Motion, Scene, make_scene
 
 Maker = Callable[[int], Scene]
 RIVALS = ("tsai", "park", "daniilidis", "li")

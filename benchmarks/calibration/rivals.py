@@ -14,7 +14,7 @@ from services.alignment.calibration.closed_form import park
 from services.alignment.calibration.hand_eye import HandEyeResult, solve_hand_eye
 
 if TYPE_CHECKING:
-    from services.cli.simulated.board_scenes import Scene
+    from benchmarks.simulated.board_scenes import Scene
 
 OURS = "ours"
 OURS_POSES = "ours, poses only"

@@ -24,13 +24,13 @@ from benchmarks.retargeting.scores import (
     score_robot,
 )
 from benchmarks.rounds import interleaved
+from benchmarks.simulated.hand_motions import Motion, robot_motion, with_noise
 from benchmarks.stages import Bar
 from dextouch.errors import LimitExceededError
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_retargeter import warm_up
 from services.alignment.retargeting.profile_fit import robot_bone_m
-from services.cli.simulated.hand_motions import Motion, robot_motion, with_noise
 
 SIDES: tuple[Side, Side] = ("left", "right")
 NATURAL, FULL = "natural range", "full range"

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from scipy.optimize import least_squares
 
+from benchmarks.simulated.hand_motions import Motion
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.hands import CHAINS, NODE_INDEX
 from dextouch.hands.robot_hand import NUM_FINGERS
 from dextouch.tactile.layout import Side
-from services.cli.simulated.hand_motions import Motion
 from services.twin.hands import HumanHand
 from services.twin.human_hand import METACARPAL_BASES_M
 

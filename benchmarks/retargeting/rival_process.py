@@ -23,10 +23,10 @@ import numpy as np
 
 from benchmarks.retargeting.ours import Timed
 from benchmarks.retargeting.rivals import Rival, Setup, find_rival, set_up
+from benchmarks.simulated.hand_motions import Motion
 from dextouch.errors import InvalidInputError, LimitExceededError, UnavailableError
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import NUM_JOINTS, RobotHand
-from services.cli.simulated.hand_motions import Motion
 
 # Limit of processor time; the slowest call of a rival takes hundredths of a second.
 CALL_LIMIT_S = 10.0

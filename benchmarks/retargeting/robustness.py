@@ -9,10 +9,10 @@ from benchmarks.retargeting import ours
 from benchmarks.retargeting.compare import Rivals, scale_of
 from benchmarks.retargeting.ours import OURS
 from benchmarks.retargeting.scores import score_robot
+from benchmarks.simulated.hand_motions import Motion, robot_motion, with_dropouts
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.hands import NODE_INDEX
-from services.cli.simulated.hand_motions import Motion, robot_motion, with_dropouts
 
 NODE_LOST, HAND_LOST, NODES_LOST = "one node lost once", "hand lost once", "2 % of nodes lost"
 _NUM_SAMPLES, _LOST_SAMPLE = 60, 30

@@ -8,9 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 
 from benchmarks.retargeting.pinches import PinchMotion
+from benchmarks.simulated.hand_motions import Motion
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.hands.robot_hand import RobotHand
-from services.cli.simulated.hand_motions import Motion
 
 # Rivals answer in float32, which may exceed a limit by rounding.
 LIMIT_TOLERANCE_RAD = 1e-6

@@ -54,7 +54,6 @@ COMMANDS = {
         "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
     ),
     "dashboard": Command("services.dashboard.__main__", "serve the operators' page"),
-    "stress": Command("services.cli.stress.command", "check every stage against numerical hazards"),
 }
 
 # Subcommands of a group whose module has none; without one, the group runs its module.

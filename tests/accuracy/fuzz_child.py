@@ -7,9 +7,9 @@ import time
 import numpy as np
 
 from benchmarks.retargeting.pinches import people, pinch_motion
+from benchmarks.simulated.hand_motions import Motion, robot_motion
+from benchmarks.simulated.tracking_faults import FAULTS, fuzzed
 from services.alignment.retargeting import HandRetargeter, RetargetStatus, warm_up
-from services.cli.simulated.hand_motions import Motion, robot_motion
-from services.cli.simulated.tracking_faults import FAULTS, fuzzed
 
 # Of the robot, swaps of neighbours go untold for up to 8 samples; at the velocity limit as many
 # bring the joints back, and then the pull of the samples before has to fade.

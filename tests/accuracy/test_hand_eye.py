@@ -9,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated import board_scenes as scenes
+from benchmarks.simulated.board_scenes import Motion
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import invert, transform
 from services.alignment.calibration.closed_form import park
@@ -19,8 +21,6 @@ from services.alignment.calibration.hand_eye import (
     solve_hand_eye,
 )
 from services.alignment.calibration.twists import move, twist
-from services.cli.simulated import board_scenes as scenes
-from services.cli.simulated.board_scenes import Motion
 
 RECORDED_POSES = Path(__file__).parents[3] / "shared/data/hand_eye/pose_samples.json"
 NUM_SEEDS = 20

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated import board_scenes as scenes
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.board_detection import (
@@ -25,7 +26,6 @@ from services.alignment.calibration.intrinsics import (
     calibrate_found,
     unseen_parts,
 )
-from services.cli.simulated import board_scenes as scenes
 
 PHOTOS = Path(__file__).parents[3] / "shared/data/camera_chessboard"
 CHARUCO_PHOTO = PHOTOS.parent / "hand_eye/charuco.jpg"

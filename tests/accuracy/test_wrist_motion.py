@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.simulated.board_scenes import make_scene
 from dextouch.errors import DegenerateRotationError, NonFiniteError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
@@ -25,7 +26,6 @@ from services.alignment.calibration.hand_eye import solve_hand_eye
 from services.alignment.calibration.robot_base import solve_robot_base
 from services.alignment.calibration.twists import move
 from services.alignment.retargeting.wrist import pose_difference
-from services.cli.simulated.board_scenes import make_scene
 from tests.accuracy.test_robot_base import pairs
 
 BOUND_M, BOUND_DEG = 1e-6, 1e-4

@@ -20,8 +20,8 @@ from benchmarks.calibration.refusals import SceneResult, scene_makers
 from benchmarks.calibration.rivals import METHODS, OURS, OURS_POSES, PARK
 from benchmarks.command import stage_parser
 from benchmarks.figures import Figure
+from benchmarks.simulated.board_scenes import Motion, board_points, make_scene
 from dextouch.errors import DegenerateRotationError, InvalidInputError, LimitExceededError
-from services.cli.simulated.board_scenes import Motion, board_points, make_scene
 
 NAMES = [method.name for method in METHODS]
 BY_NAME = {method.name: method for method in METHODS}
@@ -98,7 +98,7 @@ def test_a_seed_makes_one_scene_with_the_noise_it_should_have():
 
 
 def test_scenes_that_cannot_be_seen_are_refused(monkeypatch):
-    monkeypatch.setattr("services.cli.simulated.board_scenes.MAX_TRIES", 50)
+    monkeypatch.setattr("benchmarks.simulated.board_scenes.MAX_TRIES", 50)
     with pytest.raises(LimitExceededError):
         make_scene(0, Motion(distance_m=(0.14, 0.15), tilt_deg=1.0))
 

@@ -31,6 +31,7 @@ from benchmarks.retargeting.rivals import RIVALS
 from benchmarks.retargeting.robustness import faulty_motions, try_faults
 from benchmarks.retargeting.scores import PinchScore, RobotScore, score_robot
 from benchmarks.retargeting.tables import tables
+from benchmarks.simulated.hand_motions import cold_postures, robot_motion
 from dextouch.errors import (
     InvalidInputError,
     LimitExceededError,
@@ -38,7 +39,6 @@ from dextouch.errors import (
     UnknownNameError,
 )
 from dextouch.hands.robot_hand import RobotHand
-from services.cli.simulated.hand_motions import cold_postures, robot_motion
 
 SIDES = ("left", "right")
 DEX = RIVALS["dex vector15"]

@@ -12,12 +12,9 @@ from benchmarks.retargeting.pinches import (
     pinch_motion,
 )
 from benchmarks.retargeting.scores import score_pinches, score_robot
-from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteError
-from dextouch.hands import NODE_INDEX
-from dextouch.hands.robot_hand import RobotHand
-from services.cli.simulated import hand_motions as sequences
-from services.cli.simulated.finger_contact import segment_distance_m, touching
-from services.cli.simulated.hand_motions import (
+from benchmarks.simulated import hand_motions as sequences
+from benchmarks.simulated.finger_contact import segment_distance_m, touching
+from benchmarks.simulated.hand_motions import (
     MAX_SPEED_RAD_S,
     RATE_HZ,
     cold_postures,
@@ -25,6 +22,9 @@ from services.cli.simulated.hand_motions import (
     with_dropouts,
     with_noise,
 )
+from dextouch.errors import InvalidInputError, LimitExceededError, NonFiniteError
+from dextouch.hands import NODE_INDEX
+from dextouch.hands.robot_hand import RobotHand
 from services.twin.hands import HumanHand, twin_hand
 from services.twin.mjcf import scene_xml
 

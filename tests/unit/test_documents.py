@@ -85,7 +85,8 @@ def test_every_package_of_the_library_has_an_api_page():
 def test_make_bench_runs_every_stage():
     text = (ROOT / "Makefile").read_text(encoding="utf-8")
     listed = re.search(r"^STAGE \?= (.+)$", text, re.MULTILINE)
-    assert sorted(listed.group(1).split()) == sorted(STAGES)
+    # `make stress` runs the stress matrix, which times nothing.
+    assert sorted([*listed.group(1).split(), "stress"]) == sorted(STAGES)
     assert "|".join(listed.group(1).split()) in (ROOT / "README.md").read_text(encoding="utf-8")
     table = (ROOT / "docs/command_line.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| `python -m benchmarks ([a-z-]+)` \|", table, re.MULTILINE)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import approx_fprime, least_squares
 
+from benchmarks.simulated.board_scenes import DISTORTION, K, Motion, board_points, make_scene
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector, vector_from_rotation
@@ -23,7 +24,6 @@ from services.alignment.calibration.twists import (
     right_jacobian_inverse,
     twist,
 )
-from services.cli.simulated.board_scenes import DISTORTION, K, Motion, board_points, make_scene
 
 
 def some_poses(num, seed=0):

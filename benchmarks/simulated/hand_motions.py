@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy.random import Generator
 
+from benchmarks.simulated.finger_contact import touching
 from dextouch.errors import InvalidInputError, LimitExceededError
 from dextouch.hands import CHAINS, NODE_INDEX, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import NUM_FINGERS, NUM_JOINTS
 from dextouch.tactile.layout import Side
-from services.cli.simulated.finger_contact import touching
 from services.twin.hands import TwinHand, twin_hand
 
 RATE_HZ: Final = 60.0

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import PacketError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor, decode_batch, encode_batch, pack, unpack
-from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("store")
 _ODD = np.array(

@@ -5,10 +5,10 @@ from functools import cache
 import numpy as np
 import torch
 
+from benchmarks.stress import worlds
+from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.worlds import CAMERA, Subject
 from dextouch.errors import InvalidInputError
-from services.cli.stress import worlds
-from services.cli.stress.cells import Check, StageCells
-from services.cli.stress.worlds import CAMERA, Subject
 from services.world_model.checkpoints import Checkpoint, paper_form_checkpoint, read_checkpoint
 from services.world_model.network.flow_matching import add_noise, sample, shift_time
 from services.world_model.network.inputs import PredictionRequest, build_inputs

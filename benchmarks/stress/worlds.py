@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.stress.cells import Check
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
 from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, actions_from_poses
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.worlds import BatchWorld
-from services.cli.stress.cells import Check
 from services.twin.settings import TwinSettings
 from services.twin.stage import Stage
 from services.twin.world import TwinWorld

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
 from dextouch.geometry import pose_from_transform, transform
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
@@ -12,7 +13,6 @@ from services.alignment.synchronization.resampling import (
     poses_on_grid,
     vectors_on_grid,
 )
-from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("resampling")
 _PERIOD_NS, _GAP_NS = 10_000_000, 50_000_000

@@ -8,9 +8,9 @@ from tempfile import gettempdir
 import numpy as np
 import torch
 
+from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.worlds import twin_start
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
-from services.cli.stress.cells import Check, StageCells
-from services.cli.stress.worlds import twin_start
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.flow_matching import MIN_TIME, training_times
 from services.world_model.network.inputs import build_inputs

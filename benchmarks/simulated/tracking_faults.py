@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy.random import Generator
 
+from benchmarks.simulated.hand_motions import Motion
 from dextouch.hands import CHAINS, chain_indices
-from services.cli.simulated.hand_motions import Motion
 
 DROPOUT_SAMPLES = 60
 # Maximum duration of the other faults, and of the clean samples after each.

@@ -1,4 +1,4 @@
-"""The stress matrix: every cell of `dextouch stress` is a test, and the command tells of them."""
+"""The stress matrix: each cell is a test, and `python -m benchmarks stress` reports them."""
 
 import json
 import subprocess
@@ -7,13 +7,14 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks import command
+from benchmarks.__main__ import main
+from benchmarks.stress import benchmark
+from benchmarks.stress.benchmark import STAGES, load_cells
+from benchmarks.stress.cells import HAZARDS, Cell, Check, Exemption, StageCells, run_cell
 from dextouch.errors import InvalidInputError, NonFiniteError, UnknownNameError
-from services.cli.main import main
-from services.cli.stress import command
-from services.cli.stress.cells import HAZARDS, Cell, Check, Exemption, StageCells, run_cell
-from services.cli.stress.stages import STAGES, load_stage
 
-ROWS = {name: load_stage(name).row() for name in STAGES}
+ROWS = {name: load_cells(name).row() for name in STAGES}
 # Cells that fail on the present code, each with the defect that is not fixed yet (docs/stress.md).
 KNOWN_FAILURES = {("world-model", "long_run")}
 # Cells in which numbers are not of the kind that annotations say: the command runs them, without
@@ -40,7 +41,7 @@ def test_cell(cell):
 
 @pytest.mark.parametrize(("stage", "hazard"), sorted(UNCHECKED))
 def test_cell_without_shape_checks(stage, hazard):
-    words = [sys.executable, "-m", "services.cli.main", "stress", stage, "--hazard", hazard]
+    words = [sys.executable, "-m", "benchmarks", "stress", stage, "--hazard", hazard]
     done = subprocess.run(words, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -109,6 +110,13 @@ def test_a_cell_is_given_once_and_for_a_known_hazard():
         stage.row()
 
 
+@pytest.fixture
+def unchecked(monkeypatch):
+    """This very process checks array shapes, in which `python -m benchmarks` refuses to run."""
+    monkeypatch.setattr(command, "refuse_shape_checks", lambda: None)
+
+
+@pytest.mark.usefixtures("unchecked")
 def test_the_command_prints_a_row_a_cell_and_writes_json(tmp_path, capsys):
     path = tmp_path / "stress.json"
     assert main(["stress", "geometry", "--hazard", "ends", "--hazard", "touch",
@@ -120,7 +128,8 @@ def test_the_command_prints_a_row_a_cell_and_writes_json(tmp_path, capsys):
     assert [row["hazard"] for row in told["cells"]] == ["touch", "ends"]
 
 
-def test_a_failed_cell_ends_with_one(monkeypatch, capsys):
+@pytest.mark.usefixtures("unchecked")
+def test_a_failed_cell_ends_with_one(monkeypatch, capsys, tmp_path):
     def broken(check: Check) -> None:
         check.at_most("drift", np.inf, 1.0)
 
@@ -128,19 +137,22 @@ def test_a_failed_cell_ends_with_one(monkeypatch, capsys):
     stage.cell("touch", "something")(broken)
     stage.cell("ends", "something slow", slow=True)(broken)
     stage.does_not_apply(**{name: "toy" for name in HAZARDS if name not in {"touch", "ends"}})
-    monkeypatch.setattr(command, "STAGES", {"toy": ""})
-    monkeypatch.setattr(command, "load_stage", lambda _: stage)
-    assert command.main(["--quick"]) == 1
+    monkeypatch.setattr(benchmark, "STAGES", {"toy": ""})
+    monkeypatch.setattr(benchmark, "load_cells", lambda _: stage)
+    assert main(["stress", "--quick", "--out", str(tmp_path)]) == 1
+    assert "| toy |" in (tmp_path / "bench_stress.md").read_text(encoding="utf-8")
     assert "1 failed, 8 does not apply, 1 not run" in capsys.readouterr().out
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_the_list_runs_nothing(monkeypatch, capsys):
-    monkeypatch.setattr(command, "run_cell", _raise)
+    monkeypatch.setattr(benchmark, "run_cell", _raise)
     assert main(["stress", "--list"]) == 0
     text = capsys.readouterr().out
     assert all(name in text for name in STAGES)
 
 
+@pytest.mark.usefixtures("unchecked")
 def test_unknown_names_are_refused(capsys):
     assert main(["stress", "gravity"]) == 3
     assert "geometry" in capsys.readouterr().err

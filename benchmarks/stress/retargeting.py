@@ -4,11 +4,11 @@ from functools import cache, partial
 
 import numpy as np
 
+from benchmarks.simulated.hand_motions import Motion, motion_of, robot_motion
+from benchmarks.simulated.tracking_faults import fuzzed
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.hands.robot_hand import RobotHand
 from services.alignment.retargeting.hand_retargeter import HandRetargeter, RetargetStatus
-from services.cli.simulated.hand_motions import Motion, motion_of, robot_motion
-from services.cli.simulated.tracking_faults import fuzzed
-from services.cli.stress.cells import Check, StageCells
 from services.twin.hands import twin_hand
 
 STAGE = StageCells("retargeting")

@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import (
@@ -21,7 +22,6 @@ from dextouch.hands.actions import (
     poses_from_actions,
     reanchor,
 )
-from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("geometry")
 CHUNK_STEPS, NUM_CHUNKS = 16, 63

@@ -2,10 +2,10 @@
 
 import numpy as np
 
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.clocks import OnlineClock, TickCounter, find_lost_samples, fit_clock, unwrap_counter
 from dextouch.errors import ClockFitError, ShapeError
 from dextouch.streams import ClockCapabilities, StreamDescriptor
-from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("clocks")
 _PERIOD_NS = 16_666_667

@@ -4,12 +4,8 @@ from functools import cache
 
 import numpy as np
 
-from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
-from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, WRIST_RIGHT
-from dextouch.schemas import Observation, RolloutStart
-from dextouch.worlds import StartedRollout
-from services.cli.stress.cells import Check, StageCells
-from services.cli.stress.worlds import (
+from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.worlds import (
     NUM_CHUNKS,
     SEED,
     TASK,
@@ -17,6 +13,10 @@ from services.cli.stress.worlds import (
     there_and_back,
     twin_start,
 )
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError
+from dextouch.hands.actions import JOINTS_LEFT, WRIST_LEFT, WRIST_RIGHT
+from dextouch.schemas import Observation, RolloutStart
+from dextouch.worlds import StartedRollout
 from services.twin.settings import TwinSettings
 from services.twin.world import TwinState, TwinWorld
 

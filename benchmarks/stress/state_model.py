@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.stress import worlds
+from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.worlds import TASK, Subject
 from dextouch.errors import EndedError, InvalidInputError
-from services.cli.stress import worlds
-from services.cli.stress.cells import Check, StageCells
-from services.cli.stress.worlds import TASK, Subject
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsModel
 from services.world_model.rendering.configuration import RendererConfig
@@ -143,7 +143,7 @@ def _written(folder: Path) -> Path:
         renderer=shape,
         object_names={TASK: ("bottle",)},
         object_boxes_m={TASK: ((0.0, 0.0, 0.0, 0.03, 0.03, 0.1),)},
-        command="dextouch stress",
+        command="python -m benchmarks stress",
         seed=0,
         training_cpu_s=0.0,
         num_training_episodes=0,

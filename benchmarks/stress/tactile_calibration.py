@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import NUM_TAXELS, raw_indices
@@ -9,7 +10,6 @@ from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.alignment.calibration.tactile_faults import SATURATED, STATES
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
-from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("tactile-calibration")
 _TARE, _GAIN, _FULL = 500.0, 100.0, 65_535.0

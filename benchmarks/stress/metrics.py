@@ -4,10 +4,10 @@ from functools import partial
 
 import numpy as np
 
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
 from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from dextouch.metrics import image, policy, tactile
-from services.cli.stress.cells import Check, StageCells
 from services.evaluation.statistics import (
     area_under_roc,
     bootstrap_mean_interval,

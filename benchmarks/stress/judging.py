@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 import services.evaluation
+from benchmarks.stress.cells import Check, StageCells
+from benchmarks.stress.worlds import CAMERA, CHUNK_STEPS, NUM_CHUNKS, twin_start
 from dextouch.clients import PolicyStart
 from dextouch.errors import DexTouchError, InvalidInputError, NonFiniteError
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import Observation
-from services.cli.stress.cells import Check, StageCells
-from services.cli.stress.worlds import CAMERA, CHUNK_STEPS, NUM_CHUNKS, twin_start
 from services.evaluation.checkpoints import Checkpoint, load_checkpoint
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.object_features import known_objects, object_features

@@ -4,6 +4,14 @@ from functools import cache
 
 import numpy as np
 
+from benchmarks.simulated.board_scenes import (
+    TURN_AXES,
+    Motion,
+    Scene,
+    make_scene,
+    simulated_boards,
+)
+from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
@@ -14,14 +22,6 @@ from services.alignment.calibration.hand_eye import (
     solve_hand_eye,
 )
 from services.alignment.calibration.intrinsics import calibrate_found
-from services.cli.simulated.board_scenes import (
-    TURN_AXES,
-    Motion,
-    Scene,
-    make_scene,
-    simulated_boards,
-)
-from services.cli.stress.cells import Check, StageCells
 
 STAGE = StageCells("hand-eye")
 # Bounds of the accuracy tests for 20 views with 0.3 px of noise.

@@ -1,0 +1,1 @@
+"""Simulated inputs with known truth, shared by benchmarks and accuracy tests."""

@@ -1,0 +1,1 @@
+"""Stress of every stage: checks under numerical hazards, run by the command and as tests."""

@@ -1,1 +1,0 @@
-"""Simulated inputs with known truth, shared by `dextouch stress` and the benchmarks."""

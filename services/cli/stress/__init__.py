@@ -1,1 +1,0 @@
-"""Command `dextouch stress`: checks of every stage under numerical hazards, also run as tests."""
