@@ -1,6 +1,6 @@
 """Robot and human hands of the twin: kinematics, collision shape and tactile skin.
 
-Both are five fingers × four hinges in the wrist frame of `dextouch.hands.wuji_hand_2` (fingers
+Both are five fingers × four hinges in the wrist frame of `dextouch.hands.robot_hand` (fingers
 along -z, thumb side +x, right palm towards +y, left palm towards -y).
 """
 

@@ -5,9 +5,11 @@
 the right palm faces +y, the left -y.
 """
 
+import json
 from collections.abc import Sequence
-from functools import cached_property
-from typing import Final, Literal
+from functools import cache, cached_property
+from importlib.resources import files
+from typing import Any, Final, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -15,8 +17,7 @@ from jaxtyping import Bool, Float64, Int64
 from dextouch.errors import NonFiniteError, ShapeError, UnknownNameError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_quaternion, rotation_from_vector
-from dextouch.hands.finger_table import FingerTable, check_fingers
-from dextouch.hands.wuji_hand_2 import LEFT_HAND, RIGHT_HAND
+from dextouch.hands.finger_table import FingerTable, JointRow, check_fingers
 
 NUM_JOINTS: Final = 20
 NUM_FINGERS: Final = 5
@@ -140,10 +141,12 @@ class HandModel:
 
 
 class RobotHand(HandModel):
-    """Wuji Hand 2: five fingers × four hinges, thumb … little, from the wrist outwards.
+    """Wuji Hand 2 (Beta 2): five fingers × four hinges, thumb … little, from the wrist outwards.
 
     The four hinges of a finger are S1 flexion, S2 abduction, S3 and S4 flexion; the order is the
-    firmware's.
+    firmware's. The tables of both hands, which are not exact mirrors, are in `wuji_hand_2.json`:
+    the exact values of the manufacturer's MJCF (MIT, (c) 2025 Wuji Technology; `aiowuji` 0.1.0 on
+    PyPI), the fingertips its sites `*_tip` (tests/accuracy/test_hand_model.py compares).
 
     Args:
         side: "left" or "right".
@@ -153,5 +156,17 @@ class RobotHand(HandModel):
     """
 
     def __init__(self, side: str) -> None:
-        fingers = LEFT_HAND if side == "left" else RIGHT_HAND
-        super().__init__(side, fingers, name=f"Wuji Hand 2 {side}")
+        super().__init__(side, _wuji_hand_2().get(side, ()), name=f"Wuji Hand 2 {side}")
+
+
+@cache
+def _wuji_hand_2() -> dict[str, tuple[FingerTable, ...]]:
+    def row(pairs: list[tuple[str, Any]]) -> object:
+        values = {key: tuple(value) if isinstance(value, list) else value for key, value in pairs}
+        if "joints" in values:
+            return FingerTable(**values)
+        return JointRow(**values) if "axis" in values else values
+
+    text = files("dextouch.hands").joinpath("wuji_hand_2.json").read_text(encoding="utf-8")
+    tables: dict[str, tuple[FingerTable, ...]] = json.loads(text, object_pairs_hook=row)
+    return tables
