@@ -1,35 +1,39 @@
 """Exports of a package that are imported at their first use (PEP 562).
 
-A package whose modules need different libraries uses it, so that `dextouch.streams.pack` does not
-import what only `dextouch.streams.encode_batch` needs.
+They are listed once, in the block of imports that the package's `__init__` has for type checkers
+(`from dextouch.streams.packing import pack as pack`). A package whose modules need different
+libraries uses it, so that `dextouch.streams.pack` does not import what only
+`dextouch.streams.encode_batch` needs.
 """
 
+import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from importlib import import_module
+from pathlib import Path
+
+_EXPORT = re.compile(r"^    from ([\w.]+) import (\w+) as \2$", re.MULTILINE)
 
 
 def lazy_exports(
-    package: str, names_by_module: Mapping[str, str]
-) -> tuple[Callable[[str], object], Callable[[], list[str]]]:
-    """The functions `__getattr__` and `__dir__` of a package.
+    package: str,
+) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
+    """The `__getattr__`, `__dir__` and `__all__` of a package, read from its `__init__`.
 
     Args:
-        package: full name of the package.
-        names_by_module: exported names by the module that defines them, separated by spaces.
+        package: full name of the package; what it imports from itself is a public module.
     """
-    module_of = {
-        name: f"{package}.{module}"
-        for module, names in names_by_module.items()
-        for name in names.split()
-    }
+    init = Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8")
+    home_of = {name: module for module, name in _EXPORT.findall(init)}
 
     def get(name: str) -> object:
-        if name not in module_of:
+        if name not in home_of:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(import_module(module_of[name]), name)
+        if home_of[name] == package:
+            return import_module(f"{package}.{name}")
+        return getattr(import_module(home_of[name]), name)
 
     def names() -> list[str]:
-        return sorted({*vars(sys.modules[package]), *module_of})
+        return sorted({*vars(sys.modules[package]), *home_of})
 
-    return get, names
+    return get, names, sorted(home_of)

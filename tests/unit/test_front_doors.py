@@ -1,4 +1,4 @@
-"""Packages of `dextouch` are entered through their `__init__` and its `__all__` alone."""
+"""Packages of `dextouch` are entered through their `__init__` and the names that it lists alone."""
 
 import ast
 import re
@@ -39,22 +39,27 @@ PACKAGES = {
 MODULES = {dotted(path) for path in LIBRARY.rglob("*.py")} - PACKAGES.keys()
 
 
+def imports(package):
+    """The names that a package takes from itself and its modules, in pairs with their home."""
+    return [
+        (alias, node.module)
+        for node in ast.walk(PACKAGES[package])
+        if isinstance(node, ast.ImportFrom) and f"{node.module}.".startswith(f"{package}.")
+        for alias in node.names
+    ]
+
+
 def listed(package):
-    """The names in the `__all__` of a package; None without one."""
+    """The public names of a package: of its `__all__`, else those that it imports lazily."""
     for node in PACKAGES[package].body:
         if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
             return ast.literal_eval(node.value)
-    return None
+    return [alias.asname for alias, _ in imports(package)]
 
 
 def imported(package):
     """The names that a package takes from its modules, and these modules."""
-    return {
-        alias.name: node.module
-        for node in ast.walk(PACKAGES[package])
-        if isinstance(node, ast.ImportFrom) and node.module.startswith(f"{package}.")
-        for alias in node.names
-    }
+    return {alias.name: home for alias, home in imports(package) if home != package}
 
 
 def is_private(module, importer):
@@ -79,15 +84,18 @@ def offences(source, importer=""):
 @pytest.mark.parametrize("package", sorted(PACKAGES))
 def test_a_package_exports_what_its_init_lists(package):
     public, homes = listed(package), imported(package)
-    assert public is not None, f"{package} has no __all__"
     modules = {name for name in public if f"{package}.{name}" in MODULES | PACKAGES.keys()}
     # A name that is both would hide the module of that name.
     assert not homes.keys() & modules
     assert homes.keys() | modules == set(public)
     door = import_module(package)
+    assert sorted(door.__all__) == sorted(public)
     assert set(homes) <= set(dir(door))
     for name, home in homes.items():
         assert getattr(door, name) is getattr(import_module(home), name)
+    for alias, home in imports(package):
+        if home == package:
+            assert getattr(door, alias.name) is import_module(f"{package}.{alias.name}")
     with pytest.raises(AttributeError, match=f"{package}.*no_such_name"):
         _ = door.no_such_name
 

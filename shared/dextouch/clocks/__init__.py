@@ -1,43 +1,29 @@
 """Clock models: counter unwrapping, and device time to host time, offline and online."""
 
-from dextouch.clocks.clock_model import ClockModel, ClockSegment, fit_clock, lateness_ns
-from dextouch.clocks.counters import TickCounter, prefers_sequence
-from dextouch.clocks.counting_clock import (
-    CountedSample,
-    CountedTake,
-    CountingClock,
-    CountingUpdate,
-    date_by_counting,
-)
-from dextouch.clocks.online_clock import OnlineClock
-from dextouch.clocks.round_trips import (
-    ClockOffset,
-    KnownSkew,
-    PathLatency,
-    RoundTrip,
-    RoundTripClock,
-)
-from dextouch.clocks.timestamps import SequenceReport, find_lost_samples, unwrap_counter
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "ClockModel",
-    "ClockOffset",
-    "ClockSegment",
-    "CountedSample",
-    "CountedTake",
-    "CountingClock",
-    "CountingUpdate",
-    "KnownSkew",
-    "OnlineClock",
-    "PathLatency",
-    "RoundTrip",
-    "RoundTripClock",
-    "SequenceReport",
-    "TickCounter",
-    "date_by_counting",
-    "find_lost_samples",
-    "fit_clock",
-    "lateness_ns",
-    "prefers_sequence",
-    "unwrap_counter",
-]
+from dextouch.lazy_exports import lazy_exports
+
+if TYPE_CHECKING:
+    from dextouch.clocks.clock_model import ClockModel as ClockModel
+    from dextouch.clocks.clock_model import ClockSegment as ClockSegment
+    from dextouch.clocks.clock_model import fit_clock as fit_clock
+    from dextouch.clocks.clock_model import lateness_ns as lateness_ns
+    from dextouch.clocks.counters import TickCounter as TickCounter
+    from dextouch.clocks.counters import prefers_sequence as prefers_sequence
+    from dextouch.clocks.counting_clock import CountedSample as CountedSample
+    from dextouch.clocks.counting_clock import CountedTake as CountedTake
+    from dextouch.clocks.counting_clock import CountingClock as CountingClock
+    from dextouch.clocks.counting_clock import CountingUpdate as CountingUpdate
+    from dextouch.clocks.counting_clock import date_by_counting as date_by_counting
+    from dextouch.clocks.online_clock import OnlineClock as OnlineClock
+    from dextouch.clocks.round_trips import ClockOffset as ClockOffset
+    from dextouch.clocks.round_trips import KnownSkew as KnownSkew
+    from dextouch.clocks.round_trips import PathLatency as PathLatency
+    from dextouch.clocks.round_trips import RoundTrip as RoundTrip
+    from dextouch.clocks.round_trips import RoundTripClock as RoundTripClock
+    from dextouch.clocks.timestamps import SequenceReport as SequenceReport
+    from dextouch.clocks.timestamps import find_lost_samples as find_lost_samples
+    from dextouch.clocks.timestamps import unwrap_counter as unwrap_counter
+else:
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -5,101 +5,43 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from dextouch.episodes.files import disk_errors, folder_bytes, replace_file
-    from dextouch.episodes.format import (
-        COMMIT_FILE,
-        GOP_IMAGES,
-        KINDS,
-        Kind,
-        check_id,
-        shard_path,
-        stream_arrays,
-    )
-    from dextouch.episodes.local_storage import local_folder
-    from dextouch.episodes.reader import EpisodeReader, RecordingReader
-    from dextouch.episodes.sources import GroupFiles, LocalGroup
-    from dextouch.episodes.store import EpisodeStore
-    from dextouch.episodes.trash import TRASH_KINDS, TrashKind
-    from dextouch.episodes.video import (
-        FULL_FORM,
-        GopEncoder,
-        ImageForm,
-        VideoSettings,
-        check_video_size,
-        decoder_of_this_thread,
-        is_keyframe,
-        parameter_sets,
-    )
-    from dextouch.episodes.window import (
-        NativeWindow,
-        StreamData,
-        Window,
-        mean_over_ranges,
-        nearest_indices,
-        step_ranges,
-    )
-    from dextouch.episodes.window_codec import decode_window, encode_window
-    from dextouch.episodes.write_options import WriteOptions
-    from dextouch.episodes.writer import EpisodeWriter
+    from dextouch.episodes import care as care
+    from dextouch.episodes import spool as spool
+    from dextouch.episodes.files import disk_errors as disk_errors
+    from dextouch.episodes.files import folder_bytes as folder_bytes
+    from dextouch.episodes.files import replace_file as replace_file
+    from dextouch.episodes.format import COMMIT_FILE as COMMIT_FILE
+    from dextouch.episodes.format import GOP_IMAGES as GOP_IMAGES
+    from dextouch.episodes.format import KINDS as KINDS
+    from dextouch.episodes.format import Kind as Kind
+    from dextouch.episodes.format import check_id as check_id
+    from dextouch.episodes.format import shard_path as shard_path
+    from dextouch.episodes.format import stream_arrays as stream_arrays
+    from dextouch.episodes.local_storage import local_folder as local_folder
+    from dextouch.episodes.reader import EpisodeReader as EpisodeReader
+    from dextouch.episodes.reader import RecordingReader as RecordingReader
+    from dextouch.episodes.sources import GroupFiles as GroupFiles
+    from dextouch.episodes.sources import LocalGroup as LocalGroup
+    from dextouch.episodes.store import EpisodeStore as EpisodeStore
+    from dextouch.episodes.trash import TRASH_KINDS as TRASH_KINDS
+    from dextouch.episodes.trash import TrashKind as TrashKind
+    from dextouch.episodes.video import FULL_FORM as FULL_FORM
+    from dextouch.episodes.video import GopEncoder as GopEncoder
+    from dextouch.episodes.video import ImageForm as ImageForm
+    from dextouch.episodes.video import VideoSettings as VideoSettings
+    from dextouch.episodes.video import check_video_size as check_video_size
+    from dextouch.episodes.video import decoder_of_this_thread as decoder_of_this_thread
+    from dextouch.episodes.video import is_keyframe as is_keyframe
+    from dextouch.episodes.video import parameter_sets as parameter_sets
+    from dextouch.episodes.window import NativeWindow as NativeWindow
+    from dextouch.episodes.window import StreamData as StreamData
+    from dextouch.episodes.window import Window as Window
+    from dextouch.episodes.window import mean_over_ranges as mean_over_ranges
+    from dextouch.episodes.window import nearest_indices as nearest_indices
+    from dextouch.episodes.window import step_ranges as step_ranges
+    from dextouch.episodes.window_codec import decode_window as decode_window
+    from dextouch.episodes.window_codec import encode_window as encode_window
+    from dextouch.episodes.write_options import WriteOptions as WriteOptions
+    from dextouch.episodes.writer import EpisodeWriter as EpisodeWriter
 else:
-    __getattr__, __dir__ = lazy_exports(
-        __name__,
-        {
-            "files": "disk_errors folder_bytes replace_file",
-            "format": "COMMIT_FILE GOP_IMAGES KINDS Kind check_id shard_path stream_arrays",
-            "local_storage": "local_folder",
-            "reader": "EpisodeReader RecordingReader",
-            "sources": "GroupFiles LocalGroup",
-            "store": "EpisodeStore",
-            "trash": "TRASH_KINDS TrashKind",
-            "video": (
-                "FULL_FORM GopEncoder ImageForm VideoSettings check_video_size "
-                "decoder_of_this_thread is_keyframe parameter_sets"
-            ),
-            "window": "NativeWindow StreamData Window mean_over_ranges nearest_indices step_ranges",
-            "window_codec": "decode_window encode_window",
-            "write_options": "WriteOptions",
-            "writer": "EpisodeWriter",
-        },
-    )
-
-__all__ = [
-    "COMMIT_FILE",
-    "FULL_FORM",
-    "GOP_IMAGES",
-    "KINDS",
-    "TRASH_KINDS",
-    "EpisodeReader",
-    "EpisodeStore",
-    "EpisodeWriter",
-    "GopEncoder",
-    "GroupFiles",
-    "ImageForm",
-    "Kind",
-    "LocalGroup",
-    "NativeWindow",
-    "RecordingReader",
-    "StreamData",
-    "TrashKind",
-    "VideoSettings",
-    "Window",
-    "WriteOptions",
-    "care",
-    "check_id",
-    "check_video_size",
-    "decode_window",
-    "decoder_of_this_thread",
-    "disk_errors",
-    "encode_window",
-    "folder_bytes",
-    "is_keyframe",
-    "local_folder",
-    "mean_over_ranges",
-    "nearest_indices",
-    "parameter_sets",
-    "replace_file",
-    "shard_path",
-    "spool",
-    "step_ranges",
-    "stream_arrays",
-]
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -1,31 +1,21 @@
 """Rotations, rigid transforms, interpolation and pinhole cameras in float64."""
 
-from dextouch.geometry.cameras import pinhole_matrix, project
-from dextouch.geometry.interpolation import (
-    bracket,
-    interpolate_linear,
-    interpolate_poses,
-    nearest_index,
-)
-from dextouch.geometry.transforms import (
-    apply,
-    invert,
-    pose_from_transform,
-    transform,
-    transform_from_pose,
-)
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "apply",
-    "bracket",
-    "interpolate_linear",
-    "interpolate_poses",
-    "invert",
-    "nearest_index",
-    "pinhole_matrix",
-    "pose_from_transform",
-    "project",
-    "rotations",
-    "transform",
-    "transform_from_pose",
-]
+from dextouch.lazy_exports import lazy_exports
+
+if TYPE_CHECKING:
+    from dextouch.geometry import rotations as rotations
+    from dextouch.geometry.cameras import pinhole_matrix as pinhole_matrix
+    from dextouch.geometry.cameras import project as project
+    from dextouch.geometry.interpolation import bracket as bracket
+    from dextouch.geometry.interpolation import interpolate_linear as interpolate_linear
+    from dextouch.geometry.interpolation import interpolate_poses as interpolate_poses
+    from dextouch.geometry.interpolation import nearest_index as nearest_index
+    from dextouch.geometry.transforms import apply as apply
+    from dextouch.geometry.transforms import invert as invert
+    from dextouch.geometry.transforms import pose_from_transform as pose_from_transform
+    from dextouch.geometry.transforms import transform as transform
+    from dextouch.geometry.transforms import transform_from_pose as transform_from_pose
+else:
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

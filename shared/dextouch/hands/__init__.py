@@ -1,57 +1,35 @@
 """Hand models: tracked human skeleton, robot hand kinematics, and the 67-D action space."""
 
-from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion, Vector3
-from dextouch.hands.mean_hand import (
-    FINGER_CHAINS,
-    KNUCKLE_NODES,
-    METACARPAL_NODES,
-    PALM_NODES,
-    WRIST_NODE,
-    mean_hand_m,
-)
-from dextouch.hands.skeleton import (
-    CHAINS,
-    FINGER_JOINTS,
-    NODE_INDEX,
-    NODES,
-    NUM_KEYPOINTS,
-    WRIST,
-    chain_indices,
-    solver_indices,
-)
-from dextouch.hands.tracker_nodes import (
-    FINGER_METACARPALS,
-    NO_KEYPOINT,
-    TreeNode,
-    node_order,
-    nodes_of_tree,
-)
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "CHAINS",
-    "FINGER_CHAINS",
-    "FINGER_JOINTS",
-    "FINGER_METACARPALS",
-    "KNUCKLE_NODES",
-    "METACARPAL_NODES",
-    "NODES",
-    "NODE_INDEX",
-    "NO_KEYPOINT",
-    "NUM_KEYPOINTS",
-    "PALM_NODES",
-    "WRIST",
-    "WRIST_NODE",
-    "FingerTable",
-    "JointRow",
-    "Quaternion",
-    "TreeNode",
-    "Vector3",
-    "actions",
-    "chain_indices",
-    "hand_files",
-    "mean_hand_m",
-    "node_order",
-    "nodes_of_tree",
-    "robot_hand",
-    "solver_indices",
-]
+from dextouch.lazy_exports import lazy_exports
+
+if TYPE_CHECKING:
+    from dextouch.hands import actions as actions
+    from dextouch.hands import hand_files as hand_files
+    from dextouch.hands import robot_hand as robot_hand
+    from dextouch.hands.finger_table import FingerTable as FingerTable
+    from dextouch.hands.finger_table import JointRow as JointRow
+    from dextouch.hands.finger_table import Quaternion as Quaternion
+    from dextouch.hands.finger_table import Vector3 as Vector3
+    from dextouch.hands.mean_hand import FINGER_CHAINS as FINGER_CHAINS
+    from dextouch.hands.mean_hand import KNUCKLE_NODES as KNUCKLE_NODES
+    from dextouch.hands.mean_hand import METACARPAL_NODES as METACARPAL_NODES
+    from dextouch.hands.mean_hand import PALM_NODES as PALM_NODES
+    from dextouch.hands.mean_hand import WRIST_NODE as WRIST_NODE
+    from dextouch.hands.mean_hand import mean_hand_m as mean_hand_m
+    from dextouch.hands.skeleton import CHAINS as CHAINS
+    from dextouch.hands.skeleton import FINGER_JOINTS as FINGER_JOINTS
+    from dextouch.hands.skeleton import NODE_INDEX as NODE_INDEX
+    from dextouch.hands.skeleton import NODES as NODES
+    from dextouch.hands.skeleton import NUM_KEYPOINTS as NUM_KEYPOINTS
+    from dextouch.hands.skeleton import WRIST as WRIST
+    from dextouch.hands.skeleton import chain_indices as chain_indices
+    from dextouch.hands.skeleton import solver_indices as solver_indices
+    from dextouch.hands.tracker_nodes import FINGER_METACARPALS as FINGER_METACARPALS
+    from dextouch.hands.tracker_nodes import NO_KEYPOINT as NO_KEYPOINT
+    from dextouch.hands.tracker_nodes import TreeNode as TreeNode
+    from dextouch.hands.tracker_nodes import node_order as node_order
+    from dextouch.hands.tracker_nodes import nodes_of_tree as nodes_of_tree
+else:
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -161,12 +161,12 @@ class RobotHand(HandModel):
 
 @cache
 def _wuji_hand_2() -> dict[str, tuple[FingerTable, ...]]:
-    def row(pairs: list[tuple[str, Any]]) -> object:
-        values = {key: tuple(value) if isinstance(value, list) else value for key, value in pairs}
+    def row(values: dict[str, Any]) -> Any:  # noqa: ANN401 - a table, a row or the whole file
+        values = {key: tuple(v) if isinstance(v, list) else v for key, v in values.items()}
         if "joints" in values:
             return FingerTable(**values)
         return JointRow(**values) if "axis" in values else values
 
     text = files("dextouch.hands").joinpath("wuji_hand_2.json").read_text(encoding="utf-8")
-    tables: dict[str, tuple[FingerTable, ...]] = json.loads(text, object_pairs_hook=row)
+    tables: dict[str, tuple[FingerTable, ...]] = json.loads(text, object_hook=row)
     return tables

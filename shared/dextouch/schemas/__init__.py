@@ -5,169 +5,67 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from dextouch.schemas.episodes import (
-        ID_PATTERN,
-        CatalogHours,
-        ClockMethod,
-        ClockReport,
-        ClockWarning,
-        Domain,
-        EpisodeAttributes,
-        EpisodeDetail,
-        EpisodeList,
-        EpisodeSummary,
-        HoursRow,
-        LineageEntry,
-        Matrix,
-        Origin,
-        StoredAnchor,
-        StoreId,
-        Verification,
-        json_ready,
-        matrix_rows,
-    )
-    from dextouch.schemas.health import Health, Readiness
-    from dextouch.schemas.problems import (
-        CLASS_OF_STATUS,
-        PROBLEM_MEDIA_TYPE,
-        Problem,
-        error_from_problem,
-        first_problems,
-        problem_from_error,
-        status_of,
-    )
-    from dextouch.schemas.recordings import (
-        ID_TAKEN,
-        BatchReceipt,
-        ExpireUploads,
-        FinishRecording,
-        LedgerEntry,
-        RecordingAttributes,
-        RecordingList,
-        RecordingStatus,
-        RecordingSummary,
-        UploadList,
-        UploadSummary,
-    )
-    from dextouch.schemas.rollout_codec import (
-        RolloutAnswer,
-        RolloutOrigin,
-        decode_answer,
-        decode_observation,
-        decode_start,
-        encode_answer,
-        encode_observation,
-        encode_start,
-        start_from,
-    )
-    from dextouch.schemas.rollouts import (
-        EVERYTHING,
-        MAX_SEED,
-        ActionKind,
-        Doubt,
-        ForkRequest,
-        Observation,
-        ReturnSelector,
-        RolloutInfo,
-        RolloutStart,
-        StartRequest,
-        WorldDescription,
-        WorldKind,
-        WorldList,
-        check_observation,
-    )
+    from dextouch.schemas.episodes import ID_PATTERN as ID_PATTERN
+    from dextouch.schemas.episodes import CatalogHours as CatalogHours
+    from dextouch.schemas.episodes import ClockMethod as ClockMethod
+    from dextouch.schemas.episodes import ClockReport as ClockReport
+    from dextouch.schemas.episodes import ClockWarning as ClockWarning
+    from dextouch.schemas.episodes import Domain as Domain
+    from dextouch.schemas.episodes import EpisodeAttributes as EpisodeAttributes
+    from dextouch.schemas.episodes import EpisodeDetail as EpisodeDetail
+    from dextouch.schemas.episodes import EpisodeList as EpisodeList
+    from dextouch.schemas.episodes import EpisodeSummary as EpisodeSummary
+    from dextouch.schemas.episodes import HoursRow as HoursRow
+    from dextouch.schemas.episodes import LineageEntry as LineageEntry
+    from dextouch.schemas.episodes import Matrix as Matrix
+    from dextouch.schemas.episodes import Origin as Origin
+    from dextouch.schemas.episodes import StoredAnchor as StoredAnchor
+    from dextouch.schemas.episodes import StoreId as StoreId
+    from dextouch.schemas.episodes import Verification as Verification
+    from dextouch.schemas.episodes import json_ready as json_ready
+    from dextouch.schemas.episodes import matrix_rows as matrix_rows
+    from dextouch.schemas.health import Health as Health
+    from dextouch.schemas.health import Readiness as Readiness
+    from dextouch.schemas.problems import CLASS_OF_STATUS as CLASS_OF_STATUS
+    from dextouch.schemas.problems import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
+    from dextouch.schemas.problems import Problem as Problem
+    from dextouch.schemas.problems import error_from_problem as error_from_problem
+    from dextouch.schemas.problems import first_problems as first_problems
+    from dextouch.schemas.problems import problem_from_error as problem_from_error
+    from dextouch.schemas.problems import status_of as status_of
+    from dextouch.schemas.recordings import ID_TAKEN as ID_TAKEN
+    from dextouch.schemas.recordings import BatchReceipt as BatchReceipt
+    from dextouch.schemas.recordings import ExpireUploads as ExpireUploads
+    from dextouch.schemas.recordings import FinishRecording as FinishRecording
+    from dextouch.schemas.recordings import LedgerEntry as LedgerEntry
+    from dextouch.schemas.recordings import RecordingAttributes as RecordingAttributes
+    from dextouch.schemas.recordings import RecordingList as RecordingList
+    from dextouch.schemas.recordings import RecordingStatus as RecordingStatus
+    from dextouch.schemas.recordings import RecordingSummary as RecordingSummary
+    from dextouch.schemas.recordings import UploadList as UploadList
+    from dextouch.schemas.recordings import UploadSummary as UploadSummary
+    from dextouch.schemas.rollout_codec import RolloutAnswer as RolloutAnswer
+    from dextouch.schemas.rollout_codec import RolloutOrigin as RolloutOrigin
+    from dextouch.schemas.rollout_codec import decode_answer as decode_answer
+    from dextouch.schemas.rollout_codec import decode_observation as decode_observation
+    from dextouch.schemas.rollout_codec import decode_start as decode_start
+    from dextouch.schemas.rollout_codec import encode_answer as encode_answer
+    from dextouch.schemas.rollout_codec import encode_observation as encode_observation
+    from dextouch.schemas.rollout_codec import encode_start as encode_start
+    from dextouch.schemas.rollout_codec import start_from as start_from
+    from dextouch.schemas.rollouts import EVERYTHING as EVERYTHING
+    from dextouch.schemas.rollouts import MAX_SEED as MAX_SEED
+    from dextouch.schemas.rollouts import ActionKind as ActionKind
+    from dextouch.schemas.rollouts import Doubt as Doubt
+    from dextouch.schemas.rollouts import ForkRequest as ForkRequest
+    from dextouch.schemas.rollouts import Observation as Observation
+    from dextouch.schemas.rollouts import ReturnSelector as ReturnSelector
+    from dextouch.schemas.rollouts import RolloutInfo as RolloutInfo
+    from dextouch.schemas.rollouts import RolloutStart as RolloutStart
+    from dextouch.schemas.rollouts import StartRequest as StartRequest
+    from dextouch.schemas.rollouts import WorldDescription as WorldDescription
+    from dextouch.schemas.rollouts import WorldKind as WorldKind
+    from dextouch.schemas.rollouts import WorldList as WorldList
+    from dextouch.schemas.rollouts import check_observation as check_observation
 else:
-    __getattr__, __dir__ = lazy_exports(
-        __name__,
-        {
-            "episodes": (
-                "CatalogHours ClockMethod ClockReport ClockWarning Domain EpisodeAttributes "
-                "EpisodeDetail EpisodeList EpisodeSummary HoursRow ID_PATTERN LineageEntry Matrix "
-                "Origin StoreId StoredAnchor Verification json_ready matrix_rows"
-            ),
-            "health": "Health Readiness",
-            "problems": (
-                "CLASS_OF_STATUS PROBLEM_MEDIA_TYPE Problem error_from_problem first_problems "
-                "problem_from_error status_of"
-            ),
-            "recordings": (
-                "BatchReceipt ExpireUploads FinishRecording ID_TAKEN LedgerEntry "
-                "RecordingAttributes RecordingList RecordingStatus RecordingSummary UploadList "
-                "UploadSummary"
-            ),
-            "rollout_codec": (
-                "RolloutAnswer RolloutOrigin decode_answer decode_observation decode_start "
-                "encode_answer encode_observation encode_start start_from"
-            ),
-            "rollouts": (
-                "ActionKind Doubt EVERYTHING ForkRequest MAX_SEED Observation ReturnSelector "
-                "RolloutInfo RolloutStart StartRequest WorldDescription WorldKind WorldList "
-                "check_observation"
-            ),
-        },
-    )
-
-__all__ = [
-    "CLASS_OF_STATUS",
-    "EVERYTHING",
-    "ID_PATTERN",
-    "ID_TAKEN",
-    "MAX_SEED",
-    "PROBLEM_MEDIA_TYPE",
-    "ActionKind",
-    "BatchReceipt",
-    "CatalogHours",
-    "ClockMethod",
-    "ClockReport",
-    "ClockWarning",
-    "Domain",
-    "Doubt",
-    "EpisodeAttributes",
-    "EpisodeDetail",
-    "EpisodeList",
-    "EpisodeSummary",
-    "ExpireUploads",
-    "FinishRecording",
-    "ForkRequest",
-    "Health",
-    "HoursRow",
-    "LedgerEntry",
-    "LineageEntry",
-    "Matrix",
-    "Observation",
-    "Origin",
-    "Problem",
-    "Readiness",
-    "RecordingAttributes",
-    "RecordingList",
-    "RecordingStatus",
-    "RecordingSummary",
-    "ReturnSelector",
-    "RolloutAnswer",
-    "RolloutInfo",
-    "RolloutOrigin",
-    "RolloutStart",
-    "StartRequest",
-    "StoreId",
-    "StoredAnchor",
-    "UploadList",
-    "UploadSummary",
-    "Verification",
-    "WorldDescription",
-    "WorldKind",
-    "WorldList",
-    "check_observation",
-    "decode_answer",
-    "decode_observation",
-    "decode_start",
-    "encode_answer",
-    "encode_observation",
-    "encode_start",
-    "error_from_problem",
-    "first_problems",
-    "json_ready",
-    "matrix_rows",
-    "problem_from_error",
-    "start_from",
-    "status_of",
-]
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -5,58 +5,29 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from dextouch.serving.access import AccessControl, RequireScope, not_signed_in
-    from dextouch.serving.app import create_service_app
-    from dextouch.serving.bodies import AS_SET, FORM, JSON, KIB, MSGPACK, OCTETS, media_type, takes
-    from dextouch.serving.child_process import Answer, ChildProcess, serve_parent
-    from dextouch.serving.logs import configure_logging
-    from dextouch.serving.middleware import timed
-    from dextouch.serving.settings import (
-        MAX_WEBSOCKET_BYTES,
-        ServiceSettings,
-        load_settings,
-        run,
-        service_config,
-    )
-    from dextouch.serving.state import StateStore, open_state
+    from dextouch.serving.access import AccessControl as AccessControl
+    from dextouch.serving.access import RequireScope as RequireScope
+    from dextouch.serving.access import not_signed_in as not_signed_in
+    from dextouch.serving.app import create_service_app as create_service_app
+    from dextouch.serving.bodies import AS_SET as AS_SET
+    from dextouch.serving.bodies import FORM as FORM
+    from dextouch.serving.bodies import JSON as JSON
+    from dextouch.serving.bodies import KIB as KIB
+    from dextouch.serving.bodies import MSGPACK as MSGPACK
+    from dextouch.serving.bodies import OCTETS as OCTETS
+    from dextouch.serving.bodies import media_type as media_type
+    from dextouch.serving.bodies import takes as takes
+    from dextouch.serving.child_process import Answer as Answer
+    from dextouch.serving.child_process import ChildProcess as ChildProcess
+    from dextouch.serving.child_process import serve_parent as serve_parent
+    from dextouch.serving.logs import configure_logging as configure_logging
+    from dextouch.serving.middleware import timed as timed
+    from dextouch.serving.settings import MAX_WEBSOCKET_BYTES as MAX_WEBSOCKET_BYTES
+    from dextouch.serving.settings import ServiceSettings as ServiceSettings
+    from dextouch.serving.settings import load_settings as load_settings
+    from dextouch.serving.settings import run as run
+    from dextouch.serving.settings import service_config as service_config
+    from dextouch.serving.state import StateStore as StateStore
+    from dextouch.serving.state import open_state as open_state
 else:
-    __getattr__, __dir__ = lazy_exports(
-        __name__,
-        {
-            "access": "AccessControl RequireScope not_signed_in",
-            "app": "create_service_app",
-            "bodies": "AS_SET FORM JSON KIB MSGPACK OCTETS media_type takes",
-            "child_process": "Answer ChildProcess serve_parent",
-            "logs": "configure_logging",
-            "middleware": "timed",
-            "settings": "MAX_WEBSOCKET_BYTES ServiceSettings load_settings run service_config",
-            "state": "StateStore open_state",
-        },
-    )
-
-__all__ = [
-    "AS_SET",
-    "FORM",
-    "JSON",
-    "KIB",
-    "MAX_WEBSOCKET_BYTES",
-    "MSGPACK",
-    "OCTETS",
-    "AccessControl",
-    "Answer",
-    "ChildProcess",
-    "RequireScope",
-    "ServiceSettings",
-    "StateStore",
-    "configure_logging",
-    "create_service_app",
-    "load_settings",
-    "media_type",
-    "not_signed_in",
-    "open_state",
-    "run",
-    "serve_parent",
-    "service_config",
-    "takes",
-    "timed",
-]
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

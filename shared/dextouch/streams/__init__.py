@@ -5,62 +5,25 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from dextouch.streams.checks import (
-        ENCODED_UNITS,
-        H264_UNIT,
-        JPEG_UNIT,
-        check_batch,
-        check_encoded_image,
-        check_follows,
-    )
-    from dextouch.streams.descriptors import (
-        MAX_STREAMS,
-        ClockCapabilities,
-        StreamDescriptor,
-        StreamKind,
-    )
-    from dextouch.streams.packing import pack, unpack
-    from dextouch.streams.samples import (
-        NO_DEVICE_TIME,
-        NO_SEQUENCE,
-        Sample,
-        SampleBatch,
-        encoded_values,
-    )
-    from dextouch.streams.wire import MAX_BATCH_BYTES, decode_batch, encode_batch
+    from dextouch.streams.checks import ENCODED_UNITS as ENCODED_UNITS
+    from dextouch.streams.checks import H264_UNIT as H264_UNIT
+    from dextouch.streams.checks import JPEG_UNIT as JPEG_UNIT
+    from dextouch.streams.checks import check_batch as check_batch
+    from dextouch.streams.checks import check_encoded_image as check_encoded_image
+    from dextouch.streams.checks import check_follows as check_follows
+    from dextouch.streams.descriptors import MAX_STREAMS as MAX_STREAMS
+    from dextouch.streams.descriptors import ClockCapabilities as ClockCapabilities
+    from dextouch.streams.descriptors import StreamDescriptor as StreamDescriptor
+    from dextouch.streams.descriptors import StreamKind as StreamKind
+    from dextouch.streams.packing import pack as pack
+    from dextouch.streams.packing import unpack as unpack
+    from dextouch.streams.samples import NO_DEVICE_TIME as NO_DEVICE_TIME
+    from dextouch.streams.samples import NO_SEQUENCE as NO_SEQUENCE
+    from dextouch.streams.samples import Sample as Sample
+    from dextouch.streams.samples import SampleBatch as SampleBatch
+    from dextouch.streams.samples import encoded_values as encoded_values
+    from dextouch.streams.wire import MAX_BATCH_BYTES as MAX_BATCH_BYTES
+    from dextouch.streams.wire import decode_batch as decode_batch
+    from dextouch.streams.wire import encode_batch as encode_batch
 else:
-    __getattr__, __dir__ = lazy_exports(
-        __name__,
-        {
-            "checks": (
-                "ENCODED_UNITS H264_UNIT JPEG_UNIT check_batch check_encoded_image check_follows"
-            ),
-            "descriptors": "ClockCapabilities MAX_STREAMS StreamDescriptor StreamKind",
-            "packing": "pack unpack",
-            "samples": "NO_DEVICE_TIME NO_SEQUENCE Sample SampleBatch encoded_values",
-            "wire": "MAX_BATCH_BYTES decode_batch encode_batch",
-        },
-    )
-
-__all__ = [
-    "ENCODED_UNITS",
-    "H264_UNIT",
-    "JPEG_UNIT",
-    "MAX_BATCH_BYTES",
-    "MAX_STREAMS",
-    "NO_DEVICE_TIME",
-    "NO_SEQUENCE",
-    "ClockCapabilities",
-    "Sample",
-    "SampleBatch",
-    "StreamDescriptor",
-    "StreamKind",
-    "check_batch",
-    "check_encoded_image",
-    "check_follows",
-    "decode_batch",
-    "encode_batch",
-    "encoded_values",
-    "pack",
-    "unpack",
-]
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

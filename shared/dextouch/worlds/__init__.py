@@ -5,27 +5,14 @@ from typing import TYPE_CHECKING
 from dextouch.lazy_exports import lazy_exports
 
 if TYPE_CHECKING:
-    from dextouch.worlds.baseline import CopyFirstWorld
-    from dextouch.worlds.serve import WorldServiceSettings, create_world_app, serve_worlds
-    from dextouch.worlds.world import BatchWorld, StartedRollout, State, SteppedRollout, World
+    from dextouch.worlds.baseline import CopyFirstWorld as CopyFirstWorld
+    from dextouch.worlds.serve import WorldServiceSettings as WorldServiceSettings
+    from dextouch.worlds.serve import create_world_app as create_world_app
+    from dextouch.worlds.serve import serve_worlds as serve_worlds
+    from dextouch.worlds.world import BatchWorld as BatchWorld
+    from dextouch.worlds.world import StartedRollout as StartedRollout
+    from dextouch.worlds.world import State as State
+    from dextouch.worlds.world import SteppedRollout as SteppedRollout
+    from dextouch.worlds.world import World as World
 else:
-    __getattr__, __dir__ = lazy_exports(
-        __name__,
-        {
-            "baseline": "CopyFirstWorld",
-            "serve": "WorldServiceSettings create_world_app serve_worlds",
-            "world": "BatchWorld StartedRollout State SteppedRollout World",
-        },
-    )
-
-__all__ = [
-    "BatchWorld",
-    "CopyFirstWorld",
-    "StartedRollout",
-    "State",
-    "SteppedRollout",
-    "World",
-    "WorldServiceSettings",
-    "create_world_app",
-    "serve_worlds",
-]
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)

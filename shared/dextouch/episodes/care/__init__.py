@@ -1,36 +1,26 @@
 """Care of a store: inspection for damage, repair with salvage of intact samples, and deletion."""
 
-from dextouch.episodes.care.deletion import DeletionRequest, delete_for_good, plan_deletion
-from dextouch.episodes.care.inspection import (
-    UPLOADS,
-    Finding,
-    ItemReport,
-    Progress,
-    inspect_group,
-    inspect_stage,
-    inspect_upload,
-    interrupted_takes,
-    open_contents,
-    unfinished_folders,
-)
-from dextouch.episodes.care.repair import LEFT, RepairReport, repair_group, repair_unfinished
+from typing import TYPE_CHECKING
 
-__all__ = [
-    "LEFT",
-    "UPLOADS",
-    "DeletionRequest",
-    "Finding",
-    "ItemReport",
-    "Progress",
-    "RepairReport",
-    "delete_for_good",
-    "inspect_group",
-    "inspect_stage",
-    "inspect_upload",
-    "interrupted_takes",
-    "open_contents",
-    "plan_deletion",
-    "repair_group",
-    "repair_unfinished",
-    "unfinished_folders",
-]
+from dextouch.lazy_exports import lazy_exports
+
+if TYPE_CHECKING:
+    from dextouch.episodes.care.deletion import DeletionRequest as DeletionRequest
+    from dextouch.episodes.care.deletion import delete_for_good as delete_for_good
+    from dextouch.episodes.care.deletion import plan_deletion as plan_deletion
+    from dextouch.episodes.care.inspection import UPLOADS as UPLOADS
+    from dextouch.episodes.care.inspection import Finding as Finding
+    from dextouch.episodes.care.inspection import ItemReport as ItemReport
+    from dextouch.episodes.care.inspection import Progress as Progress
+    from dextouch.episodes.care.inspection import inspect_group as inspect_group
+    from dextouch.episodes.care.inspection import inspect_stage as inspect_stage
+    from dextouch.episodes.care.inspection import inspect_upload as inspect_upload
+    from dextouch.episodes.care.inspection import interrupted_takes as interrupted_takes
+    from dextouch.episodes.care.inspection import open_contents as open_contents
+    from dextouch.episodes.care.inspection import unfinished_folders as unfinished_folders
+    from dextouch.episodes.care.repair import LEFT as LEFT
+    from dextouch.episodes.care.repair import RepairReport as RepairReport
+    from dextouch.episodes.care.repair import repair_group as repair_group
+    from dextouch.episodes.care.repair import repair_unfinished as repair_unfinished
+else:
+    __getattr__, __dir__, __all__ = lazy_exports(__name__)
