@@ -2,8 +2,9 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 
+from dextouch.frozen_model import FrozenModel
 from services.acquisition.devices.registry import kind_names
 
 # How the kinds of gloves of this package were called before they were kinds.
@@ -14,7 +15,7 @@ GLOVE_PROTOCOLS = {
 }
 
 
-class MockLinks(BaseModel):
+class MockLinks(FrozenModel):
     """Which of the ways that real stations know the mock devices of a station take.
 
     Attributes:
@@ -27,8 +28,6 @@ class MockLinks(BaseModel):
             packets hold them in any case.
         images: how images are encoded: by the bridge, or by the station for a camera of its own.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     gloves: str = Field(
         default="tactile_glove", description="kind of both gloves, ours or of another package"

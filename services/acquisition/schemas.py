@@ -2,8 +2,9 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import Field, FiniteFloat
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain, StoreId
 
 Level = Literal["OK", "WARN", "ERROR", "STALE"]
@@ -55,10 +56,8 @@ State = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 Action = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
 
 
-class TakePrompt(BaseModel):
+class TakePrompt(FrozenModel):
     """What is going to be recorded; given before the start."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: str = Field(min_length=1, max_length=128)
     instruction: str = Field(min_length=1, max_length=2000)
@@ -67,14 +66,12 @@ class TakePrompt(BaseModel):
     consent: bool = False
 
 
-class TakeName(BaseModel):
+class TakeName(FrozenModel):
     """Which take an action is meant for; without an id, the present one.
 
     A request that names its take may be sent again: what was done is not done twice. `record` gives
     its take this id.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: StoreId | None = None
 
@@ -86,10 +83,8 @@ class SaveTake(TakeName):
     accept_incomplete: bool = False
 
 
-class TakeProblem(BaseModel):
+class TakeProblem(FrozenModel):
     """Something that the check after a take found in one stream."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
     code: str
@@ -97,10 +92,8 @@ class TakeProblem(BaseModel):
     message: str
 
 
-class StreamTake(BaseModel):
+class StreamTake(FrozenModel):
     """Summary of one stream in a take."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
     num_samples: int
@@ -110,10 +103,8 @@ class StreamTake(BaseModel):
     crc_errors: int
 
 
-class TakeCheck(BaseModel):
+class TakeCheck(FrozenModel):
     """Whether a take is complete, found right after its end."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     complete: bool
     duration_s: float
@@ -121,38 +112,32 @@ class TakeCheck(BaseModel):
     problems: tuple[TakeProblem, ...]
 
 
-class RecorderStatus(BaseModel):
+class RecorderStatus(FrozenModel):
     """Current state of the recorder, and the actions that are possible."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     state: State
     actions: tuple[Action, ...]
     recording_id: str | None = None
     prompt: TakePrompt | None = None
     duration_s: float | None = None
-    num_samples: dict[str, int] = {}
+    num_samples: dict[str, int] = Field(default={})
     problems: tuple[str, ...] = ()
     check: TakeCheck | None = None
 
 
-class HealthFinding(BaseModel):
+class HealthFinding(FrozenModel):
     """Problem of a stream or of the station found by one evaluation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     code: Code
     level: Literal["WARN", "ERROR"]
     message: str
 
 
-class RaisedFinding(BaseModel):
+class RaisedFinding(FrozenModel):
     """Something that is wrong now, since when, and what to do about it.
 
     `lasted_s` is None where nothing was ever heard of a stream.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     code: Code
     level: Literal["WARN", "ERROR", "STALE"]
@@ -161,15 +146,13 @@ class RaisedFinding(BaseModel):
     lasted_s: float | None
 
 
-class StreamHealth(BaseModel):
+class StreamHealth(FrozenModel):
     """One stream at this moment; `lost` and `received` count its device's packets since start.
 
     `stale` says why nothing is known; it is the first of the findings then. `reasons` are their
     messages. `figures` are the numbers behind them by their Prometheus names, none while the
     stream is stale.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
     device: str
@@ -178,7 +161,7 @@ class StreamHealth(BaseModel):
     stale: StaleCode | None = None
     reasons: tuple[str, ...]
     findings: tuple[RaisedFinding, ...] = ()
-    figures: dict[str, FiniteFloat] = {}
+    figures: dict[str, FiniteFloat] = Field(default={})
     rate_hz: float | None
     nominal_rate_hz: float
     age_s: float | None
@@ -189,10 +172,8 @@ class StreamHealth(BaseModel):
     clock_residual_ms: float | None = None
 
 
-class DeviceHealth(BaseModel):
+class DeviceHealth(FrozenModel):
     """One device and its counters since the station's start."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     device: str
     hand: Literal["left", "right"] | None = None
@@ -213,26 +194,22 @@ class DeviceHealth(BaseModel):
     last_error: str | None
 
 
-class StationHealth(BaseModel):
+class StationHealth(FrozenModel):
     """All streams and devices; `level` is the worst of the streams and of `findings`.
 
     `findings` and `figures` are those of the station itself: disk, calibration and uploads.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     station: str
     level: Level
     findings: tuple[RaisedFinding, ...] = ()
-    figures: dict[str, FiniteFloat] = {}
+    figures: dict[str, FiniteFloat] = Field(default={})
     streams: tuple[StreamHealth, ...]
     devices: tuple[DeviceHealth, ...]
 
 
-class HealthEvent(BaseModel):
+class HealthEvent(FrozenModel):
     """A code of a stream (or of the `station`) reached a level; OK is its end."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     t_host_ns: int
     stream: str
@@ -240,19 +217,15 @@ class HealthEvent(BaseModel):
     level: Level
 
 
-class HealthEvents(BaseModel):
+class HealthEvents(FrozenModel):
     """Changes of levels, oldest first, and the station's clock now."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     now_ns: int
     events: tuple[HealthEvent, ...]
 
 
-class CameraLive(BaseModel):
+class CameraLive(FrozenModel):
     """A camera whose newest image can be had."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     image_index: int
@@ -261,22 +234,18 @@ class CameraLive(BaseModel):
     width_px: int
 
 
-class CameraList(BaseModel):
+class CameraList(FrozenModel):
     """Cameras that have sent an image."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cameras: tuple[CameraLive, ...]
 
 
-class UploadStatus(BaseModel):
+class UploadStatus(FrozenModel):
     """One saved take and whether the store has it.
 
     `stored_as` is its id in the store, which differs where another recording had that id already. A
     `refused` take stays in the spool and is not sent again until a retry is requested.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: str
     uploaded: bool

@@ -1,9 +1,11 @@
 """Options of an alignment, such as the rate of its action grid."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from dextouch.frozen_model import FrozenModel
 
 
-class AlignmentOptions(BaseModel):
+class AlignmentOptions(FrozenModel):
     """Options of one alignment; they are part of the episode's identity.
 
     Args:
@@ -11,8 +13,6 @@ class AlignmentOptions(BaseModel):
         max_gap_ms: two samples further apart than this are not interpolated between.
         min_num_steps: shorter stretches without a gap are no episode.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="of the action grid")
     max_gap_ms: float = Field(

@@ -3,9 +3,10 @@
 from collections.abc import Mapping
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import Field, FiniteFloat
 
 from dextouch.episodes import EpisodeReader
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ClockReport, Domain, Matrix
 from dextouch.tactile.layout import SIDES
 from services.alignment.calibration.tactile_baseline import REASONS
@@ -20,7 +21,7 @@ EXPECTED_STREAMS = (
 )
 
 
-class AlignmentReport(BaseModel):
+class AlignmentReport(FrozenModel):
     """Report of one aligned recording.
 
     `created` is False where the same recording had been aligned with the same options before.
@@ -30,8 +31,6 @@ class AlignmentReport(BaseModel):
     of steps by status. `refused_taxels` names, by stream and reason, taxels (anatomical order) that
     are zero because they were not measured.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: str
     episode_id: str
@@ -43,9 +42,9 @@ class AlignmentReport(BaseModel):
     absent: tuple[str, ...]
     clocks: tuple[ClockReport, ...]
     quality: dict[str, FiniteFloat]
-    retargeting: dict[str, dict[str, FiniteFloat]] = {}
+    retargeting: dict[str, dict[str, FiniteFloat]] = Field(default={})
     refused_parts: tuple[RefusedPart, ...] = ()
-    refused_taxels: dict[str, dict[str, tuple[int, ...]]] = {}
+    refused_taxels: dict[str, dict[str, tuple[int, ...]]] = Field(default={})
     content_sha256: str
 
 

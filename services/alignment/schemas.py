@@ -3,9 +3,10 @@
 from datetime import UTC, datetime
 from typing import Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import AwareDatetime, Field, FiniteFloat, model_validator
 
 from dextouch.errors import DexTouchError, UnavailableError
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Problem, StoreId, problem_from_error
 from services.alignment.options import AlignmentOptions
 from services.alignment.report import AlignmentReport
@@ -18,10 +19,8 @@ MIN_ETA_SHARE = 0.05
 ENDED: frozenset[JobState] = frozenset({"done", "failed", "cancelled"})
 
 
-class AlignmentRequest(BaseModel):
+class AlignmentRequest(FrozenModel):
     """Align one or up to a thousand recordings; missing options default to the service's."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: StoreId | None = None
     recording_ids: tuple[StoreId, ...] | None = Field(
@@ -43,15 +42,13 @@ class AlignmentRequest(BaseModel):
         return tuple(dict.fromkeys(self.recording_ids or ()))
 
 
-class AlignmentJob(BaseModel):
+class AlignmentJob(FrozenModel):
     """One alignment: `alignment_id` is the episode's id, `progress` goes from 0 to 1.
 
     `stage` and `stream` are being processed, `eta_s` is the estimated remaining time; `attempts`
     counts how often work began. `report` is there when `state` is done, `problem` when it is
     failed.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alignment_id: str
     recording_id: str
@@ -145,13 +142,11 @@ class AlignmentJob(BaseModel):
         return self.model_copy(update=changes)
 
 
-class AlignmentList(BaseModel):
+class AlignmentList(FrozenModel):
     """One page of the alignments, oldest first, and how many match in all.
 
     `next_after` is the id to ask on from; None on the last page.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     alignments: tuple[AlignmentJob, ...]
     num_matching: int = Field(ge=0)

@@ -5,6 +5,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.tactile import CONTACT_THRESHOLD_KPA, colour, hand_canvas
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 
@@ -69,10 +70,8 @@ class RecorderView(BaseModel):
     problems: tuple[str, ...] = ()
 
 
-class StationView(BaseModel):
+class StationView(FrozenModel):
     """Overview of the station."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     reachable: bool
     level: Level
@@ -83,20 +82,16 @@ class StationView(BaseModel):
     recorder: RecorderView
 
 
-class ServiceView(BaseModel):
+class ServiceView(FrozenModel):
     """Readiness of a service."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     level: Level
     message: str
 
 
-class TakeView(BaseModel):
+class TakeView(FrozenModel):
     """A stored recording or episode; `consent` is None where unknown."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["recording", "episode"]
     name: str
@@ -118,10 +113,8 @@ class RefusedView(BaseModel):
     error: str
 
 
-class TakesView(BaseModel):
+class TakesView(FrozenModel):
     """The newest takes; `note` explains an empty list. `refused` ones are still at the station."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     refused: tuple[RefusedView, ...] = ()
     takes: tuple[TakeView, ...] = ()

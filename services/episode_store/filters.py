@@ -6,8 +6,9 @@ from datetime import datetime
 from operator import attrgetter
 from typing import Annotated, Any, Protocol, runtime_checkable
 
-from pydantic import AfterValidator, AwareDatetime, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, AwareDatetime, Field
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain, Origin
 
 
@@ -52,14 +53,12 @@ def _checked(text: str) -> str:
     return text
 
 
-class CatalogFilter(BaseModel):
+class CatalogFilter(FrozenModel):
     """Filter of episodes or recordings; omitted fields match anything.
 
     `min_quality` are bounds `NAME:NUMBER` that must all hold; an item without the figure does not
     match. Times are created_after ≤ t < created_before; an item without a time does not match.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: str | None = None
     operator: str | None = None
@@ -112,10 +111,8 @@ class EpisodeFilter(CatalogFilter):
         return (*super()._fields(), "origin")
 
 
-class Page(BaseModel):
+class Page(FrozenModel):
     """Page of a list: after an id, or from an offset."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     limit: int | None = Field(default=None, ge=1)
     offset: int = Field(default=0, ge=0)

@@ -5,10 +5,11 @@ from dataclasses import dataclass
 from math import prod
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, Field
 
 from dextouch.episodes import EpisodeReader, EpisodeStore, ImageForm, RecordingReader, encode_window
 from dextouch.errors import LimitExceededError
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ActionKind, EpisodeDetail, RecordingAttributes
 from dextouch.streams import pack
 
@@ -16,13 +17,11 @@ from dextouch.streams import pack
 ANSWER_VERSION = 1
 
 
-class WindowQuery(BaseModel):
+class WindowQuery(FrozenModel):
     """Query of a window; `cameras` is a comma-separated list, which may be empty.
 
     Images are optionally at half size in both axes, or gray with one channel.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start: int = Field(ge=0)
     num_steps: int = Field(default=17, ge=1)
@@ -40,10 +39,8 @@ class WindowQuery(BaseModel):
         return ImageForm(half_size=self.half_size, gray=self.gray)
 
 
-class SpanQuery(BaseModel):
+class SpanQuery(FrozenModel):
     """Query of samples: start_ns ≤ t < stop_ns, by default all."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start_ns: int | None = None
     stop_ns: int | None = None

@@ -4,8 +4,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Generic, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from dextouch.frozen_model import FrozenModel
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver
 
@@ -13,14 +14,12 @@ from services.acquisition.drivers.base import Driver
 StreamName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
 
 
-class DeviceSettings(BaseModel):
+class DeviceSettings(FrozenModel):
     """Settings of one device of a station; every kind derives its own class.
 
     `kind` names the kind. A derived class narrows it to that name and makes it the default:
     `kind: Literal["wuji_glove"] = "wuji_glove"`. Unknown keys are refused.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: str
 

@@ -7,9 +7,10 @@ from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from dextouch.errors import DeviceError
+from dextouch.frozen_model import FrozenModel
 from services.acquisition.drivers.base import check_packet
 from services.acquisition.drivers.packets import DecoderStatistics, Packet, PacketDecoder
 from services.acquisition.drivers.reports import OrderFilter
@@ -28,11 +29,7 @@ BridgeKind = Literal["finger_tracker", "pose_tracker"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
 
 
-class _Message(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class BridgedDevice(_Message):
+class BridgedDevice(FrozenModel):
     """One device behind a bridge: its index in packets, serial number and place."""
 
     index: int = Field(ge=0, le=65535)
@@ -40,7 +37,7 @@ class BridgedDevice(_Message):
     source: Literal["left", "right", "head", "none"]
 
 
-class FrameConvention(_Message):
+class FrameConvention(FrozenModel):
     """Orientation of the sender's coordinates in ours.
 
     `axes` says for the sender's x, y and z in turn which axis of our frame points the same way.
@@ -69,7 +66,7 @@ class FrameConvention(_Message):
         return matrix
 
 
-class BridgeHello(_Message):
+class BridgeHello(FrozenModel):
     """The first line of every connection."""
 
     protocol: Literal["dextouch-bridge"]

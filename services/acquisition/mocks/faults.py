@@ -6,14 +6,16 @@ from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Int64
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from dextouch.frozen_model import FrozenModel
 
 MILLISECOND_NS = 1_000_000
 MAX_BOOT_NS = 10**12
 WINDOWS = ("stalls_s", "unplugged_s", "occluded_s", "not_running_s", "jumped_s")
 
 
-class DeviceFaults(BaseModel):
+class DeviceFaults(FrozenModel):
     """What disturbs one device; the default is a perfect one.
 
     Times in seconds count from the start of the device's first take. `jitter_ms` is the mean of an
@@ -33,8 +35,6 @@ class DeviceFaults(BaseModel):
     `not_running_s` a pose tracker has no tracking at all; during `jumped_s` it says that it runs,
     but its pose is elsewhere.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     skew_ppm: float = Field(default=0.0, ge=-10_000, le=10_000)
     path_delay_ms: float = Field(default=0.0, ge=0, le=1_000)
@@ -73,10 +73,8 @@ class DeviceFaults(BaseModel):
         return self
 
 
-class FaultScript(BaseModel):
+class FaultScript(FrozenModel):
     """The faults of every device of a station, by device name."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     devices: Mapping[str, DeviceFaults] = {}
     others: DeviceFaults = DeviceFaults()

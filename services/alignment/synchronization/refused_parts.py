@@ -9,8 +9,9 @@ from collections.abc import Mapping
 from typing import Literal, get_args
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, FiniteFloat
+from pydantic import FiniteFloat
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Matrix, matrix_rows
 from services.alignment.synchronization.resampling import runs_of
 
@@ -21,14 +22,12 @@ _KEY = re.compile(rf"refused_({'|'.join(get_args(RefusedReason))})(?:_(\w+))?_s"
 NS_PER_S = 1e9
 
 
-class RefusedPart(BaseModel):
+class RefusedPart(FrozenModel):
     """A stretch of the recording that is not in the episode.
 
     `start_s` and `stop_s` count from the recording's start; `stream` is the one to blame, None
     where none is.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start_s: FiniteFloat
     stop_s: FiniteFloat

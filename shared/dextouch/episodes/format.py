@@ -6,9 +6,10 @@ import re
 from collections.abc import Mapping
 from typing import Annotated, Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ID_PATTERN
 from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor
 
@@ -36,14 +37,12 @@ STAMPS: Mapping[Kind, tuple[str, ...]] = {
 }
 
 
-class ArrayEntry(BaseModel):
+class ArrayEntry(FrozenModel):
     """Entry of one array in the commit record.
 
     `sha256` covers the decoded bytes; for image codecs, the concatenated encoded storage chunks.
     `encoder` names the encoder of the images and its settings.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     dtype: Literal["uint8", "uint16", "int64", "float32", "float64"]
     shape: tuple[Size, ...] = Field(min_length=1)
@@ -54,10 +53,8 @@ class ArrayEntry(BaseModel):
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class CommitRecord(BaseModel):
+class CommitRecord(FrozenModel):
     """Manifest of an episode or a recording; without it the group is not committed."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: Literal[2] = FORMAT_VERSION
     kind: Kind

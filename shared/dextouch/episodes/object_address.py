@@ -7,16 +7,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import parse_qsl, unquote, urlsplit
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from dextouch.data_folder import data_folder
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.frozen_model import FrozenModel
 
 MIB = 1 << 20
 _SECRETS = frozenset({"access_key_id", "secret_access_key", "session_token"})
 
 
-class ObjectOptions(BaseModel):
+class ObjectOptions(FrozenModel):
     """Connection options of a bucket; None leaves an option to obstore's AWS_* environment.
 
     Attributes:
@@ -31,8 +32,6 @@ class ObjectOptions(BaseModel):
         cache_bytes: size of the in-memory block cache; 0 disables it.
         work_folder: where groups are written before they are uploaded.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     endpoint: str | None = None
     region: str | None = None

@@ -10,10 +10,11 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from dextouch.episodes.format import GOP_IMAGES
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
+from dextouch.frozen_model import FrozenModel
 
 if TYPE_CHECKING:
     from av.video.frame import VideoFrame
@@ -27,10 +28,8 @@ _TO_YUV = 0x20 | 0x4000
 _TO_RGB = "BICUBIC"
 
 
-class VideoSettings(BaseModel):
+class VideoSettings(FrozenModel):
     """H.264 encoder settings; a lower `crf` gives better quality and larger files."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     crf: int = Field(default=25, ge=1, le=51)
     preset: str = Field(default="ultrafast", pattern="^[a-z]+$")

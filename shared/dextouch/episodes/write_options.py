@@ -2,14 +2,13 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from dextouch.episodes.video import VideoSettings
+from dextouch.frozen_model import FrozenModel
 
 WhenFull = Literal["wait", "drop"]
 
 
-class WriteOptions(BaseModel):
+class WriteOptions(FrozenModel):
     """Settings of a writer.
 
     Attributes:
@@ -24,8 +23,6 @@ class WriteOptions(BaseModel):
             over, such as an import.
         video: quality of `h264` streams.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sync: bool = False
     threads: bool = True

@@ -8,12 +8,12 @@ from jaxtyping import Float64
 from pydantic import (
     AwareDatetime,
     BaseModel,
-    ConfigDict,
     Field,
     FiniteFloat,
     field_validator,
 )
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import AnchorPoses
 from dextouch.streams import StreamDescriptor
 
@@ -48,10 +48,8 @@ def _check_matrix(rows: Matrix, shape: tuple[int, int]) -> Matrix:
     return rows
 
 
-class StoredAnchor(BaseModel):
+class StoredAnchor(FrozenModel):
     """Absolute poses of step 0, the anchor of an episode's actions, as 4×4 matrices."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     T_world_wrist_left: Matrix
     T_world_wrist_right: Matrix
@@ -84,17 +82,15 @@ class StoredAnchor(BaseModel):
         )
 
 
-class LineageEntry(BaseModel):
+class LineageEntry(FrozenModel):
     """A source of derived data, by id and content hash."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["recording", "episode", "checkpoint", "rollout"]
     id: str
     sha256: str | None = Field(default=None, pattern=r"^[0-9a-f]{64}$")
 
 
-class ClockReport(BaseModel):
+class ClockReport(FrozenModel):
     """Quality of the clock fit of one stream against the reference clock.
 
     `method` is the source of the time stamps, None where unknown. `latency_ms` is the constant path
@@ -102,8 +98,6 @@ class ClockReport(BaseModel):
     `num_steps` counts jumps and stops of the device's clock, where the fit was split; `warnings`
     are reasons to doubt the times.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
     method: ClockMethod | None = None
@@ -117,7 +111,7 @@ class ClockReport(BaseModel):
     warnings: tuple[ClockWarning, ...] = ()
 
 
-class EpisodeAttributes(BaseModel):
+class EpisodeAttributes(FrozenModel):
     """Metadata of an episode.
 
     `anchor` and `K_head` (pixels) belong to step 0; `streams` is completed by the writer;
@@ -128,8 +122,6 @@ class EpisodeAttributes(BaseModel):
     reached are absent. If empty, these two are not written, so that older releases can read the
     episode.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: Literal[1] = FORMAT_VERSION
     episode_id: StoreId
@@ -150,9 +142,9 @@ class EpisodeAttributes(BaseModel):
     object_names: tuple[str, ...] = ()
     object_boxes_m: tuple[Box, ...] = Field(default=(), exclude_if=not_)
     event_times_s: dict[str, NonNegativeFinite] = Field(default={}, exclude_if=not_)
-    calibration: dict[str, Matrix] = {}
+    calibration: dict[str, Matrix] = Field(default={})
     clocks: tuple[ClockReport, ...] = ()
-    quality: dict[str, FiniteFloat] = {}
+    quality: dict[str, FiniteFloat] = Field(default={})
     created_at: AwareDatetime | None = None
     streams: tuple[StreamDescriptor, ...] = ()
 
@@ -166,10 +158,8 @@ class EpisodeAttributes(BaseModel):
         return np.array(self.K_head)
 
 
-class EpisodeSummary(BaseModel):
+class EpisodeSummary(FrozenModel):
     """One row of the catalog; `duration_s` is that of the model grid, or of the longest stream."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     episode_id: StoreId
     task: str
@@ -185,23 +175,19 @@ class EpisodeSummary(BaseModel):
     content_sha256: str
 
 
-class EpisodeList(BaseModel):
+class EpisodeList(FrozenModel):
     """One page of the catalog and how many episodes match in all.
 
     `next_after` is the cursor of the next page; None on the last page.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     episodes: tuple[EpisodeSummary, ...]
     num_matching: int
     next_after: str | None = None
 
 
-class HoursRow(BaseModel):
+class HoursRow(FrozenModel):
     """Total duration of one task in one domain from one origin."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     task: str
     domain: Domain
@@ -211,30 +197,24 @@ class HoursRow(BaseModel):
     hours: float
 
 
-class CatalogHours(BaseModel):
+class CatalogHours(FrozenModel):
     """Hours by task, domain and origin, in this order, and their sum."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rows: tuple[HoursRow, ...]
     num_episodes: int
     hours: float
 
 
-class EpisodeDetail(BaseModel):
+class EpisodeDetail(FrozenModel):
     """An episode's attributes with its length and hash."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     attributes: EpisodeAttributes
     num_steps: int
     content_sha256: str
 
 
-class Verification(BaseModel):
+class Verification(FrozenModel):
     """Result of a successful `verify`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_arrays: int
     num_bytes: int

@@ -2,23 +2,19 @@
 
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict
+from dextouch.frozen_model import FrozenModel
 
 
-class Health(BaseModel):
+class Health(FrozenModel):
     """Liveness: the process responds."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     status: Literal["ok"] = "ok"
     service: str
     version: str
 
 
-class Readiness(BaseModel):
+class Readiness(FrozenModel):
     """Readiness for requests; `waiting_for` names what is missing (empty when ready)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     ready: bool
     service: str

@@ -2,8 +2,9 @@
 
 from typing import Literal
 
-from pydantic import AwareDatetime, BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import AwareDatetime, Field, FiniteFloat
 
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas.episodes import (
     FORMAT_VERSION,
     Domain,
@@ -17,10 +18,8 @@ from dextouch.streams import StreamDescriptor
 ID_TAKEN = "id_taken"
 
 
-class LedgerEntry(BaseModel):
+class LedgerEntry(FrozenModel):
     """One kind of fault that a station noticed in one stream, and how often."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     stream: str
     event: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
@@ -28,15 +27,13 @@ class LedgerEntry(BaseModel):
     first_t_host_ns: int | None = None
 
 
-class RecordingAttributes(BaseModel):
+class RecordingAttributes(FrozenModel):
     """Metadata of a raw take.
 
     `started_t_host_ns` is the station's monotonic clock at `started_at`; `calibration` holds named
     matrices (`K_head`, `T_tracker_left_wrist_left`, …); `ledger` the counted faults; `quality`
     named figures; `recovered` marks a take that the station did not finish.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: Literal[1] = FORMAT_VERSION
     recording_id: StoreId
@@ -50,10 +47,10 @@ class RecordingAttributes(BaseModel):
     started_t_host_ns: int | None = None
     success: bool | None = None
     recovered: bool = False
-    calibration: dict[str, Matrix] = {}
+    calibration: dict[str, Matrix] = Field(default={})
     lineage: tuple[LineageEntry, ...] = ()
     ledger: tuple[LedgerEntry, ...] = ()
-    quality: dict[str, FiniteFloat] = {}
+    quality: dict[str, FiniteFloat] = Field(default={})
     streams: tuple[StreamDescriptor, ...] = ()
 
     def as_interrupted(self) -> "RecordingAttributes":
@@ -62,20 +59,16 @@ class RecordingAttributes(BaseModel):
         return self.model_copy(update={"ledger": (*self.ledger, *marks), "recovered": True})
 
 
-class RecordingStatus(BaseModel):
+class RecordingStatus(FrozenModel):
     """Progress of an upload: the batch number that each stream expects next."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: StoreId
     state: Literal["open", "finished"]
-    next_batch: dict[str, int] = {}
+    next_batch: dict[str, int] = Field(default={})
 
 
-class BatchReceipt(BaseModel):
+class BatchReceipt(FrozenModel):
     """Acknowledgement of a batch; `replayed` if it was stored before."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: StoreId
     stream: str
@@ -84,23 +77,19 @@ class BatchReceipt(BaseModel):
     replayed: bool
 
 
-class FinishRecording(BaseModel):
+class FinishRecording(FrozenModel):
     """The end of an upload: number of batches per stream, and attributes known only at the end."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_batches: dict[str, int]
     success: bool | None = None
     ledger: tuple[LedgerEntry, ...] = ()
 
 
-class RecordingSummary(BaseModel):
+class RecordingSummary(FrozenModel):
     """One row of the list of recordings.
 
     `duration_s` is that of the longest stream at its nominal rate; `num_bytes` the size on disk.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: StoreId
     task: str
@@ -117,23 +106,19 @@ class RecordingSummary(BaseModel):
     content_sha256: str
 
 
-class RecordingList(BaseModel):
+class RecordingList(FrozenModel):
     """One page of the finished recordings, by id, and how many there are in all.
 
     `next_after` is the cursor of the next page; None on the last page.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recordings: tuple[RecordingSummary, ...]
     num_matching: int
     next_after: str | None = None
 
 
-class UploadSummary(BaseModel):
+class UploadSummary(FrozenModel):
     """An unfinished upload and how long it has been idle."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     recording_id: StoreId
     station: str
@@ -142,17 +127,13 @@ class UploadSummary(BaseModel):
     idle_s: float = Field(ge=0)
 
 
-class UploadList(BaseModel):
+class UploadList(FrozenModel):
     """Unfinished uploads, by id."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     uploads: tuple[UploadSummary, ...]
 
 
-class ExpireUploads(BaseModel):
+class ExpireUploads(FrozenModel):
     """Request to drop every upload that has been idle for at least `idle_s`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     idle_s: float = Field(ge=0, allow_inf_nan=False)

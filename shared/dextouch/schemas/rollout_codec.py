@@ -6,9 +6,10 @@ from typing import TypeVar
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from dextouch.errors import DegenerateRotationError, InvalidInputError, ShapeError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import AnchorPoses
 from dextouch.schemas.problems import first_problems
 from dextouch.schemas.rollouts import (
@@ -27,10 +28,8 @@ RIGID_TOLERANCE = 1e-6
 ModelT = TypeVar("ModelT", bound=BaseModel)
 
 
-class ObservationFields(BaseModel):
+class ObservationFields(FrozenModel):
     """The non-array fields of an observation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     first_step: int
     reached_is_measured: bool
@@ -38,20 +37,16 @@ class ObservationFields(BaseModel):
     doubt: Doubt | None = Field(default=None, exclude_if=lambda doubt: doubt is None)
 
 
-class AnswerFields(BaseModel):
+class AnswerFields(FrozenModel):
     """The fields of a response with an observation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     rollout: RolloutInfo
     observation: ObservationFields
-    info: dict[str, float] = {}
+    info: dict[str, float] = Field(default={})
 
 
-class StartFields(BaseModel):
+class StartFields(FrozenModel):
     """The fields of a start request with an observation."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     start: StartRequest
     observation: ObservationFields | None = None

@@ -6,9 +6,10 @@ from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from dextouch.errors import DegenerateRotationError, NonFiniteError, ShapeError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses
 
 ActionKind = Literal["measured", "commanded"]
@@ -18,14 +19,12 @@ MAX_SEED = 2**63 - 1
 QUATERNION_TOLERANCE: Final = 1e-3
 
 
-class WorldDescription(BaseModel):
+class WorldDescription(FrozenModel):
     """Capabilities of a world, exchanged before a rollout.
 
     `object_names` lists, by task, the objects whose poses are in its observations; empty for a
     world without object poses.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str
     kind: WorldKind
@@ -40,17 +39,15 @@ class WorldDescription(BaseModel):
     chunk_multiple: int = 4
     max_chunk_steps: int = 64
     knows_success: bool = False
-    object_names: dict[str, tuple[str, ...]] = {}
+    object_names: dict[str, tuple[str, ...]] = Field(default={})
 
 
-class ReturnSelector(BaseModel):
+class ReturnSelector(FrozenModel):
     """Requested part of an observation.
 
     `cameras` None means all cameras of the world, an empty list none; in a query, where an empty
     list cannot be written, none is `cameras=`.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cameras: tuple[str, ...] | None = None
     steps: Literal["last", "all"] = "all"
@@ -69,7 +66,7 @@ class ReturnSelector(BaseModel):
 EVERYTHING: Final = ReturnSelector()
 
 
-class Doubt(BaseModel):
+class Doubt(FrozenModel):
     """Uncertainty of an imagining world about its prediction.
 
     Both numbers are non-negative, and comparable within one world digest only.
@@ -80,8 +77,6 @@ class Doubt(BaseModel):
         outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
         reason: why it is outside; None otherwise.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     disagreement: float = Field(ge=0, allow_inf_nan=False)
     distance: float = Field(ge=0, allow_inf_nan=False)
@@ -160,18 +155,14 @@ class RolloutStart:
     K_head: Float64[np.ndarray, "3 3"] | None = None
 
 
-class WorldList(BaseModel):
+class WorldList(FrozenModel):
     """Response of GET /v1/worlds."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     worlds: tuple[WorldDescription, ...]
 
 
-class StartRequest(BaseModel):
+class StartRequest(FrozenModel):
     """The fields of POST /v1/rollouts; an observation to start from is sent as arrays."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     world: str
     task: str
@@ -180,21 +171,17 @@ class StartRequest(BaseModel):
     action_kind: ActionKind = "commanded"
 
 
-class ForkRequest(BaseModel):
+class ForkRequest(FrozenModel):
     """The body of POST /v1/rollouts/{id}/fork; a new seed gives the branch its own noise."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int | None = Field(default=None, ge=0, le=MAX_SEED)
 
 
-class RolloutInfo(BaseModel):
+class RolloutInfo(FrozenModel):
     """State of a rollout; `next_chunk` is the only chunk number accepted next.
 
     `ended` is why its world cannot continue it, omitted while it can.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     id: str
     world: str

@@ -9,8 +9,6 @@ from typing import Annotated, Any, Literal, TypeVar
 from fastapi import FastAPI
 from pydantic import (
     AfterValidator,
-    BaseModel,
-    ConfigDict,
     Field,
     SecretStr,
     ValidationError,
@@ -20,6 +18,7 @@ from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsC
 
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
 
 MIN_KEY_CHARACTERS = 16
@@ -77,10 +76,8 @@ Origin = Annotated[str, AfterValidator(canonical_origin)]
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
 
 
-class ApiKey(BaseModel):
+class ApiKey(FrozenModel):
     """A key and its scopes; `name` appears in logs, the key never."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")
     key: SecretStr = Field(min_length=MIN_KEY_CHARACTERS)

@@ -4,7 +4,9 @@ import math
 from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from dextouch.frozen_model import FrozenModel
 
 # Batches and windows add an axis to those of a sample, and a packed array has at most eight.
 MAX_SAMPLE_AXES = 7
@@ -17,10 +19,8 @@ MAX_STREAMS = 100
 StreamKind = Literal["tactile", "keypoints", "pose", "image", "robot_state", "scalar"]
 
 
-class ClockCapabilities(BaseModel):
+class ClockCapabilities(FrozenModel):
     """Time stamps and sequence numbers that a device provides; timing quality depends on them."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     crc: bool = False
     sequence: bool = False
@@ -30,15 +30,13 @@ class ClockCapabilities(BaseModel):
     device_time_bits: int = Field(default=64, ge=16, le=64)
 
 
-class StreamDescriptor(BaseModel):
+class StreamDescriptor(FrozenModel):
     """One stream of a recording or an episode.
 
     `shape` is that of one sample's payload, at most MAX_SAMPLE_BYTES; `unit` that of its values
     (`counts`, `kPa`, `m`, `rad`, `pose_m_wxyz`, `rgb8`, …); `frame` their coordinate system, if
     any.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")
     kind: StreamKind

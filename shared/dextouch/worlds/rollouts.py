@@ -16,7 +16,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 import structlog
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from dextouch.errors import (
     ConflictError,
@@ -24,6 +24,7 @@ from dextouch.errors import (
     LimitExceededError,
     UnknownNameError,
 )
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import (
     MAX_SEED,
     ReturnSelector,
@@ -42,10 +43,8 @@ from dextouch.worlds.world import StartedRollout, World
 logger = structlog.get_logger(__name__)
 
 
-class RolloutLimits(BaseModel):
+class RolloutLimits(FrozenModel):
     """Limits of this installation; every chunk renews `ttl_s`."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     max_rollouts: int = Field(default=64, ge=1, description="open at the same time")
     max_chunks: int = Field(default=1000, ge=1, description="of one rollout")

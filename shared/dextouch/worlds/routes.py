@@ -7,10 +7,11 @@ from typing import Annotated, TypeVar
 import numpy as np
 from fastapi import APIRouter, Depends, Query, Request, Response
 from jaxtyping import Shaped
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ValidationError
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import ACTION_DIM
 from dextouch.schemas import (
     ForkRequest,
@@ -45,10 +46,8 @@ MAX_CHUNK_BYTES = 2**20
 BodyT = TypeVar("BodyT", bound=BaseModel)
 
 
-class ActionsBody(BaseModel):
+class ActionsBody(FrozenModel):
     """A chunk as JSON: rows of 67 numbers."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     actions: list[list[float]]
 

@@ -4,24 +4,23 @@ import json
 from pathlib import Path
 from typing import Final, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from dextouch.bridges.lerobot.layout import SIDECAR_PATH, confined, fill_path
 from dextouch.bridges.lerobot.rows import Grid
 from dextouch.episodes import disk_errors
 from dextouch.errors import CorruptDataError
+from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import ActionKind, EpisodeAttributes
 
 MAX_SIDECAR_BYTES: Final = 1 << 22
 
 
-class Sidecar(BaseModel):
+class Sidecar(FrozenModel):
     """An episode's attributes, its content hash, and how its frames were made.
 
     `cameras` says whether a camera's video was `remuxed` (bytes unchanged) or `encoded` again.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     sidecar_version: Literal[1] = 1
     episode_index: int = Field(ge=0)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 
 from dextouch.bridges.umi.layout import (
     ATTRIBUTES_KEY,
@@ -21,6 +21,7 @@ from dextouch.bridges.umi.layout import (
 from dextouch.bridges.umi.zarr_zip import ZarrZipReader
 from dextouch.episodes import EpisodeStore, EpisodeWriter
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, StorageError
+from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import pose_from_transform
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import EpisodeAttributes, LineageEntry
@@ -31,16 +32,12 @@ MAX_STEPS: Final = 100_000
 _BLOCK_BYTES: Final = 1 << 26
 
 
-class _Episode(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+class _Episode(FrozenModel):
     attributes: EpisodeAttributes
     content_sha256: str = Field(pattern=r"^[0-9a-f]{64}$")
 
 
-class _Meta(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
+class _Meta(FrozenModel):
     layout_version: int
     cameras: tuple[str, ...]
     episodes: tuple[_Episode, ...] = Field(max_length=MAX_EPISODES)

@@ -31,6 +31,7 @@ from dextouch.errors import (
     NotFoundError,
     StorageError,
 )
+from dextouch.frozen_model import FrozenModel
 
 ZSTD_LEVEL: Final = 1
 MAX_CHUNK_BYTES: Final = 1 << 27
@@ -48,10 +49,8 @@ class _Codec(BaseModel):
     id: str
 
 
-class ArrayMetadata(BaseModel):
+class ArrayMetadata(FrozenModel):
     """`.zarray` of one array; only the features modelled here are supported."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     zarr_format: Literal[2] = 2
     shape: tuple[Annotated[int, Field(ge=0, le=MAX_ROWS)], ...] = Field(min_length=1, max_length=6)
