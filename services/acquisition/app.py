@@ -7,9 +7,10 @@ from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.episodes import disk_errors
-from dextouch.serving import create_service_app
+from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
+from services.acquisition.memory import keep_for_life
 from services.acquisition.routes import recorder_router, station_router
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.station import Station
@@ -142,3 +143,14 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         lifespan=lifespan,
         readiness=missing,
     )
+
+
+def main(argv: Sequence[str]) -> int:
+    """Run a station until SIGINT or SIGTERM."""
+
+    def create(settings: AcquisitionSettings) -> FastAPI:
+        app = create_app(settings)
+        keep_for_life()
+        return app
+
+    return serve("acquisition", AcquisitionSettings, create, argv)

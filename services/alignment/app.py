@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
-from dextouch.serving import create_service_app
+from dextouch.serving import create_service_app, serve
 from services.alignment.job_runner import JobRunner
 from services.alignment.new_recordings import NewRecordings
 from services.alignment.routes import alignments_router
@@ -44,3 +44,8 @@ def create_app(settings: AlignmentSettings) -> FastAPI:
         lifespan=lifespan,
         readiness=readiness,
     )
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serve the alignment service until SIGINT or SIGTERM."""
+    return serve("alignment", AlignmentSettings, create_app, argv)

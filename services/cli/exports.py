@@ -221,12 +221,17 @@ def _import(options: argparse.Namespace) -> Report:
     return {"format": options.format, "store": options.store, "ids": ids}
 
 
-def main(argv: Sequence[str]) -> int:
-    """Run `dextouch export` or `dextouch import`, selected by the first argument."""
-    word, *rest = argv
-    options = (_export_parser() if word == "export" else _import_parser()).parse_args(rest)
-    report = _export(options) if word == "export" else _import(options)
-    write_result(options.json, report)
+def export_main(argv: Sequence[str]) -> int:
+    """Run `dextouch export`."""
+    options = _export_parser().parse_args(list(argv))
+    write_result(options.json, _export(options))
+    return 0
+
+
+def import_main(argv: Sequence[str]) -> int:
+    """Run `dextouch import`."""
+    options = _import_parser().parse_args(list(argv))
+    write_result(options.json, _import(options))
     return 0
 
 

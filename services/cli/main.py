@@ -2,7 +2,7 @@
 
 import importlib
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 from dextouch import __version__
@@ -12,68 +12,94 @@ from services.cli.extras import missing_package
 
 
 class Command(NamedTuple):
-    """A command: the module whose `main(argv)` runs it, and its summary.
+    """A command: its summary, and `module:function` that runs it; a bare group has none."""
 
-    `before` holds words inserted before the arguments.
-    """
-
-    module: str
     does: str
-    before: tuple[str, ...] = ()
+    target: str = ""
 
 
 COMMANDS = {
-    "demo": Command("services.cli.demo", "record, align, imagine and score on this machine"),
-    "up": Command("services.cli.up", "run every service in one process, with a dashboard"),
-    "doctor": Command("services.cli.doctor", "check what this machine can do and what is missing"),
+    "demo": Command("record, align, imagine and score on this machine", "services.cli.demo:main"),
+    "up": Command("run every service in one process, with a dashboard", "services.cli.up:main"),
+    "doctor": Command(
+        "check what this machine can do and what is missing", "services.cli.doctor:main"
+    ),
     "twin": Command(
-        "services.twin.__main__", "record true episodes in the physics twin, or serve it"
+        "record true episodes in the physics twin, or serve it", "services.twin.command_line:main"
     ),
-    "station": Command("services.acquisition.__main__", "record and calibrate a station's devices"),
+    "twin serve": Command("serve the twin as a world", "services.twin.serving:serve"),
+    "station": Command("record and calibrate a station's devices"),
+    "station serve": Command(
+        "record gloves, trackers and cameras", "services.acquisition.app:main"
+    ),
+    "station calibrate": Command(
+        "measure tare and gain, lenses and mounts", "services.cli.calibrate:main"
+    ),
     "store": Command(
-        "services.episode_store.__main__",
         "list, show, verify, repair, migrate, delete, restore, purge, serve",
+        "services.episode_store.command_line:main",
     ),
+    "store serve": Command("serve the store over HTTP", "services.episode_store.app:main"),
     "export": Command(
-        "services.cli.exports", "write LeRobot, MCAP, Rerun or UMI files from a store", ("export",)
+        "write LeRobot, MCAP, Rerun or UMI files from a store", "services.cli.exports:export_main"
     ),
     "import": Command(
-        "services.cli.exports", "read LeRobot, MCAP or UMI files into a store", ("import",)
+        "read LeRobot, MCAP or UMI files into a store", "services.cli.exports:import_main"
     ),
-    "align": Command("services.alignment.__main__", "turn recordings into synchronized episodes"),
-    "train": Command("services.cli.train", "train the world model, a policy or the success probe"),
+    "align": Command(
+        "turn recordings into synchronized episodes", "services.alignment.command_line:main"
+    ),
+    "align serve": Command("serve alignment over HTTP", "services.alignment.app:main"),
+    "train": Command("train the world model, a policy or the success probe"),
+    "train data": Command(
+        "record the twin episodes that all training uses", "services.cli.training_data:main"
+    ),
+    "train world-model": Command(
+        "train the joint visuo-tactile flow-matching model",
+        "services.world_model.command_line:run_train",
+    ),
+    "train state": Command(
+        "train the state model: start readers and recurrent cores",
+        "services.world_model.command_line:run_train_state",
+    ),
+    "train imagined": Command(
+        "imagine these episodes with the world model", "services.cli.imagined_data:main"
+    ),
+    "train policy": Command(
+        "train a closed-loop policy on the demonstrations",
+        "services.evaluation.command_line:run_train_policy",
+    ),
+    "train probe": Command(
+        "train the success probe on true and imagined episodes",
+        "services.evaluation.command_line:run_train_probe",
+    ),
+    "train direct-judge": Command(
+        "train its baseline, for `python -m benchmarks evaluator --direct`",
+        "services.evaluation.command_line:run_train_direct_judge",
+    ),
     "checkpoint": Command(
-        "services.world_model.__main__",
         "show the provenance and accuracy of a world model",
-        ("show",),
+        "services.world_model.command_line:run_show",
     ),
     "serve": Command(
-        "services.world_model.__main__", "serve the world model's rollouts", ("serve",)
+        "serve the world model's rollouts", "services.world_model.command_line:run_serve"
     ),
     "evaluate": Command(
-        "services.evaluation.__main__", "score policies in real and imagined worlds", ("run",)
+        "score policies in real and imagined worlds",
+        "services.evaluation.command_line:run_evaluation",
     ),
-    "dashboard": Command("services.dashboard.__main__", "serve the operators' page"),
+    "dashboard": Command("serve the operators' page", "services.dashboard.app:main"),
 }
 
-# Subcommands of a group whose module has none; without one, the group runs its module.
-INNER_COMMANDS = {
-    ("station", "serve"): Command(
-        "services.acquisition.__main__", "record gloves, trackers and cameras"
-    ),
-    ("station", "calibrate"): Command(
-        "services.cli.calibrate", "measure tare and gain, lenses and mounts"
-    ),
-}
-
+# Groups that serve when no command is named, as earlier versions did.
+SERVING_GROUPS = ("station", "store", "align")
 EXIT_USAGE = 2
 EXIT_REFUSED = 3
 
 
 def usage() -> str:
     """The text of `dextouch --help`."""
-    named = {**COMMANDS, **{" ".join(words): inner for words, inner in INNER_COMMANDS.items()}}
-    rows = [f"  {name:<19}{command.does}" for name, command in named.items()]
+    rows = [f"  {name:<19}{command.does}" for name, command in COMMANDS.items() if " " not in name]
     return "\n".join(
         [
             "usage: dextouch COMMAND [options]",
@@ -93,41 +119,61 @@ def usage() -> str:
     )
 
 
+def commands_of(group: str) -> dict[str, Command]:
+    """The commands of a group that have a row in `COMMANDS`, by their last word."""
+    names = {name: name.partition(" ") for name in COMMANDS}
+    return {
+        word: COMMANDS[name] for name, (first, _, word) in names.items() if first == group and word
+    }
+
+
 def group_usage(group: str) -> str:
-    """The help of a group of `INNER_COMMANDS`."""
-    inner = {word: entry for (name, word), entry in INNER_COMMANDS.items() if name == group}
-    rows = [f"  {word:<11}{command.does}" for word, command in inner.items()]
+    """The help of a group whose commands all have a row in `COMMANDS`."""
+    inner = commands_of(group)
     return "\n".join(
         [
             f"usage: dextouch {group} COMMAND [options]",
             "",
-            *rows,
+            *(f"  {word:<14}{command.does}" for word, command in inner.items()),
             "",
             f"Help for one of them: dextouch {group} {next(iter(inner))} --help",
         ]
     )
 
 
-def find_command(name: str, rest: Sequence[str]) -> tuple[str, Command, list[str]]:
-    """Resolve a command.
-
-    Args:
-        name: name in `COMMANDS`.
-        rest: remaining arguments.
-
-    Returns:
-        Full name of the command, the command, and its arguments.
+def find_command(words: Sequence[str]) -> tuple[str, list[str]]:
+    """Name of the command that a command line runs, and its arguments.
 
     Raises:
-        UnknownNameError: an unknown subcommand.
+        UnknownNameError: no such command.
     """
-    inner = {word: command for (outer, word), command in INNER_COMMANDS.items() if outer == name}
-    first = rest[0] if rest else ""
-    if first in inner:
-        return f"{name} {first}", inner[first], list(rest[1:])
-    if inner and first and not first.startswith("-"):
-        raise UnknownNameError("word", first, list(inner))
-    return name, COMMANDS[name], list(rest)
+    first, second = words[0], words[1] if len(words) > 1 else ""
+    if first not in {name.partition(" ")[0] for name in COMMANDS}:
+        raise UnknownNameError("command", first, [name for name in COMMANDS if " " not in name])
+    if f"{first} {second}" in COMMANDS:
+        return f"{first} {second}", list(words[2:])
+    is_bare = not second or (second.startswith("--") and second != "--help")
+    if first in SERVING_GROUPS and is_bare:
+        return f"{first} serve", list(words[1:])
+    if not COMMANDS[first].target and second not in {"", "-h", "--help"}:
+        raise UnknownNameError(f"dextouch {first} command", second, list(commands_of(first)))
+    return first, list(words[1:])
+
+
+def run_command(words: Sequence[str]) -> int:
+    """Run a command line without the program's name, and return its exit status.
+
+    Raises:
+        DexTouchError: what the command refuses.
+        ModuleNotFoundError: it needs a package that is not installed.
+    """
+    name, arguments = find_command(words)
+    module, _, function = COMMANDS[name].target.partition(":")
+    if not module:
+        print(group_usage(name))
+        return 0
+    command: Callable[[list[str]], int | None] = getattr(importlib.import_module(module), function)
+    return command(arguments) or 0
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -136,30 +182,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         Its exit status; 2 for an unknown command, 3 for a refusal with its reason on stderr.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if not arguments or arguments[0] in {"-h", "--help", "help"}:
+    words = list(sys.argv[1:] if argv is None else argv)
+    if not words or words[0] in {"-h", "--help", "help"}:
         print(usage())
         return 0
-    if arguments[0] == "--version":
+    if words[0] == "--version":
         print(f"dextouch {__version__}")
         return 0
-    name, *rest = arguments
-    if name not in COMMANDS:
-        print(f"dextouch: unknown command {name!r}\n\n{usage()}", file=sys.stderr)
-        return EXIT_USAGE
-    if rest in (["-h"], ["--help"]) and any(group == name for group, _ in INNER_COMMANDS):
-        print(group_usage(name))
-        return 0
-    return _run(name, rest)
-
-
-def _run(name: str, rest: list[str]) -> int:
-    """Run one command; a refusal or a missing package is printed as one line."""
     try:
-        name, command, rest = find_command(name, rest)
-        module = importlib.import_module(command.module)
-        with messages_aside(rest):
-            return int(module.main([*command.before, *rest]) or 0)
+        name, _ = find_command(words)
+    except UnknownNameError as error:
+        print(f"dextouch: {error.message}; see dextouch --help", file=sys.stderr)
+        return EXIT_USAGE
+    try:
+        with messages_aside(words):
+            return run_command(words)
     except ModuleNotFoundError as error:
         refusal = missing_package(error)
         if refusal is None:

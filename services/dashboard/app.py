@@ -1,14 +1,14 @@
 """Application factory of the dashboard."""
 
 import asyncio
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Mapping, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 
 from fastapi import FastAPI
 from fastapi.staticfiles import StaticFiles
 
-from dextouch.serving import AccessControl, create_service_app
+from dextouch.serving import AccessControl, create_service_app, serve
 from services.dashboard.feeds import Feeds
 from services.dashboard.pages import page_router, refusal_page
 from services.dashboard.routes import api_router, live_router
@@ -68,3 +68,8 @@ def create_app(
     app.state.refusal_page = refusal_page
     app.mount("/static", StaticFiles(directory=STATIC), name="static")
     return app
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serve the dashboard until SIGINT or SIGTERM."""
+    return serve("dashboard", DashboardSettings, create_app, argv)

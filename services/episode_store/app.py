@@ -1,7 +1,7 @@
 """Application factory of the episode store."""
 
 import threading
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
 import structlog
@@ -9,7 +9,7 @@ from fastapi import FastAPI
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import StorageError
-from dextouch.serving import create_service_app
+from dextouch.serving import create_service_app, serve
 from services.episode_store.admission import Admission, DiskReserve
 from services.episode_store.catalog import Catalog
 from services.episode_store.commit_process import CommitProcess
@@ -122,3 +122,8 @@ def _warm_up(catalog: Catalog) -> None:
         catalog.warm_up()
     except StorageError as error:
         logger.warning("warm_up_failed", reason=error.message)
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serve the store until SIGINT or SIGTERM."""
+    return serve("episode_store", EpisodeStoreSettings, create_app, argv)

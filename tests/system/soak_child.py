@@ -123,7 +123,7 @@ def main(spool, store_url, seed, first_take, end_take, seconds):
     )
     with mock, EpisodeStoreClient(store_url) as client:
         uploader = Uploader(root, client, period_s=1.0)
-        # As `python -m services.acquisition` does.
+        # As `dextouch station serve` does.
         keep_for_life()
         assert {pair.device.name for pair in mock.pairs} == set(NAMES)
         for _ in range(num_takes):

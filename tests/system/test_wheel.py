@@ -21,11 +21,10 @@ import dextouch, services
 absent = []
 for package in (dextouch, services):
     for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
-        if not module.name.endswith("__main__"):
-            try:
-                importlib.import_module(module.name)
-            except ModuleNotFoundError as error:
-                absent.append([module.name, error.name])
+        try:
+            importlib.import_module(module.name)
+        except ModuleNotFoundError as error:
+            absent.append([module.name, error.name])
 print(json.dumps(absent))
 """
 

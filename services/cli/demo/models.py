@@ -9,8 +9,8 @@ import torch
 
 from dextouch.errors import ConflictError
 from dextouch.worlds import BatchWorld
-from services.cli import train
 from services.cli.demo.settings import TASKS
+from services.cli.main import run_command
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
@@ -97,17 +97,21 @@ def train_models(folder: Path) -> Models:
     )
     world_model = folder / "state.safetensors"
     policy, probe = folder / "behaviour_cloning.safetensors", folder / "success_probe.safetensors"
-    train.main(["data", "--store", episodes, *DEMONSTRATIONS])
-    train.main(["data", "--store", exact, *EXACT_DATA])
-    train.main(["data", "--store", endings, *ENDINGS])
-    train.main(["data", "--store", unseen, *UNSEEN_ENDINGS])
+    run_command(["train", "data", "--store", episodes, *DEMONSTRATIONS])
+    run_command(["train", "data", "--store", exact, *EXACT_DATA])
+    run_command(["train", "data", "--store", endings, *ENDINGS])
+    run_command(["train", "data", "--store", unseen, *UNSEEN_ENDINGS])
     both = ["--episodes", episodes, "--episodes", endings, "--output", str(world_model)]
-    train.main(["state", *both, f"--tasks={','.join(TASKS)}", *SMALL_STATE_MODEL])
-    train.main(["policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)])
+    run_command(["train", "state", *both, f"--tasks={','.join(TASKS)}", *SMALL_STATE_MODEL])
+    run_command(
+        ["train", "policy", "--episodes", exact, "--episodes", episodes, "--output", str(policy)]
+    )
     of_world = ["--checkpoint", str(world_model)]
-    train.main(["imagined", "--episodes", endings, "--store", imagined, *of_world])
+    run_command(["train", "imagined", "--episodes", endings, "--store", imagined, *of_world])
     true_and_imagined = ["--episodes", endings, "--episodes", imagined]
-    train.main(["probe", *true_and_imagined, "--held-out", unseen, "--output", str(probe)])
+    run_command(
+        ["train", "probe", *true_and_imagined, "--held-out", unseen, "--output", str(probe)]
+    )
     return _load(world_model, policy, probe)
 
 

@@ -4,6 +4,7 @@ import argparse
 import inspect
 import ipaddress
 import re
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, TypeVar
 
 from fastapi import FastAPI
@@ -20,6 +21,7 @@ from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
+from dextouch.serving.logs import configure_logging
 
 MIN_KEY_CHARACTERS = 16
 # Keep-alive, so that a policy may take this long between two chunks.
@@ -141,6 +143,9 @@ class ServiceSettings(BaseSettings):
         return self
 
 
+ServiceT = TypeVar("ServiceT", bound=ServiceSettings)
+
+
 def service_config(service: str, command: str | None = None) -> SettingsConfigDict:
     """The `model_config` of a service's settings class: variables DEXTOUCH_<SERVICE>_<FIELD>.
 
@@ -235,3 +240,29 @@ def run(app: FastAPI, settings: ServiceSettings) -> None:
         ws_max_size=MAX_WEBSOCKET_BYTES,
         timeout_graceful_shutdown=settings.shutdown_grace_s,
     )
+
+
+def serve(
+    service: str,
+    kind: type[ServiceT],
+    create_app: Callable[[ServiceT], FastAPI],
+    arguments: Sequence[str],
+) -> int:
+    """Run a service until SIGINT or SIGTERM, with settings from flags and environment.
+
+    Args:
+        service: name in log events.
+        kind: class of its settings.
+        create_app: creates the application from them.
+        arguments: flags of the command line.
+
+    Returns:
+        0, the exit status.
+
+    Raises:
+        InvalidInputError: invalid settings.
+    """
+    settings = load_settings(kind, list(arguments))
+    configure_logging(service=service, log_format=settings.log_format, level=settings.log_level)
+    run(create_app(settings), settings)
+    return 0

@@ -6,8 +6,8 @@ import threading
 import pytest
 
 from dextouch.episodes import EpisodeStore
-from services.alignment import __main__ as command
 from services.alignment import batch
+from services.cli.main import main
 from tests.unit.alignment.recordings import write_recording
 from tests.unit.alignment.test_service import FakeWorker
 
@@ -32,42 +32,42 @@ def store(tmp_path):
 def test_recordings_are_aligned_and_told(store, tmp_path, capsys):
     path = tmp_path / "reports.json"
     arguments = ["run", "take", "--store", str(store.root), "--json", str(path)]
-    assert command.main(arguments) == 0
+    assert main(["align", *arguments]) == 0
     assert "take aligned" in capsys.readouterr().out
     assert json.loads(path.read_text())[0]["created"] is True
-    assert command.main(arguments) == 0
+    assert main(["align", *arguments]) == 0
     assert "take was aligned already" in capsys.readouterr().out
 
 
 def test_a_failure_is_told_and_the_others_are_aligned(store, capsys):
     arguments = ["run", "headless", "take", "--workers", "2", "--store", str(store.root)]
-    assert command.main(arguments) == 3
+    assert main(["align", *arguments]) == 3
     told = capsys.readouterr()
     assert "take aligned" in told.out
     assert "head" in told.err
 
 
 def test_all_aligns_what_has_no_episode(store, capsys):
-    assert command.main(["run", "other", "--store", str(store.root)]) == 0
+    assert main(["align", "run", "other", "--store", str(store.root)]) == 0
     capsys.readouterr()
-    assert command.main(["run", "--all", "--store", str(store.root)]) == 3
+    assert main(["align", "run", "--all", "--store", str(store.root)]) == 3
     told = capsys.readouterr()
     assert "take aligned" in told.out
     assert "other" not in told.out
     assert "headless" in told.err
     store.delete("headless", kind="recording")
-    assert command.main(["run", "--all", "--store", str(store.root)]) == 0
+    assert main(["align", "run", "--all", "--store", str(store.root)]) == 0
     assert "nothing to do" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("which", ["take", "episode"])
 def test_report_of_a_recording_or_its_episode(store, tmp_path, capsys, which):
-    command.main(["run", "take", "--store", str(store.root)])
+    main(["align", "run", "take", "--store", str(store.root)])
     item_id = "take" if which == "take" else store.list()[0]
     capsys.readouterr()
     path = tmp_path / "report.json"
     arguments = ["report", item_id, "--store", str(store.root), "--json", str(path)]
-    assert command.main(arguments) == 0
+    assert main(["align", *arguments]) == 0
     page = capsys.readouterr().out
     for word in ("not in the episode", "wrist_left: no samples", "residual", "latency", "dropped"):
         assert word in page
@@ -77,7 +77,7 @@ def test_report_of_a_recording_or_its_episode(store, tmp_path, capsys, which):
 
 
 def test_report_of_what_is_not_aligned(store, capsys):
-    assert command.main(["report", "other", "--store", str(store.root)]) == 3
+    assert main(["align", "report", "other", "--store", str(store.root)]) == 3
     assert "other" in capsys.readouterr().err
 
 
@@ -85,13 +85,13 @@ def test_report_of_what_is_not_aligned(store, capsys):
     "arguments", [["run"], ["run", "take", "--all"], ["report", "nothing"], ["run", "nothing"]]
 )
 def test_refusals(store, capsys, arguments):
-    assert command.main([*arguments, "--store", str(store.root)]) == 3
+    assert main(["align", *arguments, "--store", str(store.root)]) == 3
     assert capsys.readouterr().err.startswith("dextouch align: ")
 
 
 @pytest.mark.parametrize("arguments", [["--help"], ["run", "--help"]])
 def test_help_teaches(capsys, arguments):
     with pytest.raises(SystemExit) as stop:
-        command.main(arguments)
+        main(["align", *arguments])
     assert stop.value.code == 0
     assert "dextouch align run --all" in capsys.readouterr().out

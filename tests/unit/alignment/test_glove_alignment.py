@@ -13,7 +13,7 @@ from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveD
 from services.acquisition.devices.wuji_glove.mock import FULL_SCALE_KPA, WujiGloveSource, grid_of
 from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.mocks.replay import ReplayStream
-from services.alignment.__main__ import main
+from services.alignment.command_line import main
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 

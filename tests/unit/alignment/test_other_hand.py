@@ -8,9 +8,9 @@ import pytest
 from dextouch.episodes import EpisodeStore
 from dextouch.hands import chain_indices
 from dextouch.hands.hand_files import load_hand
-from services.alignment import __main__ as command
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
+from services.cli.main import main
 from tests.accuracy.test_alignment import truth_streams, write_recording
 from tests.unit.alignment.recordings import write_recording as write_robot_recording
 from tests.unit.hands.hand_texts import documented_mappings, four_finger_urdf, write_hand
@@ -25,7 +25,7 @@ def retarget(store, tmp_path, item_id):
     model, mapping = write_hand(tmp_path, four_finger_urdf(), documented_mappings()[1])
     files = ["--model", str(model), "--mapping", str(mapping), "--to", str(tmp_path / "out.npz")]
     report = ["--json", str(tmp_path / "out.json"), "--store", str(store.root)]
-    return command.main(["retarget", item_id, *files, *report]), load_hand(model, mapping)
+    return main(["align", "retarget", item_id, *files, *report]), load_hand(model, mapping)
 
 
 def test_fingers_point_where_the_persons_do(store, tmp_path, capsys):

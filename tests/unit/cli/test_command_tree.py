@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import pytest
 
-from services.cli import main, train
+from services.cli import main
 
 COMMANDS = """
 align report, align retarget, align run, align serve,
@@ -28,9 +28,9 @@ NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
 # Services run until they are stopped and answer over HTTP: they have no result to write.
 WITHOUT_JSON = {"align serve", "dashboard", "serve", "station serve", "store serve", "twin serve"}
 GROUPS = {
-    "": tuple(main.COMMANDS),
-    "train": tuple(train.TRAINERS),
-    "station": tuple(word for group, word in main.INNER_COMMANDS if group == "station"),
+    "": tuple(name for name in main.COMMANDS if " " not in name),
+    "train": tuple(main.commands_of("train")),
+    "station": tuple(main.commands_of("station")),
 }
 EXAMPLE = re.compile(r"^examples?:\n((?:  .*(?:\n|$))+)", re.MULTILINE | re.IGNORECASE)
 DOCUMENT = Path(__file__).parents[3] / "docs" / "command_line.md"

@@ -3,7 +3,6 @@
 import pytest
 
 from dextouch.serving import load_settings
-from services.cli import train
 from services.cli.demo import models
 from services.world_model.settings import TrainStateCommand
 
@@ -18,7 +17,7 @@ def load(*paths):
 
 def test_a_small_state_model_is_trained_before_its_endings_are_judged(tmp_path, monkeypatch):
     called = []
-    monkeypatch.setattr(train, "main", lambda words: called.append(list(words)) or 0)
+    monkeypatch.setattr(models, "run_command", lambda words: called.append(list(words[1:])) or 0)
     monkeypatch.setattr(models, "_load", load)
     with pytest.raises(LoadedError) as caught:
         models.train_models(tmp_path)

@@ -14,7 +14,7 @@ from services.cli import doctor, main
 def test_help_lists_every_command(capsys):
     assert main.main(["--help"]) == 0
     text = capsys.readouterr().out
-    assert all(name in text for name in main.COMMANDS)
+    assert all(name.split()[0] in text for name in main.COMMANDS)
 
 
 def test_unknown_command_names_the_valid_ones(capsys):
@@ -23,11 +23,9 @@ def test_unknown_command_names_the_valid_ones(capsys):
 
 
 def test_a_misspelt_inner_command_names_the_valid_ones(capsys):
-    assert main.main(["station", "calibrat"]) == main.EXIT_REFUSED
-    assert (
-        "dextouch station: unknown word 'calibrat'; valid: calibrate, serve"
-        in capsys.readouterr().err
-    )
+    assert main.main(["station", "calibrat"]) == main.EXIT_USAGE
+    told = capsys.readouterr().err
+    assert "unknown dextouch station command 'calibrat'; valid: calibrate, serve" in told
 
 
 def test_help_of_a_group_lists_its_commands(capsys):
@@ -48,7 +46,7 @@ def test_a_result_on_standard_output_stands_alone(capsys):
 @pytest.mark.parametrize("name", sorted(main.COMMANDS))
 def test_every_command_can_be_loaded_and_explains_itself(name, capsys):
     try:
-        status = main.main([name, "--help"])
+        status = main.main([*name.split(), "--help"])
     except SystemExit as stop:
         status = stop.code
     assert status == 0
@@ -80,7 +78,9 @@ def test_doctor_tells_devices_that_may_not_be_opened(monkeypatch):
 def test_names_in_lists_of_commands_stand_apart(capsys):
     main.main(["--help"])
     lines = capsys.readouterr().out.splitlines()
-    assert set(main.COMMANDS) <= {line.split()[0] for line in lines if line.startswith("  ")}
+    assert {name for name in main.COMMANDS if " " not in name} <= {
+        line.split()[0] for line in lines if line.startswith("  ")
+    }
 
 
 def test_the_nouns_cannot_be_imported_twice():

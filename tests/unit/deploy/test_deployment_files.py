@@ -13,8 +13,7 @@ import yaml
 from dextouch.serving import ServiceSettings, create_service_app
 from services.acquisition.health_metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.schemas import StationHealth
-from services.cli.main import COMMANDS, INNER_COMMANDS
-from services.cli.train import TRAINERS
+from services.cli.main import COMMANDS, find_command
 
 ROOT = Path(__file__).parents[3]
 COMPOSE = ROOT / "docker-compose.yml"
@@ -66,20 +65,13 @@ def test_published_ports_differ():
     assert len(set(defaults)) == len(defaults)
 
 
-def _module(group, word="", *_flags):
-    """The module that runs a command of `dextouch`."""
-    if group == "train":
-        return TRAINERS[word][0]
-    return (INNER_COMMANDS.get((group, word)) or COMMANDS[group]).module
-
-
 @pytest.mark.parametrize("name", OURS)
 def test_commands_and_variables_exist(name):
     program, *words = OURS[name]["command"]
     assert program == "dextouch"
-    module = _module(*words).removesuffix(".__main__")
+    command, _ = find_command(words)
+    module = COMMANDS[command].target.partition(":")[0].rpartition(".")[0]
     folder = Path(importlib.import_module(module).__file__).parent
-    assert (folder / "__main__.py").is_file()
     prefix = f"DEXTOUCH_{module.removeprefix('services.').upper()}_"
     # Settings stand in settings.py; those of serving a world may stand beside the serving.
     files = [name for name in ("settings", "serving") if (folder / f"{name}.py").is_file()]

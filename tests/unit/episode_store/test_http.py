@@ -20,8 +20,8 @@ from dextouch.errors import (
 )
 from dextouch.geometry import transform
 from dextouch.serving.settings import ApiKey
-from services.episode_store import __main__ as command_line
-from services.episode_store.__main__ import main
+from services.cli.main import main
+from services.episode_store import command_line
 from services.episode_store.app import create_app
 from tests.unit.episode_store.episodes import write_episode
 
@@ -185,7 +185,7 @@ def test_window_codec_refuses_what_is_no_window(store):
 
 
 def run(store, *words):
-    return main([words[0], "--store", str(store.root), *words[1:]])
+    return main(["store", words[0], "--store", str(store.root), *words[1:]])
 
 
 @pytest.fixture
@@ -221,16 +221,16 @@ def test_command_line(store, capsys, tmp_path):
     assert run(store, "list", "--kind", "recording") == 0
     assert run(store, "list", "--kind", "recording", "--origin", "twin") == 3
     assert "--origin" in capsys.readouterr().err
-    assert main(["list", "--store", str(tmp_path / "nowhere")]) == 3
+    assert main(["store", "list", "--store", str(tmp_path / "nowhere")]) == 3
     assert "no such folder" in capsys.readouterr().err
     with pytest.raises(SystemExit):
-        main(["list", "--colour"])
+        main(["store", "list", "--colour"])
 
 
 def test_serve_refuses_bad_settings(capsys):
-    assert main(["serve", "--max_page", "0"]) == 3
+    assert main(["store", "serve", "--max_page", "0"]) == 3
     assert "max_page" in capsys.readouterr().err
-    assert main(["--host", "192.0.2.1"]) == 3
+    assert main(["store", "--host", "192.0.2.1"]) == 3
     assert "api_keys" in capsys.readouterr().err
 
 

@@ -12,7 +12,8 @@ from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor
-from services.episode_store import __main__ as command_line
+from services.cli.main import main
+from services.episode_store import command_line
 from services.episode_store.commands.context import readable_size, seconds_of, table
 
 IDENTITY_ROWS = [[float(i == j) for j in range(4)] for i in range(4)]
@@ -83,7 +84,7 @@ def word(store, monkeypatch, capsys):
     monkeypatch.setattr(command_line, "configure_logging", lambda **_: None)
 
     def run(*words):
-        status = command_line.main([words[0], "--store", str(store.root), *words[1:]])
+        status = main(["store", words[0], "--store", str(store.root), *words[1:]])
         captured = capsys.readouterr()
         return status, captured.out, captured.err
 

@@ -10,7 +10,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.streams.descriptors import StreamDescriptor
-from services.evaluation.__main__ import main
+from services.cli.main import run_command
 from services.evaluation.demonstrations import instructions_of, read_demonstrations
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
@@ -148,7 +148,7 @@ def test_the_probe_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     flags = ["--episodes", url, "--output", str(output), "--json", str(figures)]
     training = ["--training.num_training_steps", "3", "--training.held_out_share", "0.5"]
     training += ["--training.development_share", "0.2"]
-    assert main(["train-probe", *flags, *training]) == 0
+    assert run_command(["train", "probe", *flags, *training]) == 0
     assert "held_out_accuracy" in capsys.readouterr().out
     probe = SuccessProbe.load(output)
     assert probe.metadata.settings["instructions"] == toy.INSTRUCTIONS
@@ -159,7 +159,7 @@ def test_policies_can_be_trained_from_the_command_line(url, tmp_path, capsys):
     output = tmp_path / "policy.safetensors"
     training = ["--training.num_training_steps", "4", "--training.held_out_share", "0.5"]
     flags = ["--episodes", url, "--output", str(output), "--early_at", "0.5"]
-    assert main(["train-policy", *flags, *training]) == 0
+    assert run_command(["train", "policy", *flags, *training]) == 0
     assert capsys.readouterr().out.count("wrist_error_mm_of_mean_chunk ") == 2
     finished, early = (
         BehaviourCloningPolicy.load(path)
@@ -196,15 +196,13 @@ def test_policies_learn_from_images_of_every_eighth_step(tmp_path):
         read_cloning_episodes(store)
 
 
-def test_the_command_line_refuses_clearly(capsys):
-    assert main(["juggle"]) == 2
-    assert "unknown command 'juggle'" in capsys.readouterr().err
+def test_the_command_line_refuses_clearly():
     with pytest.raises(InvalidInputError, match="FIRST:LAST"):
-        main(["run", "--seeds", "9:3"])
+        run_command(["evaluate", "--seeds", "9:3"])
     with pytest.raises(InvalidInputError, match="episodes"):
-        main(["train-policy"])
+        run_command(["train", "policy"])
     with pytest.raises(InvalidInputError, match="early_at"):
-        main(["train-policy", "--episodes", "x", "--early_at", "1.5"])
+        run_command(["train", "policy", "--episodes", "x", "--early_at", "1.5"])
 
 
 def test_starts_are_told_apart_by_image_and_touch():

@@ -7,8 +7,8 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from dextouch.worlds.serve import WorldServiceSettings, create_world_app
-from services.evaluation.__main__ import main
 from services.evaluation.checkpoints import save_checkpoint
+from services.evaluation.command_line import run_evaluation
 from services.evaluation.scores import REAL
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
@@ -32,9 +32,8 @@ def test_a_study_without_a_single_imagined_ending_is_reported(
     tmp_path, capsys, url, probe_checkpoint
 ):
     save_checkpoint(tmp_path / "probe.safetensors", probe_checkpoint)
-    status = main(
+    status = run_evaluation(
         [
-            "run",
             *("--real", json.dumps({"url": url, "world": "judge"})),
             *("--imagined", json.dumps({"dream": {"url": url, "world": "stuck"}})),
             *("--probe", str(tmp_path / "probe.safetensors"), "--builtin", '["hold"]'),
@@ -65,11 +64,10 @@ def test_a_report_is_written_before_anything_is_printed(
     def gone(*_words):
         raise BrokenPipeError
 
-    monkeypatch.setattr("services.evaluation.__main__.print", gone, raising=False)
+    monkeypatch.setattr("services.evaluation.command_line.print", gone, raising=False)
     with pytest.raises(BrokenPipeError):
-        main(
+        run_evaluation(
             [
-                "run",
                 *("--real", json.dumps({"url": url, "world": "judge"})),
                 *("--probe", str(tmp_path / "probe.safetensors"), "--builtin", '["hold"]'),
                 *("--tasks", "reach", "--seeds", "2000:2001", "--num_steps", "16"),
@@ -97,6 +95,6 @@ def test_one_file_for_two_things_is_refused(tmp_path, monkeypatch, flags, named)
     Path("link").symlink_to("target")
     real = json.dumps({"url": "http://127.0.0.1:1", "world": "twin"})
     with pytest.raises(InvalidInputError, match="the same file") as caught:
-        main(["run", "--real", real, "--seeds", "1:2", *flags])
+        run_evaluation(["--real", real, "--seeds", "1:2", *flags])
     for flag in named:
         assert flag in str(caught.value)

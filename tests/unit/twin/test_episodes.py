@@ -10,7 +10,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, ShapeError, UnknownNameError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
 from dextouch.hands.actions import IDENTITY_POSE_9D
-from services.twin import __main__ as command_line
+from services.cli.main import main
 from services.twin.episodes import record, write_episode
 from services.twin.motions import MOTION_KINDS, Motion
 from services.twin.settings import TwinSettings
@@ -231,18 +231,25 @@ def test_bad_requests_are_refused(bottle_stage):
 
 def test_the_command_line_records_and_says_so(tmp_path, capsys):
     summary = tmp_path / "summary.json"
-    arguments = ["record", "--task", "stack_bowls", "--seeds", "7:8", "--cameras", "camera_head"]
-    status = command_line.main(
-        [*arguments, "--store", str(tmp_path / "store"), "--json", str(summary)]
-    )
+    arguments = [
+        "twin",
+        "record",
+        "--task",
+        "stack_bowls",
+        "--seeds",
+        "7:8",
+        "--cameras",
+        "camera_head",
+    ]
+    status = main([*arguments, "--store", str(tmp_path / "store"), "--json", str(summary)])
     assert status == 0
     assert "twin-stack_bowls-robot-000007" in summary.read_text()
     assert EpisodeStore(tmp_path / "store").open("twin-stack_bowls-robot-000007")
-    assert command_line.main([*arguments, "--store", str(tmp_path / "store")]) == 3
+    assert main([*arguments, "--store", str(tmp_path / "store")]) == 3
     told = shlex.split(
         EpisodeStore(tmp_path / "store")
         .open("twin-stack_bowls-robot-000007")
         .attributes.generator_command
     )
-    assert command_line.main([*told[2:], "--store", str(tmp_path / "store")]) == 3
+    assert main([*told[1:], "--store", str(tmp_path / "store")]) == 3
     assert "exists already" in capsys.readouterr().err

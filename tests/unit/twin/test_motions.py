@@ -7,7 +7,7 @@ import pytest
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import apply
-from services.twin import __main__ as command_line
+from services.cli.main import main
 from services.twin.episodes import record
 from services.twin.hands import twin_hand
 from services.twin.motions import MOTION_KINDS, Motion, MotionScene, with_motion
@@ -116,7 +116,7 @@ def test_a_motion_says_how_it_is_made_again(bottle_stage, tmp_path, capsys):
     told = shlex.split(take.attributes.generator_command)
     summary = tmp_path / "summary.json"
     store = ["--store", str(tmp_path / "store"), "--json", str(summary)]
-    assert command_line.main([*told[2:], *store]) == 0
+    assert main([*told[1:], *store]) == 0
     assert f'"{take.attributes.episode_id}"' in summary.read_text()
     capsys.readouterr()
 

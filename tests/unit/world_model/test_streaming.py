@@ -10,8 +10,8 @@ from torch.utils.data import DataLoader
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
-from services.world_model.__main__ import main
 from services.world_model.checkpoints import read_checkpoint
+from services.world_model.command_line import run_train
 from services.world_model.training.dataset import (
     Place,
     WindowSampler,
@@ -230,7 +230,7 @@ def test_the_command_line_streams(toy_store, tmp_path, capsys):
         "loader_workers": 0,
     }  # fmt: skip
     arguments = [f"--{name}={value}" for name, value in flags.items()]
-    assert main(["train", "--streaming", *arguments]) == 0
+    assert run_train(["--streaming", *arguments]) == 0
     assert json.loads(report.read_text())["steps"] == 2
     command = read_checkpoint(output).metadata.command
     assert command.startswith("dextouch train world-model --")

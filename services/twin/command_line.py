@@ -1,8 +1,7 @@
-"""Command line `dextouch twin`: record true episodes to a store, or serve the twin over HTTP."""
+"""Command line `dextouch twin`: record true episodes of the physics twin to a store."""
 
 import argparse
 import multiprocessing
-import sys
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from rich.progress import track
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
-from dextouch.errors import DexTouchError, InvalidInputError
+from dextouch.errors import InvalidInputError
 from services.twin.cameras import CAMERAS
 from services.twin.episodes import record, write_episode
 from services.twin.hands import DOMAINS, Domain
@@ -25,7 +24,6 @@ from services.twin.stage import Stage
 from services.twin.take_options import STREAM_CHOICES, TakeOptions
 from services.twin.tasks import TASK_NAMES
 
-EXIT_REFUSED = 3
 _MISS_DRAW = 5
 EXAMPLE = "example:\n  dextouch twin record --task stand_bottle --seeds 0:8 --store data/store"
 
@@ -192,26 +190,9 @@ def _summary(
     }
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Returns:
-        0, or 3 for a refusal with its reason on stderr.
-    """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    try:
-        if arguments[:1] == ["serve"]:
-            from services.twin.serving import serve
-
-            serve(arguments[1:])
-            return 0
-        return _record(_parser().parse_args(arguments))
-    except DexTouchError as error:
-        print(f"dextouch twin: {error.message}", file=sys.stderr)
-        return EXIT_REFUSED
-
-
-def _record(arguments: argparse.Namespace) -> int:
+def main(argv: Sequence[str]) -> int:
+    """Run `dextouch twin record`."""
+    arguments = _parser().parse_args(list(argv))
     start_s = time.monotonic()
     orders = _orders(arguments)
     reports = _shown(_work(orders, arguments.jobs), len(orders), Console(stderr=True))
@@ -223,7 +204,3 @@ def _record(arguments: argparse.Namespace) -> int:
         f"{succeeded} succeeded, {summary['num_misses']} were misses, {summary['seconds']:.1f} s"
     )
     return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,55 +1,29 @@
-"""Command line `dextouch store`: manage a store, or serve it over HTTP."""
+"""Command line `dextouch store`: inspect, repair and delete items of a store."""
 
 import argparse
-import sys
 from collections.abc import Callable, Sequence
 
-from dextouch.command_line import STANDARD_OUTPUT, CommandParser, add_json, write_result
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import TRASH_KINDS, EpisodeStore
-from dextouch.errors import DexTouchError
-from dextouch.serving import configure_logging, load_settings, run
-from services.episode_store.app import create_app
+from dextouch.serving import configure_logging, load_settings
 from services.episode_store.commands import delete, inspect, repair
 from services.episode_store.commands.context import Context, Outcome, seconds_of
 from services.episode_store.settings import EpisodeStoreSettings
 
-EXIT_REFUSED = 3
 
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command of the store's command line; serve by default.
+def main(argv: Sequence[str]) -> int:
+    """Run a command of the store's command line.
 
     Returns:
-        0; 1 if something is damaged, remains or is not provably deleted; 3 for a refusal.
+        0; 1 if something is damaged, remains or is not provably deleted.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    try:
-        if not arguments or arguments[0] == "serve":
-            return _serve(arguments[1:])
-        if arguments[0].startswith("--") and arguments[0] != "--help":
-            return _serve(arguments)
-        options = _parser().parse_args(arguments)
-        # Items that the catalog leaves out are reported on stderr.
-        configure_logging(service="episode_store", log_format="auto", level="warning")
-        url = options.store or load_settings(EpisodeStoreSettings, []).store_url
-        # With the result on stdout, messages go to stderr.
-        out = sys.stderr if options.json == STANDARD_OUTPUT else sys.stdout
-        context = Context(EpisodeStore(url), url, options, lambda line: print(line, file=out))
-        result, status = _COMMANDS[options.command](context)
-    except DexTouchError as error:
-        print(f"dextouch store: {error.message}", file=sys.stderr)
-        return EXIT_REFUSED
+    options = _parser().parse_args(list(argv))
+    # Items that the catalog leaves out are reported on stderr.
+    configure_logging(service="episode_store", log_format="auto", level="warning")
+    url = options.store or load_settings(EpisodeStoreSettings, []).store_url
+    result, status = _COMMANDS[options.command](Context(EpisodeStore(url), url, options, print))
     write_result(options.json, result)
     return status
-
-
-def _serve(arguments: list[str]) -> int:
-    settings = load_settings(EpisodeStoreSettings, arguments)
-    configure_logging(
-        service="episode_store", log_format=settings.log_format, level=settings.log_level
-    )
-    run(create_app(settings), settings)
-    return 0
 
 
 _COMMANDS: dict[str, Callable[[Context], Outcome]] = {
@@ -151,7 +125,3 @@ def _add_delete(command: argparse.ArgumentParser) -> None:
     command.add_argument(
         "--checkpoints", metavar="FOLDER", help="also search the models in this folder"
     )
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Command line of `dextouch align`: align recordings, report on them, or serve over HTTP."""
+"""Command line of `dextouch align`: align recordings, report on them, retarget other hands."""
 
 import argparse
 import math
@@ -13,10 +13,10 @@ from rich.progress import Progress as Bars
 
 from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import DexTouchError, InvalidInputError
+from dextouch.errors import InvalidInputError
 from dextouch.hands.hand_files import load_hand
 from dextouch.schemas import json_ready
-from dextouch.serving import configure_logging, load_settings, run
+from dextouch.serving import load_settings
 from services.alignment.batch import OnRecordingProgress, Outcome, align_batch, not_aligned
 from services.alignment.jobs import episode_id_of
 from services.alignment.options import AlignmentOptions
@@ -41,24 +41,15 @@ An episode's id follows from the recording and the options: aligning again finds
 nothing, so a run that was interrupted is simply started again."""
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run `dextouch align`: align recordings, report on one, or serve over HTTP.
+def main(argv: Sequence[str]) -> int:
+    """Run `dextouch align`: align recordings, report on one, or retarget one to another hand.
 
     Returns:
-        0, or 3 for a refusal with its reason on stderr.
+        0, or 3 if a recording was refused, with the reason on stderr.
     """
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    try:
-        if not arguments or arguments[0] == "serve":
-            return _serve(arguments[1:])
-        if arguments[0].startswith("--") and arguments[0] != "--help":
-            return _serve(arguments)
-        settings = load_settings(AlignmentSettings, [])
-        parsed = _parser(settings).parse_args(arguments)
-        return COMMANDS[parsed.command](parsed, settings)
-    except DexTouchError as error:
-        print(f"dextouch align: {error.message}", file=sys.stderr)
-        return EXIT_REFUSED
+    settings = load_settings(AlignmentSettings, [])
+    parsed = _parser(settings).parse_args(list(argv))
+    return COMMANDS[parsed.command](parsed, settings)
 
 
 def _parser(settings: AlignmentSettings) -> argparse.ArgumentParser:
@@ -124,15 +115,6 @@ def _positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"got {number}, expected at least 1")
     return number
-
-
-def _serve(arguments: list[str]) -> int:
-    from services.alignment.app import create_app
-
-    settings = load_settings(AlignmentSettings, arguments)
-    configure_logging(service="alignment", log_format=settings.log_format, level=settings.log_level)
-    run(create_app(settings), settings)
-    return 0
 
 
 def _run(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
@@ -253,6 +235,3 @@ COMMANDS: dict[str, Callable[[argparse.Namespace, AlignmentSettings], int]] = {
     "report": _report,
     "retarget": _retarget,
 }
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -1,7 +1,7 @@
-"""Command line of the evaluation service: train policies and probes, and score policies."""
+"""Commands of the evaluation: train policies and probes, and score policies."""
 
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from textwrap import indent
@@ -38,35 +38,7 @@ from services.evaluation.settings import (
 from services.evaluation.success_probe import SuccessProbe
 from services.evaluation.success_probe_training import train_success_probe
 
-USAGE = """usage: python -m services.evaluation COMMAND [flags]
-
-  train-policy         train a policy on the successful robot episodes of a store
-  train-probe          train the success probe on final images and touch
-  train-direct-judge   train the probe's baseline on first observations and commands
-  run                  roll out policies in a real and in imagined worlds and score them
-
-Run a command with --help for its options."""
 EXIT_FAILED = 1
-EXIT_USAGE = 2
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status (2 for an unknown command)."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    commands: dict[str, Callable[[list[str]], int]] = {
-        "train-policy": run_train_policy,
-        "train-probe": run_train_probe,
-        "train-direct-judge": run_train_direct_judge,
-        "run": run_evaluation,
-    }
-    word, *rest = arguments or ["--help"]
-    if word in {"-h", "--help"}:
-        print(USAGE)
-        return 0
-    if word not in commands:
-        print(f"evaluation: unknown command {word!r}\n\n{USAGE}", file=sys.stderr)
-        return EXIT_USAGE
-    return commands[word](rest)
 
 
 def run_train_policy(arguments: list[str]) -> int:
@@ -231,7 +203,3 @@ def _print_failures(report: Mapping[str, Any], results: Path) -> None:
         print(f"  {row.policy} in {row.world}, {row.count} x: {row.message}", file=sys.stderr)
         if row.traceback:
             print(indent(row.traceback, "    "), file=sys.stderr)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

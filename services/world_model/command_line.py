@@ -1,8 +1,6 @@
-"""Command line of the world model: `train`, `train-state`, `serve` and `show`."""
+"""Commands of the world model: train both kinds of models, serve one, show its provenance."""
 
 import json
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -22,35 +20,6 @@ from services.world_model.settings import (
 from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
 from services.world_model.training.trainer import TrainingProgress, TrainingReport, train
 from services.world_model.world import open_world
-
-USAGE = """usage: python -m services.world_model COMMAND [flags]
-
-  train         train a model on the episodes of a store and write an evaluated checkpoint
-  train-state   train a state model: start readers and recurrent cores
-  serve         serve a checkpoint's rollouts over HTTP
-  show          print the provenance and accuracy of a checkpoint
-
-Run a command with --help for its options."""
-EXIT_USAGE = 2
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status (2 for an unknown command)."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    commands: dict[str, Callable[[list[str]], int]] = {
-        "train": run_train,
-        "train-state": run_train_state,
-        "serve": run_serve,
-        "show": run_show,
-    }
-    word, *rest = arguments or ["--help"]
-    if word in {"-h", "--help"}:
-        print(USAGE)
-        return 0
-    if word not in commands:
-        print(f"world_model: unknown command {word!r}\n\n{USAGE}", file=sys.stderr)
-        return EXIT_USAGE
-    return commands[word](rest)
 
 
 def run_train(arguments: list[str]) -> int:
@@ -140,7 +109,3 @@ def _table(report: TrainingReport) -> str:
     ]
     width = max(len(name) for name, _ in rows)
     return "\n".join(f"{name:<{width}}  {value}" for name, value in rows)
-
-
-if __name__ == "__main__":
-    sys.exit(main())
