@@ -7,7 +7,7 @@ from dextouch.schemas import LedgerEntry
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.counters import StreamCounters
-from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.drivers.packet_search import DecoderStatistics
 from services.acquisition.health_taxels import TaxelCounts, count_taxels
 from services.acquisition.schemas import StreamTake, TakeCheck, TakeProblem
 

@@ -14,10 +14,10 @@ from dextouch.tactile.layout import Side
 from services.acquisition.clock import RealClock
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
-from services.acquisition.mocks.bridge_server import BridgeServer
-from services.acquisition.mocks.bridge_sources import BridgeSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.mocks.sdk_link_server import BridgeServer
+from services.acquisition.mocks.sdk_link_sources import BridgeSource
 
 
 def pattern_source(kind: str, place: str, *, seed: int) -> BridgeSource:

@@ -21,7 +21,7 @@ from services.acquisition.completeness import (
 from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import take_gates
-from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.drivers.packet_search import DecoderStatistics
 from services.acquisition.schemas import TakeCheck
 from services.acquisition.supervisor import JUDGED_EVENTS, SpoolFlusher, SpoolSafety
 from services.acquisition.take_findings import HealthSource, TakeFindings

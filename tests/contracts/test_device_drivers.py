@@ -21,13 +21,13 @@ from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDe
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_driver import BridgeDriver
+from services.acquisition.drivers.sdk_link_driver import BridgeDriver
 from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mocks.bridge_server import BridgePort
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
+from services.acquisition.mocks.sdk_link_server import BridgePort
 
 BOOT_NS = 4_000_000_000_000
 # The promise is tried by `make slow`; the default run must not need an idle machine.

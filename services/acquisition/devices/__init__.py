@@ -11,8 +11,19 @@ from services.acquisition.devices.kind import DeviceKind, DeviceSettings
 from services.acquisition.devices.registry import ENTRY_POINT_GROUP, device_kind, kind_names
 from services.acquisition.devices.serial_line import SerialLineSettings, serial_transport
 from services.acquisition.devices.station_drivers import build_drivers, load_calibration
-from services.acquisition.drivers.base import CellLayout, Decoder, Driver, Readings, hand_name
-from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
+from services.acquisition.drivers.base import (
+    CellLayout,
+    Decoder,
+    Driver,
+    Readings,
+    StreamDecoder,
+    hand_name,
+)
+from services.acquisition.drivers.packet_search import (
+    DecoderStatistics,
+    FrameSearch,
+    SequenceCounter,
+)
 from services.acquisition.transports.base import Transport, TransportInfo
 
 __all__ = [
@@ -31,6 +42,7 @@ __all__ = [
     "SequenceCounter",
     "SerialLineSettings",
     "StationClock",
+    "StreamDecoder",
     "StreamDescriptor",
     "Transport",
     "TransportInfo",

@@ -1,12 +1,15 @@
 """Finds kinds of devices by name: those of this package, and those that other packages bring.
 
-Both are entry points of one group and are loaded by the same code, when a station names them.
+Both are entry points of one group and are loaded by the same code, when a station names them. Every
+folder beside this file is one of ours, with or without an installation: its `kind` holds `KIND`.
 """
 
+import pkgutil
 import re
 import sys
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, get_args
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
@@ -14,16 +17,6 @@ from services.acquisition.devices.kind import DeviceKind, DeviceSettings
 
 ENTRY_POINT_GROUP = "dextouch.devices"
 OWN_PACKAGE = "dextouch-wm"
-OWN_KINDS = (
-    "tactile_glove",
-    "wuji_glove",
-    "justfloat_glove",
-    "finger_tracker",
-    "pose_tracker",
-    "camera",
-    "station_camera",
-    "robot_state",
-)
 NAME = re.compile(r"[a-z][a-z0-9_]{0,63}")
 # What the import of another package's module may end in.
 IMPORT_FAILURES = (
@@ -44,7 +37,7 @@ IMPORT_FAILURES = (
 
 def kind_names() -> list[str]:
     """Names of all kinds that a station's settings can name here, loaded or not."""
-    return sorted({*OWN_KINDS, *(point.name for point in _installed(tuple(sys.path)))})
+    return sorted({point.name for point in _points(tuple(sys.path))})
 
 
 def device_kind(name: str) -> DeviceKind[Any]:
@@ -54,9 +47,7 @@ def device_kind(name: str) -> DeviceKind[Any]:
         UnknownNameError: no package brings it.
         InvalidInputError: several do, or the one that does is broken.
     """
-    found = [point for point in _installed(tuple(sys.path)) if point.name == name]
-    if name in OWN_KINDS:
-        found.insert(0, _own(name))
+    found = [point for point in _points(tuple(sys.path)) if point.name == name]
     if not found:
         raise UnknownNameError("kind of device", name, kind_names())
     if len(found) > 1:
@@ -74,17 +65,17 @@ def package_of(point: EntryPoint) -> str:
     return OWN_PACKAGE if point.dist is None else point.dist.name
 
 
-def _own(name: str) -> EntryPoint:
-    value = f"services.acquisition.devices.{name}.kind:KIND"
-    return EntryPoint(name=name, value=value, group=ENTRY_POINT_GROUP)
-
-
 @lru_cache(maxsize=4)
-def _installed(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
-    """Entry points of installed packages; looking through the folders of `path` takes 0.1 s."""
+def _points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """Ours, then those of installed packages; looking through the folders of `path` takes 0.1 s."""
     del path
-    points = {(point.name, point.value): point for point in entry_points(group=ENTRY_POINT_GROUP)}
-    return tuple(points.values())
+    ours = [
+        EntryPoint(folder.name, f"{__package__}.{folder.name}.kind:KIND", ENTRY_POINT_GROUP)
+        for folder in pkgutil.iter_modules([str(Path(__file__).parent)])
+        if folder.ispkg
+    ]
+    others = {(point.name, point.value): point for point in entry_points(group=ENTRY_POINT_GROUP)}
+    return (*ours, *others.values())
 
 
 def _load(point: EntryPoint) -> object:

@@ -1,13 +1,15 @@
 """The base of every driver: reads a transport, stamps what arrives and has it decoded."""
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Generic, Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.packets import SOURCES, VERSION, DecoderStatistics, Packet
+from services.acquisition.drivers.packet_search import DecoderStatistics, Found, PacketFinder
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet
 from services.acquisition.transports.base import Transport, TransportInfo
 
 Readings = dict[str, list[Sample]]
@@ -34,6 +36,46 @@ class Decoder(Protocol):
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Samples completed by `data`, which arrived at `t_host_ns`."""
         ...
+
+
+class StreamDecoder(ABC, Generic[Found]):
+    """Base of a decoder whose packets become samples of one stream.
+
+    Args:
+        descriptor: of the stream.
+        packets: finds the packets in the bytes.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor, packets: PacketFinder[Found]) -> None:
+        self.descriptors: tuple[StreamDescriptor, ...] = (descriptor,)
+        self.statistics = packets.statistics
+        self._packets = packets
+
+    def reset(self) -> None:
+        """Forget half a packet, since the link was lost."""
+        self._packets.reset()
+
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+        """Samples completed by `data`.
+
+        Args:
+            data: the next bytes of the stream, in any portion.
+            t_host_ns: when they arrived; 0 where only the content matters (a file of bytes).
+
+        Raises:
+            DeviceError: another version of the device, or another device than this one must be.
+        """
+        found = [self._sample(packet, t_host_ns) for packet in self._packets.feed(data)]
+        return [sample for sample in found if sample is not None]
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """The same by the name of the stream."""
+        samples = self.feed(data, t_host_ns)
+        return {self.descriptors[0].name: samples} if samples else {}
+
+    @abstractmethod
+    def _sample(self, packet: Found, t_host_ns: int) -> Sample | None:
+        """The sample of a packet; None where it gives none."""
 
 
 def hand_name(side: Side, label: str | None = None) -> str:

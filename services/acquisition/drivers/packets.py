@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
+from services.acquisition.drivers.packet_search import FrameSearch, SequenceCounter
 
 # magic, version, source, payload length, sequence, device time in ns (docs/device_packets.md)
 HEADER = struct.Struct("<4sBBIIQ")
@@ -17,20 +17,6 @@ MAGIC_SIZE = 4
 SEQUENCE_BITS = 32
 SEQUENCE_MODULUS = 1 << SEQUENCE_BITS
 SOURCES = {"none": 0, "left": 1, "right": 2, "head": 3}
-
-__all__ = [
-    "CRC",
-    "HEADER",
-    "MAGIC_SIZE",
-    "OVERHEAD",
-    "SEQUENCE_MODULUS",
-    "SOURCES",
-    "VERSION",
-    "DecoderStatistics",
-    "Packet",
-    "PacketDecoder",
-    "encode_packet",
-]
 
 
 @dataclass(slots=True)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import PacketError
-from services.acquisition.drivers.bridge_protocol import FrameConvention
+from services.acquisition.drivers.sdk_link_protocol import FrameConvention
 from services.acquisition.drivers.tracking import NORM_TOLERANCE, are_finite
 
 Rows = Sequence[Sequence[float]]

@@ -14,8 +14,8 @@ from dextouch.errors import DeviceError, StaleDataError
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
 from services.acquisition.mock_bridge import pattern_source
-from services.acquisition.mocks.bridge_server import BridgeServer
 from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.mocks.sdk_link_server import BridgeServer
 from services.acquisition.settings import AcquisitionSettings
 
 # The promises are tried by `make slow`; the default run must not need an idle machine.
@@ -68,7 +68,7 @@ def server(kind):
 
 def test_a_bridge_without_samples_still_lives(kind, server, monkeypatch):
     # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
-    monkeypatch.setattr("services.acquisition.drivers.bridge_driver.SILENCE_NS", 10**9)
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link_driver.SILENCE_NS", 10**9)
     driver = driver_of(kind, server.port)
     driver.open()
     end_s = time.monotonic() + 1.2

@@ -15,14 +15,14 @@ from pydantic import ValidationError
 from dextouch.errors import DeviceError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
-from services.acquisition.drivers.bridge_protocol import (
+from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder, encode_packet
+from services.acquisition.drivers.sdk_link_protocol import (
     MAX_HELLO_BYTES,
     BridgeConnection,
     FrameConvention,
     FreshnessGate,
     parse_hello,
 )
-from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder, encode_packet
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream
 

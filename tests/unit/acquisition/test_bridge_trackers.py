@@ -26,23 +26,23 @@ from services.acquisition.devices.pose_tracker.mock import (
     Jump,
     Occlusion,
 )
-from services.acquisition.drivers.bridge_driver import BridgeDriver
-from services.acquisition.drivers.bridge_protocol import FrameConvention
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
+from services.acquisition.drivers.sdk_link_driver import BridgeDriver
+from services.acquisition.drivers.sdk_link_protocol import FrameConvention
 from services.acquisition.drivers.sender_frame import (
     SenderFrame,
     pose_in_our_frame,
     quaternion_of_one,
 )
-from services.acquisition.mocks.bridge_server import BridgePort
-from services.acquisition.mocks.bridge_sources import (
+from services.acquisition.mocks.faults import DeviceFaults
+from services.acquisition.mocks.pattern import pattern_streams
+from services.acquisition.mocks.sdk_link_server import BridgePort
+from services.acquisition.mocks.sdk_link_sources import (
     LEFT_HANDED,
     Y_UP,
     hello_line,
     sign_of_life,
 )
-from services.acquisition.mocks.faults import DeviceFaults
-from services.acquisition.mocks.pattern import pattern_streams
 
 MS = 1_000_000
 BOOT_NS = 7_000_000_000_000
@@ -379,7 +379,7 @@ def test_samples_that_come_with_the_hello_are_not_lost(stage):
 
 
 def test_a_bridge_without_a_hello_is_refused(stage, monkeypatch):
-    monkeypatch.setattr("services.acquisition.drivers.bridge_driver.HELLO_READS", 2)
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link_driver.HELLO_READS", 2)
     stage.port._hello = lambda: b"{"
     with pytest.raises(DeviceError, match="no hello"):
         stage.driver.open()

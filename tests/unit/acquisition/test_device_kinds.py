@@ -9,7 +9,6 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import load_settings
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import DeviceKind, build_drivers, device_kind, kind_names
-from services.acquisition.devices.registry import OWN_KINDS
 from services.acquisition.settings import AcquisitionSettings
 
 GOOD = """
@@ -50,6 +49,22 @@ def install(tmp_path, monkeypatch):
     yield install
     for package in imported:
         sys.modules.pop(package, None)
+
+
+OWN_KINDS = [
+    "camera",
+    "finger_tracker",
+    "justfloat_glove",
+    "pose_tracker",
+    "robot_state",
+    "station_camera",
+    "tactile_glove",
+    "wuji_glove",
+]
+
+
+def test_every_folder_of_a_family_is_a_kind_without_a_table():
+    assert kind_names() == OWN_KINDS
 
 
 @pytest.mark.parametrize("name", OWN_KINDS)

@@ -116,7 +116,7 @@ def test_pose_of_a_running_tracker():
 def test_pose_of_another_state_is_a_gap(state):
     decoder = PoseTrackerDecoder("wrist_left")
     assert decoder.decode(pose_report(state), 3) == {}
-    assert decoder.not_running == 1
+    assert decoder.tracking.packets["occluded"] == 1
     assert decoder.statistics.packets == 1
 
 

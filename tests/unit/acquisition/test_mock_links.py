@@ -10,7 +10,7 @@ from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.camera.driver import CameraDriver
 from services.acquisition.devices.finger_tracker.driver import FingerTracker
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.drivers.bridge_driver import BridgeDriver
+from services.acquisition.drivers.sdk_link_driver import BridgeDriver
 from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation

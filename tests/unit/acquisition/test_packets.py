@@ -11,14 +11,8 @@ from services.acquisition.devices.tactile_glove.packets import (
     PAYLOAD_BYTES,
     TactileGloveDecoder,
 )
-from services.acquisition.drivers.frames import SequenceCounter
-from services.acquisition.drivers.packets import (
-    SOURCES,
-    DecoderStatistics,
-    Packet,
-    PacketDecoder,
-    encode_packet,
-)
+from services.acquisition.drivers.packet_search import DecoderStatistics, SequenceCounter
+from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder, encode_packet
 
 
 def glove_packet(sequence, rng, *, version=1, source=SOURCES["left"]):

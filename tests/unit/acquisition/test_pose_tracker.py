@@ -71,7 +71,7 @@ def test_occlusion_is_one_event_and_a_gap(state):
     assert (event.kind, event.state, event.num_packets) == ("occluded", state, 50)
     assert (event.first_sequence, event.last_sequence) == (100, 149)
     assert (event.t_first_host_ns, event.t_last_host_ns) == (1_000_000_000, 1_490_000_000)
-    assert decoder.not_running == 50
+    assert decoder.tracking.packets["occluded"] == 50
 
 
 @pytest.mark.parametrize(
@@ -88,7 +88,11 @@ def test_jump_is_one_event_and_a_gap(jump):
     assert [s.sequence for s in samples] == np.flatnonzero(tracked.labels == "").tolist()
     (event,) = decoder.tracking.events
     assert (event.kind, event.state) == ("jumped", TrackingState.RUNNING_OK)
-    assert event.num_packets == decoder.jumped == (tracked.labels == "jumped").sum()
+    assert (
+        event.num_packets
+        == decoder.tracking.packets["jumped"]
+        == (tracked.labels == "jumped").sum()
+    )
 
 
 def test_nothing_is_invented_or_repeated():
@@ -128,7 +132,7 @@ def test_the_origin_is_no_pose_however_long_it_is_sent():
         for sample in decoder.decode(report, 0).get("wrist_left", [])
     ]
     assert sequences == [*range(200), *range(300, 400)]
-    assert decoder.jumped == 100
+    assert decoder.tracking.packets["jumped"] == 100
 
 
 @pytest.mark.parametrize("step_s", [-3600.0, -0.03, 0.2, 10.0])
@@ -136,14 +140,14 @@ def test_a_step_of_the_device_clock_is_no_jump(step_s):
     step_ns = round(step_s * 1e9)
     tracked, decoder, samples = play(step_ns=lambda index: (index >= 150) * step_ns)
     assert len(samples) == len(tracked.t_ns)
-    assert decoder.jumped == 0
+    assert decoder.tracking.packets["jumped"] == 0
 
 
 def test_a_clock_step_during_a_jump_does_not_shut_the_gate():
     jump = Jump(1.0, 1.1, offset_m=(1.0, 0.0, 0.0))
     _, decoder, samples = play([jump], step_ns=lambda index: (index >= 105) * -BOOT_NS)
     assert samples[-1].sequence == 399
-    assert decoder.jumped == 10
+    assert decoder.tracking.packets["jumped"] == 10
 
 
 def test_repeated_and_late_packets_become_no_sample():

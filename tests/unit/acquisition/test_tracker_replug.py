@@ -11,11 +11,11 @@ from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDe
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_driver import BridgeDriver
-from services.acquisition.mocks.bridge_server import BridgePort
+from services.acquisition.drivers.sdk_link_driver import BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
+from services.acquisition.mocks.sdk_link_server import BridgePort
 from services.acquisition.mocks.usb_backend import UsbPort
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -67,7 +67,7 @@ class Rig:
 @pytest.fixture(params=["hid", "usb", "bridge"])
 def rig(request, monkeypatch):
     # A busy machine may be slower with the next sample than a bridge may be silent.
-    monkeypatch.setattr("services.acquisition.drivers.bridge_driver.SILENCE_NS", 10**10)
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link_driver.SILENCE_NS", 10**10)
     built = Rig(request.param)
     built.port.plug()
     built.supervisor.start()

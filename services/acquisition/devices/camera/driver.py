@@ -15,10 +15,10 @@ from dextouch.streams import (
     encoded_values,
 )
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, Readings, check_packet
+from services.acquisition.drivers.base import Driver, StreamDecoder, check_packet
 from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
-from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.transports.base import Transport
 
 __all__ = ["CameraDecoder", "CameraDriver", "ImageEncoding", "camera_descriptor"]
@@ -50,11 +50,11 @@ def camera_descriptor(
     )
 
 
-class CameraDecoder:
+class CameraDecoder(StreamDecoder[Packet]):
     """Images of one fixed size and encoding; JPEG and H.264 images stay compressed.
 
     H.264 images come in whole groups only, since the store takes no others: a group that lost an
-    image is dropped and counted as `refused`.
+    image is dropped and counted as `refused`, as images are that are no images.
     """
 
     def __init__(
@@ -63,57 +63,49 @@ class CameraDecoder:
         self._stream = stream
         self._size = (height_px, width_px)
         self._encoding: ImageEncoding = encoding
-        self._packets = PacketDecoder(
-            MAGIC, min_payload=PAYLOAD_HEADER.size + 1, max_payload=MAX_PAYLOAD_BYTES
-        )
         self._descriptor = camera_descriptor(
             stream, height_px=height_px, width_px=width_px, encoding=encoding
         )
+        packets = PacketDecoder(
+            MAGIC, min_payload=PAYLOAD_HEADER.size + 1, max_payload=MAX_PAYLOAD_BYTES
+        )
+        super().__init__(self._descriptor, packets)
         self._groups = WholeGroups()
         self._checker = ImageChecker(period_ns=self._descriptor.period_ns())
         self.damaged_images = 0
         self._num_images = 0
 
     @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far; `refused` counts images that are no images."""
-        return self._packets.statistics
-
-    @property
     def quality(self) -> ImageQuality:
         """What the images are like; of H.264 nothing is looked at."""
         return self._checker.quality
 
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The image stream."""
-        return (self._descriptor,)
-
     def reset(self) -> None:
         """Forget half a packet, and a group that was begun."""
-        self._packets.reset()
+        super().reset()
         self._groups.reset()
         self._count_left_out()
 
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
         """Images completed by `data`: uint8 [h, w, 3], or bytes as a 0-d object array.
 
         Raises:
             DeviceError: another version, image size, encoding or length of groups than announced.
         """
-        samples: list[Sample] = []
-        for packet in self._packets.feed(data):
-            check_packet(packet, device=self._stream, source=None)
-            values = self._image(packet.payload)
-            if values is None:
-                continue
-            sample = Sample(t_host_ns, values, packet.t_device_ns, packet.sequence)
-            if self._encoding == "h264":
-                samples += self._whole_group(sample)
-            else:
-                self._look(sample)
-                samples.append(sample)
-        return {self._stream: samples} if samples else {}
+        samples = super().feed(data, t_host_ns)
+        if self._encoding != "h264":
+            return samples
+        return [whole for sample in samples for whole in self._whole_group(sample)]
+
+    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        check_packet(packet, device=self._stream, source=None)
+        values = self._image(packet.payload)
+        if values is None:
+            return None
+        sample = Sample(t_host_ns, values, packet.t_device_ns, packet.sequence)
+        if self._encoding != "h264":
+            self._look(sample)
+        return sample
 
     def _image(self, payload: bytes) -> np.ndarray | None:
         height_px, width_px, code = PAYLOAD_HEADER.unpack_from(payload)

@@ -4,7 +4,7 @@ import numpy as np
 from jaxtyping import Int64
 
 from dextouch.errors import DeviceError, PacketError
-from dextouch.streams import Sample, StreamDescriptor
+from dextouch.streams import Sample
 from dextouch.tactile.layout import Side
 from services.acquisition.devices.finger_tracker.driver import MAGIC as FINGER_MAGIC
 from services.acquisition.devices.finger_tracker.driver import PAYLOAD_BYTES as FINGER_BYTES
@@ -13,13 +13,14 @@ from services.acquisition.devices.finger_tracker.driver import (
     resolve_nodes,
     unpack_keypoints,
 )
-from services.acquisition.drivers.base import Readings, check_packet
-from services.acquisition.drivers.bridge_protocol import BridgeConnection, FreshnessGate
-from services.acquisition.drivers.packets import SOURCES, DecoderStatistics, Packet, PacketDecoder
+from services.acquisition.drivers.base import check_packet
+from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
+from services.acquisition.drivers.sdk_link_driver import BridgeDecoder
+from services.acquisition.drivers.sdk_link_protocol import BridgeConnection, BridgeHello
 from services.acquisition.drivers.tracking import TrackingEvents
 
 
-class BridgeFingerTrackerDecoder:
+class BridgeFingerTrackerDecoder(BridgeDecoder):
     """Keypoints (float32 [25, 3], m, wrist frame) of one hand behind a finger tracker's SDK.
 
     Args:
@@ -30,8 +31,7 @@ class BridgeFingerTrackerDecoder:
     def __init__(self, side: Side, *, serial_number: str | None = None) -> None:
         self._side = side
         self._device = f"finger_tracker_{side}"
-        self._stream = keypoints_descriptor(side)
-        self.connection = BridgeConnection(
+        connection = BridgeConnection(
             "finger_tracker",
             device=self._device,
             source=side,
@@ -39,51 +39,26 @@ class BridgeFingerTrackerDecoder:
             packets=PacketDecoder(FINGER_MAGIC, min_payload=0, max_payload=FINGER_BYTES),
             payload_bytes=FINGER_BYTES,
         )
-        self.freshness = FreshnessGate()
+        super().__init__(keypoints_descriptor(side), connection)
         self.tracking = TrackingEvents()
         self._order: Int64[np.ndarray, 25] | None = None
         self._ours_m = np.eye(3)
         self.unseen_nodes = 0
 
-    @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far, of all devices of the bridge."""
-        return self.connection.statistics
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The keypoint stream."""
-        return (self._stream,)
-
     def reset(self) -> None:
         """The connection was lost."""
-        self.connection.reset()
-        self.freshness.reset()
+        super().reset()
         self.tracking.end()
         self._order = None
 
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """Keypoints completed by `data`.
+    def _learn(self, hello: BridgeHello) -> None:
+        """The order of the nodes and the frame.
 
         Raises:
-            DeviceError: no bridge for this hand, or nodes we do not know.
+            DeviceError: nodes we do not know.
         """
-        packets = self.connection.feed(data)
-        if self._order is None:
-            self._learn_nodes()
-        samples = []
-        for packet in packets:
-            sample = self._sample(packet, t_host_ns)
-            if sample is not None:
-                samples.append(sample)
-        return {self._stream.name: samples} if samples else {}
-
-    def _learn_nodes(self) -> None:
-        hello = self.connection.hello
-        if hello is None or hello.nodes is None:
-            return
         try:
-            self._order = np.array(resolve_nodes(hello.nodes))
+            self._order = np.array(resolve_nodes(hello.nodes or ()))
         except PacketError as error:
             raise DeviceError(
                 f"{self._device}: {error.message}", device=self._device, event="wrong_nodes"

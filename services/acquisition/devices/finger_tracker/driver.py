@@ -12,8 +12,8 @@ from dextouch.hands import CHAINS, FINGER_JOINTS, NO_KEYPOINT, NUM_KEYPOINTS, WR
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, Readings, check_packet
-from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+from services.acquisition.drivers.base import Driver, StreamDecoder, check_packet
+from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     REPORT_BYTES,
@@ -107,15 +107,18 @@ def unpack_keypoints(
     return keypoints, int(unseen.sum())
 
 
-class FingerTrackerDecoder:
-    """Joins reports, resolves nodes by the descriptor's ids, marks unseen nodes with NaN."""
+class FingerTrackerDecoder(StreamDecoder[Packet]):
+    """Joins reports, resolves nodes by the descriptor's ids, marks unseen nodes with NaN.
+
+    Its `statistics` are those of the data packets.
+    """
 
     def __init__(self, side: Side) -> None:
+        packets = PacketDecoder(MAGIC, min_payload=PAYLOAD_BYTES, max_payload=PAYLOAD_BYTES)
+        super().__init__(keypoints_descriptor(side), packets)
         self._side = side
         self._device = f"finger_tracker_{side}"
-        self._stream = keypoints_descriptor(side)
         self.reports = ReportReassembler()
-        self._data = PacketDecoder(MAGIC, min_payload=PAYLOAD_BYTES, max_payload=PAYLOAD_BYTES)
         self._descriptor = PacketDecoder(
             DESCRIPTOR_MAGIC, min_payload=DESCRIPTOR_BYTES, max_payload=DESCRIPTOR_BYTES
         )
@@ -125,29 +128,19 @@ class FingerTrackerDecoder:
         self.unseen_nodes = 0
 
     @property
-    def statistics(self) -> DecoderStatistics:
-        """Counters of the data packets."""
-        return self._data.statistics
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The keypoint stream."""
-        return (self._stream,)
-
-    @property
     def described(self) -> bool:
         """Whether the node order is known."""
         return self._order is not None
 
     def reset(self) -> None:
         """Forget half a message and the node order (another device may answer now)."""
+        super().reset()
         self.reports.reset()
-        self._data.reset()
         self._descriptor.reset()
         self.order.reset()
         self._order = None
 
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
         """Keypoints (float32 [25, 3], m) completed by one report.
 
         Raises:
@@ -155,23 +148,23 @@ class FingerTrackerDecoder:
         """
         message = self.reports.feed(data)
         if message is None:
-            return {}
+            return []
         report_id, body = message
         if report_id == DESCRIPTOR_REPORT:
             self._describe(body)
-            return {}
-        samples = []
-        for packet in self._data.feed(body):
-            check_packet(packet, device=self._device, source=self._side)
-            if not self.order.admits(packet.sequence):
-                continue
-            if self._order is None:
-                self.undescribed += 1
-                continue
-            keypoints, num_unseen = unpack_keypoints(packet.payload, self._order)
-            self.unseen_nodes += num_unseen
-            samples.append(Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence))
-        return {self._stream.name: samples} if samples else {}
+            return []
+        return super().feed(body, t_host_ns)
+
+    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        check_packet(packet, device=self._device, source=self._side)
+        if not self.order.admits(packet.sequence):
+            return None
+        if self._order is None:
+            self.undescribed += 1
+            return None
+        keypoints, num_unseen = unpack_keypoints(packet.payload, self._order)
+        self.unseen_nodes += num_unseen
+        return Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence)
 
     def _describe(self, body: bytes) -> None:
         for packet in self._descriptor.feed(body):

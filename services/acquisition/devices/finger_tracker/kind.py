@@ -7,7 +7,7 @@ from services.acquisition.devices.finger_tracker.settings import FingerTrackerSe
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.tracker_links import bridge_transport, report_transport
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_driver import BridgeDriver
+from services.acquisition.drivers.sdk_link_driver import BridgeDriver
 
 
 def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:

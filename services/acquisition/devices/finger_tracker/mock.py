@@ -15,28 +15,28 @@ from services.acquisition.devices.finger_tracker.driver import (
     VALIDITY,
     FingerTracker,
 )
-from services.acquisition.drivers.bridge_protocol import (
-    PROTOCOL,
-    PROTOCOL_VERSION,
-    BridgedDevice,
-    BridgeHello,
-    FrameConvention,
-)
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.mocks.bridge_sources import (
-    LEFT_HANDED,
-    SOFTWARE,
-    hello_line,
+from services.acquisition.drivers.sdk_link_protocol import (
+    PROTOCOL,
+    PROTOCOL_VERSION,
+    BridgedDevice,
+    BridgeHello,
+    FrameConvention,
 )
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+from services.acquisition.mocks.sdk_link_sources import (
+    LEFT_HANDED,
+    SOFTWARE,
+    hello_line,
+)
 from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
 
 # What an occluded tracker does not see.

@@ -12,8 +12,8 @@ from jaxtyping import Float32
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import CellLayout, Readings, hand_name
-from services.acquisition.drivers.frames import DecoderStatistics, PortionedSearch
+from services.acquisition.drivers.base import CellLayout, StreamDecoder, hand_name
+from services.acquisition.drivers.packet_search import PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
 FLOAT_BYTES = 4
@@ -127,8 +127,10 @@ class JustFloatFrames(PortionedSearch[bytes]):
             )
 
 
-class JustFloatGloveDecoder:
-    """Decodes one glove's byte stream.
+class JustFloatGloveDecoder(StreamDecoder[bytes]):
+    """Decodes one glove's byte stream to float32 [num_values], without stamp and number.
+
+    Without a sequence, losses cannot be counted.
 
     Args:
         side: of the glove; the packets do not contain it.
@@ -147,44 +149,13 @@ class JustFloatGloveDecoder:
         rate_hz: float,
         label: str | None = None,
     ) -> None:
-        self._frames = JustFloatFrames(num_values, full_scale)
+        frames = JustFloatFrames(num_values, full_scale)
+        descriptor = justfloat_descriptor(side, num_values=num_values, rate_hz=rate_hz, label=label)
+        super().__init__(descriptor, frames)
         self.cells = CellLayout(full_scale, grid=None)
-        self._descriptor = justfloat_descriptor(
-            side, num_values=num_values, rate_hz=rate_hz, label=label
-        )
 
-    @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far; without a sequence, losses cannot be counted."""
-        return self._frames.statistics
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The raw stream."""
-        return (self._descriptor,)
-
-    def reset(self) -> None:
-        """Forget half a packet."""
-        self._frames.reset()
-
-    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
-        """Samples (float32 [num_values]) completed by `data`, without stamp and number.
-
-        Args:
-            data: the next bytes of the stream, in any portion.
-            t_host_ns: when they arrived; 0 where only the content matters.
-
-        Raises:
-            DeviceError: packets of another length, three in a row.
-        """
-        return [
-            Sample(t_host_ns, np.frombuffer(payload, _VALUE)) for payload in self._frames.feed(data)
-        ]
-
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """The same by stream name."""
-        samples = self.feed(data, t_host_ns)
-        return {self._descriptor.name: samples} if samples else {}
+    def _sample(self, packet: bytes, t_host_ns: int) -> Sample:
+        return Sample(t_host_ns, np.frombuffer(packet, _VALUE))
 
 
 def justfloat_descriptor(

@@ -5,14 +5,14 @@ import struct
 from enum import IntEnum
 
 from dextouch.errors import PacketError
-from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.drivers.base import Readings, check_packet
-from services.acquisition.drivers.bridge_protocol import BridgeConnection, FreshnessGate
-from services.acquisition.drivers.packets import DecoderStatistics, Packet, PacketDecoder
+from dextouch.streams import Sample
+from services.acquisition.drivers.base import check_packet
+from services.acquisition.drivers.packets import Packet, PacketDecoder
+from services.acquisition.drivers.sdk_link_driver import BridgeDecoder
+from services.acquisition.drivers.sdk_link_protocol import BridgeConnection, BridgeHello
 from services.acquisition.drivers.sender_frame import SenderFrame
 from services.acquisition.drivers.tracking import (
     PoseStream,
-    TrackingEvents,
     pose_descriptor,
     source_of,
 )
@@ -34,11 +34,12 @@ class TrackingResult(IntEnum):
     FALLBACK_ROTATION_ONLY = 300
 
 
-class BridgePoseTrackerDecoder:
+class BridgePoseTrackerDecoder(BridgeDecoder):
     """Poses [x y z qw qx qy qz] (m, world frame) of one device of an OpenVR-like source.
 
     Only the result RUNNING_OK makes a sample. The pose-valid flag never does: such sources keep it
-    set while a lost tracker drifts. A running pose that is flagged invalid is dropped too.
+    set while a lost tracker drifts. A running pose that is flagged invalid is dropped too, and a
+    matrix that is no pose is counted as `refused`.
 
     Args:
         stream: `wrist_left`, `wrist_right`, `head`, or the name of another place.
@@ -46,9 +47,8 @@ class BridgePoseTrackerDecoder:
     """
 
     def __init__(self, stream: str, *, serial_number: str | None = None) -> None:
-        self._stream = stream
         self._device = f"pose_tracker_{stream}"
-        self.connection = BridgeConnection(
+        connection = BridgeConnection(
             "pose_tracker",
             device=self._device,
             source=source_of(stream),
@@ -56,49 +56,18 @@ class BridgePoseTrackerDecoder:
             packets=PacketDecoder(POSE_MAGIC, min_payload=0, max_payload=POSE_PAYLOAD.size),
             payload_bytes=POSE_PAYLOAD.size,
         )
-        self.freshness = FreshnessGate()
+        super().__init__(pose_descriptor(stream), connection)
         self.poses = PoseStream()
-        self._descriptor = pose_descriptor(stream)
+        self.tracking = self.poses.events
         self._frame: SenderFrame | None = None
-
-    @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far, of all devices of the bridge; `refused`: matrices that are none."""
-        return self.connection.statistics
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The pose stream."""
-        return (self._descriptor,)
-
-    @property
-    def tracking(self) -> TrackingEvents:
-        """What was left out: counts and the last events."""
-        return self.poses.events
 
     def reset(self) -> None:
         """The connection was lost."""
-        self.connection.reset()
-        self.freshness.reset()
+        super().reset()
         self.poses.reset()
 
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """Poses completed by `data`.
-
-        Raises:
-            DeviceError: no bridge with this tracker.
-        """
-        samples = []
-        known = self.connection.hello
-        packets = self.connection.feed(data)
-        hello = self.connection.hello
-        if hello is not known and hello is not None:
-            self._frame = SenderFrame(hello.frame, hello.scale_m())
-        for packet in packets:
-            sample = self._sample(packet, t_host_ns)
-            if sample is not None:
-                samples.append(sample)
-        return {self._stream: samples} if samples else {}
+    def _learn(self, hello: BridgeHello) -> None:
+        self._frame = SenderFrame(hello.frame, hello.scale_m())
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         chosen, frame = self.connection.chosen, self._frame

@@ -7,7 +7,7 @@ from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.pose_tracker.settings import PoseTrackerSettings
 from services.acquisition.devices.tracker_links import bridge_transport, report_transport
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_driver import BridgeDriver
+from services.acquisition.drivers.sdk_link_driver import BridgeDriver
 
 
 def build(settings: PoseTrackerSettings, clock: StationClock) -> Driver:

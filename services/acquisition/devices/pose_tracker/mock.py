@@ -19,25 +19,25 @@ from services.acquisition.devices.pose_tracker.bridge import (
 )
 from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.bridge_protocol import (
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
+from services.acquisition.drivers.sdk_link_protocol import (
     PROTOCOL,
     PROTOCOL_VERSION,
     BridgedDevice,
     BridgeHello,
     FrameConvention,
 )
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.drivers.tracking import TrackingState, source_of
-from services.acquisition.mocks.bridge_sources import (
-    SOFTWARE,
-    Y_UP,
-    hello_line,
-)
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
+from services.acquisition.mocks.sdk_link_sources import (
+    SOFTWARE,
+    Y_UP,
+    hello_line,
+)
 from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace, bridged_pair
 
 POSE_INDEX = 3

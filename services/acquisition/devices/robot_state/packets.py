@@ -9,7 +9,7 @@ import numpy as np
 from dextouch.errors import InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor, StreamKind
 from services.acquisition.drivers.base import Readings, check_packet
-from services.acquisition.drivers.packets import DecoderStatistics, PacketDecoder
+from services.acquisition.drivers.packets import PacketDecoder
 
 MAGIC = b"DXRS"
 NUM_JOINTS = 40
@@ -67,18 +67,10 @@ class RobotStateDecoder:
                 "each once"
             )
         self._packets = PacketDecoder(MAGIC, min_payload=PAYLOAD.size, max_payload=PAYLOAD.size)
-        self._descriptors = tuple(robot_descriptor(stream) for stream in streams)
+        # `refused` counts states that are not finite.
+        self.statistics = self._packets.statistics
+        self.descriptors = tuple(robot_descriptor(stream) for stream in streams)
         self._wanted = frozenset(streams)
-
-    @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far; `refused` counts states that are not finite."""
-        return self._packets.statistics
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The wanted streams."""
-        return self._descriptors
 
     def reset(self) -> None:
         """Forget half a packet."""

@@ -27,7 +27,7 @@ from services.acquisition.drivers.image_encoding import (
     StampedImage,
 )
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
-from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.drivers.packet_search import DecoderStatistics
 
 READ_TIMEOUT_S = 0.05
 # A camera that says nothing for so long is lost; the first image may take longer.

@@ -2,7 +2,7 @@
 
 from dextouch.errors import DeviceError
 from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE
-from services.acquisition.drivers.packets import DecoderStatistics
+from services.acquisition.drivers.packet_search import DecoderStatistics
 
 # How old the first image's stamp may be to be one of this host's clock; later ones may have waited.
 MAX_FIRST_AGE_NS = 1_000_000_000

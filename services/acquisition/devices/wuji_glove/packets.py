@@ -11,8 +11,11 @@ from jaxtyping import Float32
 from dextouch.errors import DeviceError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import CellLayout, Readings, hand_name
-from services.acquisition.drivers.frames import DecoderStatistics, FrameSearch, SequenceCounter
+from services.acquisition.drivers.base import CellLayout, StreamDecoder, hand_name
+from services.acquisition.drivers.packet_search import (
+    FrameSearch,
+    SequenceCounter,
+)
 
 MARK = b"\xaa\x55"
 PACKET_BYTES = 3088
@@ -84,59 +87,26 @@ class WujiFrames(FrameSearch[WujiPacket]):
         return last_ms is not None and (time_ms - last_ms) % (1 << TIME_BITS) >= 1 << TIME_BITS - 1
 
 
-class WujiGloveDecoder:
-    """Decodes one glove's byte stream; cells that the glove has not are NaN, as it sends them.
+class WujiGloveDecoder(StreamDecoder[WujiPacket]):
+    """Decodes one glove's byte stream to float32 [768] of full scale, row by row.
+
+    Cells that the glove has not are NaN, as it sends them.
 
     Args:
         side: which glove it must be; None takes any.
         label: of a further glove of this hand.
     """
 
+    cells = CellLayout(1.0, GRID)
+
     def __init__(self, side: Side | None = None, *, label: str | None = None) -> None:
-        self._frames = WujiFrames()
+        # Where the side is open, the stream is named for the left hand.
+        super().__init__(wuji_descriptor(side or "left", label), WujiFrames())
         self._side: Side | None = side
-        self._descriptor = wuji_descriptor(side or "left", label)
 
-    @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far."""
-        return self._frames.statistics
-
-    @property
-    def descriptors(self) -> tuple[StreamDescriptor, ...]:
-        """The raw stream (named for the left hand when the side is open)."""
-        return (self._descriptor,)
-
-    @property
-    def cells(self) -> CellLayout:
-        """Shares of full scale on the glove's grid."""
-        return CellLayout(1.0, GRID)
-
-    def reset(self) -> None:
-        """Forget half a packet."""
-        self._frames.reset()
-
-    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
-        """Samples (float32 [768] of full scale, row by row) completed by `data`.
-
-        Args:
-            data: the next bytes of the stream, in any portion.
-            t_host_ns: when they arrived; 0 where only the content matters.
-
-        Raises:
-            DeviceError: the other hand's glove, or a hand that there is not.
-        """
-        samples = []
-        for packet in self._frames.feed(data):
-            self._check_hand(packet.hand)
-            t_device_ns = packet.time_ms * TICK_NS
-            samples.append(Sample(t_host_ns, packet.cells, t_device_ns, packet.sequence))
-        return samples
-
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """The same by stream name."""
-        samples = self.feed(data, t_host_ns)
-        return {self._descriptor.name: samples} if samples else {}
+    def _sample(self, packet: WujiPacket, t_host_ns: int) -> Sample:
+        self._check_hand(packet.hand)
+        return Sample(t_host_ns, packet.cells, packet.time_ms * TICK_NS, packet.sequence)
 
     def _check_hand(self, hand: int) -> None:
         side = HANDS.get(hand)

@@ -2,10 +2,9 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 Found = TypeVar("Found")
-
 
 # Packets that overtake each other do so within a few; a restarted device jumps further.
 LATE_PACKETS = 64
@@ -89,6 +88,21 @@ class SequenceCounter:
             if (sequence - oldest) % self._modulus <= LATE_PACKETS:
                 break
             del self._missing[oldest]
+
+
+@runtime_checkable
+class PacketFinder(Protocol[Found]):
+    """Finds the packets of one device in its bytes."""
+
+    statistics: DecoderStatistics
+
+    def reset(self) -> None:
+        """Forget half a packet, since the link was lost."""
+        ...
+
+    def feed(self, data: bytes, /) -> list[Found]:
+        """Packets completed by `data`."""
+        ...
 
 
 class PortionedSearch(ABC, Generic[Found]):

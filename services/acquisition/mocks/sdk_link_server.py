@@ -8,9 +8,9 @@ from types import TracebackType
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock
-from services.acquisition.mocks.bridge_sources import BridgeSource, sign_of_life
 from services.acquisition.mocks.link import Link, WatchedTransport
 from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
+from services.acquisition.mocks.sdk_link_sources import BridgeSource, sign_of_life
 from services.acquisition.transports.base import Transport
 from services.acquisition.transports.socket import SocketTransport
 

@@ -1,24 +1,45 @@
 """Driver of one device behind a bridge, the process that holds a closed SDK."""
 
-from typing import Protocol
+from abc import abstractmethod
 
 from dextouch.errors import DeviceError, StaleDataError
+from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Decoder, Driver, Readings
-from services.acquisition.drivers.bridge_protocol import BridgeConnection
+from services.acquisition.drivers.base import Driver, Readings, StreamDecoder
+from services.acquisition.drivers.packets import Packet
+from services.acquisition.drivers.sdk_link_protocol import (
+    BridgeConnection,
+    BridgeHello,
+    FreshnessGate,
+)
 from services.acquisition.transports.base import Transport
 
 HELLO_READS = 20
 SILENCE_NS = 200_000_000
 
 
-class BridgeDecoder(Decoder, Protocol):
-    """A decoder of the packets of one device behind a bridge."""
+class BridgeDecoder(StreamDecoder[Packet]):
+    """Base of the decoders of one device behind a bridge.
 
-    @property
-    def connection(self) -> BridgeConnection:
-        """The bridge's hello."""
-        ...
+    Args:
+        descriptor: of the stream.
+        connection: the bridge's hello and packets; `statistics` are of all devices of the bridge.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor, connection: BridgeConnection) -> None:
+        super().__init__(descriptor, connection)
+        connection.on_hello = self._learn
+        self.connection = connection
+        self.freshness = FreshnessGate()
+
+    def reset(self) -> None:
+        """The connection was lost."""
+        super().reset()
+        self.freshness.reset()
+
+    @abstractmethod
+    def _learn(self, hello: BridgeHello) -> None:
+        """Take in what a new connection's hello says of the sender."""
 
 
 class BridgeDriver(Driver):

@@ -3,6 +3,7 @@
 The bytes are documented in docs/device_packets.md, "Bridges".
 """
 
+from collections.abc import Callable
 from typing import Final, Literal
 
 import numpy as np
@@ -12,7 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from dextouch.errors import DeviceError
 from dextouch.frozen_model import FrozenModel
 from services.acquisition.drivers.base import check_packet
-from services.acquisition.drivers.packets import DecoderStatistics, Packet, PacketDecoder
+from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.drivers.reports import OrderFilter
 
 PROTOCOL: Final = "dextouch-bridge"
@@ -169,7 +170,13 @@ class BridgeConnection:
         serial_number: of the wanted device; the only one of its source if None.
         packets: finds the packets; an empty payload must be allowed, as it is a heartbeat.
         payload_bytes: of a packet with a sample.
+
+    Attributes:
+        on_hello: takes the hello of a new connection.
+        statistics: what was seen so far; `refused` counts packets of a wrong size too.
     """
+
+    on_hello: Callable[[BridgeHello], None] | None = None
 
     def __init__(
         self,
@@ -182,6 +189,7 @@ class BridgeConnection:
         payload_bytes: int,
     ) -> None:
         self.order = OrderFilter()
+        self.statistics = packets.statistics
         self.hello: BridgeHello | None = None
         self.chosen: BridgedDevice | None = None
         self._kind = kind
@@ -191,11 +199,6 @@ class BridgeConnection:
         self._packets = packets
         self._payload_bytes = payload_bytes
         self._line = bytearray()
-
-    @property
-    def statistics(self) -> DecoderStatistics:
-        """What was seen so far; `refused` counts packets of a wrong size too."""
-        return self._packets.statistics
 
     def reset(self) -> None:
         """The connection was lost: the next one begins with a hello."""
@@ -220,6 +223,8 @@ class BridgeConnection:
             hello = parse_hello(bytes(line), device=self._device)
             self.chosen = self._choose(hello)
             self.hello, data = hello, bytes(rest)
+            if self.on_hello is not None:
+                self.on_hello(hello)
         return [packet for packet in self._packets.feed(data) if self._is_new(packet)]
 
     def _is_new(self, packet: Packet) -> bool:

@@ -5,11 +5,11 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Int64
 
-from services.acquisition.drivers.bridge_protocol import (
+from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.drivers.sdk_link_protocol import (
     BridgeHello,
     FrameConvention,
 )
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
 LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
