@@ -134,14 +134,13 @@ class MockFactory:
     def _camera(self, stream: str) -> MockPair:
         replay, images = self._streams[stream], self._links.images
         if self._links.cameras == "station":
-            camera = video_camera(
+            return video_camera(
                 replay,
                 faults=self._faults.of(stream),
                 seed=self._seed,
                 clock=self._clock,
                 encoding=images,
             )
-            return MockPair(camera.device, camera.driver)
         height_px, width_px = replay.descriptor.shape[:2]
         decoder = CameraDecoder(stream, height_px=height_px, width_px=width_px, encoding=images)
         port = SocketPort(stream)

@@ -15,7 +15,6 @@ from dextouch.images import decode_jpeg
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.station_camera.driver import CameraTiming
 from services.acquisition.devices.station_camera.mock import video_camera
 from services.acquisition.drivers.image_encoding import begin_take, take_gates
 from services.acquisition.mock_links import MockLinks
@@ -92,7 +91,8 @@ def record(stream, encoding, spool_root, **faults):
         seed=3,
         clock=clock,
         encoding=encoding,
-        timing=CameraTiming(latency_ns=12_000_000, latency_sigma_ns=500_000),
+        latency_ms=12.0,
+        latency_sigma_ms=0.5,
     )
     pair.device.port.exposure_ns = EXPOSURE_NS
     station = Station(

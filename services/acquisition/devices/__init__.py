@@ -6,10 +6,13 @@ docs/tutorials/add_a_device.md builds one.
 
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.gloves import GloveSettings
 from services.acquisition.devices.kind import DeviceKind, DeviceSettings
 from services.acquisition.devices.registry import ENTRY_POINT_GROUP, device_kind, kind_names
-from services.acquisition.devices.serial_line import SerialLineSettings, serial_transport
+from services.acquisition.devices.serial_line import (
+    GloveSettings,
+    SerialLineSettings,
+    serial_transport,
+)
 from services.acquisition.devices.station_drivers import build_drivers, load_calibration
 from services.acquisition.drivers.base import (
     CellLayout,

@@ -12,6 +12,8 @@ from services.acquisition.drivers.base import Driver
 
 # Names of streams are ROLE_LABEL or ROLE_LABEL_SIDE; the role says what reads them.
 StreamName = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,63}$")]
+# `camera_head` is what episodes need; any number of others may stand beside it.
+CameraStream = Annotated[str, Field(pattern=r"^camera_[a-z0-9_]{1,57}$")]
 
 
 class DeviceSettings(FrozenModel):
@@ -22,6 +24,13 @@ class DeviceSettings(FrozenModel):
     """
 
     kind: str
+
+
+class TcpSettings(DeviceSettings):
+    """A device at a TCP address."""
+
+    host: str = "127.0.0.1"
+    port: int = Field(gt=0, le=65535)
 
 
 SettingsT = TypeVar("SettingsT", bound=DeviceSettings)

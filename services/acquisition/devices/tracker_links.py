@@ -8,11 +8,7 @@ from dextouch.errors import InvalidInputError
 from services.acquisition.devices.kind import DeviceSettings
 from services.acquisition.transports.base import Transport
 from services.acquisition.transports.hid import HidTransport, hid_opener
-from services.acquisition.transports.socket import (
-    SocketTransport,
-    tcp_connector,
-    unix_connector,
-)
+from services.acquisition.transports.socket import SocketTransport, tcp_transport, unix_transport
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 
@@ -76,8 +72,7 @@ def bridge_transport(settings: TrackerSettings) -> SocketTransport:
         InvalidInputError: neither port nor path.
     """
     if settings.path is not None:
-        return SocketTransport(unix_connector(settings.path), address=settings.path)
+        return unix_transport(settings.path)
     if settings.port is None:
         raise InvalidInputError(f"{settings.kind} by bridge: set its port or its path")
-    address = f"{settings.host}:{settings.port}"
-    return SocketTransport(tcp_connector(settings.host, settings.port), address=address)
+    return tcp_transport(settings.host, settings.port)

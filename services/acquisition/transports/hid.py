@@ -4,7 +4,7 @@ from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.base import TransportInfo
+from services.acquisition.transports.base import HandleTransport, TransportInfo
 
 READ_TIMEOUT_MS = 100
 MAX_REPORT_BYTES = 64
@@ -42,7 +42,7 @@ def hid_opener(
     return open_device
 
 
-class HidTransport:
+class HidTransport(HandleTransport[HidDevice]):
     """One HID device; `read` gives one report, and b"" means nothing yet (never: stale)."""
 
     def __init__(
@@ -52,29 +52,8 @@ class HidTransport:
         address: str,
         serial_number: str | None = None,
     ) -> None:
+        super().__init__(TransportInfo("hid", address, serial_number))
         self._open_device = open_device
-        self._address = address
-        self._serial_number = serial_number
-        self._device: HidDevice | None = None
-
-    @property
-    def info(self) -> TransportInfo:
-        """Vendor and product."""
-        return TransportInfo("hid", self._address, self._serial_number)
-
-    def open(self) -> None:
-        """Open the device.
-
-        Raises:
-            DeviceError: absent or not permitted.
-        """
-        self.close()
-        try:
-            self._device = self._open_device()
-        except OSError as error:
-            raise DeviceError(
-                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
-            ) from error
 
     def read(self) -> bytes:
         """One report, waiting up to 0.1 s.
@@ -100,13 +79,13 @@ class HidTransport:
         if written < len(data):
             raise DeviceError(f"{self.info}: wrote {written} bytes, expected at least {len(data)}")
 
-    def close(self) -> None:
-        """Close the device."""
-        if self._device is not None:
-            self._device.close()
-            self._device = None
+    def _connect(self) -> HidDevice:
+        try:
+            return self._open_device()
+        except OSError as error:
+            raise DeviceError(
+                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
+            ) from error
 
-    def _opened(self) -> HidDevice:
-        if self._device is None:
-            raise DeviceError(f"{self.info}: not open")
-        return self._device
+    def _release(self, handle: HidDevice) -> None:
+        handle.close()

@@ -5,12 +5,13 @@ import os
 import select
 import threading
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import structlog
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.base import TransportInfo
+from services.acquisition.transports.base import HandleTransport, TransportInfo
 
 if TYPE_CHECKING:
     import serial
@@ -53,7 +54,7 @@ def find_port(serial_number: str) -> str:
     return found[0]
 
 
-class SerialTransport:
+class SerialTransport(HandleTransport["serial.Serial"]):
     """One serial port, held exclusively.
 
     Args:
@@ -69,50 +70,11 @@ class SerialTransport:
         baud_rate: int = 2_000_000,
         serial_number: str | None = None,
     ) -> None:
+        super().__init__(TransportInfo("serial", "not opened", serial_number))
         self._find = find
         self._baud_rate = baud_rate
-        self._serial_number = serial_number
-        self._address = "not opened"
-        self._port: serial.Serial | None = None
         self._closing: threading.Thread | None = None
         self._poll = select.poll()
-
-    @property
-    def info(self) -> TransportInfo:
-        """The port last opened."""
-        return TransportInfo("serial", self._address, self._serial_number)
-
-    def open(self) -> None:
-        """Find and open the port; its input buffer is cleared.
-
-        Raises:
-            DeviceError: absent, taken by another process, still closing, or not to be opened.
-        """
-        import serial
-
-        self.close()
-        if self._closing is not None and self._closing.is_alive():
-            raise DeviceError(
-                f"{self.info}: is still being closed, because the device does not read; wait half "
-                "a minute or replug it"
-            )
-        self._address = self._find()
-        try:
-            self._port = serial.Serial(
-                self._address,
-                self._baud_rate,
-                timeout=READ_TIMEOUT_S,
-                write_timeout=WRITE_TIMEOUT_S,
-                exclusive=True,
-            )
-        except (OSError, ValueError) as error:  # SerialException is an OSError
-            raise DeviceError(f"{self.info}: cannot be opened ({error}); is it in use?") from error
-        # USB bridges of one maker hold bytes back for 16 ms unless told otherwise; now is the time,
-        # since doing it in full flow stalls them. Ports without such a timer refuse.
-        with contextlib.suppress(OSError, ValueError):
-            self._port.set_low_latency_mode(True)
-        self._poll = select.poll()
-        self._poll.register(self._port.fileno(), select.POLLIN)
 
     def read(self) -> bytes:
         """All that has arrived, waiting up to 0.1 s for the first byte.
@@ -146,26 +108,47 @@ class SerialTransport:
             # pyserial fails with the latter two where another thread closes the port meanwhile.
             raise DeviceError(f"{self.info}: lost while writing ({error})") from error
 
-    def close(self) -> None:
+    def _connect(self) -> "serial.Serial":
+        """Find and open the port; its input buffer is cleared."""
+        import serial
+
+        if self._closing is not None and self._closing.is_alive():
+            raise DeviceError(
+                f"{self.info}: is still being closed, because the device does not read; wait half "
+                "a minute or replug it"
+            )
+        # The port of now, for messages.
+        self.info = replace(self.info, address=self._find())
+        try:
+            port = serial.Serial(
+                self.info.address,
+                self._baud_rate,
+                timeout=READ_TIMEOUT_S,
+                write_timeout=WRITE_TIMEOUT_S,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise DeviceError(f"{self.info}: cannot be opened ({error}); is it in use?") from error
+        # USB bridges of one maker hold bytes back for 16 ms unless told otherwise; now is the time,
+        # since doing it in full flow stalls them. Ports without such a timer refuse.
+        with contextlib.suppress(OSError, ValueError):
+            port.set_low_latency_mode(True)
+        self._poll = select.poll()
+        self._poll.register(port.fileno(), select.POLLIN)
+        return port
+
+    def _release(self, handle: "serial.Serial") -> None:
         """Close the port; what takes longer than 1 s goes on by itself, and is said."""
-        port, self._port = self._port, None
-        if port is None:
-            return
         self._closing = threading.Thread(
-            target=self._give_back, args=(port,), name="close-serial", daemon=True
+            target=self._give_back, args=(handle,), name="close-serial", daemon=True
         )
         self._closing.start()
         self._closing.join(CLOSE_TIMEOUT_S)
         if self._closing.is_alive():
-            logger.warning("wait_for_port_to_close", address=self._address)
+            logger.warning("wait_for_port_to_close", address=self.info.address)
 
     def _give_back(self, port: "serial.Serial") -> None:
         try:
             port.close()
         except OSError as error:
-            logger.warning("fail_to_close_port", address=self._address, error=str(error))
-
-    def _opened(self) -> "serial.Serial":
-        if self._port is None:
-            raise DeviceError(f"{self.info}: not open")
-        return self._port
+            logger.warning("fail_to_close_port", address=self.info.address, error=str(error))

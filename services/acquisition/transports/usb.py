@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.base import TransportInfo
+from services.acquisition.transports.base import HandleTransport, TransportInfo
 
 if TYPE_CHECKING:
     from usb.backend import IBackend
@@ -41,7 +41,7 @@ class _Opened:
     read_bytes: int
 
 
-class UsbTransport:
+class UsbTransport(HandleTransport[_Opened]):
     """One USB device with an interrupt endpoint; `read` gives one report, b"" means nothing yet.
 
     Every opening searches for the device by its serial number, so that it is found again after
@@ -58,42 +58,13 @@ class UsbTransport:
     def __init__(
         self, address: UsbAddress, *, interface: int = 0, backend: "IBackend | None" = None
     ) -> None:
+        super().__init__(TransportInfo("usb", str(address), address.serial_number))
         self._address = address
         self._interface = interface
         self._backend = backend
         # Outlives the devices found in it: libusb wants them given back before its context ends.
         self._context: IBackend | None = None
-        self._opened: _Opened | None = None
         self._detached = False
-
-    @property
-    def info(self) -> TransportInfo:
-        """Vendor, product and serial number."""
-        return TransportInfo("usb", str(self._address), self._address.serial_number)
-
-    def open(self) -> None:
-        """Find the device, take its interface.
-
-        Raises:
-            DeviceError: absent, not permitted, ambiguous, or without an interrupt endpoint.
-        """
-        import usb.core
-
-        self.close()
-        try:
-            self._context = self._backend or _new_context()
-            device = self._find()
-            try:
-                self._opened = self._take(device)
-            except (OSError, DeviceError):
-                self._give_back(device)
-                raise
-        except usb.core.NoBackendError as error:
-            raise DeviceError(f"{self.info}: libusb-1.0 is not installed ({error})") from error
-        except OSError as error:  # USBError is an OSError
-            raise DeviceError(
-                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
-            ) from error
 
     def read(self) -> bytes:
         """One report, waiting up to 0.1 s.
@@ -103,7 +74,7 @@ class UsbTransport:
         """
         import usb.core
 
-        opened = self._checked()
+        opened = self._opened()
         try:
             data = opened.device.read(opened.endpoint_in, opened.read_bytes, READ_TIMEOUT_MS)
         except OSError as error:
@@ -119,7 +90,7 @@ class UsbTransport:
         Raises:
             DeviceError: the device is gone or takes no such report.
         """
-        opened = self._checked()
+        opened = self._opened()
         try:
             if opened.endpoint_out is not None:
                 written = opened.device.write(opened.endpoint_out, data, WRITE_TIMEOUT_MS)
@@ -137,11 +108,27 @@ class UsbTransport:
         if written != len(data):
             raise DeviceError(f"{self.info}: wrote {written} bytes, expected {len(data)}")
 
-    def close(self) -> None:
+    def _connect(self) -> _Opened:
+        import usb.core
+
+        try:
+            self._context = self._backend or _new_context()
+            device = self._find()
+            try:
+                return self._take(device)
+            except (OSError, DeviceError):
+                self._give_back(device)
+                raise
+        except usb.core.NoBackendError as error:
+            raise DeviceError(f"{self.info}: libusb-1.0 is not installed ({error})") from error
+        except OSError as error:  # USBError is an OSError
+            raise DeviceError(
+                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
+            ) from error
+
+    def _release(self, handle: _Opened) -> None:
         """Release the interface; a device that is gone is only forgotten."""
-        if self._opened is not None:
-            opened, self._opened = self._opened, None
-            self._give_back(opened.device)
+        self._give_back(handle.device)
 
     def _give_back(self, device: "Device") -> None:
         import usb.util
@@ -152,11 +139,6 @@ class UsbTransport:
             if detached:
                 device.attach_kernel_driver(self._interface)
                 usb.util.dispose_resources(device)
-
-    def _checked(self) -> _Opened:
-        if self._opened is None:
-            raise DeviceError(f"{self.info}: not open")
-        return self._opened
 
     def _find(self) -> "Device":
         """The one device of this address; handles of others are closed again."""

@@ -8,19 +8,16 @@ from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.station_camera.capture import (
-    CapturedImage,
-    CaptureLink,
-    CaptureRequest,
-)
-from services.acquisition.devices.station_camera.driver import CameraTiming, StationCamera
+from services.acquisition.devices.station_camera.capture import CapturedImage, CaptureLink
+from services.acquisition.devices.station_camera.driver import StationCamera
+from services.acquisition.devices.station_camera.settings import StationCameraSettings
 from services.acquisition.drivers import image_encoding
 from services.acquisition.drivers.image_encoding import TakeAware
 from services.acquisition.settings import AcquisitionSettings
 
 MS = 1_000_000
 PERIOD = 33 * MS
-REQUEST = CaptureRequest(height_px=32, width_px=48, rate_hz=1e9 / PERIOD)
+WANTED = {"stream": "camera_head", "height_px": 32, "width_px": 48, "rate_hz": 1e9 / PERIOD}
 LATENCY = 5 * MS
 
 
@@ -77,8 +74,8 @@ class FakeCamera:
 
     def driver(self, **options):
         link = CaptureLink(self.open, address="/dev/video7", serial_number="AB12")
-        defaults = {"request": REQUEST, "encoding": "rgb8", "max_encode_wait_s": 20.0}
-        return StationCamera("camera_head", link=link, clock=self.clock, **defaults | options)
+        settings = StationCameraSettings(**{"encoding": "rgb8"} | WANTED | options)
+        return StationCamera(settings, link=link, clock=self.clock, max_encode_wait_s=20.0)
 
 
 def image(index, *, stamp="own", pixels=None):
@@ -128,8 +125,7 @@ def test_samples_carry_arrival_and_the_drivers_stamp():
 @pytest.mark.parametrize(("point", "sign"), [("start", 1), ("end", -1)])
 def test_the_middle_of_the_exposure(point, sign):
     camera = FakeCamera([image(0), image(1)], exposure_ns=16 * MS)
-    timing = CameraTiming(stamp_point=point, latency_ns=40 * MS, latency_sigma_ns=2 * MS)
-    driver = camera.driver(timing=timing)
+    driver = camera.driver(stamp_point=point, latency_ms=40, latency_sigma_ms=2)
     samples = read_all(driver, camera)
     assert [s.t_device_ns for s in samples] == [
         10**9 + sign * 8 * MS,

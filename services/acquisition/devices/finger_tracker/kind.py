@@ -1,13 +1,26 @@
 """The kind `finger_tracker`."""
 
+from typing import Literal
+
+from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.driver import FingerTracker
-from services.acquisition.devices.finger_tracker.settings import FingerTrackerSettings
 from services.acquisition.devices.kind import DeviceKind
-from services.acquisition.devices.tracker_links import bridge_transport, report_transport
+from services.acquisition.devices.tracker_links import (
+    TrackerSettings,
+    bridge_transport,
+    report_transport,
+)
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link_driver import BridgeDriver
+
+
+class FingerTrackerSettings(TrackerSettings):
+    """A finger tracker of one hand."""
+
+    kind: Literal["finger_tracker"] = "finger_tracker"
+    side: Side
 
 
 def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:

@@ -9,13 +9,14 @@ waited for without our timeout.
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import UInt8
 
-from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.transports.base import TransportInfo
+from dextouch.errors import DeviceError
+from services.acquisition.devices.station_camera.settings import StationCameraSettings
+from services.acquisition.transports.base import HandleTransport, TransportInfo
 
 BY_ID = Path("/dev/v4l/by-id")
 NS_PER_MS = 1_000_000
@@ -23,41 +24,6 @@ NS_PER_MS = 1_000_000
 EXPOSURE_UNIT_NS = 100_000
 MANUAL_EXPOSURE, AUTOMATIC_EXPOSURE = 1, 3
 RATE_TOLERANCE = 0.02
-StampPoint = Literal["start", "end"]
-
-
-@dataclass(frozen=True)
-class CaptureRequest:
-    """Requested settings of a camera; it is refused if it gives another size or rate.
-
-    Attributes:
-        height_px: of the images.
-        width_px: of the images.
-        rate_hz: images a second.
-        fourcc: pixel format on the wire, such as MJPG or YUYV.
-        exposure_ns: fixed exposure; None leaves it to the camera.
-    """
-
-    height_px: int
-    width_px: int
-    rate_hz: float = 30.0
-    fourcc: str = "MJPG"
-    exposure_ns: int | None = None
-
-    def __post_init__(self) -> None:
-        exposure_ns = self.exposure_ns
-        if min(self.height_px, self.width_px) < 1 or self.rate_hz <= 0 or len(self.fourcc) != 4:
-            raise InvalidInputError(f"camera: got {self}, expected sizes, a rate and a fourcc")
-        if exposure_ns is not None and not 0 < exposure_ns <= 1e9 / self.rate_hz:
-            raise InvalidInputError(
-                f"camera: got an exposure of {exposure_ns} ns, expected more than 0 and at most "
-                f"the period of {self.rate_hz:g} Hz"
-            )
-
-    @property
-    def period_ns(self) -> int:
-        """Nominal distance of two images."""
-        return round(1e9 / self.rate_hz)
 
 
 @dataclass(frozen=True)
@@ -94,7 +60,7 @@ class Capture(Protocol):
         ...
 
 
-class CaptureLink:
+class CaptureLink(HandleTransport[Capture]):
     """The transport of a camera: reopens it each time and returns its location.
 
     Args:
@@ -106,14 +72,8 @@ class CaptureLink:
     def __init__(
         self, opener: Callable[[], Capture], *, address: str, serial_number: str | None = None
     ) -> None:
+        super().__init__(TransportInfo("camera", address, serial_number))
         self._opener = opener
-        self._info = TransportInfo("camera", address, serial_number)
-        self._capture: Capture | None = None
-
-    @property
-    def info(self) -> TransportInfo:
-        """Where the camera is."""
-        return self._info
 
     @property
     def capture(self) -> Capture:
@@ -122,18 +82,7 @@ class CaptureLink:
         Raises:
             DeviceError: it is not open.
         """
-        if self._capture is None:
-            raise DeviceError(f"{self.info}: not open")
-        return self._capture
-
-    def open(self) -> None:
-        """Open the camera; an open one is closed first.
-
-        Raises:
-            DeviceError: it is absent, in use, or cannot do what it is asked for.
-        """
-        self.close()
-        self._capture = self._opener()
+        return self._opened()
 
     def read(self) -> bytes:
         """Refused: a camera gives images (`capture`), not bytes."""
@@ -143,11 +92,11 @@ class CaptureLink:
         """Refused: a camera takes no bytes."""
         raise DeviceError(f"{self.info}: accepts no data, got {len(data)}")
 
-    def close(self) -> None:
-        """Close the camera; closing twice is fine."""
-        if self._capture is not None:
-            capture, self._capture = self._capture, None
-            capture.close()
+    def _connect(self) -> Capture:
+        return self._opener()
+
+    def _release(self, handle: Capture) -> None:
+        handle.close()
 
 
 class OpenCvCapture:
@@ -155,14 +104,16 @@ class OpenCvCapture:
 
     Args:
         source: device such as /dev/video0, or the file.
-        request: what it is asked for.
+        request: size, rate, pixel format and exposure that it must give.
         is_file: whether `source` is a video file; its images come as fast as they are read.
 
     Raises:
         DeviceError: absent, in use, or not able to do what it is asked for.
     """
 
-    def __init__(self, source: str, request: CaptureRequest, *, is_file: bool = False) -> None:
+    def __init__(
+        self, source: str, request: StationCameraSettings, *, is_file: bool = False
+    ) -> None:
         import cv2
 
         self._cv2, self._source, self._is_file = cv2, source, is_file
@@ -214,7 +165,7 @@ class OpenCvCapture:
         """Give the camera back."""
         self._video.release()
 
-    def _set_up(self, request: CaptureRequest) -> None:
+    def _set_up(self, request: StationCameraSettings) -> None:
         if not self._video.isOpened():
             raise DeviceError(
                 f"camera {self._source}: cannot be opened; is it plugged in, is it in use, may "
@@ -225,7 +176,7 @@ class OpenCvCapture:
             self._set_exposure(request.exposure_ns)
         self._check(request)
 
-    def _ask(self, request: CaptureRequest) -> None:
+    def _ask(self, request: StationCameraSettings) -> None:
         cv2, video = self._cv2, self._video
         # The pixel format comes first: it decides which sizes and rates there are.
         fourcc = cv2.VideoWriter.fourcc(*request.fourcc)
@@ -250,10 +201,10 @@ class OpenCvCapture:
         units = round(video.get(cv2.CAP_PROP_EXPOSURE))
         self.exposure_ns = units * EXPOSURE_UNIT_NS if units > 0 else None
 
-    def _check(self, request: CaptureRequest) -> None:
+    def _check(self, request: StationCameraSettings) -> None:
         cv2, video = self._cv2, self._video
         got = (int(video.get(cv2.CAP_PROP_FRAME_HEIGHT)), int(video.get(cv2.CAP_PROP_FRAME_WIDTH)))
-        if got != (request.height_px, request.width_px):
+        if got != request.size_px:
             raise DeviceError(
                 f"camera {self._source}: gives {got[1]} by {got[0]} px, expected "
                 f"{request.width_px} by {request.height_px}; choose a supported size"

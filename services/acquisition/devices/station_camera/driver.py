@@ -5,7 +5,7 @@ exposure. A camera whose stamps are on another clock gives arrival stamps only, 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 from dextouch.errors import DeviceError
 from dextouch.schemas import Matrix
@@ -15,15 +15,16 @@ from services.acquisition.devices.station_camera.capture import (
     NS_PER_MS,
     CapturedImage,
     CaptureLink,
-    CaptureRequest,
-    StampPoint,
+)
+from services.acquisition.devices.station_camera.settings import (
+    StationCameraSettings,
+    nanoseconds,
 )
 from services.acquisition.devices.station_camera.stamps import DriverStamps
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import (
     EncodingQueue,
     ImageEncoder,
-    ImageEncoding,
     StampedImage,
 )
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
@@ -38,43 +39,30 @@ FIRST_IMAGE_NS = 3_000_000_000
 STAMP_TICK_NS = 1_000
 
 
-@dataclass(frozen=True)
-class CameraTiming:
-    """Known or assumed timing of a camera's images.
-
-    Attributes:
-        stamp_point: the end of the exposure at which the driver stamps.
-        latency_ns: calibrated, from the middle of the exposure to the earliest arrival.
-        latency_sigma_ns: of it.
-    """
-
-    stamp_point: StampPoint = "start"
-    latency_ns: int | None = None
-    latency_sigma_ns: int | None = None
-
-
 class _CaptureDecoder:
     """The decoder's part of a camera that gives images and no bytes."""
 
-    def __init__(self, stream: str, request: CaptureRequest, encoding: ImageEncoding) -> None:
+    def __init__(self, settings: StationCameraSettings) -> None:
         self.statistics = DecoderStatistics()
-        self.stamps = DriverStamps(stream, period_ns=request.period_ns, statistics=self.statistics)
-        self._stream, self._request, self._encoding = stream, request, encoding
+        self.stamps = DriverStamps(
+            settings.stream, period_ns=settings.period_ns, statistics=self.statistics
+        )
+        self._settings = settings
 
     @property
     def descriptors(self) -> tuple[StreamDescriptor, ...]:
         """The image stream; without device time once the driver's stamps proved useless."""
-        request = self._request
+        settings = self._settings
         has_time = self.stamps.usable is not False
         descriptor = StreamDescriptor(
-            name=self._stream,
+            name=settings.stream,
             kind="image",
-            shape=(request.height_px, request.width_px, 3),
+            shape=(*settings.size_px, 3),
             dtype="uint8",
-            unit=self._encoding,
-            nominal_rate_hz=request.rate_hz,
-            frame=self._stream,
-            device=self._stream,
+            unit=settings.encoding,
+            nominal_rate_hz=settings.rate_hz,
+            frame=settings.stream,
+            device=settings.stream,
             capabilities=ClockCapabilities(
                 device_time=has_time, tick_ns=STAMP_TICK_NS if has_time else 1
             ),
@@ -86,7 +74,9 @@ class _CaptureDecoder:
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Refused."""
-        raise DeviceError(f"{self._stream}: got {len(data)} bytes at {t_host_ns}, no image")
+        raise DeviceError(
+            f"{self._settings.stream}: got {len(data)} bytes at {t_host_ns}, no image"
+        )
 
 
 class StationCamera(Driver):
@@ -96,39 +86,31 @@ class StationCamera(Driver):
     by the driver's stamp, on the same clock.
 
     Args:
-        stream: name of the stream and of the device.
+        settings: name, size, rate, encoding and timing.
         link: opens the camera.
-        request: requested settings of the camera.
-        encoding: of the samples.
-        timing: its timing.
         clock: of the station.
         max_encode_wait_s: how long a read waits for the encoder, so that an image need not wait
             for the next one; half a period if None.
     """
 
-    def __init__(  # noqa: PLR0913 - the last two have a sensible default
+    def __init__(
         self,
-        stream: str,
+        settings: StationCameraSettings,
         *,
         link: CaptureLink,
-        request: CaptureRequest,
-        encoding: ImageEncoding,
         clock: StationClock,
-        timing: CameraTiming | None = None,
         max_encode_wait_s: float | None = None,
     ) -> None:
-        decoder = _CaptureDecoder(stream, request, encoding)
-        super().__init__(stream, transport=link, decoder=decoder, clock=clock)
-        self._link, self._request = link, request
-        self.timing = timing or CameraTiming()
-        size_px = (request.height_px, request.width_px)
-        encoder = ImageEncoder(encoding, size_px, rate_hz=request.rate_hz)
-        self._queue = EncodingQueue(encoder, name=stream)
-        self._checker = ImageChecker(period_ns=request.period_ns)
+        decoder = _CaptureDecoder(settings)
+        super().__init__(settings.stream, transport=link, decoder=decoder, clock=clock)
+        self._link, self._settings = link, settings
+        encoder = ImageEncoder(settings.encoding, settings.size_px, rate_hz=settings.rate_hz)
+        self._queue = EncodingQueue(encoder, name=settings.stream)
+        self._checker = ImageChecker(period_ns=settings.period_ns)
         self._stamps = decoder.stamps
-        period_s = request.period_ns / 1e9
+        period_s = settings.period_ns / 1e9
         self._encode_wait_s = period_s / 2 if max_encode_wait_s is None else max_encode_wait_s
-        self._exposure_ns = request.exposure_ns
+        self._exposure_ns = settings.exposure_ns
         self._heard_ns: int | None = None
         self._silence_ns = FIRST_IMAGE_NS
 
@@ -145,8 +127,8 @@ class StationCamera(Driver):
     def calibration(self) -> dict[str, Matrix]:
         """Latency with its sigma, if calibrated, and the exposure that the stamps assume."""
         record = {
-            "latency_ns": self.timing.latency_ns,
-            "latency_sigma_ns": self.timing.latency_sigma_ns,
+            "latency_ns": nanoseconds(self._settings.latency_ms),
+            "latency_sigma_ns": nanoseconds(self._settings.latency_sigma_ms),
             "exposure_ns": self._exposure_ns,
         }
         return {
@@ -170,7 +152,7 @@ class StationCamera(Driver):
         self._queue.prepare()
         super().open()
         exposure_ns = self._link.capture.exposure_ns
-        self._exposure_ns = self._request.exposure_ns if exposure_ns is None else exposure_ns
+        self._exposure_ns = self._settings.exposure_ns if exposure_ns is None else exposure_ns
         self._heard_ns, self._silence_ns = self._clock.now_ns(), FIRST_IMAGE_NS
 
     def read(self) -> Readings:
@@ -183,7 +165,7 @@ class StationCamera(Driver):
         if capture.wait(READ_TIMEOUT_S):
             t_host_ns = self._clock.now_ns()
             self._heard_ns = t_host_ns
-            self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._request.period_ns)
+            self._silence_ns = max(MIN_SILENCE_NS, SILENT_PERIODS * self._settings.period_ns)
             self._take(capture.retrieve(), t_host_ns)
         else:
             self._check_silence()
@@ -200,7 +182,7 @@ class StationCamera(Driver):
         if captured is None:
             statistics.refused += 1
             return
-        image, expected = captured.image, (self._request.height_px, self._request.width_px, 3)
+        image, expected = captured.image, (*self._settings.size_px, 3)
         if image.shape != expected:
             raise DeviceError(
                 f"{self.name}: sends images {image.shape}, expected {expected}; plug it in again"
@@ -219,7 +201,9 @@ class StationCamera(Driver):
     def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:
         half_ns = (self._exposure_ns or 0) // 2
         return (
-            t_driver_ns + half_ns if self.timing.stamp_point == "start" else t_driver_ns - half_ns
+            t_driver_ns + half_ns
+            if self._settings.stamp_point == "start"
+            else t_driver_ns - half_ns
         )
 
     def _check_silence(self) -> None:
@@ -229,6 +213,6 @@ class StationCamera(Driver):
         if silent_ns > self._silence_ns:
             raise DeviceError(
                 f"{self.name}: no image for {silent_ns / NS_PER_MS:.0f} ms from {self.info}, "
-                f"expected one every {self._request.period_ns / NS_PER_MS:.0f} ms",
+                f"expected one every {self._settings.period_ns / NS_PER_MS:.0f} ms",
                 device=self.name,
             )

@@ -7,7 +7,6 @@ with the kernel's stamps, four buffers, an error when it is pulled out.
 import struct
 import threading
 from collections import deque
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Int64
@@ -17,12 +16,12 @@ from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     CaptureLink,
-    CaptureRequest,
 )
-from services.acquisition.devices.station_camera.driver import CameraTiming, StationCamera
-from services.acquisition.drivers.image_encoding import ImageEncoding
+from services.acquisition.devices.station_camera.driver import StationCamera
+from services.acquisition.devices.station_camera.settings import StationCameraSettings
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.link import Link
+from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.replay import MockDevice, ReplayStream
 
 # V4L2 drivers fill their buffers and lose later images.
@@ -153,23 +152,14 @@ class VideoDevice(MockDevice):
         return super().play(clock, waiter, start_host_ns=start_host_ns, offset_ns=offset_ns)
 
 
-@dataclass(frozen=True)
-class VideoPair:
-    """A simulated camera and the real driver on its other end."""
-
-    device: VideoDevice
-    driver: StationCamera
-
-
 def video_camera(
     stream: ReplayStream,
     *,
     faults: DeviceFaults,
     seed: int,
     clock: StationClock,
-    encoding: ImageEncoding,
-    timing: CameraTiming | None = None,
-) -> VideoPair:
+    **settings: float | str,
+) -> MockPair:
     """A mock camera that plays a stream of images, and its driver.
 
     Args:
@@ -177,20 +167,19 @@ def video_camera(
         faults: what disturbs it.
         seed: of everything random.
         clock: of the station.
-        encoding: of the samples.
-        timing: what the station knows of the camera.
+        settings: what the station knows of the camera besides its size and rate, such as its
+            `encoding`.
     """
     name = stream.descriptor.name
     port = VideoPort(name)
     height_px, width_px = stream.descriptor.shape[:2]
+    known = {"height_px": height_px, "width_px": width_px, **settings}
+    rate_hz = stream.descriptor.nominal_rate_hz
     driver = StationCamera(
-        name,
+        StationCameraSettings.model_validate({"stream": name, "rate_hz": rate_hz, **known}),
         link=port.transport,
-        request=CaptureRequest(height_px, width_px, stream.descriptor.nominal_rate_hz),
-        encoding=encoding,
         clock=clock,
-        timing=timing,
         max_encode_wait_s=LOCKSTEP_WAIT_S,
     )
     device = VideoDevice(name, source=VideoSource(stream), port=port, faults=faults, seed=seed)
-    return VideoPair(device, driver)
+    return MockPair(device, driver)

@@ -1,11 +1,18 @@
 """The kind `wuji_glove`."""
 
+from typing import Literal
+
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind
-from services.acquisition.devices.serial_line import serial_transport
+from services.acquisition.devices.serial_line import GloveSettings, serial_transport
 from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
-from services.acquisition.devices.wuji_glove.settings import WujiGloveSettings
 from services.acquisition.drivers.base import Driver
+
+
+class WujiGloveSettings(GloveSettings):
+    """A Wuji glove on a serial line; its packets contain the hand."""
+
+    kind: Literal["wuji_glove"] = "wuji_glove"
 
 
 def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
