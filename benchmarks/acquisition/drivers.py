@@ -151,7 +151,9 @@ def _gloves(rng: np.random.Generator) -> list[DeviceTalk]:
 def _trackers(rng: np.random.Generator) -> list[DeviceTalk]:
     hand = _stream(keypoints_descriptor("left"), rng.uniform(-0.1, 0.1, (NUM_KEYPOINTS, 3)))
     wrist = _stream(pose_descriptor("wrist_left"), np.array([0.1, 0.2, 1.0, 0.8, 0.0, 0.6, 0.0]))
-    fingers = FingerTrackerSource(hand, side="left", noise_m=1e-4, rng=rng)
+    fingers = FingerTrackerSource(
+        hand, side="left", rng=rng, faults=DeviceFaults(position_noise_m=1e-4)
+    )
     poses = PoseTrackerSource(wrist, faults=NO_FAULTS, rng=rng)
     bridged_fingers = BridgeFingerTrackerSource(hand, side="left", rng=rng)
     bridged_poses = BridgePoseSource(wrist, faults=NO_FAULTS, rng=rng)

@@ -1,6 +1,7 @@
 """State of the host as seen by a mock device: whether it listens, and has kept up."""
 
 import threading
+from collections.abc import Callable
 
 from dextouch.errors import DeviceError
 from services.acquisition.transports.base import Transport, TransportInfo
@@ -67,11 +68,26 @@ class WatchedTransport:
 
     What a read returned counts as processed when the reader comes back for more: by then it has
     been stamped, decoded and recorded.
+
+    Args:
+        transport: the host's end.
+        link: of the mock.
+        on_open: called when the host has opened the device.
+        on_write: takes how many bytes the host has just written, in the host's thread.
     """
 
-    def __init__(self, transport: Transport, link: Link) -> None:
+    def __init__(
+        self,
+        transport: Transport,
+        link: Link,
+        *,
+        on_open: Callable[[], None] | None = None,
+        on_write: Callable[[int], None] | None = None,
+    ) -> None:
         self._transport = transport
         self._link = link
+        self._on_open = on_open
+        self._on_write = on_write
         self._pending = 0
 
     @property
@@ -84,6 +100,8 @@ class WatchedTransport:
         self._transport.open()
         self._pending = 0
         self._link.set_open(is_open=True)
+        if self._on_open is not None:
+            self._on_open()
 
     def read(self) -> bytes:
         """Tell, then read."""
@@ -94,8 +112,10 @@ class WatchedTransport:
         return data
 
     def write(self, data: bytes) -> None:
-        """Write."""
+        """Write, and tell."""
         self._transport.write(data)
+        if self._on_write is not None:
+            self._on_write(len(data))
 
     def close(self) -> None:
         """Close and tell."""

@@ -9,7 +9,8 @@ import threading
 import tty
 from collections import deque
 from collections.abc import Callable
-from typing import Protocol, runtime_checkable
+from dataclasses import dataclass, field
+from typing import ClassVar, Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
 from services.acquisition.mocks.link import KEEP_UP_TIMEOUT_S, Link, WatchedTransport
@@ -65,17 +66,11 @@ class PtyPort:
         self._master: int | None = None
         self._slave: int | None = None
         self._sending = threading.Lock()
-        transport = SerialTransport(self._find, serial_number=name)
-        self._transport = (
-            WatchedTransport(transport, self.link)
-            if answer is None
-            else _HeardTransport(transport, self.link, self._hear)
+        self.transport = WatchedTransport(
+            SerialTransport(self._find, serial_number=name),
+            self.link,
+            on_write=None if answer is None else self._hear,
         )
-
-    @property
-    def transport(self) -> Transport:
-        """A real serial transport on the terminal."""
-        return self._transport
 
     def plug(self) -> None:
         """Create the terminal."""
@@ -120,65 +115,65 @@ class PtyPort:
             self.send(unit)
 
 
-class _HeardTransport(WatchedTransport):
-    """The host's transport to a device that answers: tells it how much was written."""
+@dataclass(kw_only=True)
+class ReportDevice:
+    """A model of a device behind a real library, which keeps some reports for its host.
 
-    def __init__(self, transport: Transport, link: Link, hear: Callable[[int], None]) -> None:
-        super().__init__(transport, link)
-        self._hear = hear
+    `on_write` takes the reports of the host.
+    """
 
-    def write(self, data: bytes) -> None:
-        """Write, and let the device read and answer."""
-        super().write(data)
-        self._hear(len(data))
+    max_reports: ClassVar[int]
+    on_write: Callable[[bytes], None] | None = None
+    is_plugged: bool = False
+    _reports: deque[bytes] = field(default_factory=deque)
+    _changed: threading.Condition = field(default_factory=threading.Condition)
+
+    def set_plugged(self, *, plugged: bool) -> None:
+        """Plug it in or pull it out."""
+        with self._changed:
+            self.is_plugged = plugged
+            self._changed.notify_all()
+
+    def push(self, report: bytes) -> bool:
+        """A report (or half of one) for the host; False when as many wait as it can keep."""
+        with self._changed:
+            if len(self._reports) >= self.max_reports:
+                return False
+            self._reports.append(report)
+            self._changed.notify_all()
+            return True
+
+    def flush(self) -> None:
+        """Forget unread reports."""
+        with self._changed:
+            self._reports.clear()
 
 
-class FakeHid:
+class FakeHid(ReportDevice):
     """Behaves like an opened hidapi device.
 
     `read` gives [] when idle and OSError when unplugged; a ring keeps 63 reports and silently
     loses the newest; `write` counts one byte more than it was given.
     """
 
-    def __init__(self) -> None:
-        self.on_write: Callable[[bytes], None] | None = None
-        self._ring: deque[bytes] = deque()
-        self._changed = threading.Condition()
-        self._plugged = False
+    max_reports = HID_RING_REPORTS
 
     def open(self) -> HidDevice:
         """What hidapi's open does: reports that came before are not seen."""
-        with self._changed:
-            self._check()
-            self._ring.clear()
+        self._check()
+        self.flush()
         return self
-
-    def set_plugged(self, *, plugged: bool) -> None:
-        """Plug it in or out."""
-        with self._changed:
-            self._plugged = plugged
-            self._changed.notify_all()
-
-    def push(self, report: bytes) -> bool:
-        """A report from the device; False when the ring was full."""
-        with self._changed:
-            if len(self._ring) >= HID_RING_REPORTS:
-                return False
-            self._ring.append(report)
-            self._changed.notify_all()
-            return True
 
     def read(self, max_length: int, timeout_ms: int = 0) -> list[int]:
         """One report or []."""
         with self._changed:
-            self._changed.wait_for(lambda: self._ring or not self._plugged, timeout_ms / 1000)
+            self._changed.wait_for(lambda: self._reports or not self.is_plugged, timeout_ms / 1000)
             self._check()
-            return list(self._ring.popleft()[:max_length]) if self._ring else []
+            return list(self._reports.popleft()[:max_length]) if self._reports else []
 
     def write(self, buff: bytes) -> int:
         """A report to the device."""
-        with self._changed:
-            self._check()
+        self._check()
         if self.on_write is not None:
             self.on_write(bytes(buff))
         return len(buff) + 1
@@ -187,23 +182,8 @@ class FakeHid:
         """Nothing is held."""
 
     def _check(self) -> None:
-        if not self._plugged:
+        if not self.is_plugged:
             raise OSError(errno.EIO, "read error")
-
-
-@runtime_checkable
-class ReportDevice(Protocol):
-    """A model of a device behind a real library: what it is told, and what it gives."""
-
-    on_write: Callable[[bytes], None] | None
-
-    def set_plugged(self, *, plugged: bool) -> None:
-        """Plug it in or pull it out."""
-        ...
-
-    def push(self, report: bytes) -> bool:
-        """A report for the host; False when its buffer is full."""
-        ...
 
 
 class ReportPort:
@@ -227,12 +207,7 @@ class ReportPort:
         self.device = device
         if answer is not None:
             device.on_write = lambda report: self._send_all(answer(report))
-        self._transport = WatchedTransport(transport, self.link)
-
-    @property
-    def transport(self) -> Transport:
-        """The host's end."""
-        return self._transport
+        self.transport = WatchedTransport(transport, self.link)
 
     def plug(self) -> None:
         """Plug in."""
@@ -274,12 +249,7 @@ class SocketPort:
         self._plugged = False
         self._device_end: socket.socket | None = None
         transport = SocketTransport(self._connect, address=f"mock:{name}")
-        self._transport = WatchedTransport(transport, self.link)
-
-    @property
-    def transport(self) -> Transport:
-        """A real socket transport."""
-        return self._transport
+        self.transport = WatchedTransport(transport, self.link, on_open=self._on_open)
 
     def plug(self) -> None:
         """Accept connections."""
@@ -313,3 +283,6 @@ class SocketPort:
         self._device_end, host_end = socket.socketpair()
         self._device_end.settimeout(SEND_TIMEOUT_S)
         return host_end
+
+    def _on_open(self) -> None:
+        """The host has connected."""

@@ -8,25 +8,10 @@ from types import TracebackType
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock
-from services.acquisition.mocks.link import Link, WatchedTransport
 from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
 from services.acquisition.mocks.sdk_link_sources import BridgeSource, sign_of_life
-from services.acquisition.transports.base import Transport
-from services.acquisition.transports.socket import SocketTransport
 
 LIFE_PERIOD_NS = 50_000_000
-
-
-class _HelloTransport(WatchedTransport):
-    """Counts the hello that waits in every new connection as sent."""
-
-    def __init__(self, transport: Transport, link: Link, hello: Callable[[], bytes]) -> None:
-        super().__init__(transport, link)
-        self._hello = hello
-
-    def open(self) -> None:
-        super().open()
-        self._link.add_sent(len(self._hello()))
 
 
 class BridgePort(SocketPort):
@@ -42,8 +27,6 @@ class BridgePort(SocketPort):
         self._hello = hello
         self._unplugged = threading.Event()
         self._life: threading.Thread | None = None
-        transport = SocketTransport(self._connect, address=f"mock:{name}")
-        self._transport = _HelloTransport(transport, self.link, hello)
 
     def plug(self) -> None:
         """Accept connections, and show that the bridge lives."""
@@ -66,6 +49,10 @@ class BridgePort(SocketPort):
     def _live(self, show_life: Callable[[], None]) -> None:
         while not self._unplugged.wait(LIFE_PERIOD_NS / 1e9):
             show_life()
+
+    def _on_open(self) -> None:
+        """Count the hello that waits in every new connection as sent."""
+        self.link.add_sent(len(self._hello()))
 
     def _connect(self) -> socket.socket:
         host_end = super()._connect()

@@ -1,17 +1,15 @@
 """A pyusb backend that replays the reports of a simulated USB device."""
 
 import errno
-import threading
 from array import array
-from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from types import SimpleNamespace
 
 from usb.backend import IBackend
 from usb.core import USBError, USBTimeoutError
 
-from services.acquisition.mocks.ports import ReportPort
+from services.acquisition.mocks.ports import ReportDevice, ReportPort
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 FIFO_REPORTS = 32
@@ -22,12 +20,14 @@ ENDPOINT_IN, ENDPOINT_OUT, INTERRUPT = 0x81, 0x02, 3
 
 
 @dataclass
-class UsbDeviceModel:
+class UsbDeviceModel(ReportDevice):
     """One simulated device as the bus sees it.
 
     Its FIFO keeps 32 reports that the host has not fetched and loses what comes then. Every
     plugging is a new `generation`: handles of an earlier one are dead for ever.
     """
+
+    max_reports = FIFO_REPORTS
 
     vendor_id: int
     product_id: int
@@ -35,50 +35,30 @@ class UsbDeviceModel:
     has_out_endpoint: bool = True
     has_interrupt_endpoint: bool = True
     packet_bytes: int = 64
-    on_write: Callable[[bytes], None] | None = None
     kernel_driver: bool = True
     generation: int = 0
-    is_plugged: bool = False
     num_open: int = 0
     is_configured: bool = True
-    _fifo: deque[bytes] = field(default_factory=deque)
-    _changed: threading.Condition = field(default_factory=threading.Condition)
 
     def set_plugged(self, *, plugged: bool) -> None:
         """Plug it in or out."""
-        with self._changed:
-            if plugged:
-                self.generation += 1
-                self.kernel_driver = True
-            self.is_plugged = plugged
-            self._fifo.clear()
-            self._changed.notify_all()
-
-    def push(self, report: bytes) -> bool:
-        """A report (or half of one) for the host; False when the FIFO was full."""
-        with self._changed:
-            if len(self._fifo) >= FIFO_REPORTS:
-                return False
-            self._fifo.append(report)
-            self._changed.notify_all()
-            return True
+        if plugged:
+            self.generation += 1
+            self.kernel_driver = True
+        self.flush()
+        super().set_plugged(plugged=plugged)
 
     def fetch(self, generation: int, timeout_ms: int) -> bytes:
         """What an interrupt transfer of the host gets."""
         with self._changed:
             self._changed.wait_for(
-                lambda: self._fifo or not self._is(generation), timeout_ms / 1000
+                lambda: self._reports or not self._is(generation), timeout_ms / 1000
             )
             if not self._is(generation):
                 raise USBError("Input/Output Error", -1, errno.EIO)
-            if not self._fifo:
+            if not self._reports:
                 raise USBTimeoutError("Operation timed out", -7, errno.ETIMEDOUT)
-            return self._fifo.popleft()
-
-    def flush(self) -> None:
-        """Forget unread reports."""
-        with self._changed:
-            self._fifo.clear()
+            return self._reports.popleft()
 
     def check(self, generation: int) -> None:
         """Raise what libusb says when the device has gone."""

@@ -214,7 +214,7 @@ def test_only_the_running_result_counts():
     source, decoder = poses(tracking=tracking), BridgePoseTrackerDecoder("wrist_left")
     samples = play(source, decoder)
     # The flag was set all the time.
-    assert [s.sequence for s in samples] == np.flatnonzero(source.tracked.labels == "").tolist()
+    assert [s.sequence for s in samples] == np.flatnonzero(source.labels == "").tolist()
     (event,) = decoder.tracking.events
     assert event.state == TrackingResult.CALIBRATING_OUT_OF_RANGE
     assert (event.kind, event.num_packets) == ("occluded", 30)
@@ -269,7 +269,7 @@ def test_jumps_are_marked():
     source = poses(tracking=[Jump(1.0, 1.02, offset_m=(0.0, 0.3, 0.0))])
     decoder = BridgePoseTrackerDecoder("wrist_left")
     samples = play(source, decoder)
-    assert [s.sequence for s in samples] == np.flatnonzero(source.tracked.labels == "").tolist()
+    assert [s.sequence for s in samples] == np.flatnonzero(source.labels == "").tolist()
     assert [event.kind for event in decoder.tracking.events] == ["jumped"]
 
 

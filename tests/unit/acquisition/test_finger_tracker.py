@@ -47,7 +47,7 @@ def source(seed=1, samples=6):
     )
     stream = ReplayStream(descriptor, np.arange(samples, dtype=np.int64), values)
     rng = np.random.default_rng(seed)
-    return FingerTrackerSource(stream, side="left", noise_m=0.0, rng=rng), values
+    return FingerTrackerSource(stream, side="left", rng=rng), values
 
 
 @given(ORDERS)

@@ -38,7 +38,7 @@ def glove():
 def fingers():
     points = stream("keypoints_right", "keypoints", np.arange(75.0).reshape(1, 25, 3) / 64)
     rng = np.random.default_rng(1)
-    return FingerTrackerSource(points, side="right", noise_m=0.0, rng=rng)
+    return FingerTrackerSource(points, side="right", rng=rng)
 
 
 def tracker():

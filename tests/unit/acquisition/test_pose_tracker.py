@@ -53,7 +53,7 @@ def play(tracking=(), faults=None, order=None, step_ns=lambda index: 0):
         t_device_ns = BOOT_NS + int(source.t_ns[index]) + step_ns(index)
         for report in source.units(index, index, t_device_ns):
             samples += decoder.decode(report, int(source.t_ns[index])).get("wrist_left", [])
-    return source.tracked, decoder, samples
+    return source, decoder, samples
 
 
 def test_brisk_motion_with_noise_is_all_kept():
@@ -123,7 +123,7 @@ def test_a_tracker_that_really_moved_is_believed_once_it_can_be_there():
 def test_the_origin_is_no_pose_however_long_it_is_sent():
     stream = brisk_stream()
     source = PoseTrackerSource(stream, faults=DeviceFaults(), rng=np.random.default_rng(0))
-    source.tracked.poses[200:300] = [0, 0, 0, 1, 0, 0, 0]
+    source.poses[200:300] = [0, 0, 0, 1, 0, 0, 0]
     decoder = PoseTrackerDecoder("wrist_left")
     sequences = [
         sample.sequence

@@ -30,7 +30,7 @@ def rng():
 
 
 def finger_reports():
-    source = FingerTrackerSource(STREAMS["keypoints_left"], side="left", noise_m=0.0, rng=rng())
+    source = FingerTrackerSource(STREAMS["keypoints_left"], side="left", rng=rng())
     return FingerTrackerDecoder("left"), source.answer(b"\x02"), source
 
 

@@ -1,8 +1,5 @@
 """A simulated camera bridge that sends raw, JPEG or H.264 images."""
 
-import numpy as np
-from jaxtyping import Int64
-
 from services.acquisition.devices.camera.driver import ENCODING_CODES, MAGIC, PAYLOAD_HEADER
 from services.acquisition.drivers.image_encoding import ImageEncoder, ImageEncoding
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
@@ -18,7 +15,8 @@ class CameraSource:
     """
 
     def __init__(self, stream: ReplayStream, *, encoding: ImageEncoding = "rgb8") -> None:
-        self._stream = stream
+        self.t_ns = stream.t_ns
+        self._images = stream.values
         self._encoding: ImageEncoding = encoding
         height_px, width_px = stream.descriptor.shape[:2]
         self._encoder = ImageEncoder(
@@ -26,14 +24,9 @@ class CameraSource:
         )
         self._last_sequence: int | None = None
 
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._stream.t_ns
-
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""
-        image = self._stream.values[index]
+        image = self._images[index]
         header = PAYLOAD_HEADER.pack(*image.shape[:2], ENCODING_CODES[self._encoding])
         body = image.tobytes() if self._encoding == "rgb8" else self._encoded(index, sequence)
         packet = Packet(VERSION, SOURCES["none"], sequence, t_device_ns, header + body)
@@ -44,7 +37,7 @@ class CameraSource:
         first = sequence if self._last_sequence is None else self._last_sequence + 1
         data = b""
         for number in range(max(first, sequence - index), sequence + 1):
-            image = self._stream.values[index - (sequence - number)]
+            image = self._images[index - (sequence - number)]
             data = self._encoder.encode(image, begins=False).item()
         self._last_sequence = sequence
         return data

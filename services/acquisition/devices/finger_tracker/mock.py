@@ -1,7 +1,7 @@
 """Simulated finger tracker with its own node order, connected by HID, USB or a bridge."""
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Float64, Int64
 
 from dextouch.hands import NODES, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import Side
@@ -43,15 +43,14 @@ from services.acquisition.mocks.tracker_place import REPORT_PORTS, TrackerPlace,
 _HIDDEN = chain_indices("thumb")
 
 
-class FingerTrackerSource:
-    """Reports of one finger tracker.
+class TrackedFingers:
+    """What a finger tracker sees of a hand: points with noise, and nodes that are hidden.
 
     Args:
         stream: [n, 25, 3] in m, wrist frame.
         side: which hand.
-        noise_m: standard deviation of each coordinate.
-        rng: of the noise and of the device's node order.
-        faults: when the thumb is not seen.
+        rng: of the device's node order and of the noise.
+        faults: position noise, and when the thumb is not seen.
     """
 
     def __init__(
@@ -59,31 +58,39 @@ class FingerTrackerSource:
         stream: ReplayStream,
         *,
         side: Side,
-        noise_m: float,
         rng: np.random.Generator,
         faults: DeviceFaults | None = None,
     ) -> None:
-        self._stream = stream
+        faults = faults or DeviceFaults()
+        self.t_ns = stream.t_ns
         self._side = side
         self._order = rng.permutation(NUM_KEYPOINTS)
-        self._seen = seen_nodes(stream.t_ns, self._order, faults or DeviceFaults())
-        noise = noise_m * rng.standard_normal(stream.values.shape)
-        self._points = (stream.values + noise)[:, self._order].astype("<f4")
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._stream.t_ns
+        self._seen = seen_nodes(stream.t_ns, self._order, faults)
+        noise_m = faults.position_noise_m * rng.standard_normal(stream.values.shape)
+        self._points_m = (stream.values + noise_m)[:, self._order]
 
     def fate(self, index: int) -> Fate:
         """Whether all nodes are seen."""
         return Fate.SENT if self._seen[index] == ALL_SEEN else Fate.MARKED
 
+    def packet(self, index: int, sequence: int, t_device_ns: int) -> bytes:
+        """The data packet of one sample, in the sender's own coordinates."""
+        points = self._sent(self._points_m[index]).astype("<f4")
+        payload = VALIDITY.pack(int(self._seen[index])) + points.tobytes()
+        return encode_packet(
+            MAGIC, Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
+        )
+
+    def _sent(self, points_m: Float64[np.ndarray, "25 3"]) -> Float64[np.ndarray, "25 3"]:
+        return points_m
+
+
+class FingerTrackerSource(TrackedFingers):
+    """Reports of one finger tracker."""
+
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet, split into reports."""
-        payload = VALIDITY.pack(int(self._seen[index])) + self._points[index].tobytes()
-        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
-        return split_into_reports(DATA_REPORT, sequence, encode_packet(MAGIC, packet))
+        return split_into_reports(DATA_REPORT, sequence, self.packet(index, sequence, t_device_ns))
 
     def answer(self, report: bytes) -> list[bytes]:
         """What the device says to the host's report: its nodes, when asked for them."""
@@ -115,8 +122,8 @@ def seen_nodes(
     return seen
 
 
-class BridgeFingerTrackerSource:
-    """A finger tracker's SDK: left-handed, in centimetres, nodes in its own order.
+class BridgeFingerTrackerSource(TrackedFingers):
+    """A finger tracker's SDK: in its own frame and centimetres, nodes in its own order.
 
     Args:
         stream: [n, 25, 3] in m, wrist frame.
@@ -137,15 +144,8 @@ class BridgeFingerTrackerSource:
         frame: FrameConvention = LEFT_HANDED,
         faults: DeviceFaults | None = None,
     ) -> None:
-        faults = faults or DeviceFaults()
-        self._stream = stream
-        self._side = side
-        self._order = rng.permutation(NUM_KEYPOINTS)
-        theirs_from_ours = frame.ours_from_theirs().T
-        self._seen = seen_nodes(stream.t_ns, self._order, faults)
-        noise_m = faults.position_noise_m * rng.standard_normal(stream.values.shape)
-        points_cm = 100.0 * (stream.values + noise_m)[:, self._order] @ theirs_from_ours.T
-        self._points = points_cm.astype("<f4")
+        super().__init__(stream, side=side, rng=rng, faults=faults)
+        self._ours_from_theirs = frame.ours_from_theirs()
         self._hello = BridgeHello(
             protocol=PROTOCOL,
             version=PROTOCOL_VERSION,
@@ -157,24 +157,16 @@ class BridgeFingerTrackerSource:
             nodes=tuple(NODES[node] for node in self._order),
         )
 
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._stream.t_ns
-
     def hello(self) -> bytes:
         """Who is there, and the order of the nodes."""
         return hello_line(self._hello)
 
-    def fate(self, index: int) -> Fate:
-        """Whether all nodes are seen."""
-        return Fate.SENT if self._seen[index] == ALL_SEEN else Fate.MARKED
-
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""
-        payload = VALIDITY.pack(int(self._seen[index])) + self._points[index].tobytes()
-        packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, payload)
-        return [encode_packet(MAGIC, packet)]
+        return [self.packet(index, sequence, t_device_ns)]
+
+    def _sent(self, points_m: Float64[np.ndarray, "25 3"]) -> Float64[np.ndarray, "25 3"]:
+        return 100.0 * points_m @ self._ours_from_theirs
 
 
 def mock_finger_tracker(side: Side, stream: ReplayStream, place: TrackerPlace) -> MockPair:
@@ -190,9 +182,7 @@ def mock_finger_tracker(side: Side, stream: ReplayStream, place: TrackerPlace) -
     if place.link == "bridge":
         bridge = BridgeFingerTrackerSource(stream, side=side, rng=rng, faults=faults)
         return bridged_pair(name, bridge, BridgeFingerTrackerDecoder(side), place)
-    source = FingerTrackerSource(
-        stream, side=side, noise_m=faults.position_noise_m, rng=rng, faults=faults
-    )
+    source = FingerTrackerSource(stream, side=side, rng=rng, faults=faults)
     port = REPORT_PORTS[place.link](name, answer=source.answer)
     driver = FingerTracker(name, side, transport=port.transport, clock=place.clock)
     device = MockDevice(name, source=source, port=port, faults=faults, seed=place.seed)

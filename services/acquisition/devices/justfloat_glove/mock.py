@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
 
 from dextouch.errors import InvalidInputError
 from dextouch.tactile.layout import NUM_TAXELS
@@ -75,15 +75,10 @@ class JustFloatGloveSource:
             raise InvalidInputError(f"num_values: got {num_values}, expected at least {NUM_TAXELS}")
         # No device sends the negative zero that rounding leaves of noise.
         counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, full_scale) + 0.0
-        self._stream = stream
+        self.t_ns = stream.t_ns
         self._values = np.zeros((len(counts), num_values), dtype="<f4")
         self._values[:, :NUM_TAXELS] = counts
         self._values[:, list(dead_taxels)] = 0.0
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._stream.t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; the device sends neither sequence number nor time."""

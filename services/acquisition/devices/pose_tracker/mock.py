@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from dextouch.geometry.rotations import (
     quaternion_from_rotation,
@@ -104,6 +104,7 @@ class TrackedPoses:
         tracking: Sequence[TrackingFault] = (),
     ) -> None:
         self.t_ns = stream.t_ns
+        self.source = source_of(stream.descriptor.name)
         self.poses = add_pose_noise(stream.values, faults, rng)
         self.states = np.full(len(self.t_ns), int(TrackingState.RUNNING_OK))
         # The ledger of this source: the fault of each sample, "" if it has none.
@@ -127,40 +128,13 @@ class TrackedPoses:
         return Fate(str(self.labels[index]) or Fate.SENT)
 
 
-class PoseTrackerSource:
-    """Reports of one pose tracker.
-
-    Args:
-        stream: float64 [n, 7], x y z (m) qw qx qy qz in the world frame.
-        faults: position and rotation noise, per axis; occlusions and jumps.
-        rng: of the noise.
-        tracking: occlusions and jumps.
-    """
-
-    def __init__(
-        self,
-        stream: ReplayStream,
-        *,
-        faults: DeviceFaults,
-        rng: np.random.Generator,
-        tracking: Sequence[TrackingFault] = (),
-    ) -> None:
-        self._source = SOURCES[stream.descriptor.name.removeprefix("wrist_")]
-        self.tracked = TrackedPoses(stream, faults=faults, rng=rng, tracking=tracking)
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self.tracked.t_ns
-
-    def fate(self, index: int) -> Fate:
-        """Whether this pose is occluded or jumps."""
-        return self.tracked.fate(index)
+class PoseTrackerSource(TrackedPoses):
+    """Reports of one pose tracker."""
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet in one report."""
-        payload = PAYLOAD.pack(self.tracked.states[index], *self.tracked.poses[index])
-        packet = Packet(VERSION, self._source, sequence, t_device_ns, payload)
+        payload = PAYLOAD.pack(self.states[index], *self.poses[index])
+        packet = Packet(VERSION, SOURCES[self.source], sequence, t_device_ns, payload)
         return split_into_reports(DATA_REPORT, sequence, encode_packet(MAGIC, packet))
 
 
@@ -176,7 +150,7 @@ def add_pose_noise(
     return noisy
 
 
-class BridgePoseSource:
+class BridgePoseSource(TrackedPoses):
     """An OpenVR-like source of one tracker: y up, matrices, and a flag that stays set when lost.
 
     Args:
@@ -198,11 +172,10 @@ class BridgePoseSource:
         tracking: Sequence[TrackingFault] = (),
         frame: FrameConvention = Y_UP,
     ) -> None:
-        source = source_of(stream.descriptor.name)
-        self._source = SOURCES[source]
-        self.tracked = TrackedPoses(stream, faults=faults, rng=rng, tracking=tracking)
-        self._matrices = _matrices(self.tracked.poses, frame.ours_from_theirs().T)
-        device = {"index": POSE_INDEX, "serial_number": f"LHR-{source}", "source": source}
+        super().__init__(stream, faults=faults, rng=rng, tracking=tracking)
+        self._matrices = _matrices(self.poses, frame.ours_from_theirs().T)
+        number = f"LHR-{self.source}"
+        device = {"index": POSE_INDEX, "serial_number": number, "source": self.source}
         self._hello = BridgeHello(
             protocol=PROTOCOL,
             version=PROTOCOL_VERSION,
@@ -213,25 +186,16 @@ class BridgePoseSource:
             length_unit="m",
         )
 
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self.tracked.t_ns
-
     def hello(self) -> bytes:
         """Who is there."""
         return hello_line(self._hello)
 
-    def fate(self, index: int) -> Fate:
-        """Whether this pose is occluded or jumps."""
-        return self.tracked.fate(index)
-
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; its pose is flagged valid whatever the result says."""
-        result = RESULTS[TrackingState(int(self.tracked.states[index]))]
+        result = RESULTS[TrackingState(int(self.states[index]))]
         numbers = self._matrices[index].ravel()
         payload = POSE_PAYLOAD.pack(POSE_INDEX, 1, result, t_device_ns / 1e9, *numbers)
-        packet = Packet(VERSION, self._source, sequence, t_device_ns, payload)
+        packet = Packet(VERSION, SOURCES[self.source], sequence, t_device_ns, payload)
         return [encode_packet(POSE_MAGIC, packet)]
 
 

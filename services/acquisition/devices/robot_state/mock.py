@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 
 import numpy as np
-from jaxtyping import Int64
 
 from dextouch.errors import InvalidInputError
 from services.acquisition.devices.robot_state.packets import MAGIC, STREAM_SIZES
@@ -28,13 +27,8 @@ class RobotStateSource:
         parts = [streams[name] for name in STREAM_SIZES]
         if any(not np.array_equal(part.t_ns, parts[0].t_ns) for part in parts):
             raise InvalidInputError("robot state: the six streams have different times")
-        self._t_ns = parts[0].t_ns
+        self.t_ns = parts[0].t_ns
         self._numbers = np.concatenate([part.values for part in parts], axis=1).astype("<f8")
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet."""

@@ -9,7 +9,6 @@ import threading
 from collections import deque
 
 import numpy as np
-from jaxtyping import Int64
 
 from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock, Waiter
@@ -127,17 +126,13 @@ class VideoSource:
     """
 
     def __init__(self, stream: ReplayStream) -> None:
-        self._stream = stream
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each image is taken."""
-        return self._stream.t_ns
+        self.t_ns = stream.t_ns
+        self._images = stream.values
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One image; cameras have no sequence."""
         del sequence
-        image = self._stream.values[index]
+        image = self._images[index]
         return [UNIT_HEADER.pack(t_device_ns, *image.shape[:2]) + image.tobytes()]
 
 

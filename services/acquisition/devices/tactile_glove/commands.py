@@ -7,8 +7,7 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import UInt16
 
-from dextouch.clocks import RoundTrip
-from dextouch.errors import DeviceError, InvalidInputError, PacketError
+from dextouch.errors import InvalidInputError, PacketError
 from dextouch.tactile.layout import NUM_RAW_TAXELS
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 
@@ -43,17 +42,6 @@ class Status(IntEnum):
     OK = 0
     UNKNOWN_COMMAND = 1
     BAD_ARGUMENT = 2
-
-
-@dataclass(frozen=True)
-class Reply:
-    """Reply of the device, with the host's timestamps of request and reply."""
-
-    command: Command
-    body: bytes
-    t_asked_host_ns: int
-    t_answered_host_ns: int
-    t_device_ns: int
 
 
 @dataclass(frozen=True)
@@ -140,17 +128,15 @@ def parse_diagnostics(body: bytes) -> GloveDiagnostics:
     return GloveDiagnostics(*DIAGNOSTICS.unpack(body))
 
 
-def parse_round_trip(reply: Reply) -> RoundTrip:
-    """The four stamps of a time request, the glove being the remote clock.
+def parse_time(body: bytes) -> int:
+    """When the glove got the request, on its clock in ns.
 
     Raises:
         PacketError: another size.
     """
-    _check_size("time sync", reply.body, TIME_SYNC.size)
-    (t_received_ns,) = TIME_SYNC.unpack(reply.body)
-    return RoundTrip(
-        reply.t_asked_host_ns, t_received_ns, reply.t_device_ns, reply.t_answered_host_ns
-    )
+    _check_size("time sync", body, TIME_SYNC.size)
+    (t_received_ns,) = TIME_SYNC.unpack(body)
+    return int(t_received_ns)
 
 
 def parse_tare(body: bytes) -> UInt16[np.ndarray, "360"]:
@@ -161,20 +147,6 @@ def parse_tare(body: bytes) -> UInt16[np.ndarray, "360"]:
     """
     _check_size("tare", body, TARE_BYTES)
     return np.frombuffer(body, dtype="<u2")
-
-
-def check_status(device: str, command: Command, status: Status) -> None:
-    """Refuse an answer that is a refusal.
-
-    Raises:
-        DeviceError: the device knows or takes it not.
-    """
-    if status is not Status.OK:
-        raise DeviceError(
-            f"{device}: refused {command.name.lower()} with {status.name.lower()}; does its "
-            "firmware know the command?",
-            device=device,
-        )
 
 
 def _check_size(what: str, body: bytes, size: int) -> None:

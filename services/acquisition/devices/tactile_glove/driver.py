@@ -2,6 +2,7 @@
 
 import itertools
 import threading
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import UInt16
@@ -15,14 +16,13 @@ from services.acquisition.devices.tactile_glove.commands import (
     Command,
     GloveDiagnostics,
     GloveIdentity,
-    Reply,
-    check_status,
+    Status,
     encode_request,
     parse_diagnostics,
     parse_identity,
     parse_reply,
-    parse_round_trip,
     parse_tare,
+    parse_time,
 )
 from services.acquisition.devices.tactile_glove.packets import NOMINAL_RATE_HZ, TactileGloveDecoder
 from services.acquisition.drivers.base import Driver, Readings, hand_name
@@ -33,6 +33,15 @@ ANSWER_TIMEOUT_NS = 300_000_000
 NUM_ATTEMPTS = 3
 # A virtual clock does not advance while a device is opened; count empty reads instead.
 MAX_SILENT_READS = 5
+
+
+class Answer(NamedTuple):
+    """The glove's answer to a request, and when the host asked and was answered."""
+
+    body: bytes
+    packet: Packet
+    t_asked_host_ns: int
+    t_answered_host_ns: int
 
 
 class TactileGlove(Driver):
@@ -96,20 +105,17 @@ class TactileGlove(Driver):
 
     def identify(self) -> GloveIdentity:
         """Serial number, firmware and side, as reported by the glove."""
-        packet, _ = self._ask(Command.IDENTIFY)
-        return parse_identity(self._body(Command.IDENTIFY, packet), packet.source)
+        answer = self._ask(Command.IDENTIFY)
+        return parse_identity(answer.body, answer.packet.source)
 
     def diagnostics(self) -> GloveDiagnostics:
         """The glove's own counters."""
-        packet, _ = self._ask(Command.DIAGNOSTICS)
-        return parse_diagnostics(self._body(Command.DIAGNOSTICS, packet))
+        return parse_diagnostics(self._ask(Command.DIAGNOSTICS).body)
 
     def time_round_trip(self) -> RoundTrip:
         """One request for the glove's time; `dextouch.clocks.RoundTripClock` takes many of them."""
-        packet, (asked_ns, answered_ns) = self._ask(Command.TIME_SYNC)
-        body = self._body(Command.TIME_SYNC, packet)
-        reply = Reply(Command.TIME_SYNC, body, asked_ns, answered_ns, packet.t_device_ns)
-        return parse_round_trip(reply)
+        body, packet, t_asked_ns, t_answered_ns = self._ask(Command.TIME_SYNC)
+        return RoundTrip(t_asked_ns, parse_time(body), packet.t_device_ns, t_answered_ns)
 
     def tare(self, num_packets: int) -> UInt16[np.ndarray, "360"]:
         """Mean counts of the next packets, in raw scan order; the glove must be without load.
@@ -124,8 +130,8 @@ class TactileGlove(Driver):
         if not 1 <= num_packets <= MAX_TARE_PACKETS:
             raise InvalidInputError(f"tare: got {num_packets}, expected 1 … {MAX_TARE_PACKETS}")
         timeout_ns = ANSWER_TIMEOUT_NS + round(2e9 * num_packets / NOMINAL_RATE_HZ)
-        packet, _ = self._ask(Command.TARE, argument=num_packets, timeout_ns=timeout_ns)
-        return parse_tare(self._body(Command.TARE, packet))
+        answer = self._ask(Command.TARE, argument=num_packets, timeout_ns=timeout_ns)
+        return parse_tare(answer.body)
 
     def _check(self, identity: GloveIdentity) -> None:
         where = f"{self.name}: the glove {identity.serial_number!r} at {self.info.address}"
@@ -146,14 +152,14 @@ class TactileGlove(Driver):
 
     def _ask(
         self, command: Command, *, argument: int = 0, timeout_ns: int = ANSWER_TIMEOUT_NS
-    ) -> tuple[Packet, tuple[int, int]]:
-        """The reply packet and the host's stamps of request and reply."""
+    ) -> Answer:
         for _ in range(NUM_ATTEMPTS):
             number = next(self._numbers) % SEQUENCE_MODULUS
             data = encode_request(command, argument=argument, request=number)
-            answer = self._ask_once(number, data, timeout_ns)
-            if answer is not None:
-                return answer
+            t_asked_ns, reply = self._ask_once(number, data, timeout_ns)
+            if reply is not None:
+                packet, t_answered_ns = reply
+                return Answer(self._body(command, packet), packet, t_asked_ns, t_answered_ns)
         raise DeviceError(
             f"{self.name}: no answer to {command.name.lower()} from {self.info} in "
             f"{NUM_ATTEMPTS} attempts; is it a glove of this protocol?",
@@ -162,19 +168,18 @@ class TactileGlove(Driver):
 
     def _ask_once(
         self, number: int, data: bytes, timeout_ns: int
-    ) -> tuple[Packet, tuple[int, int]] | None:
+    ) -> tuple[int, tuple[Packet, int] | None]:
         try:
             with self._writing:
                 self._asked.add(number)
-                asked_ns = self._clock.now_ns()
+                t_asked_ns = self._clock.now_ns()
                 self.transport.write(data)
-            reply = self._await(number, timeout_ns)
+            return t_asked_ns, self._await(number, timeout_ns)
         finally:
             # Also replies that arrived too late: a station sends requests for months.
             with self._answered:
                 self._asked.discard(number)
                 self._replies.pop(number, None)
-        return None if reply is None else (reply[0], (asked_ns, reply[1]))
 
     def _await(self, number: int, timeout_ns: int) -> tuple[Packet, int] | None:
         """The reply; read here if this is the reading thread, else that one brings it."""
@@ -211,5 +216,10 @@ class TactileGlove(Driver):
                 f"{self.name}: answered command {answered}, expected {int(command)}",
                 device=self.name,
             )
-        check_status(self.name, command, status)
+        if status is not Status.OK:
+            raise DeviceError(
+                f"{self.name}: refused {command.name.lower()} with {status.name.lower()}; does its "
+                "firmware know the command?",
+                device=self.name,
+            )
         return body

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 
 from dextouch.errors import ShapeError
 from dextouch.schemas import Matrix, matrix_rows
@@ -133,16 +133,11 @@ class TactileGloveSource:
             raise ShapeError(
                 f"{stream.descriptor.name}: got {stream.descriptor.shape}, expected ({NUM_TAXELS},)"
             )
-        self._stream = stream
+        self.t_ns = stream.t_ns
         self._side = side
         self._answers = answers
         self._counts = calibration.counts(stream.values, side=side)
         self._counts[:, list(dead_taxels)] = 0
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._stream.t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet, and the reply that waited for it, if any."""

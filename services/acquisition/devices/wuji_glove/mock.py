@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from jaxtyping import Float32, Int64
+from jaxtyping import Float32
 
 from dextouch.tactile.layout import NUM_TAXELS, Side, split_pads
 from services.acquisition.devices.wuji_glove.packets import (
@@ -93,15 +93,10 @@ class WujiGloveSource:
         scale_kpa: float = FULL_SCALE_KPA,
         dead_taxels: Sequence[int] = (),
     ) -> None:
-        self._stream = stream
+        self.t_ns = stream.t_ns
         self._hand = {name: number for number, name in HANDS.items()}[side]
         self._cells = grid_of(np.clip(stream.values / scale_kpa, 0.0, 1.0).astype(np.float32))
         self._cells.reshape(len(self._cells), -1)[:, list(dead_taxels)] = 0.0
-
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        return self._stream.t_ns
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
         """One packet; sequence and milliseconds run over as the device's do."""
