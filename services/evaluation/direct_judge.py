@@ -13,7 +13,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import Calibration
-from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
+from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.direct_network import (
     Attempt,
     DirectNetwork,
@@ -32,7 +32,7 @@ class DirectJudge:
         checkpoint: from `load_checkpoint` or from training.
 
     Raises:
-        CorruptDataError: the weights do not match the shape in the metadata.
+        InvalidInputError: the weights do not match the shape in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -44,8 +44,7 @@ class DirectJudge:
             for task, values in settings.get("calibration", {}).items()
         }
         self._network = DirectNetwork(self.shape)
-        load_weights(self._network, checkpoint, prefix="network")
-        self._network.eval()
+        load_network(self._network, checkpoint)
 
     @classmethod
     def load(cls, path: Path) -> "DirectJudge":

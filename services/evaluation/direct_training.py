@@ -6,7 +6,7 @@ network is trained on true poses with noise as large as the finder's errors on d
 
 import copy
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from torch.nn import functional
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import transform_from_pose
 from services.evaluation.calibration import Calibration, expected_calibration_error, fit_calibration
-from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
+from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
 from services.evaluation.direct_data import LabelledAttempt, attempts_hash
 from services.evaluation.direct_judge import KIND, DirectJudge
@@ -33,9 +33,18 @@ from services.evaluation.direct_network import (
     views_of,
 )
 from services.evaluation.object_features import MAX_OBJECTS
-from services.evaluation.progress import Progress
+from services.evaluation.optimization import optimized
 from services.evaluation.statistics import area_under_roc
 from services.evaluation.success_probe_figures import MIN_OUTCOMES
+from services.networks.training_settings import (
+    Batch,
+    Brightness,
+    CpuBudget,
+    ImageNoise,
+    LearningRate,
+    Seed,
+    WeightDecay,
+)
 
 _UNIT_M = 0.05
 _CHECK_EVERY = 100
@@ -46,23 +55,19 @@ class DirectSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(default=0, description="seed of weights and sampling")
-    max_cpu_s: float = Field(
-        default=600.0, gt=0, description="CPU seconds after which training ends"
-    )
+    seed: Seed = 0
+    max_cpu_s: CpuBudget = 600.0
     finder_share: float = Field(
         default=0.6, gt=0, lt=1, description="share of the time for the object finder"
     )
     num_finder_steps: int = Field(default=6000, ge=1, description="largest number of finder steps")
     num_judge_steps: int = Field(default=6000, ge=1, description="largest number of judge steps")
-    batch_size: int = Field(default=64, ge=2, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
-    weight_decay: float = Field(default=2e-2, ge=0, description="AdamW weight decay")
+    batch_size: Batch = Field(default=64, ge=2)
+    learning_rate: LearningRate = 2e-3
+    weight_decay: WeightDecay = 2e-2
     bfloat16: bool = Field(default=False, description="convolve in bfloat16: twice as fast on AMX")
-    image_noise: float = Field(default=0.01, ge=0, description="noise on training images in 0 … 1")
-    brightness: float = Field(
-        default=0.03, ge=0, description="brightness variation of training images"
-    )
+    image_noise: ImageNoise = 0.01
+    brightness: Brightness = 0.03
     development_share: float = Field(
         default=0.1, gt=0, lt=1, description="share of seeds to calibrate on"
     )
@@ -143,7 +148,6 @@ def train_direct_judge(
     noise_m = _finder_errors(network.finder, checked, network.num_objects)
     best = _train_judge(network, (learned, checked), settings, noise_m)
     cpu_s = time.process_time() - started
-    tensors = {f"network.{name}": t.clone() for name, t in network.state_dict().items()}
     metadata = CheckpointMetadata(
         kind=KIND,
         command=command,
@@ -168,7 +172,7 @@ def train_direct_judge(
             },
         },
     )
-    return _calibrated(Checkpoint(metadata, tensors), apart)
+    return _calibrated(Checkpoint(metadata, network_tensors(network)), apart)
 
 
 def _calibrated(checkpoint: Checkpoint, apart: Sequence[LabelledAttempt]) -> Checkpoint:
@@ -202,7 +206,8 @@ def _train_finder(
         mine = learned.views.task == task
         finder.height_m[task] = learned.seen.position_m[mine, :, 2].median(dim=0).values
 
-    def loss(index: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def loss(generator: torch.Generator) -> torch.Tensor:
+        index = torch.randint(len(used), (settings.batch_size,), generator=generator)
         views, there = learned.views[index], used[index]
         noise = torch.randn(views.image.shape, generator=generator) * settings.image_noise
         light = torch.randn((len(index), 1, 1, 1), generator=generator) * settings.brightness
@@ -215,9 +220,8 @@ def _train_finder(
         axes = (predicted.axes - learned.seen.axes[index]).square().sum((-1, -2))
         return ((position + axes) * there).sum() / there.sum()
 
-    budget_s = settings.max_cpu_s * settings.finder_share
-    steps = (settings.num_finder_steps, budget_s)
-    for _ in _optimized(finder, loss, (len(used), steps), settings, "finder"):
+    limits = (settings.num_finder_steps, settings.max_cpu_s * settings.finder_share)
+    for _ in optimized(finder, loss, settings, limits=limits, title="finder"):
         pass
     finder.eval()
 
@@ -256,7 +260,9 @@ def _train_judge(
     learned, checked = sets
     found, shown = (_found(network.finder, one.starts) for one in sets)
 
-    def loss(index: torch.Tensor, generator: torch.Generator) -> torch.Tensor:
+    def loss(generator: torch.Generator) -> torch.Tensor:
+        num_rows = len(learned.success)
+        index = torch.randint(num_rows, (settings.batch_size,), generator=generator)
         task = learned.starts.task[index]
         drawn = torch.randn((len(index), MAX_OBJECTS, 3), generator=generator)
         placed = learned.placed.position_m[index] + drawn * noise_m[task]
@@ -266,9 +272,9 @@ def _train_judge(
 
     parts = nn.ModuleList([network.task, network.entry, network.recurrent, network.head])
     least, best, weights = float("inf"), 0, copy.deepcopy(parts.state_dict())
-    steps = (settings.num_judge_steps, settings.max_cpu_s * (1 - settings.finder_share))
-    for step in _optimized(parts, loss, (len(learned.success), steps), settings, "direct judge"):
-        if (step + 1) % _CHECK_EVERY:
+    limits = (settings.num_judge_steps, settings.max_cpu_s * (1 - settings.finder_share))
+    for used in optimized(parts, loss, settings, limits=limits, title="direct judge"):
+        if used.step % _CHECK_EVERY:
             continue
         parts.eval()
         with torch.no_grad():
@@ -276,47 +282,7 @@ def _train_judge(
             error = functional.binary_cross_entropy_with_logits(odds, checked.success)
         parts.train()
         if float(error) < least:
-            least, best, weights = float(error), step + 1, copy.deepcopy(parts.state_dict())
+            least, best, weights = float(error), used.step, copy.deepcopy(parts.state_dict())
     parts.load_state_dict(weights if best else parts.state_dict())
     network.eval()
     return best
-
-
-def _optimized(
-    module: nn.Module,
-    loss: Callable[[torch.Tensor, torch.Generator], torch.Tensor],
-    size: tuple[int, tuple[int, float]],
-    settings: DirectSettings,
-    title: str,
-) -> Iterator[int]:
-    """AdamW steps with a cosine schedule; yields each step's number after it was taken.
-
-    Args:
-        module: module to train.
-        loss: loss of some rows.
-        size: number of rows, and the limits: steps and CPU seconds.
-        settings: rate, decay, batch and seed.
-        title: for the progress bar.
-    """
-    num_rows, (num_steps, max_cpu_s) = size
-    generator = torch.Generator().manual_seed(settings.seed)
-    optimizer = torch.optim.AdamW(
-        module.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
-    module.train()
-    started = time.process_time()
-    with Progress(title, num_steps) as progress:
-        for step in range(num_steps):
-            done = max(step / num_steps, (time.process_time() - started) / max_cpu_s)
-            if done >= 1:
-                break
-            for group in optimizer.param_groups:
-                group["lr"] = settings.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
-            index = torch.randint(num_rows, (settings.batch_size,), generator=generator)
-            error = loss(index, generator)
-            optimizer.zero_grad()
-            error.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(module.parameters(), 1.0)
-            optimizer.step()
-            progress.advance(loss=float(error.detach()))
-            yield step

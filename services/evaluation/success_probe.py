@@ -14,7 +14,7 @@ from jaxtyping import Float32, Float64
 
 from dextouch.errors import InvalidInputError
 from services.evaluation.calibration import Calibration, sigmoid
-from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
+from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.endings import Ending
 from services.evaluation.judge_network import ProbeBatch, ProbeNetwork, ProbeShape, probe_batch
 
@@ -49,7 +49,7 @@ class SuccessProbe:
         checkpoint: from `load_checkpoint` or from training.
 
     Raises:
-        CorruptDataError: the weights do not match the shape in the metadata.
+        InvalidInputError: the weights do not match the shape in the metadata.
     """
 
     def __init__(self, checkpoint: Checkpoint) -> None:
@@ -63,8 +63,7 @@ class SuccessProbe:
         }
         self._told: Mapping[str, Sequence[str]] = settings.get("told_milestones", {})
         self._network = ProbeNetwork(self.shape)
-        load_weights(self._network, checkpoint, prefix="network")
-        self._network.eval()
+        load_network(self._network, checkpoint)
 
     @classmethod
     def load(cls, path: Path) -> "SuccessProbe":

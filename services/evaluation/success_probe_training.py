@@ -4,16 +4,14 @@ Three disjoint sets of episodes: training, development (to calibrate the probabi
 (for the metrics in the checkpoint).
 """
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from pydantic import BaseModel, ConfigDict, Field
 from torch.nn import functional
 
-from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
+from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
 from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
 from services.evaluation.judge_network import (
@@ -23,7 +21,7 @@ from services.evaluation.judge_network import (
     TaskNetwork,
     unit_images,
 )
-from services.evaluation.progress import Progress
+from services.evaluation.optimization import optimized
 from services.evaluation.starts import refuse_training_starts
 from services.evaluation.success_probe import DECISION_THRESHOLD, KIND, SuccessProbe
 from services.evaluation.success_probe_data import Labelled, labelled_endings, object_scale
@@ -32,6 +30,16 @@ from services.evaluation.success_probe_figures import (
     held_out_figures,
     milestones_that_can_be_told,
 )
+from services.networks.training_settings import (
+    Batch,
+    Brightness,
+    CpuBudget,
+    ImageNoise,
+    LearningRate,
+    NumSteps,
+    Seed,
+    WeightDecay,
+)
 
 
 class ProbeSettings(BaseModel):
@@ -39,19 +47,15 @@ class ProbeSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(default=0, description="seed of weights and sampling")
+    seed: Seed = 0
     # For each task.
-    num_training_steps: int = Field(default=2000, ge=1, description="training steps")
-    max_cpu_s: float = Field(
-        default=200.0, gt=0, description="CPU seconds after which training ends"
-    )
-    batch_size: int = Field(default=48, ge=2, description="examples per training step")
-    learning_rate: float = Field(default=1.5e-3, gt=0, description="peak of the cosine schedule")
-    weight_decay: float = Field(default=5e-2, ge=0, description="AdamW weight decay")
-    image_noise: float = Field(default=0.02, ge=0, description="noise on training images in 0 … 1")
-    brightness: float = Field(
-        default=0.05, ge=0, description="brightness variation of training images"
-    )
+    num_training_steps: NumSteps = 2000
+    max_cpu_s: CpuBudget = 200.0
+    batch_size: Batch = Field(default=48, ge=2)
+    learning_rate: LearningRate = 1.5e-3
+    weight_decay: WeightDecay = 5e-2
+    image_noise: ImageNoise = 0.02
+    brightness: Brightness = 0.05
     # At 64 pixels, one pixel is about 10 mm on the table, the scale that decides success.
     shift_px: int = Field(default=1, ge=0, description="largest shift of training images")
     # Shares of true endings with both inputs that lose their poses, or their image: real endings
@@ -186,8 +190,8 @@ def train_success_probe(
     cpu_s = 0.0
     for index, task in enumerate(shape.tasks):
         cpu_s += _optimize(network.of(task), learned.of_task(index), settings, name=f"probe {task}")
-    tensors = {f"network.{name}": t.clone() for name, t in network.state_dict().items()}
-    plain = Checkpoint(_metadata(sets, settings, shape, command, cpu_s), tensors)
+    metadata = _metadata(sets, settings, shape, command, cpu_s)
+    plain = Checkpoint(metadata, network_tensors(network))
     return _measured(_calibrated(plain, sets, settings), sets)
 
 
@@ -256,34 +260,23 @@ def _optimize(
     mean, std = object_scale(learned.batch)
     network.object_mean.copy_(mean)
     network.object_std.copy_(std)
-    generator = torch.Generator().manual_seed(settings.seed)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
-    network.train()
-    started = time.process_time()
-    with Progress(name, settings.num_training_steps) as progress:
-        for step in range(settings.num_training_steps):
-            elapsed = time.process_time() - started
-            done = max(step / settings.num_training_steps, elapsed / settings.max_cpu_s)
-            if done >= 1:
-                break
-            for group in optimizer.param_groups:
-                group["lr"] = settings.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
-            index = torch.multinomial(
-                learned.weight, settings.batch_size, replacement=True, generator=generator
-            )
-            batch = some_parts(learned.batch[index], network.object_std, settings, generator)
-            images = _disturb(unit_images(batch.images), settings, generator)
-            loss = _loss(
-                network(images, batch), learned.outcome[index], learned.known[index], settings
-            )
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            optimizer.step()
-            progress.advance(loss=float(loss.detach()))
+
+    def loss(generator: torch.Generator) -> torch.Tensor:
+        index = torch.multinomial(
+            learned.weight, settings.batch_size, replacement=True, generator=generator
+        )
+        batch = some_parts(learned.batch[index], network.object_std, settings, generator)
+        images = _disturb(unit_images(batch.images), settings, generator)
+        odds = network(images, batch)
+        return _loss(odds, learned.outcome[index], learned.known[index], settings)
+
+    limits = (settings.num_training_steps, settings.max_cpu_s)
+    steps = optimized(network, loss, settings, limits=limits, title=name, max_gradient_norm=None)
+    cpu_s = 0.0
+    for used in steps:
+        cpu_s = used.cpu_s
     network.eval()
-    return time.process_time() - started
+    return cpu_s
 
 
 def _loss(

@@ -7,9 +7,14 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from services.networks.weight_files import (
+    half_weights,
+    load_strictly,
+    read_weights,
+    write_weights,
+)
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.network.model import JointWorldModel
-from services.world_model.weights import half_weights, load_strictly, read_weights, write_weights
 
 FORMAT_VERSION = 1
 METADATA_KEY = "dextouch_world_model"
@@ -63,9 +68,8 @@ def read_checkpoint(path: Path) -> Checkpoint:
     """Load a checkpoint strictly, in float32 and evaluation mode.
 
     Raises:
-        NotFoundError, LimitExceededError, CorruptDataError: as `read_weights`.
+        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
         InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
-        NonFiniteError: weights that are NaN or infinite.
     """
     tensors, metadata, digest = read_weights(path, CheckpointMetadata, METADATA_KEY)
     model = JointWorldModel(metadata.network)

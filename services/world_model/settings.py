@@ -8,6 +8,17 @@ from pydantic_settings import BaseSettings, CliImplicitFlag
 from dextouch.command_line import JSON_HELP
 from dextouch.serving import service_config
 from dextouch.worlds import WorldServiceSettings
+from services.networks.training_settings import (
+    AverageDecay,
+    Batch,
+    CpuBudget,
+    LearningRate,
+    MaxGradientNorm,
+    MaxSteps,
+    NumSteps,
+    WarmupSteps,
+    WeightDecay,
+)
 from services.world_model.checkpoints import PRETRAINED, default_checkpoint
 from services.world_model.network.configuration import NetworkConfig
 from services.world_model.rendering.configuration import RendererConfig
@@ -20,14 +31,12 @@ class OptimizerSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    batch: int = Field(default=8, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
-    warmup_steps: int = Field(default=100, ge=1, description="warm-up steps of the learning rate")
-    weight_decay: float = Field(default=0.02, ge=0, description="AdamW weight decay")
-    max_gradient_norm: float = Field(
-        default=1.0, gt=0, description="norm that gradients are clipped to"
-    )
-    ema_decay: float = Field(default=0.995, ge=0, lt=1, description="decay of the averaged weights")
+    batch: Batch = 8
+    learning_rate: LearningRate = 2e-3
+    warmup_steps: WarmupSteps = 100
+    weight_decay: WeightDecay = 0.02
+    max_gradient_norm: MaxGradientNorm = 1.0
+    ema_decay: AverageDecay = 0.995
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
 
 
@@ -64,14 +73,8 @@ class TrainSettings(BaseModel):
     )
     name: str = Field(default="tiny", description="model name in the checkpoint")
     seed: int = Field(default=0, ge=0, description="seed of weights and sampling")
-    cpu_budget_s: float = Field(
-        default=1000.0, gt=0, description="CPU seconds after which training ends"
-    )
-    max_steps: int | None = Field(
-        default=None,
-        ge=1,
-        description="steps after which training ends, unless the CPU budget ends it",
-    )
+    cpu_budget_s: CpuBudget = 1000.0
+    max_steps: MaxSteps = None
     num_threads: int = Field(default=1, ge=1, description="threads of torch")
     heldout_percent: int = Field(
         default=10,
@@ -113,10 +116,10 @@ class ReaderSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    num_steps: int = Field(default=4000, ge=1, description="training steps")
-    batch: int = Field(default=32, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
-    ema_decay: float = Field(default=0.995, ge=0, lt=1, description="decay of the averaged weights")
+    num_steps: NumSteps = 4000
+    batch: Batch = 32
+    learning_rate: LearningRate = 2e-3
+    ema_decay: AverageDecay = 0.995
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of first steps")
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="convolve in bfloat16")
 
@@ -138,11 +141,11 @@ class CoreSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    num_steps: int = Field(default=6500, ge=1, description="training steps")
-    batch: int = Field(default=64, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
-    weight_decay: float = Field(default=0.05, ge=0, description="AdamW weight decay")
-    ema_decay: float = Field(default=0.99, ge=0, lt=1, description="decay of the averaged weights")
+    num_steps: NumSteps = 6500
+    batch: Batch = 64
+    learning_rate: LearningRate = 2e-3
+    weight_decay: WeightDecay = 0.05
+    ema_decay: AverageDecay = 0.99
     first_fraction: float = Field(default=0.6, ge=0, le=1, description="share of whole episodes")
     measured_fraction: float = Field(default=0.15, ge=0, le=1, description="measured actions")
     held_fraction: float = Field(default=0.04, ge=0, le=1, description="share of hands held still")

@@ -5,17 +5,17 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from services.world_model.dynamics.configuration import DynamicsConfig
-from services.world_model.dynamics.model import DynamicsModel
-from services.world_model.rendering.configuration import RendererConfig
-from services.world_model.rendering.network import RendererNetwork
-from services.world_model.weights import (
+from services.networks.weight_files import (
     half_weights,
     holds,
     load_strictly,
     read_weights,
     write_weights,
 )
+from services.world_model.dynamics.configuration import DynamicsConfig
+from services.world_model.dynamics.model import DynamicsModel
+from services.world_model.rendering.configuration import RendererConfig
+from services.world_model.rendering.network import RendererNetwork
 
 FORMAT_VERSION = 2
 METADATA_KEY = "dextouch_state_model"
@@ -112,9 +112,8 @@ def read_state_checkpoint(path: Path) -> StateCheckpoint:
     """Load a state model strictly, in float32 and evaluation mode.
 
     Raises:
-        NotFoundError, LimitExceededError, CorruptDataError: as `read_weights`.
+        NotFoundError, LimitExceededError, CorruptDataError, NonFiniteError: as `read_weights`.
         InvalidInputError: unsupported format version; missing or unexpected tensors, wrong shapes.
-        NonFiniteError: weights that are NaN or infinite.
     """
     tensors, metadata, digest = read_weights(path, StateMetadata, METADATA_KEY)
     dynamics = DynamicsModel(metadata.dynamics, metadata.num_members)

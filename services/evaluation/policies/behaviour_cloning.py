@@ -18,7 +18,7 @@ from dextouch.hands.actions import (
     poses_from_actions,
 )
 from dextouch.schemas import Observation
-from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_weights
+from services.evaluation.checkpoints import Checkpoint, load_checkpoint, load_network
 from services.evaluation.demonstrations import CAMERA
 from services.evaluation.features import pad_features
 from services.evaluation.policies.cloning_network import (
@@ -153,7 +153,7 @@ class BehaviourCloningPolicy:
         checkpoint: from `load_checkpoint` or from training.
 
     Raises:
-        CorruptDataError: the weights do not match the shape in the metadata.
+        InvalidInputError: the weights do not match the shape in the metadata.
     """
 
     looks = "last"
@@ -162,8 +162,7 @@ class BehaviourCloningPolicy:
         self.metadata = checkpoint.metadata
         self.shape = CloningShape.model_validate(checkpoint.metadata.settings["shape"])
         self._network = self.shape.network()
-        load_weights(self._network, checkpoint, prefix="network")
-        self._network.eval()
+        load_network(self._network, checkpoint)
         self._start: PolicyStart | None = None
         self._first_image: np.ndarray | None = None
 

@@ -1,7 +1,6 @@
 """Training of behaviour cloning, with held-out error and an optional early checkpoint."""
 
-import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,8 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
-from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata
+from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
+from services.evaluation.optimization import optimized
 from services.evaluation.policies.behaviour_cloning import (
     KIND,
     CloningInput,
@@ -32,7 +32,16 @@ from services.evaluation.policies.cloning_network import (
     CloningBatch,
     CloningNetwork,
 )
-from services.evaluation.progress import Progress
+from services.networks.training_settings import (
+    Batch,
+    Brightness,
+    CpuBudget,
+    ImageNoise,
+    LearningRate,
+    NumSteps,
+    Seed,
+    WeightDecay,
+)
 
 # Batch size of the held-out evaluation.
 _TESTED_AT_ONCE = 128
@@ -46,18 +55,14 @@ class CloningSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(default=0, description="seed of weights and sampling")
-    num_training_steps: int = Field(default=3000, ge=1, description="training steps")
-    max_cpu_s: float = Field(
-        default=240.0, gt=0, description="CPU seconds after which training ends"
-    )
-    batch_size: int = Field(default=72, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=1.5e-3, gt=0, description="peak of the cosine schedule")
-    weight_decay: float = Field(default=1e-3, ge=0, description="AdamW weight decay")
-    image_noise: float = Field(default=0.02, ge=0, description="noise on training images in 0 … 1")
-    brightness: float = Field(
-        default=0.06, ge=0, description="brightness variation of training images"
-    )
+    seed: Seed = 0
+    num_training_steps: NumSteps = 3000
+    max_cpu_s: CpuBudget = 240.0
+    batch_size: Batch = 72
+    learning_rate: LearningRate = 1.5e-3
+    weight_decay: WeightDecay = 1e-3
+    image_noise: ImageNoise = 0.02
+    brightness: Brightness = 0.06
     pose_noise: float = Field(default=0.2, ge=0, description="pose noise, relative to the spread")
     held_out_share: float = Field(default=0.12, gt=0, lt=1, description="share of held-out seeds")
 
@@ -210,18 +215,24 @@ def train_cloned_policy(
                 **_errors(network, tested, tasks),
             },
         )
-        tensors = {
-            f"network.{name}": t.half() if name in _KEPT_AS_HALF else t.clone()
-            for name, t in network.state_dict().items()
-        }
-        return Checkpoint(metadata, tensors)
+        return Checkpoint(metadata, network_tensors(network, halved=_KEPT_AS_HALF))
 
-    network.train()
+    wanted = network.codec.encode(learned.chunks, learned.task, learned.slot)
+    variance = wanted.var(0).sum()
+
+    def loss(generator: torch.Generator) -> torch.Tensor:
+        index = learned.drawn(settings.batch_size, generator)
+        part = _disturbed(learned.batch(index), network, settings, generator)
+        return (network(part) - wanted[index]).square().sum(1).mean() / variance
+
     early: Checkpoint | None = None
     cpu_s = 0.0
-    for done, cpu_s in _optimize(network, learned, settings):
-        if early_at is not None and early is None and done >= early_at:
-            early = checkpoint(cpu_s, round(done, 4))
+    limits = (settings.num_training_steps, settings.max_cpu_s)
+    for used in optimized(network, loss, settings, limits=limits, title="policy"):
+        cpu_s = used.cpu_s
+        if early_at is not None and early is None and used.share() >= early_at:
+            with used.paused():
+                early = checkpoint(cpu_s, round(used.share(), 4))
     return Trained(checkpoint(cpu_s, 1.0), early)
 
 
@@ -233,43 +244,6 @@ def _fit_statistics(network: CloningNetwork, learned: Decisions) -> None:
         poses = network.poses(learned.state)
         network.pose_mean.copy_(poses.mean(0))
         network.pose_scale.copy_(poses.std(0).clamp_min(1e-2))
-
-
-def _optimize(
-    network: CloningNetwork, learned: Decisions, settings: CloningSettings
-) -> Iterator[tuple[float, float]]:
-    """Minimize the weighted action error; yields completed fraction and CPU seconds per step.
-
-    The seconds count from the first step.
-    """
-    generator = torch.Generator().manual_seed(settings.seed)
-    optimizer = torch.optim.AdamW(
-        network.parameters(), lr=settings.learning_rate, weight_decay=settings.weight_decay
-    )
-    wanted = network.codec.encode(learned.chunks, learned.task, learned.slot)
-    variance = wanted.var(0).sum()
-    started = time.process_time()
-    done, others_s = 0.0, 0.0
-    with Progress("policy", settings.num_training_steps) as progress:
-        for step in range(settings.num_training_steps):
-            if done >= 1:
-                break
-            for group in optimizer.param_groups:
-                group["lr"] = settings.learning_rate * 0.5 * (1 + np.cos(np.pi * done))
-            index = learned.drawn(settings.batch_size, generator)
-            part = _disturbed(learned.batch(index), network, settings, generator)
-            loss = (network(part) - wanted[index]).square().sum(1).mean() / variance
-            optimizer.zero_grad()
-            loss.backward()
-            torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
-            optimizer.step()
-            progress.advance(loss=float(loss.detach()))
-            now = time.process_time()
-            elapsed = now - started - others_s
-            done = max((step + 1) / settings.num_training_steps, elapsed / settings.max_cpu_s)
-            yield done, elapsed
-            # Time to save and evaluate an early policy does not count as training.
-            others_s += time.process_time() - now
 
 
 def _disturbed(

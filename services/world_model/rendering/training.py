@@ -1,9 +1,9 @@
 """Training of the renderer on true states, some of them with pose noise like predicted ones."""
 
-import math
-import time
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 import torch
@@ -14,6 +14,23 @@ from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from services.networks.optimizer import (
+    Budget,
+    OptimizerLoop,
+    OptimizerOptions,
+    half_cosine,
+    update_average,
+)
+from services.networks.training_settings import (
+    AverageDecay,
+    Batch,
+    CpuBudget,
+    LearningRate,
+    MaxGradientNorm,
+    MaxSteps,
+    WarmupSteps,
+    WeightDecay,
+)
 from services.world_model.rendering.box_raster import object_transforms
 from services.world_model.rendering.clips import SceneClip, gather
 from services.world_model.rendering.configuration import RendererConfig
@@ -32,22 +49,14 @@ class RendererTraining(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    cpu_budget_s: float = Field(
-        default=540.0, gt=0, description="CPU seconds after which training ends"
-    )
-    max_steps: int | None = Field(
-        default=None,
-        ge=1,
-        description="steps after which training ends, unless the CPU budget ends it",
-    )
-    batch: int = Field(default=24, ge=1, description="examples per training step")
-    learning_rate: float = Field(default=2e-3, gt=0, description="peak of the cosine schedule")
-    warmup_steps: int = Field(default=50, ge=1, description="warm-up steps of the learning rate")
-    weight_decay: float = Field(default=0.01, ge=0, description="AdamW weight decay")
-    ema_decay: float = Field(default=0.995, ge=0, lt=1, description="decay of the averaged weights")
-    max_gradient_norm: float = Field(
-        default=1.0, gt=0, description="norm that gradients are clipped to"
-    )
+    cpu_budget_s: CpuBudget = 540.0
+    max_steps: MaxSteps = None
+    batch: Batch = 24
+    learning_rate: LearningRate = 2e-3
+    warmup_steps: WarmupSteps = 50
+    weight_decay: WeightDecay = 0.01
+    ema_decay: AverageDecay = 0.995
+    max_gradient_norm: MaxGradientNorm = 1.0
     gradient_weight: float = Field(default=0.5, ge=0, description="image gradient loss")
     sharpness_weight: float = Field(
         default=0.3, ge=0, description="weight of the edge strength loss (7 px windows)"
@@ -104,20 +113,27 @@ def train_renderer(
     """
     run = RendererRun(clips, config, settings, rng=rng)
     log: list[RendererProgress] = []
-    begin_s = time.process_time()
-    cpu_s = 0.0
-    while (share := run.share(cpu_s)) < 1.0:
-        loss = run.learn(share)
-        cpu_s = time.process_time() - begin_s
-        if run.step % LOG_EVERY_STEPS == 0:
-            log.append(RendererProgress(run.step, min(run.share(cpu_s), 1.0), loss))
+    budget = Budget(settings.cpu_budget_s, settings.max_steps)
+    options = OptimizerOptions(
+        learning_rate=settings.learning_rate,
+        weight_decay=settings.weight_decay,
+        max_gradient_norm=settings.max_gradient_norm,
+        warmup_steps=settings.warmup_steps,
+        schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
+        betas=(0.9, 0.95),
+    )
+    averaged = copy.deepcopy(run.network).eval().requires_grad_(requires_grad=False)
+    for loss in OptimizerLoop(run.network, options, budget).run(run.loss):
+        update_average(averaged, run.network, decay=settings.ema_decay, num_updates=budget.step - 1)
+        if budget.step % LOG_EVERY_STEPS == 0:
+            log.append(RendererProgress(budget.step, min(budget.share(), 1.0), loss))
             if on_progress is not None:
                 on_progress(log[-1])
-    return TrainedRenderer(run.averaged, run.step, cpu_s, log)
+    return TrainedRenderer(averaged, budget.step, budget.cpu_s, log)
 
 
 class RendererRun:
-    """One run: network, weight average, optimizer and random state."""
+    """Network of one run, with the random pairs that it is trained on."""
 
     def __init__(
         self,
@@ -128,47 +144,20 @@ class RendererRun:
         rng: np.random.Generator,
     ) -> None:
         check_clips(clips, config)
-        self.step = 0
         self._clips = clips
         self._settings = settings
         self._rng = rng
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(int(rng.integers(2**31)))
             self.network = RendererNetwork(config)
-        self.averaged = RendererNetwork(config).eval().requires_grad_(requires_grad=False)
-        self.averaged.load_state_dict(self.network.state_dict())
         self._bfloat16 = settings.uses_bfloat16 and has_fast_bfloat16()
-        self._optimizer = torch.optim.AdamW(
-            self.network.parameters(),
-            lr=settings.learning_rate,
-            weight_decay=settings.weight_decay,
-            betas=(0.9, 0.95),
-            fused=True,
-        )
 
-    def share(self, cpu_s: float) -> float:
-        """Completed fraction of the run, by the tighter of its two limits."""
-        by_time = cpu_s / self._settings.cpu_budget_s
-        limit = self._settings.max_steps
-        return by_time if limit is None else max(by_time, self.step / limit)
-
-    def learn(self, share: float) -> float:
-        """One optimizer step on a fresh batch; returns its loss."""
+    def loss(self) -> Tensor:
+        """Loss of a fresh batch."""
         inputs, true = self.batch()
         with torch.autocast("cpu", dtype=torch.bfloat16, enabled=self._bfloat16):
             drawn = self.network(inputs)
-        loss = drawing_loss(drawn, true, self._settings)
-        for group in self._optimizer.param_groups:
-            group["lr"] = self._learning_rate(share)
-        self._optimizer.zero_grad()
-        torch.autograd.backward(loss)
-        torch.nn.utils.clip_grad_norm_(
-            self.network.parameters(), self._settings.max_gradient_norm, error_if_nonfinite=True
-        )
-        self._optimizer.step()
-        self._average()
-        self.step += 1
-        return loss.item()
+        return drawing_loss(drawn, true, self._settings)
 
     def batch(self) -> tuple[DrawingInputs, Float32[Tensor, "n 3 h w"]]:
         """Inputs of random pairs and the true later images in 0 … 1."""
@@ -205,19 +194,6 @@ class RendererRun:
         Ts = object_transforms(states.object_poses)
         poses[..., 3:] = quaternion_from_rotation(R @ Ts[..., :3, :3])
         return replace(states, object_poses=poses)
-
-    def _learning_rate(self, share: float) -> float:
-        warmup = min(1.0, (self.step + 1) / self._settings.warmup_steps)
-        cosine = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
-        return self._settings.learning_rate * warmup * max(cosine, MIN_LEARNING_RATE_SHARE)
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        # A shorter memory at first, so that short runs do not keep the initial weights.
-        decay = min(self._settings.ema_decay, (1 + self.step) / (10 + self.step))
-        pairs = zip(self.averaged.parameters(), self.network.parameters(), strict=True)
-        for mean, weight in pairs:
-            mean.lerp_(weight, 1.0 - decay)
 
 
 def drawing_loss(

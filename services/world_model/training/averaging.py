@@ -1,39 +1,55 @@
-"""Moving average of weights and learning-rate schedule, shared by the small networks."""
+"""Training loop of start readers and recurrent cores, which keeps their averaged weights."""
 
-import math
+import copy
+from collections.abc import Callable
+from typing import TypeVar
 
-import torch
-from torch import nn
+from torch import Tensor, nn
+
+from services.networks.optimizer import (
+    Budget,
+    OptimizerLoop,
+    OptimizerOptions,
+    half_cosine,
+    update_average,
+)
+from services.world_model.settings import CoreSettings, ReaderSettings
 
 _WARMUP_STEPS = 100
+OnStep = Callable[[int, float], None]
+Network = TypeVar("Network", bound=nn.Module)
 
 
-class WeightAverage:
-    """Exponential moving average of a network's weights, with a shorter memory at first.
+def train_averaged(
+    network: Network,
+    loss: Callable[[], Tensor],
+    settings: ReaderSettings | CoreSettings,
+    *,
+    weight_decay: float,
+    on_step: OnStep | None = None,
+) -> Network:
+    """Train a network and return it with the moving average of its weights.
 
     Args:
-        network: its current weights initialize the average.
-        decay: decay after many updates, such as 0.995.
+        network: its weights are changed.
+        loss: loss of a fresh batch.
+        settings: number of steps, learning rate and decay of the average.
+        weight_decay: AdamW weight decay.
+        on_step: called with the step and its loss.
     """
-
-    def __init__(self, network: nn.Module, decay: float) -> None:
-        self._decay, self._num_updates = decay, 0
-        self._weights = {name: value.clone() for name, value in network.state_dict().items()}
-
-    @torch.no_grad()
-    def update(self, network: nn.Module) -> None:
-        """Update the average with the current weights."""
-        self._num_updates += 1
-        decay = min(self._decay, (1 + self._num_updates) / (10 + self._num_updates))
-        for name, value in network.state_dict().items():
-            self._weights[name].lerp_(value, 1 - decay)
-
-    def copy_to(self, network: nn.Module) -> None:
-        """Overwrite a network's weights with the average."""
-        network.load_state_dict(self._weights)
+    options = OptimizerOptions(
+        settings.learning_rate, weight_decay, warmup_steps=_WARMUP_STEPS, schedule=_to_a_hundredth
+    )
+    budget = Budget(max_steps=settings.num_steps)
+    averaged = copy.deepcopy(network)
+    for value in OptimizerLoop(network, options, budget).run(loss):
+        # Begins with a longer memory than that of a first update.
+        update_average(averaged, network, decay=settings.ema_decay, num_updates=budget.step)
+        if on_step is not None:
+            on_step(budget.step, value)
+    return averaged.eval()
 
 
-def cosine_rate(peak: float, step: int, num_steps: int) -> float:
-    """Learning rate of a step: linear warm-up, then half a cosine down to a hundredth."""
-    warm = min(1.0, (step + 1) / _WARMUP_STEPS)
-    return peak * warm * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * step / num_steps)))
+def _to_a_hundredth(share: float) -> float:
+    """Half a cosine from 1 down to 0.01."""
+    return 0.01 + 0.99 * half_cosine(share)

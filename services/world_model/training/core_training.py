@@ -1,12 +1,12 @@
 """Training of a recurrent core on whole episodes: object motion and touch."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float16, Float32, Int64
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
@@ -17,7 +17,7 @@ from services.world_model.dynamics.model import Commands
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.touch_codec import TouchCodec
 from services.world_model.settings import CoreSettings
-from services.world_model.training.averaging import WeightAverage, cosine_rate
+from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import SceneTable
 
 _UNIT_M = 0.05
@@ -31,7 +31,6 @@ _SETTLED_M = 1e-3
 # Cores are trained from the first step and from every so many steps after it.
 _START_STRIDE = 8
 _TAXEL_SHARE = 4
-OnStep = Callable[[int, float], None]
 
 
 @dataclass(frozen=True)
@@ -79,27 +78,13 @@ def train_core(
         torch.manual_seed(seed)
         core = RecurrentCore(config)
         fit_features(core, data.table)
-        optimizer = torch.optim.AdamW(
-            core.parameters(),
-            lr=settings.learning_rate,
-            weight_decay=settings.weight_decay,
-            fused=True,
+
+        def loss() -> Tensor:
+            return core_loss(core, data, _draw(data, settings, generator, rng), settings)
+
+        return train_averaged(
+            core, loss, settings, weight_decay=settings.weight_decay, on_step=on_step
         )
-        average = WeightAverage(core, settings.ema_decay)
-        for step in range(settings.num_steps):
-            batch = _draw(data, settings, generator, rng)
-            loss = core_loss(core, data, batch, settings)
-            for group in optimizer.param_groups:
-                group["lr"] = cosine_rate(settings.learning_rate, step, settings.num_steps)
-            optimizer.zero_grad()
-            loss.backward()  # type: ignore[no-untyped-call]
-            nn.utils.clip_grad_norm_(core.parameters(), 1.0, error_if_nonfinite=True)
-            optimizer.step()
-            average.update(core)
-            if on_step is not None:
-                on_step(step + 1, float(loss.detach()))
-    average.copy_to(core)
-    return core.eval()
 
 
 @torch.no_grad()

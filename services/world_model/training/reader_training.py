@@ -1,24 +1,23 @@
 """Training of a start reader on steps whose object poses are known."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float32, Int64
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional
 
 from services.world_model.dynamics.configuration import MAX_OBJECTS, DynamicsConfig
 from services.world_model.dynamics.objects import ObjectPoses
 from services.world_model.dynamics.start_reader import StartReader
 from services.world_model.settings import ReaderSettings
-from services.world_model.training.averaging import WeightAverage, cosine_rate
+from services.world_model.training.averaging import OnStep, train_averaged
 from services.world_model.training.scene_table import SceneTable
 
 # Unit of position errors in the loss.
 _UNIT_M = 0.05
 _BATCH_OF_READING = 128
-OnStep = Callable[[int, float], None]
+_WEIGHT_DECAY = 1e-3
 
 
 @dataclass(frozen=True)
@@ -54,29 +53,17 @@ def train_reader(
         torch.manual_seed(seed)
         reader = StartReader(config)
     _fit_heights(reader, table, config)
-    optimizer = torch.optim.AdamW(
-        reader.parameters(), lr=settings.learning_rate, weight_decay=1e-3, fused=True
-    )
-    average = WeightAverage(reader, settings.ema_decay)
     later = [step for step in table.image_steps if step % 4 == 0 and step > 0]
     known = torch.nonzero(table.labelled)[:, 0]
-    for step in range(settings.num_steps):
+
+    def loss() -> Tensor:
         rows = known[torch.randint(len(known), (settings.batch,), generator=generator)]
         amid = torch.tensor(later)[torch.randint(len(later), rows.shape, generator=generator)]
         is_first = torch.rand(rows.shape, generator=generator) < settings.first_fraction
         steps = torch.where(is_first, 0, amid)
-        loss = _loss(reader, (table, rows, steps), generator, bfloat16=settings.bfloat16)
-        for group in optimizer.param_groups:
-            group["lr"] = cosine_rate(settings.learning_rate, step, settings.num_steps)
-        optimizer.zero_grad()
-        loss.backward()  # type: ignore[no-untyped-call]
-        nn.utils.clip_grad_norm_(reader.parameters(), 1.0, error_if_nonfinite=True)
-        optimizer.step()
-        average.update(reader)
-        if on_step is not None:
-            on_step(step + 1, float(loss.detach()))
-    average.copy_to(reader)
-    return reader.eval()
+        return _loss(reader, (table, rows, steps), generator, bfloat16=settings.bfloat16)
+
+    return train_averaged(reader, loss, settings, weight_decay=_WEIGHT_DECAY, on_step=on_step)
 
 
 def _fit_heights(reader: StartReader, table: SceneTable, config: DynamicsConfig) -> None:

@@ -16,11 +16,11 @@ from typing import cast
 import numpy as np
 import structlog
 import torch
-from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from dextouch.errors import InvalidInputError
+from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.dynamics.configuration import DynamicsConfig
 from services.world_model.dynamics.model import DynamicsMember, DynamicsModel
 from services.world_model.dynamics.start_reader import StartReader
@@ -99,9 +99,8 @@ def train_state(settings: StateTrainSettings) -> StateReport:
     save_file({**table.tensors(), **_prefixed(codec)}, table_file)
     del table
     work = _Work(settings, config, parts, data_hash)
-    cpu_s = _train_parts(work)
-    dynamics = _assembled(work, codec)
-    renderer = _trained_renderer(work)
+    _train_parts(work)
+    dynamics, renderer, cpu_s = _assembled(work, codec)
     measured = evaluate_dynamics(dynamics, heldout_table)
     metadata = StateMetadata(
         name=settings.name,
@@ -225,8 +224,8 @@ def _prefixed(codec: TouchCodec) -> dict[str, Tensor]:
     return {f"codec/{name}": value for name, value in codec.state_dict().items()}
 
 
-def _train_parts(work: _Work) -> float:
-    """Train missing parts, several in parallel; returns the CPU seconds of all parts."""
+def _train_parts(work: _Work) -> None:
+    """Train missing parts, several in parallel."""
     missing = [m for m in range(work.settings.num_members) if not work.core_file(m).exists()]
     spawned = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(work.settings.jobs, spawned) as pool:
@@ -235,9 +234,6 @@ def _train_parts(work: _Work) -> float:
             orders.append(pool.submit(_train_renderer, work))
         for done in as_completed(orders):
             done.result()
-    members = range(work.settings.num_members)
-    parts = [part for m in members for part in (work.reader_file(m), work.core_file(m))]
-    return sum(_cpu_s_of(part) for part in (*parts, work.renderer_file))
 
 
 def _train_renderer(work: _Work) -> None:
@@ -265,22 +261,15 @@ def _say_drawing(now: RendererProgress) -> None:
 
 
 def _keep(model: nn.Module, path: Path, cpu_s: float) -> None:
-    """Write a finished part atomically, with its CPU seconds."""
-    partial = path.with_suffix(".partial")
-    tensors = {name: value.contiguous() for name, value in model.state_dict().items()}
-    save_file(tensors, partial, metadata={_CPU_S: str(cpu_s)})
-    partial.replace(path)
+    """Write a finished part with its CPU seconds."""
+    write_tensors(path, model.state_dict(), {_CPU_S: str(cpu_s)})
 
 
-def _cpu_s_of(path: Path) -> float:
-    with safe_open(path, framework="pt") as file:
-        return float(file.metadata()[_CPU_S])
-
-
-def _trained_renderer(work: _Work) -> RendererNetwork:
-    renderer = RendererNetwork(work.settings.renderer)
-    renderer.load_state_dict(load_file(work.renderer_file))
-    return renderer
+def _load(model: nn.Module, path: Path) -> float:
+    """Load a finished part; returns its CPU seconds."""
+    tensors, notes = read_tensors(path, f"finished part {path.name}")
+    model.load_state_dict(tensors)
+    return float(notes[_CPU_S])
 
 
 def _train_member(work: _Work, member: int) -> None:
@@ -300,7 +289,7 @@ def _train_member(work: _Work, member: int) -> None:
         )
         _keep(trained, work.reader_file(member), time.process_time() - started_s)
     reader = StartReader(work.config)
-    reader.load_state_dict(load_file(work.reader_file(member)))
+    _load(reader, work.reader_file(member))
     reader.eval()
     started_s = time.process_time()
     readings = {step: read_objects(reader, table, step) for step in start_steps(table)}
@@ -330,14 +319,18 @@ class _Log:
             )
 
 
-def _assembled(work: _Work, codec: TouchCodec) -> DynamicsModel:
+def _assembled(work: _Work, codec: TouchCodec) -> tuple[DynamicsModel, RendererNetwork, float]:
+    """Models of the finished parts, and the CPU seconds of all of these."""
     dynamics = DynamicsModel(work.config, work.settings.num_members)
     dynamics.codec.load_state_dict(codec.state_dict())
+    cpu_s = 0.0
     for index, module in enumerate(dynamics.members):
         member = cast("DynamicsMember", module)
-        member.reader.load_state_dict(load_file(work.reader_file(index)))
-        member.core.load_state_dict(load_file(work.core_file(index)))
-    return dynamics.eval().requires_grad_(requires_grad=False)
+        cpu_s += _load(member.reader, work.reader_file(index))
+        cpu_s += _load(member.core, work.core_file(index))
+    renderer = RendererNetwork(work.settings.renderer)
+    cpu_s += _load(renderer, work.renderer_file)
+    return dynamics.eval().requires_grad_(requires_grad=False), renderer, cpu_s
 
 
 def _command(settings: StateTrainSettings) -> str:

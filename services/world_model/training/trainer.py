@@ -1,11 +1,10 @@
 """Training of the joint flow-matching model, from settings to an evaluated checkpoint."""
 
 import json
-import math
-import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import astuple, dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from dextouch.errors import ConflictError, NonFiniteError
+from dextouch.errors import ConflictError
+from services.networks.optimizer import (
+    Budget,
+    OptimizerLoop,
+    OptimizerOptions,
+    half_cosine,
+    update_average,
+)
 from services.world_model.checkpoints import (
     Checkpoint,
     CheckpointMetadata,
@@ -22,7 +28,7 @@ from services.world_model.checkpoints import (
 )
 from services.world_model.network.inputs import build_inputs
 from services.world_model.network.model import JointWorldModel
-from services.world_model.settings import OptimizerSettings, TrainSettings, command_line
+from services.world_model.settings import TrainSettings, command_line
 from services.world_model.training.dataset import (
     EpisodeArrays,
     Place,
@@ -115,8 +121,8 @@ def train_on(
         tasks=tuple(sorted({episode.task for episode in trained})),
         command=command_line(settings),
         seed=settings.seed,
-        training_steps=run.step,
-        training_cpu_s=round(run.cpu_s, 1),
+        training_steps=run.budget.step,
+        training_cpu_s=round(run.budget.cpu_s, 1),
         train_episode_ids=tuple(sorted(names)),
         train_fingerprints=tuple(sorted(prints)),
         data_hash=combined_hash(sorted(prints)),
@@ -139,8 +145,8 @@ def train_on(
         checkpoint=settings.output,
         digest=digest,
         num_parameters=sum(p.numel() for p in stored.parameters()),
-        steps=run.step,
-        cpu_s=run.cpu_s,
+        steps=run.budget.step,
+        cpu_s=run.budget.cpu_s,
         num_train_episodes=len(trained),
         num_heldout_episodes=len(heldout),
         metrics=metrics,
@@ -165,14 +171,14 @@ def _run_or_resume(
         run.start_from(ancestor)
     else:
         run.fit_codecs()
-    kept_cpu_s = run.cpu_s
+    kept_cpu_s = run.budget.cpu_s
 
     def keep(now: TrainingRun) -> None:
         nonlocal kept_cpu_s
-        if now.cpu_s - kept_cpu_s >= settings.state_every_cpu_s:
+        if now.budget.cpu_s - kept_cpu_s >= settings.state_every_cpu_s:
             tensors, facts = now.state()
             write_state(path, TrainingState(tensors, RunFacts(identity=identity, **facts)))
-            kept_cpu_s = now.cpu_s
+            kept_cpu_s = now.budget.cpu_s
 
     return run.run(on_progress, keep)
 
@@ -186,8 +192,7 @@ class TrainingRun:
     def __init__(self, episodes: Sequence[TrainingEpisode], settings: TrainSettings) -> None:
         self.settings = settings
         self.episodes = episodes
-        self.step = 0
-        self.cpu_s = 0.0
+        self.budget = Budget(settings.cpu_budget_s, settings.max_steps)
         self.log: list[TrainingProgress] = []
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(settings.seed)
@@ -206,13 +211,15 @@ class TrainingRun:
             commanded_fraction=windows.commanded_fraction,
             chained_fraction=windows.chained_fraction,
         )
-        self._optimizer = torch.optim.AdamW(
-            self.model.parameters(),
-            lr=settings.optimizer.learning_rate,
+        options = OptimizerOptions(
+            learning_rate=settings.optimizer.learning_rate,
             weight_decay=settings.optimizer.weight_decay,
+            max_gradient_norm=settings.optimizer.max_gradient_norm,
+            warmup_steps=settings.optimizer.warmup_steps,
+            schedule=partial(half_cosine, least=MIN_LEARNING_RATE_SHARE),
             betas=(0.9, 0.95),
-            fused=True,
         )
+        self.loop = OptimizerLoop(self.model, options, self.budget)
 
     @torch.no_grad()
     def fit_codecs(self) -> None:
@@ -252,11 +259,11 @@ class TrainingRun:
         """Tensors and metadata that the next steps depend on."""
         tensors = {f"model.{n}": t for n, t in self.model.state_dict().items()}
         tensors |= {f"averaged.{n}": t for n, t in self.averaged.state_dict().items()}
-        tensors |= optimizer_tensors(self._optimizer)
+        tensors |= optimizer_tensors(self.loop.optimizer)
         tensors["generator"] = self._generator.get_state()
         facts = {
-            "step": self.step,
-            "cpu_s": self.cpu_s,
+            "step": self.budget.step,
+            "cpu_s": self.budget.cpu_s,
             "window_numbers": self._window_numbers,
             "log": tuple(astuple(entry) for entry in self.log),
         }
@@ -266,11 +273,11 @@ class TrainingRun:
         """Continue from `state`."""
         self.model.load_state_dict(part_of(state.tensors, "model."))
         self.averaged.load_state_dict(part_of(state.tensors, "averaged."))
-        restore_optimizer(self._optimizer, state.tensors)
+        restore_optimizer(self.loop.optimizer, state.tensors)
         self._generator.set_state(state.tensors["generator"])
         self._window_numbers = state.facts.window_numbers
         self._rng.bit_generator.state = json.loads(self._window_numbers)
-        self.step, self.cpu_s = state.facts.step, state.facts.cpu_s
+        self.budget.step, self.budget.cpu_s = state.facts.step, state.facts.cpu_s
         self.log = [TrainingProgress(*row) for row in state.facts.log]
 
     def run(
@@ -282,17 +289,17 @@ class TrainingRun:
             on_progress: called with every entry of the log.
             on_step: called with the run after every step.
         """
-        start_s = time.process_time() - self.cpu_s
+        budget = self.budget
+        budget.start()
         self.model.train()
         batches = self._batches()
-        while self.share() < 1.0:
+        while budget.share() < 1.0:
             loss_video, loss_tactile = self.learn(next(batches))
             self._window_numbers = self._drawn.popleft()
-            self.step += 1
-            self.cpu_s = time.process_time() - start_s
-            if self.step % LOG_EVERY_STEPS == 0 or self.share() >= 1.0:
+            budget.advance()
+            if budget.step % LOG_EVERY_STEPS == 0 or budget.share() >= 1.0:
                 progress = TrainingProgress(
-                    self.step, min(self.share(), 1.0), loss_video, loss_tactile
+                    budget.step, min(budget.share(), 1.0), loss_video, loss_tactile
                 )
                 self.log.append(progress)
                 if on_progress is not None:
@@ -300,12 +307,6 @@ class TrainingRun:
             if on_step is not None:
                 on_step(self)
         return self.log
-
-    def share(self) -> float:
-        """Completed fraction of the run, by the tighter of its two limits."""
-        by_time = self.cpu_s / self.settings.cpu_budget_s
-        limit = self.settings.max_steps
-        return by_time if limit is None else max(by_time, self.step / limit)
 
     def learn(self, batch: WindowBatch) -> tuple[float, float]:
         """One optimizer step; returns the video and tactile losses."""
@@ -318,20 +319,11 @@ class TrainingRun:
             generator=self._generator,
             context_noise=self.settings.windows.context_noise,
         )
-        for group in self._optimizer.param_groups:
-            group["lr"] = learning_rate(settings, self.step, self.share())
-        self._optimizer.zero_grad()
-        torch.autograd.backward(loss.video + settings.tactile_weight * loss.tactile)
-        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.max_gradient_norm)
-        if not torch.isfinite(norm):
-            raise NonFiniteError(
-                f"training: gradients of step {self.step} are NaN or infinite (loss of sight "
-                f"{loss.video.item():.3g}, of touch {loss.tactile.item():.3g}), expected finite "
-                "ones; no weight was moved: look for NaN in the episodes, or lower the learning "
-                "rate"
-            )
-        self._optimizer.step()
-        self._average()
+        total = loss.video + settings.tactile_weight * loss.tactile
+        self.loop.learn(total, sight=loss.video, touch=loss.tactile)
+        update_average(
+            self.averaged, self.model, decay=settings.ema_decay, num_updates=self.budget.step
+        )
         return loss.video.item(), loss.tactile.item()
 
     def _batches(self) -> Iterator[WindowBatch]:
@@ -358,17 +350,3 @@ class TrainingRun:
         if self._rng.random() >= self.settings.windows.short_fraction:
             return longest
         return int(self._rng.choice(np.arange(5, longest + 1, 4)))
-
-    @torch.no_grad()
-    def _average(self) -> None:
-        # A shorter memory at first, so that short runs do not keep the initial weights.
-        decay = min(self.settings.optimizer.ema_decay, (1 + self.step) / (10 + self.step))
-        for mean, weight in zip(self.averaged.parameters(), self.model.parameters(), strict=True):
-            mean.lerp_(weight, 1.0 - decay)
-
-
-def learning_rate(settings: OptimizerSettings, step: int, share: float) -> float:
-    """Linear warm-up, then half a cosine over the completed fraction of the run."""
-    warmup = min(1.0, (step + 1) / settings.warmup_steps)
-    cosine = 0.5 * (1.0 + math.cos(math.pi * min(share, 1.0)))
-    return settings.learning_rate * warmup * max(cosine, MIN_LEARNING_RATE_SHARE)

@@ -6,7 +6,6 @@ time leaves the last complete state. It is removed when the run has ended.
 """
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,11 +13,10 @@ from typing import Any, Final
 
 import torch
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
-from safetensors import SafetensorError, safe_open
-from safetensors.torch import save
 from torch import Tensor
 
 from dextouch.errors import ConflictError, CorruptDataError
+from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.settings import TrainSettings
 
 METADATA_KEY: Final = "dextouch_training_state"
@@ -74,14 +72,7 @@ def identity_of(
 
 def write_state(path: Path, state: TrainingState) -> None:
     """Replace the state of a run atomically."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    tensors = {name: tensor.detach().contiguous() for name, tensor in state.tensors.items()}
-    partial = path.with_name(path.name + ".partial")
-    with partial.open("wb") as file:
-        file.write(save(tensors, {METADATA_KEY: state.facts.model_dump_json()}))
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+    write_tensors(path, state.tensors, {METADATA_KEY: state.facts.model_dump_json()})
 
 
 def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
@@ -91,14 +82,13 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
         ConflictError: the state has other settings or data; they are named.
         CorruptDataError: not a training state, or a damaged one.
     """
+    where = f"training state {path.name}"
     try:
-        with safe_open(path, framework="pt") as file:
-            notes = file.metadata() or {}
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        tensors, notes = read_tensors(path, where)
         facts = RunFacts.model_validate_json(notes.get(METADATA_KEY, ""))
-    except (SafetensorError, ValidationError) as error:
+    except (CorruptDataError, ValidationError) as error:
         raise CorruptDataError(
-            f"training state {path.name}: unreadable ({error}); remove it to start afresh"
+            f"{where}: unreadable ({error}); remove it to start afresh"
         ) from error
     expected = json.loads(json.dumps(dict(identity)))
     names = facts.identity.keys() | expected.keys()
@@ -107,7 +97,7 @@ def read_state(path: Path, identity: Mapping[str, JsonValue]) -> TrainingState:
         was = {name: facts.identity.get(name) for name in others}
         now = {name: expected.get(name) for name in others}
         raise ConflictError(
-            f"training state {path.name}: of a run with {was}, got {now}; go on with the settings "
+            f"{where}: of a run with {was}, got {now}; go on with the settings "
             "and episodes that it began with, or leave --resume away to start afresh"
         )
     return TrainingState(tensors, facts)

@@ -13,9 +13,11 @@ from dextouch.errors import (
     NonFiniteError,
     NotFoundError,
 )
-from services.world_model import checkpoints, weights
+from services.networks.weight_files import read_weights
+from services.world_model import checkpoints
 from services.world_model.checkpoints import (
     METADATA_KEY,
+    CheckpointMetadata,
     default_checkpoint,
     list_checkpoints,
     read_checkpoint,
@@ -100,7 +102,7 @@ def test_weights_that_are_no_numbers_are_refused_both_ways(path, tiny_model, met
         write_checkpoint(path, tiny_model, metadata)
 
 
-def test_foreign_files_are_refused(path, tiny_model, metadata, monkeypatch):
+def test_foreign_files_are_refused(path, tiny_model, metadata):
     with pytest.raises(NotFoundError):
         read_checkpoint(path)
     path.write_bytes(b"not a checkpoint at all")
@@ -113,8 +115,11 @@ def test_foreign_files_are_refused(path, tiny_model, metadata, monkeypatch):
     newer = json.dumps({**metadata.model_dump(mode="json"), "format_version": 2})
     with pytest.raises(InvalidInputError, match="format version 2"):
         read_checkpoint(_damage(path, tiny_model, metadata, notes=newer))
-    monkeypatch.setattr(weights, "MAX_FILE_BYTES", 100)
-    with pytest.raises(LimitExceededError):
+    with pytest.raises(LimitExceededError, match="at most 100"):
+        read_weights(path, CheckpointMetadata, METADATA_KEY, max_bytes=100)
+    with path.open("wb") as file:
+        file.truncate(64 * 2**20 + 1)
+    with pytest.raises(LimitExceededError, match="at most 67108864"):
         read_checkpoint(path)
 
 

@@ -18,7 +18,6 @@ from services.world_model.training.objective import losses
 from services.world_model.training.splits import check_disjoint
 from services.world_model.training.trainer import (
     TrainingRun,
-    learning_rate,
     train,
     train_on,
 )
@@ -57,12 +56,12 @@ def test_averaged_weights_follow_fast_at_first(toy_episodes, train_settings):
     # 1 − (1 + k) / (10 + k) of the way at step k, as long as that is more than 1 − ema_decay.
     for share in (9 / 10, 9 / 11, 9 / 12):
         run.learn(next(batches))
-        run.step += 1
+        run.budget.step += 1
         weights = list(run.model.parameters())
         mean = [m + share * (w - m) for m, w in zip(mean, weights, strict=True)]
         for expected, averaged in zip(mean, run.averaged.parameters(), strict=True):
             torch.testing.assert_close(averaged, expected)
-    run.step = 10**6
+    run.budget.step = 10**6
     before = [weight.clone() for weight in run.averaged.parameters()]
     run.learn(next(batches))
     decay = train_settings.optimizer.ema_decay
@@ -172,9 +171,10 @@ def test_invalid_touch_is_not_learned_from(tiny_model, toy_episodes):
     assert loss(valid=True).video == loss(valid=False).video
 
 
-def test_the_learning_rate_warms_up_and_falls(train_settings):
+def test_the_learning_rate_warms_up_and_falls(toy_episodes, train_settings):
     settings = train_settings.optimizer
-    rates = [learning_rate(settings, step, step / 100) for step in range(101)]
+    options = TrainingRun(toy_episodes, train_settings).loop.options
+    rates = [options.rate(step, step / 100) for step in range(101)]
     assert rates[0] < rates[5] < rates[10]
     assert max(rates) <= settings.learning_rate
     assert 0 < rates[-1] < 0.02 * settings.learning_rate

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
@@ -32,7 +33,7 @@ def half_weights(model: nn.Module, *, prefix: str = "") -> dict[str, Tensor]:
     """
     learned = {name for name, _ in model.named_parameters()}
     tensors = {
-        f"{prefix}{name}": (tensor.half() if name in learned else tensor).contiguous()
+        f"{prefix}{name}": tensor.half() if name in learned else tensor
         for name, tensor in model.state_dict().items()
     }
     refuse_non_finite(tensors, "weights to be written")
@@ -48,16 +49,24 @@ def write_weights(path: Path, tensors: Mapping[str, Tensor], history: BaseModel,
         history: provenance of the weights; stored as JSON.
         key: metadata key of the history, which identifies the kind of model.
     """
-    data = save(dict(tensors), {key: history.model_dump_json()})
+    return write_tensors(path, tensors, {key: history.model_dump_json()})
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor], notes: dict[str, str]) -> str:
+    """Write tensors with texts as metadata; as `write_weights`."""
+    data = save({name: tensor.contiguous() for name, tensor in tensors.items()}, notes)
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(path.suffix + ".partial")
-    partial.write_bytes(data)
+    partial = path.with_name(path.name + ".partial")
+    with partial.open("wb") as file:
+        file.write(data)
+        file.flush()
+        os.fsync(file.fileno())
     partial.replace(path)
     return hashlib.sha256(data).hexdigest()
 
 
 def read_weights(
-    path: Path, history: type[History], key: str
+    path: Path, history: type[History], key: str, *, max_bytes: int = MAX_FILE_BYTES
 ) -> tuple[dict[str, Tensor], History, str]:
     """Read tensors, history and SHA-256 of a file.
 
@@ -65,27 +74,41 @@ def read_weights(
         path: file to read.
         history: class of the history; it has a `format_version`.
         key: metadata key of the history.
+        max_bytes: largest size of the file.
 
     Raises:
         NotFoundError: no such file.
-        LimitExceededError: larger than 64 MiB.
+        LimitExceededError: a larger file.
         CorruptDataError: not a safetensors file, or one without this history.
         InvalidInputError: unsupported format version.
+        NonFiniteError: weights that are NaN or infinite.
     """
     where = f"checkpoint {path.name}"
     if not path.is_file():
-        raise NotFoundError(f"checkpoint: no file {path.name} in {path.parent}")
+        raise NotFoundError(
+            f"checkpoint: no file {path.name} in {path.parent}; check the path, or train one first"
+        )
     size = path.stat().st_size
-    if size > MAX_FILE_BYTES:
-        raise LimitExceededError(f"{where}: got {size} bytes, expected at most {MAX_FILE_BYTES}")
+    if size > max_bytes:
+        raise LimitExceededError(f"{where}: got {size} bytes, expected at most {max_bytes}")
+    tensors, notes = read_tensors(path, where)
+    parsed = _history(notes.get(key), history, key, where)
+    refuse_non_finite(tensors, where)
+    return tensors, parsed, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def read_tensors(path: Path, where: str) -> tuple[dict[str, Tensor], dict[str, str]]:
+    """Read the tensors and the metadata of any safetensors file; `where` begins error messages.
+
+    Raises:
+        CorruptDataError: not a safetensors file.
+    """
     try:
         with safe_open(path, framework="pt") as file:
-            notes = file.metadata() or {}
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+            return tensors, file.metadata() or {}
     except SafetensorError as error:
         raise CorruptDataError(f"{where}: no safetensors file ({error})") from error
-    parsed = _history(notes.get(key), history, key, where)
-    return tensors, parsed, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _history(text: str | None, history: type[History], key: str, where: str) -> History:
@@ -93,7 +116,7 @@ def _history(text: str | None, history: type[History], key: str, where: str) -> 
         raise CorruptDataError(f"{where}: has no {key!r} metadata; it is no such model of ours")
     expected = history.model_fields["format_version"].default
     try:
-        version = json.loads(text).get("format_version")
+        version = json.loads(text).get("format_version", expected)
         if version != expected:
             raise InvalidInputError(
                 f"{where}: format version {version}, expected {expected}; "
@@ -120,7 +143,7 @@ def load_strictly(
     where: str,
     later: Collection[str] = (),
 ) -> None:
-    """Load tensors into models as float32; the names must match exactly.
+    """Load tensors into models in their precision, for inference; the names must match exactly.
 
     Args:
         models: keyed by the prefix of their tensor names.
@@ -129,8 +152,7 @@ def load_strictly(
         later: names that older files do not have; the model keeps its own values.
 
     Raises:
-        InvalidInputError: missing or unexpected tensors, or wrong shapes.
-        NonFiniteError: weights that are NaN or infinite.
+        InvalidInputError: missing or unexpected tensors, wrong shapes or kinds of numbers.
     """
     expected = {
         prefix + name: value
@@ -146,15 +168,15 @@ def load_strictly(
             f"foreign {foreign[:3]}; expected exactly those of its own network settings"
         )
     for name, tensor in found.items():
-        if tensor.shape != expected[name].shape or not tensor.is_floating_point():
+        wanted = expected[name]
+        kinds = tensor.is_floating_point(), wanted.is_floating_point()
+        if tensor.shape != wanted.shape or kinds[0] != kinds[1]:
             raise InvalidInputError(
                 f"{where}: {name} is {tensor.dtype} {tuple(tensor.shape)}, expected "
-                f"floating point {tuple(expected[name].shape)}"
+                f"{'floating point' if kinds[1] else wanted.dtype} {tuple(wanted.shape)}"
             )
-    refuse_non_finite(found, where)
     for prefix, model in models.items():
-        names = model.state_dict()
-        model.load_state_dict({name: found[prefix + name].float() for name in names})
+        model.load_state_dict({name: found[prefix + name] for name in model.state_dict()})
         model.eval().requires_grad_(requires_grad=False)
 
 

@@ -1,0 +1,1 @@
+"""Weight files and optimizer loop of the networks of the world model and of the evaluation."""

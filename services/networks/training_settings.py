@@ -1,0 +1,25 @@
+"""Types of training settings: the bounds and the command-line help that all networks share."""
+
+from typing import Annotated
+
+from pydantic import Field
+
+Seed = Annotated[int, Field(description="seed of weights and sampling")]
+NumSteps = Annotated[int, Field(ge=1, description="training steps")]
+MaxSteps = Annotated[
+    int | None,
+    Field(ge=1, description="steps after which training ends, unless the CPU budget ends it"),
+]
+CpuBudget = Annotated[float, Field(gt=0, description="CPU seconds after which training ends")]
+Batch = Annotated[int, Field(ge=1, description="examples per training step")]
+LearningRate = Annotated[float, Field(gt=0, description="peak of the cosine schedule")]
+WarmupSteps = Annotated[int, Field(ge=1, description="warm-up steps of the learning rate")]
+WeightDecay = Annotated[float, Field(ge=0, description="AdamW weight decay")]
+MaxGradientNorm = Annotated[float, Field(gt=0, description="norm that gradients are clipped to")]
+AverageDecay = Annotated[float, Field(ge=0, lt=1, description="decay of the averaged weights")]
+ImageNoise = Annotated[float, Field(ge=0, description="noise on training images in 0 … 1")]
+Brightness = Annotated[float, Field(ge=0, description="brightness variation of training images")]
+Stores = Annotated[
+    tuple[str, ...], Field(min_length=1, description="stores (folder or file:// URL)")
+]
+Tasks = Annotated[tuple[str, ...], Field(description="tasks to train on; default: all")]
