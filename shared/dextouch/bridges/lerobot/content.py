@@ -1,19 +1,19 @@
 """Contents of one episode of a LeRobot dataset: actions, tactile rows and image locations."""
 
-from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64
+from jaxtyping import Int64
 
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.mapping import FeatureMap
 from dextouch.bridges.lerobot.rows import WORLD
 from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
-from dextouch.bridges.lerobot.video_reader import VideoSpan
+from dextouch.bridges.lerobot.video_reader import read_images, read_units
+from dextouch.bridges.model_grid import GridEpisode, GridImages, GridNumbers, tactile_numbers
 from dextouch.errors import CorruptDataError
 from dextouch.hands.actions import ACTION_DIM, AnchorPoses, poses_from_actions, reanchor
-from dextouch.tactile.layout import NUM_TAXELS
 
 # What our own exports keep beside LeRobot's features; None: one number a camera.
 _OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
@@ -24,38 +24,13 @@ _OURS: dict[str, tuple[str, tuple[int, ...] | None]] = {
 }
 
 
-@dataclass(frozen=True)
-class CameraContent:
-    """Location of a camera's images, and the image stamp of each frame.
-
-    A stamp that comes twice is one image that was the nearest to two frames.
-    """
-
-    span: VideoSpan
-    t_ref_ns: Int64[np.ndarray, " n"]
-
-
-@dataclass(frozen=True)
-class EpisodeContent:
-    """An episode's frames as the store wants them.
-
-    Actions are relative to the measured poses of the first frame, which `anchor` holds where they
-    are not those that the dataset's description gives.
-    """
-
-    t_ref_ns: Int64[np.ndarray, " n"]
-    measured: Float64[np.ndarray, "n 67"]
-    commanded: Float64[np.ndarray, "n 67"] | None
-    anchor: AnchorPoses | None
-    tactile_kpa: Float32[np.ndarray, "n 2 320"]
-    tactile_valid: Bool[np.ndarray, "n 2"]
-    cameras: dict[str, CameraContent]
-
-
 def content_of(
     source: LeRobotFolder, entry: EpisodeEntry, features: FeatureMap, sidecar: Sidecar | None
-) -> EpisodeContent:
+) -> tuple[GridEpisode, AnchorPoses | None]:
     """Read an episode's numbers and find its videos.
+
+    Actions are relative to the measured poses of the first frame; these are returned where they are
+    not those that the dataset's description gives.
 
     Raises:
         NotFoundError: a file is missing.
@@ -71,22 +46,18 @@ def content_of(
     if (np.diff(t_ns) <= 0).any():
         raise CorruptDataError(f"{where}: {layout.STAMP!r} does not rise from frame to frame")
     measured, commanded, anchor = _actions(columns, features, sidecar, where)
-    kpa, valid = _tactile(columns, features, entry.length)
-    return EpisodeContent(
-        t_ref_ns=t_ns,
-        measured=measured,
-        commanded=commanded,
-        anchor=anchor,
-        tactile_kpa=kpa,
-        tactile_valid=valid,
-        cameras={
-            camera: CameraContent(
-                source.span(entry, key),
-                _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where),
-            )
-            for camera, key in features.cameras.items()
-        },
-    )
+    numbers = _tactile(columns, features, entry.length)
+    numbers["action"] = GridNumbers("robot_state", "action", measured)
+    if commanded is not None:
+        numbers["action_commanded"] = GridNumbers("robot_state", "action", commanded)
+    cameras = {}
+    for camera, key in features.cameras.items():
+        span = source.span(entry, key)
+        stamps = _image_stamps(source, key, t_ns, columns.get(layout.IMAGE_DT), where)
+        cameras[camera] = GridImages(
+            span.shape, stamps, partial(read_images, span), partial(read_units, span)
+        )
+    return GridEpisode(t_ns, numbers, cameras), anchor
 
 
 def _columns(
@@ -132,12 +103,12 @@ def _actions(
 
 def _tactile(
     columns: dict[str, np.ndarray], features: FeatureMap, count: int
-) -> tuple[Float32[np.ndarray, "n 2 320"], Bool[np.ndarray, "n 2"]]:
+) -> dict[str, GridNumbers]:
     if features.tactile is None:
-        return np.zeros((count, 2, NUM_TAXELS), dtype=np.float32), np.zeros((count, 2), dtype=bool)
+        return {}
     kpa = columns[features.tactile].astype(np.float32)
-    valid = columns.get(layout.VALID)
-    return kpa, np.ones((count, 2), dtype=bool) if valid is None else valid.astype(bool)
+    valid = columns.get(layout.VALID, np.ones((count, 2), dtype=bool))
+    return tactile_numbers(kpa, valid.astype(bool))
 
 
 def _image_stamps(

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from pydantic import ValidationError
 
-from dextouch.bridges.lerobot.content import EpisodeContent, content_of
+from dextouch.bridges.lerobot.content import content_of
 from dextouch.bridges.lerobot.mapping import FeatureMap, map_features
+from dextouch.bridges.lerobot.rows import WORLD
 from dextouch.bridges.lerobot.sidecar import Sidecar, read_sidecar
 from dextouch.bridges.lerobot.source import EpisodeEntry, LeRobotFolder
-from dextouch.bridges.lerobot.storing import ImageUnit, store_episode
+from dextouch.bridges.model_grid import ImageUnit, store_episode
 from dextouch.episodes import EpisodeStore, disk_errors
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.hands.actions import AnchorPoses
@@ -64,22 +64,22 @@ def import_lerobot(
     ids: list[str] = []
     for entry in source.episodes:
         sidecar = read_sidecar(folder, entry.index)
-        content = content_of(source, entry, features, sidecar)
+        episode, anchor = content_of(source, entry, features, sidecar)
         if sidecar is None:
-            attributes = _foreign_attributes(source, entry, content, features, options)
+            attributes = _foreign_attributes(source, entry, anchor, features, options)
         else:
-            attributes = _known_attributes(source, content, sidecar, options)
+            attributes = _known_attributes(source, anchor, sidecar, options)
         if store.exists(attributes.episode_id):
             raise ConflictError(
                 f"episode {attributes.episode_id!r} exists already; give another id_prefix"
             )
-        store_episode(store, attributes, content, images=options.images)
+        store_episode(store, attributes, episode, images=options.images)
         ids.append(attributes.episode_id)
     return ids
 
 
 def _known_attributes(
-    source: LeRobotFolder, content: EpisodeContent, sidecar: Sidecar, options: ImportOptions
+    source: LeRobotFolder, anchor: AnchorPoses | None, sidecar: Sidecar, options: ImportOptions
 ) -> EpisodeAttributes:
     """The exported attributes, with the anchor of the first frame and the source in the lineage."""
     known = sidecar.attributes
@@ -88,7 +88,7 @@ def _known_attributes(
         "episode_id": f"{options.id_prefix}{known.episode_id}",
         "model_rate_hz": float(source.info.fps),
         "lineage": (*known.lineage, came_from),
-        "anchor": known.anchor if content.anchor is None else _stored(content.anchor),
+        "anchor": known.anchor if anchor is None else StoredAnchor.from_poses(anchor),
         "streams": (),
     }
     return _checked(known.model_dump() | changes)
@@ -97,7 +97,7 @@ def _known_attributes(
 def _foreign_attributes(
     source: LeRobotFolder,
     entry: EpisodeEntry,
-    content: EpisodeContent,
+    anchor: AnchorPoses | None,
     features: FeatureMap,
     options: ImportOptions,
 ) -> EpisodeAttributes:
@@ -110,7 +110,6 @@ def _foreign_attributes(
     data_file = source.data_file(entry)
     with disk_errors(f"read {data_file}"), data_file.open("rb") as file:
         digest = hashlib.file_digest(file, "sha256").hexdigest()
-    anchor = content.anchor or AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
     return _checked(
         {
             "episode_id": f"{options.id_prefix}{(name or 'lerobot')[:96]}-{entry.index:06d}",
@@ -119,7 +118,7 @@ def _foreign_attributes(
             "domain": options.domain,
             "origin": "recorded",
             "model_rate_hz": float(source.info.fps),
-            "anchor": _stored(anchor),
+            "anchor": StoredAnchor.from_poses(anchor or WORLD),
             "K_head": options.K_head,
             "lineage": (
                 LineageEntry(
@@ -137,7 +136,3 @@ def _checked(fields: Mapping[str, object]) -> EpisodeAttributes:
         raise InvalidInputError(
             f"import from LeRobot: the options make no episode ({error})"
         ) from error
-
-
-def _stored(anchor: AnchorPoses) -> StoredAnchor:
-    return StoredAnchor.from_poses(anchor)

@@ -7,6 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float32, Int64, UInt8
 
+from dextouch.bridges.model_grid import BLOCK_IMAGES
 from dextouch.episodes import EpisodeReader, mean_over_ranges, nearest_indices, step_ranges
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.geometry import bracket, interpolate_linear, interpolate_poses
@@ -22,7 +23,6 @@ from dextouch.schemas import ActionKind
 from dextouch.tactile.layout import NUM_TAXELS, SIDES
 
 Grid = Literal["model", "camera", "uniform"]
-BLOCK_IMAGES = 32
 WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 
 

@@ -1,13 +1,23 @@
 """Import of zip files written by `export_umi`, as episodes on the model grid."""
 
 import json
-import math
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from jaxtyping import UInt8
 from pydantic import Field, ValidationError
 
+from dextouch.bridges.model_grid import (
+    BLOCK_IMAGES,
+    GridEpisode,
+    GridImages,
+    GridNumbers,
+    store_episode,
+    tactile_numbers,
+)
 from dextouch.bridges.umi.layout import (
     ATTRIBUTES_KEY,
     COMMANDED,
@@ -19,17 +29,15 @@ from dextouch.bridges.umi.layout import (
     camera_dt_array,
 )
 from dextouch.bridges.umi.zarr_zip import ZarrZipReader
-from dextouch.episodes import EpisodeStore, EpisodeWriter
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import CorruptDataError, InvalidInputError, LimitExceededError, StorageError
 from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import pose_from_transform
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, poses_from_actions
 from dextouch.schemas import EpisodeAttributes, LineageEntry
-from dextouch.streams import StreamDescriptor, StreamKind
 
 MAX_EPISODES: Final = 1_000_000
 MAX_STEPS: Final = 100_000
-_BLOCK_BYTES: Final = 1 << 26
 
 
 class _Episode(FrozenModel):
@@ -66,7 +74,14 @@ def import_umi(path: Path, store: EpisodeStore) -> list[str]:
         meta = _meta(archive, path)
         ends = _ends(archive, path, meta)
         for episode, start, stop in zip(meta.episodes, [0, *ends], ends, strict=False):
-            _Import(archive, store, meta.cameras).run(episode, start, stop)
+            source = episode.attributes
+            entry = LineageEntry(
+                kind="episode", id=source.episode_id, sha256=episode.content_sha256
+            )
+            lineage = (*source.lineage, entry)
+            attributes = source.model_copy(update={"streams": (), "lineage": lineage})
+            rows = slice(start, stop)
+            store_episode(store, attributes, _episode(archive, attributes, meta.cameras, rows))
     return [episode.attributes.episode_id for episode in meta.episodes]
 
 
@@ -120,108 +135,40 @@ def _ends(archive: ZarrZipReader, path: Path, meta: _Meta) -> list[int]:
     return [int(end) for end in ends]
 
 
-class _Import:
-    """Import of one episode into the store."""
-
-    def __init__(
-        self, archive: ZarrZipReader, store: EpisodeStore, cameras: tuple[str, ...]
-    ) -> None:
-        self._archive, self._store, self._cameras = archive, store, cameras
-
-    def run(self, episode: _Episode, start: int, stop: int) -> None:
-        """Write rows start … stop-1 as one episode."""
-        source = episode.attributes
-        entry = LineageEntry(kind="episode", id=source.episode_id, sha256=episode.content_sha256)
-        attributes = source.model_copy(update={"streams": (), "lineage": (*source.lineage, entry)})
-        with self._store.writer(attributes=attributes) as writer:
-            t_ref_ns = self._archive.read("data/t_ref_ns", start, stop)
-            self._add_numbers(writer, attributes, t_ref_ns, start)
-            for index, camera in enumerate(self._cameras):
-                self._add_camera(writer, attributes, camera, t_ref_ns, (index, start))
-
-    def _add_numbers(
-        self,
-        writer: EpisodeWriter,
-        attributes: EpisodeAttributes,
-        t_ref_ns: np.ndarray,
-        start: int,
-    ) -> None:
-        stop, rate_hz = start + len(t_ref_ns), attributes.model_rate_hz
-        actions = self._archive.read("data/action", start, stop)
-        poses = poses_from_actions(actions, attributes.anchor.to_poses())
-        found: dict[str, tuple[StreamKind, str, np.ndarray]] = {
-            "action": ("robot_state", "action", actions),
-            "wrist_left": ("pose", "pose_m_wxyz", pose_from_transform(poses.Ts_world_wrist_left)),
-            "wrist_right": ("pose", "pose_m_wxyz", pose_from_transform(poses.Ts_world_wrist_right)),
-            "head": ("pose", "pose_m_wxyz", pose_from_transform(poses.Ts_world_camera_head)),
-        }
-        if COMMANDED in self._archive.arrays("data"):
-            commanded = self._archive.read(COMMANDED, start, stop)
-            found["action_commanded"] = ("robot_state", "action", commanded)
-        if attributes.domain == "robot":
-            joints = np.concatenate([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
-            found["joints_measured"] = ("robot_state", "rad", joints)
-        for name, (kind, unit, values) in found.items():
-            frame = "world" if kind == "pose" else None
-            writer.add_stream(_descriptor(name, kind, unit, values, rate_hz, frame))
-            writer.append(name, values=values, t_ref_ns=t_ref_ns)
-        tactile = self._archive.read("data/tactile", start, stop)
-        valid = self._archive.read("data/tactile_valid", start, stop)
-        for index, side in enumerate(("left", "right")):
-            values, keep = tactile[:, index], valid[:, index]
-            if not keep.any():
-                continue
-            name = f"tactile_{side}"
-            writer.add_stream(_descriptor(name, "tactile", "kPa", values, rate_hz, None))
-            writer.append(name, values=values[keep], t_ref_ns=t_ref_ns[keep])
-
-    def _add_camera(
-        self,
-        writer: EpisodeWriter,
-        attributes: EpisodeAttributes,
-        camera: str,
-        t_ref_ns: np.ndarray,
-        where: tuple[int, int],
-    ) -> None:
-        index, start = where
-        stop, name = start + len(t_ref_ns), camera_array(index)
-        stamps = t_ref_ns + self._archive.read(camera_dt_array(index), start, stop)
-        # A camera slower than the grid repeats an image at several steps; it is stored once.
-        keep = np.diff(stamps, prepend=stamps[0] - 1) > 0
-        shape = self._archive.metadata(name).shape[1:]
-        writer.add_stream(
-            StreamDescriptor(
-                name=camera,
-                kind="image",
-                shape=shape,
-                dtype="uint8",
-                unit="rgb8",
-                nominal_rate_hz=attributes.model_rate_hz,
-                frame=camera,
-            )
+def _episode(
+    archive: ZarrZipReader, attributes: EpisodeAttributes, cameras: tuple[str, ...], rows: slice
+) -> GridEpisode:
+    start, stop = rows.start, rows.stop
+    t_ref_ns = archive.read("data/t_ref_ns", start, stop)
+    actions = archive.read("data/action", start, stop)
+    poses = poses_from_actions(actions, attributes.anchor.to_poses())
+    numbers = {"action": GridNumbers("robot_state", "action", actions)}
+    for name, Ts_world in (
+        ("wrist_left", poses.Ts_world_wrist_left),
+        ("wrist_right", poses.Ts_world_wrist_right),
+        ("head", poses.Ts_world_camera_head),
+    ):
+        values = pose_from_transform(Ts_world)
+        numbers[name] = GridNumbers("pose", "pose_m_wxyz", values, frame="world")
+    if COMMANDED in archive.arrays("data"):
+        commanded = archive.read(COMMANDED, start, stop)
+        numbers["action_commanded"] = GridNumbers("robot_state", "action", commanded)
+    if attributes.domain == "robot":
+        joints = np.concatenate([actions[:, JOINTS_LEFT], actions[:, JOINTS_RIGHT]], axis=1)
+        numbers["joints_measured"] = GridNumbers("robot_state", "rad", joints)
+    tactile = archive.read("data/tactile", start, stop)
+    numbers |= tactile_numbers(tactile, archive.read("data/tactile_valid", start, stop))
+    images = {}
+    for index, camera in enumerate(cameras):
+        name = camera_array(index)
+        stamps = t_ref_ns + archive.read(camera_dt_array(index), start, stop)
+        shape = archive.metadata(name).shape[1:]
+        images[camera] = GridImages(
+            shape, stamps, partial(_images, archive, name, rows), frame=camera
         )
-        each = max(1, _BLOCK_BYTES // math.prod(shape))
-        for first in range(0, len(keep), each):
-            chosen = keep[first : first + each]
-            images = self._archive.read(name, start + first, start + first + len(chosen))
-            writer.append(
-                camera,
-                values=images[chosen],
-                t_ref_ns=stamps[first : first + each][chosen],
-            )
+    return GridEpisode(t_ref_ns, numbers, images)
 
 
-def _descriptor(
-    name: str, kind: StreamKind, unit: str, values: np.ndarray, rate_hz: float, frame: str | None
-) -> StreamDescriptor:
-    return StreamDescriptor.model_validate(
-        {
-            "name": name,
-            "kind": kind,
-            "shape": values.shape[1:],
-            "dtype": str(values.dtype),
-            "unit": unit,
-            "nominal_rate_hz": rate_hz,
-            "frame": frame,
-        }
-    )
+def _images(archive: ZarrZipReader, name: str, rows: slice) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    for first in range(rows.start, rows.stop, BLOCK_IMAGES):
+        yield from archive.read(name, first, min(first + BLOCK_IMAGES, rows.stop))

@@ -1,0 +1,142 @@
+"""Writing of episodes whose streams have one row per step, as other formats hold them."""
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import islice
+from typing import Final, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float32, Int64, Shaped, UInt8
+
+from dextouch.episodes import GOP_IMAGES, EpisodeStore, EpisodeWriter, is_keyframe
+from dextouch.schemas import EpisodeAttributes
+from dextouch.streams import StreamDescriptor, StreamKind, encoded_values
+from dextouch.tactile.layout import SIDES
+
+ImageUnit = Literal["h264", "jpeg", "rgb8"]
+BLOCK_IMAGES: Final = 32
+
+
+@dataclass(frozen=True)
+class GridNumbers:
+    """Values of a stream at the steps; `keep` says at which it has one (None: at all)."""
+
+    kind: StreamKind
+    unit: str
+    values: Shaped[np.ndarray, "n ..."]
+    frame: str | None = None
+    keep: Bool[np.ndarray, " n"] | None = None
+
+
+@dataclass(frozen=True)
+class GridImages:
+    """Images of a camera, one per step.
+
+    Attributes:
+        shape: [height, width, 3].
+        t_ref_ns: of each image. A stamp that comes twice is one image, the nearest to two steps.
+        read: decodes the images one by one.
+        read_units: copies them as H.264 access units; None where that is not possible.
+        frame: of the camera.
+    """
+
+    shape: tuple[int, ...]
+    t_ref_ns: Int64[np.ndarray, " n"]
+    read: Callable[[], Iterator[UInt8[np.ndarray, "h w 3"]]]
+    read_units: Callable[[], list[bytes] | None] = lambda: None
+    frame: str | None = None
+
+
+@dataclass(frozen=True)
+class GridEpisode:
+    """An episode on the model grid: times of the steps, and streams by name."""
+
+    t_ref_ns: Int64[np.ndarray, " n"]
+    numbers: Mapping[str, GridNumbers]
+    cameras: Mapping[str, GridImages]
+
+
+def tactile_numbers(
+    kpa: Float32[np.ndarray, "n 2 320"], valid: Bool[np.ndarray, "n 2"]
+) -> dict[str, GridNumbers]:
+    """The touch of the hands that were sensed at any step."""
+    return {
+        f"tactile_{side}": GridNumbers("tactile", "kPa", kpa[:, hand], keep=valid[:, hand])
+        for hand, side in enumerate(SIDES)
+        if valid[:, hand].any()
+    }
+
+
+def store_episode(
+    store: EpisodeStore,
+    attributes: EpisodeAttributes,
+    episode: GridEpisode,
+    *,
+    images: ImageUnit = "rgb8",
+) -> None:
+    """Write an episode into the store, atomically.
+
+    Args:
+        store: destination.
+        attributes: of the episode, without streams; the model rate is that of the steps.
+        episode: its streams.
+        images: unit of the camera streams. Video that is H.264 in the store's groups already is
+            copied into `h264` streams; everything else is decoded and encoded again.
+
+    Raises:
+        CorruptDataError: damaged images.
+        ConflictError: the id exists.
+        NonFiniteError: NaN or infinity among the numbers.
+    """
+    rate_hz = attributes.model_rate_hz
+    with store.writer(attributes=attributes) as writer:
+        for name, found in episode.numbers.items():
+            keep = slice(None) if found.keep is None else found.keep
+            writer.add_stream(
+                StreamDescriptor.model_validate(
+                    {
+                        "name": name,
+                        "kind": found.kind,
+                        "shape": found.values.shape[1:],
+                        "dtype": str(found.values.dtype),
+                        "unit": found.unit,
+                        "nominal_rate_hz": rate_hz,
+                        "frame": found.frame,
+                    }
+                )
+            )
+            writer.append(name, values=found.values[keep], t_ref_ns=episode.t_ref_ns[keep])
+        for name, camera in episode.cameras.items():
+            writer.add_stream(
+                StreamDescriptor(
+                    name=name,
+                    kind="image",
+                    shape=camera.shape,
+                    dtype="uint8",
+                    unit=images,
+                    nominal_rate_hz=rate_hz,
+                    frame=camera.frame,
+                )
+            )
+            _store_images(writer, name, camera, images)
+
+
+def _store_images(writer: EpisodeWriter, name: str, camera: GridImages, unit: ImageUnit) -> None:
+    fresh = np.diff(camera.t_ref_ns, prepend=camera.t_ref_ns[0] - 1) > 0
+    units = camera.read_units() if unit == "h264" and fresh.all() else None
+    if units is not None and _in_groups(units):
+        writer.append(name, values=encoded_values(units), t_ref_ns=camera.t_ref_ns)
+        return
+    images = (image for image, wanted in zip(camera.read(), fresh, strict=True) if wanted)
+    stamps = camera.t_ref_ns[fresh]
+    for start in range(0, len(stamps), BLOCK_IMAGES):
+        block = np.stack(list(islice(images, BLOCK_IMAGES)))
+        writer.append(name, values=block, t_ref_ns=stamps[start : start + BLOCK_IMAGES])
+    # Exhausts the reader, so that a file that is too short is refused.
+    for _ in images:
+        pass
+
+
+def _in_groups(units: list[bytes]) -> bool:
+    """Whether access units form the closed groups that the store requires."""
+    return all(is_keyframe(data) == (index % GOP_IMAGES == 0) for index, data in enumerate(units))
