@@ -184,10 +184,11 @@ def test_other_parameter_sets_start_another_file(store, folder):
 
 
 def test_large_files_are_followed_by_others(store, folder, monkeypatch):
-    for name in ("CameraVideo", "DataFiles"):
-        small = functools.partial(getattr(dataset, name), file_bytes=1)
-        monkeypatch.setattr(dataset, name, small)
-    monkeypatch.setattr(dataset.EpisodeRows, "BUFFERED", 1)
+    monkeypatch.setattr(
+        dataset, "CameraVideo", functools.partial(dataset.CameraVideo, file_bytes=1)
+    )
+    monkeypatch.setattr(dataset.layout, "DATA_FILE_MB", 0)
+    monkeypatch.setattr(dataset, "ROWS_AT_ONCE", 1)
     export_lerobot(two(store), folder, repo_id="touch")
     assert problems(folder) == []
     assert sorted(p.name for p in folder.glob("data/*/*")) == [

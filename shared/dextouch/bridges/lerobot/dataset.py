@@ -3,18 +3,22 @@
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
+import pyarrow as pa
 
 from dextouch.bridges.lerobot import layout
 from dextouch.bridges.lerobot.rows import EpisodeFrames
 from dextouch.bridges.lerobot.sidecar import Sidecar, write_sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, combine, value_statistics
-from dextouch.bridges.lerobot.tables import DataFiles, EpisodeRows, write_tasks
+from dextouch.bridges.lerobot.tables import ParquetFiles, data_table, write_tasks
 from dextouch.bridges.lerobot.video import CameraVideo
 from dextouch.episodes import disk_errors
 from dextouch.errors import InvalidInputError
+
+# Rows of the table of episodes that are written together.
+ROWS_AT_ONCE: Final = 100
 
 
 class DatasetWriter:
@@ -49,9 +53,9 @@ class DatasetWriter:
         self._total: dict[str, Statistics] = {}
         with disk_errors(f"create {folder}"):
             folder.mkdir(parents=True)
-        self._data = DataFiles(folder, self._features)
-        path = layout.fill_path(layout.EPISODES_PATH, chunk_index=0, file_index=0)
-        self._episodes = EpisodeRows(folder / path)
+        self._data = ParquetFiles(folder, layout.DATA_PATH, file_bytes=layout.DATA_FILE_MB << 20)
+        self._episodes = ParquetFiles(folder, layout.EPISODES_PATH)
+        self._rows: list[dict[str, Any]] = []
         self._videos = {
             camera: CameraVideo(folder, layout.IMAGES + camera, fps=fps, shape=shape)
             for camera, shape in cameras.items()
@@ -99,7 +103,7 @@ class DatasetWriter:
             row[f"{key}/from_timestamp"] = place.from_timestamp_s
             row[f"{key}/to_timestamp"] = place.to_timestamp_s
         columns = self._columns(frames, task_index)
-        file_number = self._data.append(columns)
+        file_number = self._data.append(data_table(self._features, columns))
         row["data/chunk_index"], row["data/file_index"] = layout.file_place(file_number)
         row["dataset_from_index"] = self.num_frames
         row["dataset_to_index"] = self.num_frames + len(frames)
@@ -107,10 +111,12 @@ class DatasetWriter:
         statistics.update(image_statistics)
         for name, values in statistics.items():
             self._total[name] = combine(self._total.get(name), values)
-            row.update({f"stats/{name}/{kind}": value for kind, value in values.items()})
+            row.update({f"stats/{name}/{kind}": value.tolist() for kind, value in values.items()})
         write_sidecar(self._folder, sidecar)
         row["meta/episodes/chunk_index"] = row["meta/episodes/file_index"] = 0
-        self._episodes.append(row)
+        self._rows.append(row)
+        if len(self._rows) == ROWS_AT_ONCE:
+            self._write_rows()
         self.num_frames += len(frames)
         self.num_episodes += 1
 
@@ -137,8 +143,14 @@ class DatasetWriter:
         """Complete the data, video and episode files."""
         for video in self._videos.values():
             video.close()
+        self._write_rows()
         self._data.close()
         self._episodes.close()
+
+    def _write_rows(self) -> None:
+        if self._rows:
+            self._episodes.append(pa.Table.from_pylist(self._rows))
+            self._rows = []
 
     def finish(self, repo_id: str) -> None:
         """Write the metadata, when the files are closed.

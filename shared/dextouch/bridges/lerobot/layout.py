@@ -125,6 +125,14 @@ def fill_path(template: str, **values: int | str) -> str:
     return filled
 
 
+def numbered_path(folder: Path, template: str, number: int, **values: str) -> Path:
+    """Path of the n-th file of a kind; its folder is created."""
+    chunk, file = file_place(number)
+    path = folder / fill_path(template, chunk_index=chunk, file_index=file, **values)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
 def confined(folder: Path, relative: str) -> Path:
     """Resolve a path below `folder`, following links.
 

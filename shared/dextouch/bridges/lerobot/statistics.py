@@ -4,7 +4,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float64, Shaped, UInt8
+from jaxtyping import Shaped, UInt8
 
 QUANTILES: Final = {"q01": 0.01, "q10": 0.10, "q50": 0.50, "q90": 0.90, "q99": 0.99}
 # Maximum number of images per episode, and the side length they are subsampled to.
@@ -35,55 +35,34 @@ def value_statistics(values: np.ndarray) -> Statistics:
     return statistics
 
 
-class ImageStatistics:
-    """Histogram of each channel over 256 levels: exact statistics of any number of images."""
-
-    def __init__(self) -> None:
-        self._counts = np.zeros((3, 256), dtype=np.int64)
-        self._num_images = 0
-
-    def add(self, image: UInt8[np.ndarray, "h w 3"]) -> None:
-        """Add one image, subsampled if it is large."""
-        step = max(1, -(-max(image.shape[:2]) // SAMPLED_SIDE_PX))
-        thin = image[::step, ::step]
-        for channel in range(3):
-            self._counts[channel] += np.bincount(thin[..., channel].ravel(), minlength=256)
-        self._num_images += 1
-
-    def statistics(self) -> Statistics:
-        """Statistics of all added images, levels scaled to 0 … 1, each of shape [3, 1, 1].
-
-        At least one image must have been added.
-        """
-        level = np.arange(256) / 255
-        share = self._counts / self._counts.sum(axis=1, keepdims=True)
-        cumulative = np.cumsum(share, axis=1)
-        mean = share @ level
-        present = self._counts > 0
-        numbers = {
-            "min": level[present.argmax(axis=1)],
-            "max": level[255 - present[:, ::-1].argmax(axis=1)],
-            "mean": mean,
-            "std": np.sqrt(np.maximum(0.0, share @ level**2 - mean**2)),
-        }
-        for name, q in QUANTILES.items():
-            # The lowest level with at least that share of the pixels at or below it.
-            numbers[name] = level[(cumulative < q - 1e-12).sum(axis=1)]
-        result: Statistics = {name: _per_channel(value) for name, value in numbers.items()}
-        result["count"] = np.array([self._num_images], dtype=np.int64)
-        return result
-
-
-def _per_channel(values: np.ndarray) -> Float64[np.ndarray, "3 1 1"]:
-    return np.asarray(values, dtype=np.float64).reshape(3, 1, 1)
-
-
 def image_statistics(images: Iterable[UInt8[np.ndarray, "h w 3"]]) -> Statistics:
-    """Statistics of some images of one size; at least one."""
-    counted = ImageStatistics()
+    """Of at least one image: levels scaled to 0 … 1, each statistic of shape [3, 1, 1].
+
+    Large images are subsampled. The histogram of each channel over 256 levels gives exact
+    statistics of any number of images.
+    """
+    counts, num_images = np.zeros((3, 256), dtype=np.int64), 0
     for image in images:
-        counted.add(image)
-    return counted.statistics()
+        step = max(1, -(-max(image.shape[:2]) // SAMPLED_SIDE_PX))
+        for channel, levels in enumerate(np.moveaxis(image[::step, ::step], -1, 0)):
+            counts[channel] += np.bincount(levels.ravel(), minlength=256)
+        num_images += 1
+    level = np.arange(256) / 255
+    share = counts / counts.sum(axis=1, keepdims=True)
+    cumulative = np.cumsum(share, axis=1)
+    mean = share @ level
+    present = counts > 0
+    numbers = {
+        "min": level[present.argmax(axis=1)],
+        "max": level[255 - present[:, ::-1].argmax(axis=1)],
+        "mean": mean,
+        "std": np.sqrt(np.maximum(0.0, share @ level**2 - mean**2)),
+    }
+    for name, q in QUANTILES.items():
+        # The lowest level with at least that share of the pixels at or below it.
+        numbers[name] = level[(cumulative < q - 1e-12).sum(axis=1)]
+    result: Statistics = {name: value.reshape(3, 1, 1) for name, value in numbers.items()}
+    return result | {"count": np.array([num_images], dtype=np.int64)}
 
 
 def combine(first: Statistics | None, second: Statistics) -> Statistics:

@@ -1,6 +1,7 @@
 """Parquet files of a dataset: typed columns, written per episode and read with size limits."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,13 +10,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dextouch.bridges.lerobot.layout import (
-    DATA_FILE_MB,
-    DATA_PATH,
-    Features,
-    file_place,
-    fill_path,
-)
+from dextouch.bridges.lerobot.layout import Features, numbered_path
 from dextouch.episodes import disk_errors
 from dextouch.errors import CorruptDataError, LimitExceededError, NotFoundError
 
@@ -23,76 +18,55 @@ MAX_TABLE_BYTES = 1 << 31
 MAX_TABLE_ROWS = 20_000_000
 
 
-def column_type(dtype: str, shape: Sequence[int]) -> pa.DataType:
-    """Arrow type of a feature: a plain value, a fixed list, or lists of lists."""
-    item = pa.from_numpy_dtype(np.dtype(dtype))
-    if list(shape) == [1]:
-        return item
-    if len(shape) == 1:
-        return pa.list_(item, shape[0])
-    for _ in shape:
-        item = pa.list_(item)
-    return item
+def data_table(features: Features, columns: Mapping[str, np.ndarray]) -> pa.Table:
+    """Rows of the data files from columns [n, *shape]; every feature except video.
+
+    A feature of shape [1] is a plain value, one of another axis a fixed list, one of several axes
+    lists of lists.
+    """
+    table = {}
+    for name, feature in features.items():
+        if feature["dtype"] == "video":
+            continue
+        values = np.asarray(columns[name], dtype=feature["dtype"])
+        shape = [] if feature["shape"] == [1] else feature["shape"]
+        column = pa.array(values.reshape(-1))
+        kind = column.type
+        for size in reversed(shape):
+            column = pa.FixedSizeListArray.from_arrays(column, size)
+            kind = pa.list_(kind, size if len(shape) == 1 else -1)
+        table[name] = column.cast(kind)
+    return pa.table(table)
 
 
-def data_schema(features: Features) -> pa.Schema:
-    """Schema of the data files: every feature except video."""
-    return pa.schema(
-        [
-            (name, column_type(feature["dtype"], feature["shape"]))
-            for name, feature in features.items()
-            if feature["dtype"] != "video"
-        ]
-    )
-
-
-def nested(values: np.ndarray, *, fixed: bool) -> pa.Array:
-    """An array [n, …] as a column of n plain values, fixed lists or lists of lists."""
-    column = pa.array(np.ascontiguousarray(values).reshape(-1))
-    if values.ndim == 2 and fixed:
-        return pa.FixedSizeListArray.from_arrays(column, values.shape[1])
-    for axis in range(values.ndim - 1, 0, -1):
-        rows = int(np.prod(values.shape[:axis]))
-        offsets = np.arange(rows + 1, dtype=np.int32) * values.shape[axis]
-        column = pa.ListArray.from_arrays(pa.array(offsets), column)
-    return column
-
-
-class DataFiles:
-    """The data files of a dataset: one row group per episode, a new file above a size limit.
+class ParquetFiles:
+    """Numbered parquet files of one kind; each table becomes a row group.
 
     Args:
         folder: root of the dataset.
-        features: of the dataset.
-        file_bytes: size after which no episode is added to a file.
+        template: of the files' paths.
+        file_bytes: size after which the next table starts a new file; without it none does.
     """
 
-    def __init__(
-        self, folder: Path, features: Features, *, file_bytes: int = DATA_FILE_MB << 20
-    ) -> None:
-        self._folder, self._features, self._file_bytes = folder, features, file_bytes
-        self._schema = data_schema(features)
+    def __init__(self, folder: Path, template: str, *, file_bytes: int = sys.maxsize) -> None:
+        self._folder, self._template, self._file_bytes = folder, template, file_bytes
         self._path = folder
         self._writer: pq.ParquetWriter | None = None
         self._file_number = -1
 
-    def append(self, columns: Mapping[str, np.ndarray]) -> int:
-        """Write one episode's columns [n, *shape] by feature and return its file number.
+    def append(self, table: pa.Table) -> int:
+        """Write a table and return the number of its file.
 
         Raises:
             StorageError: the write failed.
         """
-        with disk_errors("write the frames of an episode"):
+        with disk_errors(f"write a table of {self._folder}"):
             if self._writer is None or self._path.stat().st_size >= self._file_bytes:
-                self._start_file()
-            assert self._writer is not None  # noqa: S101 (just opened)
-            rows = {}
-            for name in self._schema.names:
-                dtype, shape = self._features[name]["dtype"], self._features[name]["shape"]
-                values = np.asarray(columns[name], dtype=dtype)
-                row_shape = () if list(shape) == [1] else tuple(shape)
-                rows[name] = nested(values.reshape(len(values), *row_shape), fixed=True)
-            self._writer.write_table(pa.Table.from_pydict(rows, schema=self._schema))
+                self.close()
+                self._file_number += 1
+                self._path = numbered_path(self._folder, self._template, self._file_number)
+                self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy")
+            self._writer.write_table(table)
         return self._file_number
 
     def close(self) -> None:
@@ -101,63 +75,6 @@ class DataFiles:
             with disk_errors(f"complete {self._path}"):
                 self._writer.close()
             self._writer = None
-
-    def _start_file(self) -> None:
-        self.close()
-        self._file_number += 1
-        chunk, file = file_place(self._file_number)
-        self._path = self._folder / fill_path(DATA_PATH, chunk_index=chunk, file_index=file)
-        self._path.parent.mkdir(parents=True, exist_ok=True)
-        self._writer = pq.ParquetWriter(self._path, self._schema, compression="snappy")
-
-
-class EpisodeRows:
-    """The table of episodes: one row each, arrays as nested lists; written in batches of 100.
-
-    Args:
-        path: of the file.
-    """
-
-    BUFFERED = 100
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._rows: list[Mapping[str, Any]] = []
-        self._writer: pq.ParquetWriter | None = None
-
-    def append(self, row: Mapping[str, Any]) -> None:
-        """Add an episode; every row has the columns of the first.
-
-        Raises:
-            StorageError: the write failed.
-        """
-        self._rows.append(row)
-        if len(self._rows) >= self.BUFFERED:
-            self._flush()
-
-    def close(self) -> None:
-        """Write the remaining rows and close the file."""
-        self._flush()
-        if self._writer is not None:
-            with disk_errors(f"complete {self._path}"):
-                self._writer.close()
-            self._writer = None
-
-    def _flush(self) -> None:
-        if not self._rows:
-            return
-        columns = {}
-        for name, first in self._rows[0].items():
-            values = [row[name] for row in self._rows]
-            is_array = isinstance(first, np.ndarray)
-            columns[name] = nested(np.stack(values), fixed=False) if is_array else pa.array(values)
-        table = pa.Table.from_pydict(columns)
-        with disk_errors(f"write {self._path}"):
-            if self._writer is None:
-                self._path.parent.mkdir(parents=True, exist_ok=True)
-                self._writer = pq.ParquetWriter(self._path, table.schema, compression="snappy")
-            self._writer.write_table(table)
-        self._rows.clear()
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:

@@ -10,7 +10,7 @@ import av
 from av.container import OutputContainer
 from av.video.stream import VideoStream
 
-from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, file_place, fill_path
+from dextouch.bridges.lerobot.layout import VIDEO_FILE_MB, VIDEO_PATH, numbered_path
 from dextouch.episodes import disk_errors, is_keyframe, parameter_sets
 from dextouch.errors import CorruptDataError, ShapeError
 
@@ -94,18 +94,16 @@ class CameraVideo:
         self.close()
         self._file_number += 1
         self._num_images = self._num_bytes = 0
-        chunk, file = file_place(self._file_number)
-        path = self._folder / fill_path(
-            VIDEO_PATH, video_key=self._key, chunk_index=chunk, file_index=file
-        )
         try:
             with av.open(io.BytesIO(access_unit), format="h264") as source:
                 template = source.streams.video[0]
                 size = (template.height, template.width)
                 if size != self._shape[:2]:
                     raise ShapeError(f"{where}: got images {size}, expected {self._shape[:2]}")
-                with disk_errors(f"create {path}"):
-                    path.parent.mkdir(parents=True, exist_ok=True)
+                with disk_errors(f"create a video of {self._key}"):
+                    path = numbered_path(
+                        self._folder, VIDEO_PATH, self._file_number, video_key=self._key
+                    )
                     self._output = av.open(path, "w", format="mp4")
                 self._stream = self._output.add_stream_from_template(template)
         except (av.error.InvalidDataError, IndexError) as error:
