@@ -1,6 +1,5 @@
 """Import of zip files written by `export_umi`, as episodes on the model grid."""
 
-import json
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
@@ -99,7 +98,7 @@ def _meta(archive: ZarrZipReader, path: Path) -> _Meta:
             f"{LAYOUT_VERSION}; read it with the release that wrote it"
         )
     try:
-        meta = _Meta.model_validate_json(json.dumps(plain))
+        meta = _Meta.model_validate(plain)
     except ValidationError as error:
         raise CorruptDataError(
             f"{path}: attributes in meta/.zattrs are invalid ({error})"

@@ -15,6 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -67,22 +68,24 @@ class ArrayMetadata(FrozenModel):
         return math.prod(self.chunks) * np.dtype(self.dtype).itemsize
 
 
+@dataclass
 class _NewArray:
-    def __init__(self, dtype: str, row_shape: tuple[int, ...], chunk_rows: int) -> None:
-        self.dtype, self.row_shape, self.chunk_rows = dtype, row_shape, chunk_rows
-        self.num_rows = 0
-        self.attributes: dict[str, Any] = {}
-        self.pending: list[np.ndarray] = []
-        self.num_pending = 0
+    """An array that grows: the number of rows in storage chunks, and those that fill none yet."""
+
+    pending: Shaped[np.ndarray, "n ..."]
+    chunk_rows: int
+    attributes: Mapping[str, Any]
+    num_rows: int = 0
 
     def metadata(self) -> ArrayMetadata:
+        row_shape, dtype = self.pending.shape[1:], self.pending.dtype.str
         return ArrayMetadata.model_validate(
             {
-                "shape": (self.num_rows, *self.row_shape),
-                "chunks": (self.chunk_rows, *self.row_shape),
-                "dtype": self.dtype,
+                "shape": (self.num_rows + len(self.pending), *row_shape),
+                "chunks": (self.chunk_rows, *row_shape),
+                "dtype": dtype,
                 "compressor": {"id": "zstd", "level": ZSTD_LEVEL},
-                "fill_value": False if self.dtype == "|b1" else 0,
+                "fill_value": False if dtype == "|b1" else 0,
             }
         )
 
@@ -109,35 +112,25 @@ class ZarrZipWriter:
         attributes: Mapping[str, Any] | None = None,
     ) -> None:
         """Declare an array `GROUP/NAME` of one of the types of `ArrayMetadata`."""
-        array = _NewArray(np.dtype(dtype).str, row_shape, chunk_rows)
-        array.attributes = dict(attributes or {})
-        self._arrays[name] = array
+        empty = np.empty((0, *row_shape), dtype=dtype)
+        self._arrays[name] = _NewArray(empty, chunk_rows, attributes or {})
 
     def append(self, name: str, rows: np.ndarray) -> None:
         """Append rows [n, *row_shape]; they are cast to the array's type."""
         array = self._arrays[name]
-        rows = np.array(rows, dtype=array.dtype)
-        if rows.shape[1:] != array.row_shape:
-            raise InvalidInputError(
-                f"{name}: got rows of {rows.shape[1:]}, expected {array.row_shape}"
-            )
-        while len(rows):
-            taken = rows[: array.chunk_rows - array.num_pending]
-            array.pending.append(taken)
-            array.num_pending += len(taken)
-            array.num_rows += len(taken)
-            rows = rows[len(taken) :]
-            if array.num_pending == array.chunk_rows:
-                self._write_chunk(name, array)
+        rows, row_shape = np.asarray(rows), array.pending.shape[1:]
+        if rows.shape[1:] != row_shape:
+            raise InvalidInputError(f"{name}: got rows of {rows.shape[1:]}, expected {row_shape}")
+        pending = np.concatenate([array.pending, rows.astype(array.pending.dtype)])
+        while len(pending) >= array.chunk_rows:
+            self._write_chunk(name, array, pending[: array.chunk_rows])
+            array.num_rows += array.chunk_rows
+            pending = pending[array.chunk_rows :]
+        array.pending = pending.copy()
 
-    def _write_chunk(self, name: str, array: _NewArray) -> None:
-        missing = array.chunk_rows - array.num_pending
-        padding = np.zeros((missing, *array.row_shape), dtype=array.dtype)
-        data = np.concatenate([*array.pending, padding]).tobytes()
-        index = (array.num_rows - 1) // array.chunk_rows
-        key = ".".join([str(index), *("0" for _ in array.row_shape)])
-        self._write(f"{name}/{key}", self._zstd.compress(data))
-        array.pending, array.num_pending = [], 0
+    def _write_chunk(self, name: str, array: _NewArray, rows: np.ndarray) -> None:
+        key = ".".join([str(array.num_rows // array.chunk_rows), *("0" for _ in rows.shape[1:])])
+        self._write(f"{name}/{key}", self._zstd.compress(rows.tobytes()))
 
     def _write(self, name: str, data: bytes) -> None:
         self._zip.writestr(zipfile.ZipInfo(name, _DATE), data)
@@ -151,8 +144,10 @@ class ZarrZipWriter:
             if attributes.get(group):
                 self._write(f"{prefix}.zattrs", _json(attributes[group]))
         for name, array in self._arrays.items():
-            if array.num_pending:
-                self._write_chunk(name, array)
+            if len(array.pending):
+                missing = array.chunk_rows - len(array.pending)
+                padding = np.zeros_like(array.pending, shape=(missing, *array.pending.shape[1:]))
+                self._write_chunk(name, array, np.concatenate([array.pending, padding]))
             self._write(f"{name}/.zarray", _json(array.metadata().model_dump()))
             if array.attributes:
                 self._write(f"{name}/.zattrs", _json(array.attributes))
@@ -234,7 +229,10 @@ class ZarrZipReader:
         key = f"{name}/.zattrs" if name else ".zattrs"
         if key not in self._entries:
             return {}
-        value = self._json(key)
+        try:
+            value = json.loads(self._bytes(key, MAX_METADATA_BYTES))
+        except (ValueError, RecursionError) as error:
+            raise CorruptDataError(f"{self._path}: {key} is not JSON ({error})") from error
         if not isinstance(value, dict):
             raise CorruptDataError(f"{self._path}: {key} is not a JSON object")
         return value
@@ -252,7 +250,7 @@ class ZarrZipReader:
             if key not in self._entries:
                 raise NotFoundError(f"{self._path}: holds no array {name!r}")
             try:
-                metadata = ArrayMetadata.model_validate_json(json.dumps(self._json(key)))
+                metadata = ArrayMetadata.model_validate_json(self._bytes(key, MAX_METADATA_BYTES))
             except ValidationError as error:
                 raise CorruptDataError(f"{self._path}: {key} is invalid ({error})") from error
             self._check(name, metadata)
@@ -329,9 +327,3 @@ class ZarrZipReader:
                 f"{self._path}: {key} holds more than {limit} bytes, the most that is read"
             )
         return data
-
-    def _json(self, key: str) -> object:
-        try:
-            return json.loads(self._bytes(key, MAX_METADATA_BYTES))
-        except (ValueError, RecursionError) as error:
-            raise CorruptDataError(f"{self._path}: {key} is not JSON ({error})") from error
