@@ -92,16 +92,8 @@ async def test_values_expire(state, key):
         if await state.get(key) is None:
             break
     assert await state.get(key) is None
-    assert not await state.touch(key, ttl_s=60.0)
     assert await state.keys(key) == []
     assert await state.set(key, b"again", expected_version=0, ttl_s=60.0) == 1
-
-
-async def test_touch_makes_a_value_stay(state, key):
-    await state.set(key, b"kept", expected_version=0, ttl_s=0.5)
-    assert await state.touch(key, ttl_s=60.0)
-    await state.set(key + "x", b"brief", expected_version=0, ttl_s=0.001)
-    assert (await state.get(key)).version == 1
 
 
 @pytest.mark.parametrize("ttl_s", [0.0, -1.0, float("nan"), float("inf")])
@@ -121,7 +113,7 @@ async def test_memory_expires_by_its_clock(key):
     await store.set(key, b"x", expected_version=0, ttl_s=10.0)
     now_s[0] = 109.9
     assert await store.get(key) is not None
-    await store.touch(key, ttl_s=10.0)
+    await store.set(key, b"y", expected_version=1, ttl_s=10.0)
     now_s[0] = 119.8
     assert await store.get(key) is not None
     now_s[0] = 119.9

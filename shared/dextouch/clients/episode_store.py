@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from datetime import datetime
-from types import TracebackType
 from typing import TypeVar
 from urllib.parse import quote
 
@@ -72,12 +71,7 @@ class EpisodeStoreClient:
     def __enter__(self) -> "EpisodeStoreClient":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def create(self, attributes: RecordingAttributes) -> RecordingStatus:

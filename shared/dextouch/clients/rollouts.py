@@ -8,7 +8,6 @@ with RolloutClient("http://127.0.0.1:8100") as client:
 
 from contextlib import suppress
 from copy import copy
-from types import TracebackType
 from typing import TypeVar
 from urllib.parse import urlencode
 
@@ -124,12 +123,7 @@ class RolloutClient:
     def __enter__(self) -> "RolloutClient":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -217,13 +211,8 @@ class Rollout:
     def __enter__(self) -> "Rollout":
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if error is None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        if kind is None:
             self.close()
             return
         # An exception in the block matters more than a failure to close the rollout.

@@ -23,10 +23,6 @@ MIN_SLOPE_SPAN_S = 1.0
 MAX_DRIFT_NS_PER_S = 1e6
 SILENCE_S = 1.0
 NEIGHBOURS = 2
-PATH_DELAY_NOTE = (
-    "host times include the stream's smallest path delay, which one-way stamps cannot "
-    "show; subtract the calibrated latency_ns"
-)
 
 
 @dataclass(frozen=True)
@@ -63,6 +59,9 @@ class ClockSegment:
 class ClockModel:
     """Piecewise map from device time to host time.
 
+    Host times include the stream's smallest path delay, which one-way stamps cannot show; subtract
+    the calibrated latency_ns.
+
     Attributes:
         segments: in order of arrival; more than one where the device's clock was stepped.
         skew_ppm: how much faster the host's clock runs, mean over all segments.
@@ -73,7 +72,6 @@ class ClockModel:
             queueing, bursts and stalls.
         has_unsure_stops: whether a stop of the device's clock may have been a delay, or a delay at
             the end of the take a stop.
-        path_delay_note: offset that these host times still contain.
     """
 
     segments: tuple[ClockSegment, ...]
@@ -81,7 +79,6 @@ class ClockModel:
     residual_rms_ns: float
     lateness_ns: float = 0.0
     has_unsure_stops: bool = False
-    path_delay_note: str = PATH_DELAY_NOTE
 
     @property
     def num_steps(self) -> int:

@@ -1,43 +1,15 @@
 """Conversion of a sample's wrapping stamps or sequence numbers to continuous device time."""
 
-from typing import Literal, Protocol, runtime_checkable
+from typing import Literal
 
 from dextouch.errors import InvalidInputError
+from dextouch.streams import StreamDescriptor
 
 ABSENT = -1
 # Stamps coarser than this share of the sample period are less accurate than counting samples.
 COARSE_SHARE = 0.25
 
 Source = Literal["device", "sequence", "arrival"]
-
-
-@runtime_checkable
-class Capabilities(Protocol):
-    """Counter properties of a device, see `dextouch.streams.descriptors.ClockCapabilities`."""
-
-    @property
-    def sequence_bits(self) -> int:
-        """Width of the sequence number."""
-
-    @property
-    def tick_ns(self) -> int:
-        """Resolution of the device's stamp."""
-
-    @property
-    def device_time_bits(self) -> int:
-        """Width of the device's stamp, in ticks."""
-
-
-@runtime_checkable
-class ClockSource(Protocol):
-    """Clock-related part of a stream's descriptor."""
-
-    @property
-    def capabilities(self) -> Capabilities:
-        """Counters of the device."""
-
-    def period_ns(self) -> int:
-        """Nominal sample period."""
 
 
 class TickCounter:
@@ -85,25 +57,19 @@ class DeviceCounter:
     Args:
         descriptor: the stream's descriptor; needed for counters that wrap, for the resolution
             of stamps, and for streams that have only a sequence number.
+
+    Attributes:
+        source: of device time; None before the first sample.
+        resolution_ns: device time is truncated to multiples of this.
     """
 
-    def __init__(self, descriptor: ClockSource | None) -> None:
+    def __init__(self, descriptor: StreamDescriptor | None) -> None:
         self._descriptor = descriptor
         self._period_ns = 0 if descriptor is None else descriptor.period_ns()
-        self._resolution_ns = 0
+        self.resolution_ns = 0
         self._modulus_ns: int | None = None
         self._last: tuple[int, int] | None = None
-        self._source: Source | None = None
-
-    @property
-    def source(self) -> Source | None:
-        """Source of device time; None before the first sample."""
-        return self._source
-
-    @property
-    def resolution_ns(self) -> int:
-        """Resolution of device time, which is truncated to multiples of this."""
-        return self._resolution_ns
+        self.source: Source | None = None
 
     def straighten(
         self, t_host_ns: int, t_device_ns: int | None, sequence: int | None
@@ -115,33 +81,33 @@ class DeviceCounter:
         """
         t_device_ns = None if t_device_ns == ABSENT else t_device_ns
         sequence = None if sequence == ABSENT else sequence
-        if self._source is None:
+        if self.source is None:
             self._choose(has_time=t_device_ns is not None, has_sequence=sequence is not None)
-        if self._source == "arrival":
+        if self.source == "arrival":
             return None
-        if self._source == "device" and t_device_ns is not None:
+        if self.source == "device" and t_device_ns is not None:
             return self._unwrap(t_device_ns, t_host_ns)
-        if self._source == "sequence" and sequence is not None:
+        if self.source == "sequence" and sequence is not None:
             return self._unwrap(sequence * self._period_ns, t_host_ns)
         raise InvalidInputError(
-            f"online clock: a sample at {t_host_ns} ns came without its {self._source} stamp, "
+            f"online clock: a sample at {t_host_ns} ns came without its {self.source} stamp, "
             "which earlier samples had; expected the same fields in every sample of a stream"
         )
 
     def _choose(self, *, has_time: bool, has_sequence: bool) -> None:
         if self._descriptor is None:
-            self._source = "device" if has_time else "arrival"
+            self.source = "device" if has_time else "arrival"
             return
         device = self._descriptor.capabilities
         if has_time and not (has_sequence and prefers_sequence(device.tick_ns, self._period_ns)):
-            self._source = "device"
-            self._resolution_ns = device.tick_ns
+            self.source = "device"
+            self.resolution_ns = device.tick_ns
             self._modulus_ns = _modulus(device.device_time_bits, device.tick_ns)
         elif has_sequence:
-            self._source = "sequence"
+            self.source = "sequence"
             self._modulus_ns = _modulus(device.sequence_bits, self._period_ns)
         else:
-            self._source = "arrival"
+            self.source = "arrival"
 
     def _unwrap(self, count_ns: int, t_host_ns: int) -> int:
         straight = count_ns

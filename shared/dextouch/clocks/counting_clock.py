@@ -52,34 +52,29 @@ class CountingUpdate(NamedTuple):
 class CountingClock:
     """Estimates the times of samples of a steady device without stamps and sequence numbers.
 
-    Final times are available `look_ahead` samples later, or once a queue has drained; a provisional
-    one at once.
+    Final times are available ten samples later, or once a queue has drained; a provisional one at
+    once.
 
     Args:
         period_ns: nominal sample period, accurate within a few percent.
-        look_ahead: samples to wait for.
+
+    Attributes:
+        num_lost: lost samples, up to the last final time.
     """
 
-    def __init__(self, period_ns: int, *, look_ahead: int = LOOK_AHEAD) -> None:
-        if period_ns < 1 or look_ahead < 1:
+    def __init__(self, period_ns: int) -> None:
+        if period_ns < 1:
             raise InvalidInputError(
-                f"counting clock: got a period of {period_ns} ns and {look_ahead} samples, "
-                "expected at least 1 each"
+                f"counting clock: got a period of {period_ns} ns, expected at least 1"
             )
         self._period_ns = period_ns
-        self._look_ahead = look_ahead
         self._waiting: deque[int] = deque()
         self._envelope = RunningEnvelope(min_slope_span_s=COUNTED_SLOPE_SPAN_S, is_counted=True)
         self._start_ns: int | None = None
         self._index = -1
-        self._num_lost = 0
+        self.num_lost = 0
         self._last_final_ns: int | None = None
         self._last_provisional_ns: int | None = None
-
-    @property
-    def num_lost(self) -> int:
-        """Number of lost samples, up to the last final time."""
-        return self._num_lost
 
     @property
     def num_steps(self) -> int:
@@ -94,10 +89,10 @@ class CountingClock:
     @property
     def is_steady(self) -> bool:
         """Whether the device is so steady that counting is more accurate than arrival times."""
-        num_arrived = self._index + 1 - self._num_lost
+        num_arrived = self._index + 1 - self.num_lost
         return (
             abs(self.skew_ppm) <= MAX_STEADY_SKEW_PPM
-            and self._num_lost <= MAX_STEADY_LOSS * num_arrived
+            and self.num_lost <= MAX_STEADY_LOSS * num_arrived
             and self.num_steps <= MAX_STEPS_PER_SAMPLE * num_arrived
         )
 
@@ -125,7 +120,7 @@ class CountingClock:
             self._start_ns = t_host_ns
         self._waiting.append(t_host_ns)
         final: list[CountedSample] = []
-        while len(self._waiting) > self._look_ahead and (sample := self._decide()) is not None:
+        while len(self._waiting) > LOOK_AHEAD and (sample := self._decide()) is not None:
             final.append(sample)
         return tuple(final)
 
@@ -156,7 +151,7 @@ class CountingClock:
             return 0
         # A queue that is still draining: the following samples are delayed less.
         draining = late_ns[-1] <= least_ns
-        if draining and not is_last_chance and len(late_ns) < MAX_WAIT * self._look_ahead:
+        if draining and not is_last_chance and len(late_ns) < MAX_WAIT * LOOK_AHEAD:
             return None
         return int(least_ns / self._period_ns + 1.0 - LOST_SHARE)
 
@@ -164,7 +159,7 @@ class CountingClock:
         num_lost = self._num_lost_before(is_last_chance=is_last_chance)
         if num_lost is None or self._start_ns is None:
             return None
-        self._num_lost += num_lost
+        self.num_lost += num_lost
         self._index += 1 + num_lost
         since_ns = self._waiting.popleft() - self._start_ns
         x_ns = self._index * self._period_ns
@@ -211,20 +206,17 @@ class CountedTake:
     is_steady: bool
 
 
-def date_by_counting(
-    t_host_ns: np.ndarray, *, period_ns: int, look_ahead: int = LOOK_AHEAD
-) -> CountedTake:
+def date_by_counting(t_host_ns: np.ndarray, *, period_ns: int) -> CountedTake:
     """Estimate the sample times of a steady device from its arrivals alone.
 
     Args:
         t_host_ns: arrivals [n] in order, int64.
         period_ns: nominal sample period, accurate within a few percent.
-        look_ahead: number of samples to look ahead.
 
     Raises:
         InvalidInputError: arrivals out of order.
     """
-    clock = CountingClock(period_ns, look_ahead=look_ahead)
+    clock = CountingClock(period_ns)
     counted: list[CountedSample] = []
     for arrival_ns in np.asarray(t_host_ns, dtype=np.int64).tolist():
         counted.extend(clock.advance(arrival_ns))

@@ -1,7 +1,8 @@
 """Online clock that estimates host times of samples as they arrive: causal and monotonic."""
 
-from dextouch.clocks.counters import ClockSource, DeviceCounter, Source
+from dextouch.clocks.counters import DeviceCounter, Source
 from dextouch.clocks.running_envelope import MIN_SLOPE_SPAN_S, RunningEnvelope
+from dextouch.streams import StreamDescriptor
 
 # A nominal rate can be off by percents, a crystal by tens of ppm: counted samples need a slope
 # earlier than stamped ones.
@@ -21,7 +22,7 @@ class OnlineClock:
             that have only a sequence number.
     """
 
-    def __init__(self, descriptor: ClockSource | None = None) -> None:
+    def __init__(self, descriptor: StreamDescriptor | None = None) -> None:
         self._counter = DeviceCounter(descriptor)
         self._envelope: RunningEnvelope | None = None
         self._last_ns: int | None = None

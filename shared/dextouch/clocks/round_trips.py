@@ -82,29 +82,22 @@ class RoundTripClock:
 
     Args:
         resolution_ns: of the remote stamps.
+
+    Attributes:
+        num_steps: steps of the remote clock.
+        num_exchanges: exchanges since the last step.
     """
 
     def __init__(self, *, resolution_ns: int = 1) -> None:
         self._resolution_ns = resolution_ns
-        self._num_steps = 0
-        self._num_exchanges = 0
+        self.num_steps = 0
         self._reference: tuple[int, int] | None = None
         self._last_ns = 0
         self._start()
 
-    @property
-    def num_steps(self) -> int:
-        """Number of steps of the remote clock."""
-        return self._num_steps
-
-    @property
-    def num_exchanges(self) -> int:
-        """Number of exchanges since the last step."""
-        return self._num_exchanges
-
     def _start(self) -> None:
         self._upper, self._lower = LowerHull(), LowerHull()
-        self._num_exchanges = 0
+        self.num_exchanges = 0
 
     def add(self, exchange: RoundTrip) -> None:
         """Add one exchange, in order of the requests.
@@ -130,12 +123,12 @@ class RoundTripClock:
         self._last_ns = exchange.sent_ns
         x_s = self._x_s(exchange.sent_ns)
         high, low = (float(value - self._reference[1]) for value in (above_ns, below_ns))
-        if self._num_exchanges and self._contradicts(x_s, high, low):
-            self._num_steps += 1
+        if self.num_exchanges and self._contradicts(x_s, high, low):
+            self.num_steps += 1
             self._start()
         self._upper.add(x_s, high)
         self._lower.add(x_s, -low)
-        self._num_exchanges += 1
+        self.num_exchanges += 1
         for hull in (self._upper, self._lower):
             hull.forget_before(x_s - WINDOW_S)
 
@@ -190,7 +183,7 @@ class RoundTripClock:
     def _slope(self) -> tuple[float, float]:
         """Drift in ns per second, and its uncertainty."""
         span_s = min(self._upper.span_s, self._lower.span_s)
-        if span_s < MIN_SLOPE_SPAN_S or self._num_exchanges < MIN_SLOPE_EXCHANGES:
+        if span_s < MIN_SLOPE_SPAN_S or self.num_exchanges < MIN_SLOPE_EXCHANGES:
             return 0.0, MAX_SKEW_PPM * 1e3 * BAND_SIGMA * 2
         middle_s = self._x_s(self._last_ns) - span_s / 2
         above = self._upper.supporting_line(middle_s).slope_ns_per_s

@@ -104,6 +104,11 @@ class RunningEnvelope:
         resolution_ns: of the device's stamps; smaller steps are not detectable.
         min_slope_span_s: the slope is 0 until the points span this many seconds.
         is_counted: device time is a sample count, whose distances are always regular.
+
+    Attributes:
+        num_steps: restarts of the line so far.
+        slope_ns_per_s: of the line.
+        spread_ns: mean distance of the last few hundred points above the line.
     """
 
     def __init__(
@@ -116,31 +121,16 @@ class RunningEnvelope:
         self._step_ns = STEP_NS + resolution_ns
         self._min_slope_span_s = min_slope_span_s
         self._is_counted = is_counted
-        self._num_steps = 0
+        self.num_steps = 0
         self._num_points = 0
-        self._spread_ns = 0.0
-        self._slope_ns_per_s = 0.0
+        self.spread_ns = 0.0
+        self.slope_ns_per_s = 0.0
         self._slope_span_s = 0.0
         self._last_x_s = 0.0
         self._rhythm = Rhythm()
         self._odd: _Odd | None = None
         self._broken_x_s = -math.inf
         self._start(LowerHull())
-
-    @property
-    def num_steps(self) -> int:
-        """Number of restarts of the line."""
-        return self._num_steps
-
-    @property
-    def slope_ns_per_s(self) -> float:
-        """Current slope."""
-        return self._slope_ns_per_s
-
-    @property
-    def spread_ns(self) -> float:
-        """Mean distance of the last few hundred points above the line."""
-        return self._spread_ns
 
     def at(self, x_s: float) -> float:
         """Value of the line in ns; 0 before the first point."""
@@ -184,12 +174,12 @@ class RunningEnvelope:
         early_ns, late_ns = self._thresholds_ns()
         settled = self._hull.span_s >= SETTLED_S
         if x_s < self._last_x_s or (settled and residual_ns < -early_ns):
-            self._num_steps += self._trial is None
+            self.num_steps += self._trial is None
             step_s = self._step_s(line, x_s - self._last_x_s, (x_s, y_ns))
             self._start_after(step_s, _Trial(LowerHull()))
             return False
         self._measure_spread(residual_ns)
-        if self._trial is not None and self._trial.fails(x_s, y_ns, residual_ns, self._spread_ns):
+        if self._trial is not None and self._trial.fails(x_s, y_ns, residual_ns, self.spread_ns):
             self._start(self._trial.hull)
             return False
         if residual_ns <= late_ns or not settled:
@@ -197,7 +187,7 @@ class RunningEnvelope:
             return False
         if not self._has_lasted(x_s, y_ns, now_s):
             return True
-        self._num_steps += 1
+        self.num_steps += 1
         self._confirm(line)
         return False
 
@@ -220,7 +210,7 @@ class RunningEnvelope:
             point: device time and apparent offset of a promptly delivered sample after the step.
         """
         period_s = self._rhythm.period_s
-        if period_s is None or period_s * 1e9 < MIN_PERIOD_SPREADS * self._spread_ns:
+        if period_s is None or period_s * 1e9 < MIN_PERIOD_SPREADS * self.spread_ns:
             return None
         step_s = distance_s - period_s
         residual_s = (point[1] - line.at(point[0] - step_s)) * 1e-9 + step_s
@@ -257,7 +247,7 @@ class RunningEnvelope:
 
     def _thresholds_ns(self) -> tuple[float, float]:
         """Detection thresholds below and above the line."""
-        spread_ns = self._spread_ns
+        spread_ns = self.spread_ns
         late_ns = self._step_ns + LATE_SPREADS * spread_ns
         if self._slope_span_s < MIN_SLOPE_SPAN_S:
             unsure_ns = UNSURE_STEP_NS + UNSURE_SPREADS * spread_ns
@@ -267,9 +257,9 @@ class RunningEnvelope:
     def _measure_spread(self, residual_ns: float) -> None:
         """Update the mean distance to the line, robust against outliers and steps."""
         self._num_points += 1
-        bounded_ns = min(abs(residual_ns), UNSURE_STEP_NS + UNSURE_SPREADS * self._spread_ns)
+        bounded_ns = min(abs(residual_ns), UNSURE_STEP_NS + UNSURE_SPREADS * self.spread_ns)
         rate = max(SPREAD_RATE, 1.0 / self._num_points)
-        self._spread_ns += rate * (bounded_ns - self._spread_ns)
+        self.spread_ns += rate * (bounded_ns - self.spread_ns)
 
     def _follow(self, x_s: float, y_ns: float) -> float:
         hull = self._hull
@@ -279,10 +269,10 @@ class RunningEnvelope:
         self._num_followed += 1
         needed_s = max(self._min_slope_span_s, min(self._slope_span_s, GOOD_SLOPE_SPAN_S))
         if span_s < needed_s or self._num_followed < MIN_SLOPE_POINTS:
-            line = hull.line_of_slope(self._slope_ns_per_s)
+            line = hull.line_of_slope(self.slope_ns_per_s)
         else:
             line = hull.supporting_line(x_s - span_s / 2)
-            self._slope_ns_per_s = line.slope_ns_per_s
+            self.slope_ns_per_s = line.slope_ns_per_s
             self._slope_span_s = span_s
         self._line = line
         if self._trial is not None and self._trial.is_over:

@@ -48,10 +48,6 @@ class StateStore(Protocol):
         """
         ...
 
-    async def touch(self, key: str, *, ttl_s: float) -> bool:
-        """Renew the time to live; False if absent."""
-        ...
-
     async def delete(self, key: str) -> bool:
         """Delete a key; False if absent."""
         ...
@@ -112,14 +108,6 @@ class MemoryState:
         if key not in self._entries and len(await self.keys(within)) >= limit:
             return False
         await self.set(key, value, expected_version=0, ttl_s=ttl_s)
-        return True
-
-    async def touch(self, key: str, *, ttl_s: float) -> bool:
-        """See StateStore."""
-        self._expire()
-        if key not in self._entries:
-            return False
-        self._entries[key] = (self._entries[key][0], self._clock_s() + _checked_ttl(ttl_s))
         return True
 
     async def delete(self, key: str) -> bool:
@@ -196,11 +184,6 @@ class RedisState:
             stored = await self.get(key)
             raise _version_conflict(key, expected=0, got=stored.version if stored else 0)
         return bool(added)
-
-    async def touch(self, key: str, *, ttl_s: float) -> bool:
-        """See StateStore."""
-        done = await self._link.call("PEXPIRE", REDIS_PREFIX + key, _milliseconds(ttl_s))
-        return bool(done)
 
     async def delete(self, key: str) -> bool:
         """See StateStore."""

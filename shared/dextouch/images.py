@@ -1,4 +1,4 @@
-"""JPEG codec for uint8 RGB images [h, w, 3]."""
+"""JPEG codec of still images: uint8 RGB [h, w, 3]."""
 
 import numpy as np
 import simplejpeg
