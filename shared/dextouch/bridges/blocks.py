@@ -8,10 +8,15 @@ import numpy as np
 from jaxtyping import Int64, Shaped
 
 from dextouch.episodes import EpisodeReader, RecordingReader
-from dextouch.streams import NO_DEVICE_TIME, NO_SEQUENCE, SampleBatch, StreamDescriptor
+from dextouch.streams import (
+    ENCODED_UNITS,
+    NO_DEVICE_TIME,
+    NO_SEQUENCE,
+    SampleBatch,
+    encoded_values,
+)
 
 Reader = EpisodeReader | RecordingReader
-ENCODED_UNITS: Final = ("jpeg", "h264")
 BLOCK_SECONDS: Final = 1.0
 
 
@@ -32,18 +37,6 @@ class Block:
         return len(self.t_ns)
 
 
-def is_encoded(descriptor: StreamDescriptor) -> bool:
-    """Whether a stream's images are kept as encoded bytes."""
-    return descriptor.unit in ENCODED_UNITS
-
-
-def objects(items: list[bytes]) -> Shaped[np.ndarray, " n"]:
-    """Pack encoded images into an object array, as episode writers expect them."""
-    array = np.empty(len(items), dtype=object)
-    array[:] = items
-    return array
-
-
 def blocks(reader: Reader, name: str) -> Iterator[Block]:
     """Iterate over a stream in order, about one second per block; encoded images stay encoded.
 
@@ -62,8 +55,8 @@ def blocks(reader: Reader, name: str) -> Iterator[Block]:
 def _block(reader: Reader, name: str, start: int, stop: int) -> Block:
     stamps_ns = reader.stamps_ns(name)
     encoded: np.ndarray | None = None
-    if is_encoded(reader.streams[name]):
-        encoded = objects(reader.encoded_images(name, start, stop))
+    if reader.streams[name].unit in ENCODED_UNITS:
+        encoded = encoded_values(reader.encoded_images(name, start, stop))
     if encoded is not None and isinstance(reader, EpisodeReader):
         return _of_episode(stamps_ns[start:stop], encoded)
     data = reader.read(

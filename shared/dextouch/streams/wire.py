@@ -117,14 +117,14 @@ def _checked_body(data: bytes) -> bytes:
 def _check_count(descriptor: StreamDescriptor, count: int) -> None:
     if count == 0:
         raise InvalidInputError(f"{descriptor.name}: an empty batch, expected at least one sample")
+    _check_limit(descriptor.name, count)
+
+
+def _check_limit(what: str, count: int) -> None:
     if count > MAX_BATCH_SAMPLES:
-        raise _too_many(descriptor.name, count)
-
-
-def _too_many(what: str, count: int) -> LimitExceededError:
-    return LimitExceededError(
-        f"{what}: got {count} samples in a batch, expected at most {MAX_BATCH_SAMPLES}"
-    )
+        raise LimitExceededError(
+            f"{what}: got {count} samples in a batch, expected at most {MAX_BATCH_SAMPLES}"
+        )
 
 
 def _check_columns(arrays: dict[str, np.ndarray], values: np.ndarray, where: str) -> None:
@@ -141,8 +141,7 @@ def _images(arrays: dict[str, np.ndarray], where: str) -> np.ndarray:
     data, ends = arrays["image_bytes"], arrays["image_end"]
     if data.dtype != np.uint8 or data.ndim != 1 or ends.dtype != np.int64 or ends.ndim != 1:
         raise InvalidInputError(f"{where}: image_bytes must be uint8 [bytes], image_end int64 [n]")
-    if len(ends) > MAX_BATCH_SAMPLES:
-        raise _too_many(where, len(ends))
+    _check_limit(where, len(ends))
     bounds = np.concatenate([np.zeros(1, dtype=np.int64), ends])
     # Compared, not subtracted: the difference of two forged numbers can overflow.
     if (bounds[1:] <= bounds[:-1]).any() or int(bounds[-1]) != len(data):

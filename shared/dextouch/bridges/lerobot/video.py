@@ -52,8 +52,7 @@ class CameraVideo:
         self._file_number = -1
         self._num_images = self._num_bytes = 0
         self._parameters = b""
-        self._output: OutputContainer | None = None
-        self._stream: VideoStream | None = None
+        self._file: tuple[OutputContainer, VideoStream] | None = None
 
     def append(self, access_units: Sequence[bytes], *, where: str) -> VideoPlace:
         """Mux one episode.
@@ -72,25 +71,31 @@ class CameraVideo:
             raise CorruptDataError(f"{where}: does not begin with an IDR image and its headers")
         size = sum(map(len, access_units))
         full = self._num_bytes + size > self._file_bytes
-        if self._output is None or full or parameters != self._parameters:
-            self._start_file(access_units[0], where=where)
+        if self._file is None or full or parameters != self._parameters:
+            self._file = self._new_file(access_units[0], where=where)
             self._parameters = parameters
+        output, stream = self._file
         first = self._num_images
         with disk_errors(f"write {where}"):
             for data in access_units:
-                self._mux(data)
+                packet = av.Packet(data)
+                packet.stream, packet.time_base = stream, Fraction(1, self._fps)
+                packet.pts = packet.dts = self._num_images
+                packet.duration, packet.is_keyframe = 1, is_keyframe(data)
+                output.mux(packet)
+                self._num_images += 1
         self._num_bytes += size
         stop = self._num_images
         return VideoPlace(self._file_number, first / self._fps, stop / self._fps)
 
     def close(self) -> None:
         """Complete the file that is open."""
-        if self._output is not None:
+        if self._file is not None:
             with disk_errors(f"complete a video of {self._key}"):
-                self._output.close()
-        self._output = self._stream = None
+                self._file[0].close()
+        self._file = None
 
-    def _start_file(self, access_unit: bytes, *, where: str) -> None:
+    def _new_file(self, access_unit: bytes, *, where: str) -> tuple[OutputContainer, VideoStream]:
         self.close()
         self._file_number += 1
         self._num_images = self._num_bytes = 0
@@ -104,20 +109,9 @@ class CameraVideo:
                     path = numbered_path(
                         self._folder, VIDEO_PATH, self._file_number, video_key=self._key
                     )
-                    self._output = av.open(path, "w", format="mp4")
-                self._stream = self._output.add_stream_from_template(template)
+                    output = av.open(path, "w", format="mp4")
+                stream = output.add_stream_from_template(template)
         except (av.error.InvalidDataError, IndexError) as error:
             raise CorruptDataError(f"{where}: is not an H.264 stream ({error})") from error
-        self._stream.time_base = Fraction(1, self._fps)
-
-    def _mux(self, data: bytes) -> None:
-        assert self._output is not None  # noqa: S101 (opened by append)
-        assert self._stream is not None  # noqa: S101 (likewise)
-        packet = av.Packet(data)
-        packet.stream = self._stream
-        packet.pts = packet.dts = self._num_images
-        packet.duration = 1
-        packet.time_base = Fraction(1, self._fps)
-        packet.is_keyframe = is_keyframe(data)
-        self._output.mux(packet)
-        self._num_images += 1
+        stream.time_base = Fraction(1, self._fps)
+        return output, stream

@@ -8,13 +8,13 @@ import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Schema
 from pydantic import ValidationError
 
-from dextouch.bridges.blocks import is_encoded, objects
 from dextouch.bridges.mcap.messages import MessageCodec, Sent
 from dextouch.bridges.mcap.records import records
 from dextouch.bridges.mcap.writing import ABOUT, ATTRIBUTES_FILE, BRIDGE_VERSION, COUNTS
 from dextouch.episodes import EpisodeStore, EpisodeWriter, WriteOptions
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
+from dextouch.streams import ENCODED_UNITS, encoded_values
 
 MAX_ATTRIBUTES_BYTES: Final = 1 << 24
 _BLOCK_BYTES: Final = 1 << 24
@@ -124,8 +124,8 @@ class _Pending:
         self._sent, self._num_bytes = [], 0
         if not sent:
             return
-        if is_encoded(descriptor):
-            values = objects([s.value for s in sent if isinstance(s.value, bytes)])
+        if descriptor.unit in ENCODED_UNITS:
+            values = encoded_values([s.value for s in sent if isinstance(s.value, bytes)])
         else:
             values = np.stack([np.asarray(s.value) for s in sent])
         t_ns = np.array([s.t_ns for s in sent], dtype=np.int64)

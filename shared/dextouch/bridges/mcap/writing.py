@@ -10,7 +10,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from dextouch import __version__
-from dextouch.bridges.blocks import Reader, blocks, is_encoded
+from dextouch.bridges.blocks import Reader, blocks
 from dextouch.bridges.mcap.messages import MessageCodec, Sent, calibration_message
 from dextouch.bridges.mcap.schemas import CALIBRATION, descriptor_set, raw_encoding
 from dextouch.bridges.new_file import new_file
@@ -18,7 +18,7 @@ from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.images import encode_jpeg
 from dextouch.schemas import json_ready
-from dextouch.streams import StreamDescriptor
+from dextouch.streams import ENCODED_UNITS, StreamDescriptor
 
 PROFILE: Final = "dextouch"
 BRIDGE_VERSION: Final = "1"
@@ -87,9 +87,10 @@ class _Export:
         self._channel_ids: list[int] = []
 
     def _as_sent(self, stream: StreamDescriptor) -> StreamDescriptor:
-        if self._quality is None or stream.kind != "image" or raw_encoding(stream) != "rgb8":
+        is_raw = stream.kind == "image" and stream.unit not in ENCODED_UNITS
+        if self._quality is None or not is_raw or raw_encoding(stream) != "rgb8":
             return stream
-        return stream if is_encoded(stream) else stream.model_copy(update={"unit": "jpeg"})
+        return stream.model_copy(update={"unit": "jpeg"})
 
     def run(self) -> int:
         """Write schemas, channels, attachments and messages, in this order."""
@@ -184,7 +185,7 @@ class _Export:
     def _messages(self, order: int) -> Iterator[_Message]:
         stream = self._streams[order]
         codec = MessageCodec(stream)
-        to_jpeg = is_encoded(stream) and not is_encoded(self._sources[order])
+        to_jpeg = stream.unit != self._sources[order].unit
         for block in blocks(self._reader, stream.name):
             columns = (block.t_ns.tolist(), block.t_device_ns.tolist(), block.sequence.tolist())
             for t_ns, t_device_ns, number, value in zip(*columns, block.values, strict=True):

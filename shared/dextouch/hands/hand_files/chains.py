@@ -11,10 +11,10 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import apply, invert, transform
-from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
-from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion, Vector3
+from dextouch.geometry.rotations import quaternion_from_rotation
+from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion
 from dextouch.hands.hand_files.mapping import FingerMapping, TipMapping
-from dextouch.hands.hand_files.model_file import Joint, Link, ModelFile
+from dextouch.hands.hand_files.model_file import Joint, Link, ModelFile, vector3
 
 _NO_TURN: Final = np.eye(3)
 
@@ -72,7 +72,7 @@ def finger_table(
         _index(finger, name, f"{what} of {where}")
         for what, name in (("knuckle", finger.knuckle), ("pip", finger.pip), ("dip", finger.dip))
     )
-    return FingerTable(finger.chain, tuple(rows), _vector(tip_m), (knuckle, pip, dip))
+    return FingerTable(finger.chain, tuple(rows), vector3(tip_m), (knuckle, pip, dip))
 
 
 def _tip(model: ModelFile, tip: TipMapping, where: str) -> tuple[np.ndarray, str]:
@@ -138,7 +138,7 @@ def _hinge(joint: Joint, T_frame_link: np.ndarray, where: str) -> tuple[JointRow
     T_frame_hinge = T_frame_link @ transform(R_undrawn, anchor)
     w, x, y, z = quaternion_from_rotation(T_frame_hinge[:3, :3]).tolist()
     q_wxyz: Quaternion = (w, x, y, z)
-    position_m = _vector(T_frame_hinge[:3, 3])
+    position_m = vector3(T_frame_hinge[:3, 3])
     row = JointRow(joint.name, position_m, q_wxyz, joint.axis, joint.limits_rad)
     return row, transform(_NO_TURN, -anchor)
 
@@ -147,8 +147,3 @@ def _index(finger: FingerMapping, name: str, what: str) -> int:
     if name not in finger.joints:
         raise UnknownNameError(what, name, list(finger.joints))
     return finger.joints.index(name)
-
-
-def _vector(values: np.ndarray) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z

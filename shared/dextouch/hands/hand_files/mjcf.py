@@ -9,10 +9,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dextouch.geometry import apply
-from dextouch.hands.finger_table import Vector3
 from dextouch.hands.hand_files.elements import Element
 from dextouch.hands.hand_files.mjcf_settings import MAIN_CLASS, MjcfSettings
-from dextouch.hands.hand_files.model_file import Joint, Link
+from dextouch.hands.hand_files.model_file import Joint, Link, unit_axis, vector3
 
 WORLD: Final = "world"
 # Elements that import bodies from elsewhere: the file must contain the whole model.
@@ -139,13 +138,10 @@ class MjcfModel:
         T = place.T_body_parent
         anchor = apply(T, np.array([element.numbers("pos", 3) or (0.0, 0.0, 0.0)]))[0]
         axis = T[:3, :3] @ np.array(element.numbers("axis", 3) or (0.0, 0.0, 1.0))
-        length = float(np.linalg.norm(axis))
-        if length < 1e-9:
-            raise element.refusal(f"got axis {axis.tolist()}, expected a direction")
         (zero,) = element.numbers("ref", 1) or (0.0,)
         return joint._replace(
-            anchor_m=_vector(anchor),
-            axis=_vector(axis / length),
+            anchor_m=vector3(anchor),
+            axis=unit_axis(axis, element),
             limits_rad=self._limits(element),
             zero_rad=zero * self._settings.radians_per_unit,
         )
@@ -159,11 +155,6 @@ class MjcfModel:
             raise joint.refusal("got a range but autolimits is off; say limited='true' or 'false'")
         scale = self._settings.radians_per_unit
         return values[0] * scale, values[1] * scale
-
-
-def _vector(values: np.ndarray) -> Vector3:
-    x, y, z = values.tolist()
-    return x, y, z
 
 
 def _flatten(tag: str) -> str:

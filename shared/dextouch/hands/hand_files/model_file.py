@@ -6,6 +6,25 @@ from typing import NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from dextouch.hands.finger_table import Vector3
+from dextouch.hands.hand_files.elements import Element
+
+
+def vector3(values: np.ndarray) -> Vector3:
+    """An array of three numbers as a tuple."""
+    x, y, z = values.tolist()
+    return x, y, z
+
+
+def unit_axis(axis: np.ndarray, joint: Element) -> Vector3:
+    """The direction of a joint's axis.
+
+    Raises:
+        InvalidInputError: an axis of zeros.
+    """
+    length = float(np.linalg.norm(axis))
+    if length < 1e-9:
+        raise joint.refusal(f"got axis {axis.tolist()}, expected a direction")
+    return vector3(axis / length)
 
 
 class Joint(NamedTuple):

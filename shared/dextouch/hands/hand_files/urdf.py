@@ -11,7 +11,7 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.hands.finger_table import Vector3
 from dextouch.hands.hand_files.elements import Element
-from dextouch.hands.hand_files.model_file import Joint, Link
+from dextouch.hands.hand_files.model_file import Joint, Link, unit_axis
 
 _TYPES: Final = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 
@@ -117,11 +117,7 @@ def _origin(joint: Element) -> np.ndarray:
 def _axis(joint: Element) -> Vector3:
     element = joint.child("axis")
     axis = np.array([1.0, 0, 0]) if element is None else _three(element, "xyz", (1.0, 0.0, 0.0))
-    length = float(np.linalg.norm(axis))
-    if length < 1e-9:
-        raise joint.refusal(f"got axis {axis.tolist()}, expected a direction")
-    x, y, z = (axis / length).tolist()
-    return x, y, z
+    return unit_axis(axis, joint)
 
 
 def _limits(joint: Element) -> tuple[float, float] | None:
