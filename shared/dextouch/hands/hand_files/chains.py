@@ -11,7 +11,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import apply, invert, transform
-from dextouch.geometry.rotations import quaternion_from_rotation
+from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion
 from dextouch.hands.hand_files.mapping import FingerMapping, TipMapping
 from dextouch.hands.hand_files.model_file import Joint, Link, ModelFile, vector3
@@ -81,7 +81,7 @@ def _tip(model: ModelFile, tip: TipMapping, where: str) -> tuple[np.ndarray, str
             raise UnknownNameError(f"site in {where}:", tip.site, list(model.sites))
         link, T_link_site = model.site(tip.site)
         return T_link_site, link
-    link = tip.link or ""
+    link = tip.link_name
     if link not in model.parents:
         raise UnknownNameError(f"link in {where}:", link, list(model.parents))
     return np.eye(4), link

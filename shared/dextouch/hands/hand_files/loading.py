@@ -16,7 +16,7 @@ from dextouch.geometry import invert, transform
 from dextouch.hands.finger_table import FingerTable
 from dextouch.hands.hand_files.chains import finger_table, fixed_links
 from dextouch.hands.hand_files.elements import Element, read_elements
-from dextouch.hands.hand_files.mapping import HandMapping, read_mapping
+from dextouch.hands.hand_files.mapping import WristMapping, read_mapping
 from dextouch.hands.hand_files.mjcf import MjcfModel
 from dextouch.hands.hand_files.model_file import ModelFile
 from dextouch.hands.hand_files.urdf import UrdfModel
@@ -53,28 +53,26 @@ def load_hand(model_path: Path | str, mapping_path: Path | str) -> HandModel:
             expected value.
     """
     root = read_elements(Path(model_path))
-    mapping = read_mapping(Path(mapping_path))
-    model = _model(root)
-    if mapping.wrist not in model.parents:
-        raise UnknownNameError(
-            f"link in {mapping.source} [wrist]:", mapping.wrist, list(model.parents)
-        )
-    bases = fixed_links(model, mapping.wrist, invert(_wrist_axes(mapping)))
+    mapping, where = read_mapping(Path(mapping_path)), Path(mapping_path).name
+    model, wrist = _model(root), mapping.wrist.link_name
+    if wrist not in model.parents:
+        raise UnknownNameError(f"link in {where} [wrist]:", wrist, list(model.parents))
+    bases = fixed_links(model, wrist, invert(_wrist_axes(mapping.wrist, f"{where} [wrist]")))
     tables = [
         finger_table(
             model,
             finger,
             bases=bases,
-            where=f"{mapping.source} [[fingers]] {finger.chain!r}",
+            where=f"{where} [[fingers]] {finger.chain!r}",
         )
         for finger in mapping.fingers
     ]
     name = root.attributes.get("model") or root.attributes.get("name") or model.source
     hand = HandModel(mapping.side, tables, name=name)
     for table in tables:
-        _check_units(table, mapping)
-    _check_thumb_side(hand, mapping)
-    _check_palm(hand, mapping)
+        _check_units(table, f"{where}, finger {table.chain!r}")
+    _check_thumb_side(hand, where)
+    _check_palm(hand, where)
     return hand
 
 
@@ -86,10 +84,9 @@ def _model(root: Element) -> ModelFile:
     raise root.refusal("expected <robot> (URDF) or <mujoco> (MJCF) as the outermost element")
 
 
-def _wrist_axes(mapping: HandMapping) -> Float64[np.ndarray, "4 4"]:
+def _wrist_axes(wrist: WristMapping, where: str) -> Float64[np.ndarray, "4 4"]:
     """T_wrist_ours: our wrist frame in the frame of the model's wrist link."""
-    where = f"{mapping.source} [wrist]"
-    along, across = np.array(mapping.fingers_along), np.array(mapping.thumb_side)
+    along, across = np.array(wrist.fingers_along), np.array(wrist.thumb_side)
     lengths = np.linalg.norm([along, across], axis=1)
     if lengths.min() < 1e-6:
         raise InvalidInputError(f"{where}: got a direction of zeros, expected two directions")
@@ -101,7 +98,7 @@ def _wrist_axes(mapping: HandMapping) -> Float64[np.ndarray, "4 4"]:
         )
     y = np.cross(z, x)
     y /= np.linalg.norm(y)
-    return transform(np.stack([np.cross(y, z), y, z], axis=-1), np.array(mapping.origin_m))
+    return transform(np.stack([np.cross(y, z), y, z], axis=-1), np.array(wrist.origin_m))
 
 
 def _length_m(finger: FingerTable) -> float:
@@ -110,8 +107,7 @@ def _length_m(finger: FingerTable) -> float:
     return float(np.linalg.norm([*beyond, finger.tip_m], axis=-1).sum())
 
 
-def _check_units(finger: FingerTable, mapping: HandMapping) -> None:
-    where = f"{mapping.source}, finger {finger.chain!r}"
+def _check_units(finger: FingerTable, where: str) -> None:
     length_m, palm_m = _length_m(finger), float(np.linalg.norm(finger.joints[0].position_m))
     shortest, longest = FINGER_LENGTH_M
     if not shortest <= length_m <= longest or palm_m > MAX_PALM_M:
@@ -135,7 +131,7 @@ def _middle_points_m(hand: HandModel) -> dict[str, np.ndarray]:
     return {finger.chain: points[index] for index, finger in enumerate(hand.fingers)}
 
 
-def _check_thumb_side(hand: HandModel, mapping: HandMapping) -> None:
+def _check_thumb_side(hand: HandModel, where: str) -> None:
     """Check the order of knuckles from the thumb's side: index, middle, ring, little."""
     points = _middle_points_m(hand)
     chains = [chain for chain in CHAINS[1:] if chain in points]
@@ -145,12 +141,12 @@ def _check_thumb_side(hand: HandModel, mapping: HandMapping) -> None:
             f"{chain} {1e3 * x:.1f} mm" for chain, x in zip(chains, across_m, strict=True)
         )
         raise InvalidInputError(
-            f"{mapping.source}: got knuckles along thumb_side at {listed}, expected them to fall "
+            f"{where}: got knuckles along thumb_side at {listed}, expected them to fall "
             "from index to little; check thumb_side, fingers_along and the fingers' chains"
         )
 
 
-def _check_palm(hand: HandModel, mapping: HandMapping) -> None:
+def _check_palm(hand: HandModel, where: str) -> None:
     points = _middle_points_m(hand)
     to_palm = 1.0 if hand.side == "right" else -1.0
     bends = []
@@ -160,7 +156,7 @@ def _check_palm(hand: HandModel, mapping: HandMapping) -> None:
             bends.append(to_palm * (tip[1] - knuckle[1]) / _length_m(finger))
     if bends and float(np.mean(bends)) < -MAX_BACKWARD:
         raise InvalidInputError(
-            f"{mapping.source}: fingers in the middle of their range bend to the back of a "
+            f"{where}: fingers in the middle of their range bend to the back of a "
             f"{hand.side} hand (by {-float(np.mean(bends)):.2f} of their length); check side, "
             "thumb_side and fingers_along"
         )

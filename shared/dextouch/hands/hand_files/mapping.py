@@ -2,120 +2,80 @@
 
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, TypeVar
+
+from pydantic import Field, ValidationError, model_validator
 
 from dextouch.errors import InvalidInputError, UnknownNameError
-from dextouch.hands.finger_table import Vector3
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.hand_files.reading import read_bounded
 
 MAX_BYTES: Final = 64 * 2**10
 # Far above any length or direction.
 MAX_NUMBER: Final = 1e6
-_ORIGIN: Final = (0.0, 0.0, 0.0)
-_PLACES: Final = ("link", "body", "site")
+
+# Messages say the description of a value as what was expected.
+Name = Annotated[str, Field(min_length=1, description="a name")]
+Number = Annotated[float, Field(strict=True, ge=-MAX_NUMBER, le=MAX_NUMBER)]
+Vector = Annotated[tuple[Number, Number, Number], Field(description="three finite numbers")]
+TableT = TypeVar("TableT", bound=FrozenModel)
 
 
-@dataclass(frozen=True)
-class TipMapping:
+class _Place(FrozenModel):
+    """A table that names one part of the model: a link (of MJCF: a body) or a site."""
+
+    link: Name | None = None
+    body: Name | None = None
+
+    @model_validator(mode="after")
+    def _names_one_part(self) -> "_Place":
+        parts = [part for part in ("link", "body", "site") if part in type(self).model_fields]
+        named = [part for part in parts if part in self.model_fields_set]
+        if len(named) != 1:
+            raise ValueError(
+                f"got {' and '.join(named) or 'none'}, expected one of {', '.join(parts)}"
+            )
+        return self
+
+    @property
+    def link_name(self) -> str:
+        """The link or body; empty where a site is named."""
+        return self.link or self.body or ""
+
+
+class TipMapping(_Place):
     """Fingertip: a link (body) or a site, and an offset in its frame."""
 
-    link: str | None
-    site: str | None
-    offset_m: Vector3
+    site: Name | None = None
+    offset_m: Vector = (0.0, 0.0, 0.0)
 
 
-@dataclass(frozen=True)
-class FingerMapping:
+class FingerMapping(FrozenModel):
     """A finger: its chain of the tracked skeleton, joints from the wrist outwards, its tip."""
 
-    chain: str
-    joints: tuple[str, ...]
-    knuckle: str
-    pip: str
-    dip: str
+    chain: Name
+    joints: tuple[str, ...] = Field(description="a list of names")
+    knuckle: Name
+    pip: Name
+    dip: Name
     tip: TipMapping
 
 
-@dataclass(frozen=True)
-class HandMapping:
-    """A hand: side, the wrist link, our wrist axes in that link's frame, and the fingers."""
+class WristMapping(_Place):
+    """The wrist's link, and our wrist axes in its frame."""
 
-    source: str
-    side: str
-    wrist: str
-    fingers_along: Vector3
-    thumb_side: Vector3
-    origin_m: Vector3
-    fingers: tuple[FingerMapping, ...]
+    fingers_along: Vector
+    thumb_side: Vector
+    origin_m: Vector = (0.0, 0.0, 0.0)
 
 
-class _Table:
-    """A validated TOML table: unknown keys are refused, and errors name their location."""
+class HandMapping(FrozenModel):
+    """A hand: side, wrist and fingers."""
 
-    def __init__(self, where: str, values: Any, keys: tuple[str, ...]) -> None:  # noqa: ANN401
-        if not isinstance(values, Mapping):
-            raise InvalidInputError(f"{where}: got {values!r:.80}, expected a table")
-        for key in values:
-            if key not in keys:
-                raise UnknownNameError(f"key in {where}:", key, list(keys))
-        self.where = where
-        self._values = values
-
-    def __contains__(self, key: str) -> bool:
-        return key in self._values
-
-    def __getitem__(self, key: str) -> Any:  # noqa: ANN401
-        if key not in self._values:
-            raise InvalidInputError(f"{self.where}: got no {key!r}, expected one")
-        return self._values[key]
-
-    def refusal(self, key: str, expected: str) -> InvalidInputError:
-        return InvalidInputError(
-            f"{self.where}: got {key} = {self[key]!r:.80}, expected {expected}"
-        )
-
-    def text(self, key: str) -> str:
-        value = self[key]
-        if not isinstance(value, str) or not value:
-            raise self.refusal(key, "a name")
-        return value
-
-    def names(self, key: str) -> tuple[str, ...]:
-        value = self[key]
-        if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-            raise self.refusal(key, "a list of names")
-        return tuple(value)
-
-    def vector(self, key: str) -> Vector3:
-        value = self[key]
-        if not isinstance(value, list) or len(value) != 3 or not all(map(_is_number, value)):
-            raise self.refusal(key, "three finite numbers")
-        x, y, z = map(float, value)
-        return x, y, z
-
-    def tables(self, key: str) -> list[Any]:
-        value = self[key]
-        if not isinstance(value, list):
-            raise self.refusal(key, "a list of tables")
-        return value
-
-    def one_of(self, *keys: str) -> str:
-        found = [key for key in keys if key in self]
-        if len(found) != 1:
-            raise InvalidInputError(
-                f"{self.where}: got {' and '.join(found) or 'none'}, expected one of "
-                f"{', '.join(keys)}"
-            )
-        return found[0]
-
-
-def _is_number(value: object) -> bool:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    # Comparisons with NaN are false, and integers of any size compare.
-    return -MAX_NUMBER <= value <= MAX_NUMBER
+    side: Name
+    wrist: WristMapping
+    fingers: tuple[FingerMapping, ...] = Field(description="a list of tables")
 
 
 def read_mapping(path: Path) -> HandMapping:
@@ -127,25 +87,15 @@ def read_mapping(path: Path) -> HandMapping:
         InvalidInputError: not TOML, or a key that is missing or has the wrong type.
         UnknownNameError: an unknown key; the valid ones are listed.
     """
-    table = _Table(path.name, _parse(path), ("side", "wrist", "fingers"))
-    wrist = _Table(
-        f"{path.name} [wrist]",
-        table["wrist"],
-        ("link", "body", "fingers_along", "thumb_side", "origin_m"),
-    )
-    fingers = tuple(
-        _finger(f"{path.name} [[fingers]] {number}", values)
-        for number, values in enumerate(table.tables("fingers"), 1)
-    )
-    return HandMapping(
-        source=path.name,
-        side=table.text("side"),
-        wrist=wrist.text(wrist.one_of("link", "body")),
-        fingers_along=wrist.vector("fingers_along"),
-        thumb_side=wrist.vector("thumb_side"),
-        origin_m=wrist.vector("origin_m") if "origin_m" in wrist else _ORIGIN,
-        fingers=fingers,
-    )
+    values = _parse(path)
+    if "wrist" in values:
+        values["wrist"] = _checked(WristMapping, f"{path.name} [wrist]", values["wrist"])
+    if isinstance(values.get("fingers"), list):
+        values["fingers"] = [
+            _finger(f"{path.name} [[fingers]] {number}", finger)
+            for number, finger in enumerate(values["fingers"], 1)
+        ]
+    return _checked(HandMapping, path.name, values)
 
 
 def _parse(path: Path) -> dict[str, Any]:
@@ -159,20 +109,31 @@ def _parse(path: Path) -> dict[str, Any]:
         raise InvalidInputError(f"{path.name}: got invalid TOML: {error}") from error
 
 
-def _finger(where: str, values: Any) -> FingerMapping:  # noqa: ANN401
-    finger = _Table(where, values, ("chain", "joints", "knuckle", "pip", "dip", "tip"))
-    tip = _Table(f"{where} tip", finger["tip"], (*_PLACES, "offset_m"))
-    kind = tip.one_of(*_PLACES)
-    name = tip.text(kind)
-    return FingerMapping(
-        chain=finger.text("chain"),
-        joints=finger.names("joints"),
-        knuckle=finger.text("knuckle"),
-        pip=finger.text("pip"),
-        dip=finger.text("dip"),
-        tip=TipMapping(
-            link=None if kind == "site" else name,
-            site=name if kind == "site" else None,
-            offset_m=tip.vector("offset_m") if "offset_m" in tip else _ORIGIN,
-        ),
-    )
+def _finger(where: str, values: object) -> FingerMapping:
+    if isinstance(values, dict) and "tip" in values:
+        values = values | {"tip": _checked(TipMapping, f"{where} tip", values["tip"])}
+    return _checked(FingerMapping, where, values)
+
+
+def _checked(model: type[TableT], where: str, values: object) -> TableT:
+    """A validated table, whose own tables are validated already."""
+    if not isinstance(values, Mapping):
+        raise InvalidInputError(f"{where}: got {values!r:.80}, expected a table")
+    try:
+        return model.model_validate(values)
+    except ValidationError as error:
+        # An unknown key often explains why another is missing.
+        problems = error.errors(include_url=False)
+        problem = min(problems, key=lambda found: found["type"] != "extra_forbidden")
+        if not problem["loc"]:
+            message = problem["msg"].removeprefix("Value error, ")
+            raise InvalidInputError(f"{where}: {message}") from error
+        key = str(problem["loc"][0])
+        if problem["type"] == "extra_forbidden":
+            raise UnknownNameError(f"key in {where}:", key, list(model.model_fields)) from error
+        if key not in values:
+            raise InvalidInputError(f"{where}: got no {key!r}, expected one") from error
+        raise InvalidInputError(
+            f"{where}: got {key} = {values[key]!r:.80}, "
+            f"expected {model.model_fields[key].description or 'a name'}"
+        ) from error
