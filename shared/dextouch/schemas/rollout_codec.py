@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float64
@@ -165,12 +165,7 @@ def start_from(
 
 
 def _fields_of(observation: Observation) -> ObservationFields:
-    return ObservationFields(
-        first_step=observation.first_step,
-        reached_is_measured=observation.reached_is_measured,
-        success=observation.success,
-        doubt=observation.doubt,
-    )
+    return ObservationFields.model_validate(observation, from_attributes=True)
 
 
 def _observation_arrays(observation: Observation) -> dict[str, np.ndarray]:
@@ -199,26 +194,14 @@ def _observation_from(
         for name, array in arrays.items()
         if name.startswith(IMAGE_PREFIX)
     }
-    tactile_kpa = _array(arrays, "tactile_kpa", where=where)
-    action_reached = _array(arrays, "action_reached", where=where)
-    object_poses = arrays.get("object_poses")
-    check_observation_arrays(
-        images=images,
-        tactile_kpa=tactile_kpa,
-        action_reached=action_reached,
-        object_poses=object_poses,
-        where=where,
-    )
-    return Observation(
-        first_step=fields.first_step,
-        images=images,
-        tactile_kpa=tactile_kpa,
-        action_reached=action_reached,
-        reached_is_measured=fields.reached_is_measured,
-        success=fields.success,
-        object_poses=object_poses,
-        doubt=fields.doubt,
-    )
+    found: dict[str, Any] = {
+        "images": images,
+        "tactile_kpa": _array(arrays, "tactile_kpa", where=where),
+        "action_reached": _array(arrays, "action_reached", where=where),
+        "object_poses": arrays.get("object_poses"),
+    }
+    check_observation_arrays(**found, where=where)
+    return Observation(**dict(fields), **found)
 
 
 def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> RolloutOrigin:

@@ -36,7 +36,7 @@ def data_table(features: Features, columns: Mapping[str, np.ndarray]) -> pa.Tabl
             column = pa.FixedSizeListArray.from_arrays(column, size)
             kind = pa.list_(kind, size if len(shape) == 1 else -1)
         table[name] = column.cast(kind)
-    return pa.table(table)
+    return pa.Table.from_pydict(table)
 
 
 class ParquetFiles:
