@@ -1,14 +1,25 @@
 """Versioned key-value state shared by processes (rollouts, leases), in memory or in Redis."""
 
+import asyncio
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
-from dextouch.errors import ConflictError, InvalidInputError
-from dextouch.serving.redis_link import RedisLink, open_redis
+import redis.asyncio
+from redis.commands.core import AsyncScript
+from redis.exceptions import ConnectionError as RedisConnectionError
+from redis.exceptions import RedisError, ResponseError
+from redis.exceptions import TimeoutError as RedisTimeoutError
+
+from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnavailableError
 
 REDIS_PREFIX = "dextouch:state:"
+CONNECT_TIMEOUT_S = 2.0
+ANSWER_TIMEOUT_S = 10.0
+
+Argument = str | bytes | int | float
 
 
 @dataclass(frozen=True)
@@ -74,7 +85,7 @@ def open_state(url: str) -> StateStore:
     if url == "memory://":
         return MemoryState()
     if url.startswith(("redis://", "rediss://")):
-        return RedisState(open_redis(url))
+        return RedisState(url)
     raise InvalidInputError(f"state: got {url!r}, expected memory:// or redis://HOST:PORT/DB")
 
 
@@ -155,22 +166,39 @@ return 1
 
 
 class RedisState:
-    """A store shared by several processes; one hash per key, written by a Lua script."""
+    """A store shared by several processes; one hash per key, written by a Lua script.
 
-    def __init__(self, link: RedisLink) -> None:
-        self._link = link
-        self._compare_and_set = link.script(COMPARE_AND_SET)
-        self._add = link.script(ADD)
+    Args:
+        url: redis://HOST:PORT/DB; connects lazily.
+
+    Raises:
+        InvalidInputError: an invalid URL.
+    """
+
+    def __init__(self, url: str) -> None:
+        try:
+            self._client = redis.asyncio.Redis.from_url(
+                url,
+                decode_responses=False,
+                socket_connect_timeout=CONNECT_TIMEOUT_S,
+                socket_timeout=ANSWER_TIMEOUT_S,
+            )
+        except ValueError as error:
+            raise InvalidInputError(f"redis address: {error}") from error
+        # Credentials in the URL are kept out of messages.
+        self._where = url.rsplit("@", 1)[-1]
+        self._compare_and_set = self._client.register_script(COMPARE_AND_SET)
+        self._add = self._client.register_script(ADD)
 
     async def get(self, key: str) -> Versioned | None:
         """See StateStore."""
-        version, value = await self._link.call("HMGET", REDIS_PREFIX + key, "version", "value")
+        version, value = await self._call("HMGET", REDIS_PREFIX + key, "version", "value")
         return None if version is None else Versioned(value, int(version))
 
     async def set(self, key: str, value: bytes, *, expected_version: int, ttl_s: float) -> int:
         """See StateStore."""
-        written, version = await self._compare_and_set(
-            [REDIS_PREFIX + key], [expected_version, value, _milliseconds(ttl_s)]
+        written, version = await self._run(
+            self._compare_and_set, key, expected_version, value, _milliseconds(ttl_s)
         )
         if not written:
             raise _version_conflict(key, expected=expected_version, got=int(version))
@@ -179,7 +207,7 @@ class RedisState:
     async def add(self, key: str, value: bytes, *, within: str, limit: int, ttl_s: float) -> bool:
         """See StateStore."""
         counted = _literal(REDIS_PREFIX + within) + "*"
-        added = await self._add([REDIS_PREFIX + key], [counted, limit, value, _milliseconds(ttl_s)])
+        added = await self._run(self._add, key, counted, limit, value, _milliseconds(ttl_s))
         if added < 0:
             stored = await self.get(key)
             raise _version_conflict(key, expected=0, got=stored.version if stored else 0)
@@ -187,14 +215,14 @@ class RedisState:
 
     async def delete(self, key: str) -> bool:
         """See StateStore."""
-        return bool(await self._link.call("DEL", REDIS_PREFIX + key))
+        return bool(await self._call("DEL", REDIS_PREFIX + key))
 
     async def keys(self, prefix: str) -> list[str]:
         """See StateStore."""
         found: set[bytes] = set()
         cursor = 0
         while True:
-            cursor, some = await self._link.call(
+            cursor, some = await self._call(
                 "SCAN", cursor, "MATCH", _literal(REDIS_PREFIX + prefix) + "*", "COUNT", 1000
             )
             found.update(some)
@@ -204,11 +232,39 @@ class RedisState:
 
     async def ping(self) -> None:
         """See StateStore."""
-        await self._link.call("PING")
+        await self._call("PING")
 
     async def close(self) -> None:
         """See StateStore."""
-        await self._link.close()
+        await self._client.aclose()
+
+    async def _call(self, *command: Argument) -> Any:  # noqa: ANN401 - Redis answers by command
+        task = asyncio.current_task()
+        cancels_before = 0 if task is None else task.cancelling()
+        with self._as_our_errors():
+            answer = await self._client.execute_command(*command)  # type: ignore[no-untyped-call]
+        if task is not None and task.cancelling() > cancels_before:
+            # redis-py 8.1 loses a cancellation that arrives while it acquires a connection.
+            raise asyncio.CancelledError
+        return answer
+
+    async def _run(self, script: AsyncScript, key: str, *arguments: Argument) -> Any:  # noqa: ANN401
+        with self._as_our_errors():
+            return await script(keys=[REDIS_PREFIX + key], args=list(arguments))
+
+    @contextmanager
+    def _as_our_errors(self) -> Iterator[None]:
+        try:
+            yield
+        except (RedisConnectionError, RedisTimeoutError, OSError) as error:
+            raise UnavailableError(
+                f"redis at {self._where}: {type(error).__name__}: {error}; is the server running?",
+                retry_after_s=1,
+            ) from error
+        except ResponseError as error:
+            raise StorageError(f"redis at {self._where}: {error}") from error
+        except RedisError as error:
+            raise UnavailableError(f"redis at {self._where}: {error}", retry_after_s=1) from error
 
 
 def _version_conflict(key: str, *, expected: int, got: int) -> ConflictError:
