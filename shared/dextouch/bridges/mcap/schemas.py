@@ -158,17 +158,11 @@ def _array_file(name: str, element: str, *, repeated: bool) -> FileDescriptorPro
         syntax="proto3",
     )
     message = file.message_type.add(name=short)
-    message.field.add(
-        name="timestamp",
-        number=1,
-        label=_ONE,
-        type=_type("message"),
-        type_name=".google.protobuf.Timestamp",
-    )
-    message.field.add(name="frame_id", number=2, label=_ONE, type=_type("string"))
-    message.field.add(name="shape", number=3, label=_MANY, type=_type("fixed32"))
-    values = message.field.add(name="values", number=4, type=_type(element))
-    values.label = _MANY if repeated else _ONE
+    labels = (_ONE, _ONE, _MANY, _MANY if repeated else _ONE)
+    names = {"timestamp": "message", "frame_id": "string", "shape": "fixed32", "values": element}
+    for number, ((field, kind), label) in enumerate(zip(names.items(), labels, strict=True), 1):
+        message.field.add(name=field, number=number, label=label, type=_type(kind))
+    message.field[0].type_name = ".google.protobuf.Timestamp"
     _add_device_fields(message)
     return file
 
