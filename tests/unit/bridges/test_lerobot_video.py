@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.bridges.lerobot import ExportOptions, ImportOptions, export_lerobot, import_lerobot
-from dextouch.bridges.lerobot.exporting import stored_units
-from dextouch.bridges.lerobot.h264 import decode_entry_points, encode_images
+from dextouch.bridges.lerobot.exporting import decode_entry_points, encode_images, stored_units
 from dextouch.bridges.lerobot.rows import frames_of
 from dextouch.bridges.lerobot.video import CameraVideo
 from dextouch.bridges.lerobot.video_reader import VideoSpan, read_images, read_units
@@ -27,7 +26,7 @@ def store(tmp_path):
 
 def encoded(count, *, crf=20, group=2):
     settings = VideoSettings(crf=crf, preset="veryfast")
-    return encode_images(pictures(count), fps=15, settings=settings, group=group)
+    return encode_images(pictures(count), 15, ExportOptions(video=settings, group=group))
 
 
 def decoded_alone(units):

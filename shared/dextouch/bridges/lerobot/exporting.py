@@ -3,21 +3,29 @@
 import re
 import shutil
 import uuid
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from jaxtyping import UInt8
 
 from dextouch.bridges.lerobot.dataset import DatasetWriter
-from dextouch.bridges.lerobot.h264 import decode_entry_points, encode_images
 from dextouch.bridges.lerobot.layout import IMAGES
 from dextouch.bridges.lerobot.rows import frames_of, images_at
 from dextouch.bridges.lerobot.sidecar import Sidecar
 from dextouch.bridges.lerobot.statistics import Statistics, image_statistics, sample_places
-from dextouch.episodes import EpisodeReader, VideoSettings, disk_errors, is_keyframe
-from dextouch.errors import ConflictError, InvalidInputError, ShapeError
+from dextouch.episodes import (
+    FULL_FORM,
+    EpisodeReader,
+    GopEncoder,
+    VideoSettings,
+    decoder_of_this_thread,
+    disk_errors,
+    is_keyframe,
+)
+from dextouch.errors import ConflictError, CorruptDataError, InvalidInputError, ShapeError
 
 REPO_ID = re.compile(r"[A-Za-z0-9][\w.-]{0,95}(/[A-Za-z0-9][\w.-]{0,95})?")
 
@@ -159,10 +167,7 @@ def _add_episode(
             stored
             if stored is not None
             else encode_images(
-                images_at(reader, camera, frames.image_indices[camera]),
-                fps=dataset.fps,
-                settings=options.video,
-                group=options.group,
+                images_at(reader, camera, frames.image_indices[camera]), dataset.fps, options
             )
         )
         entries = [data for data in videos[camera] if is_keyframe(data)]
@@ -192,3 +197,39 @@ def stored_units(reader: EpisodeReader, camera: str, indices: np.ndarray) -> lis
         return None
     units = reader.encoded_images(camera, int(indices[0]), int(indices[-1]) + 1)
     return units if is_keyframe(units[0]) else None
+
+
+def encode_images(
+    images: Iterable[UInt8[np.ndarray, "h w 3"]], fps: int, options: ExportOptions
+) -> list[bytes]:
+    """RGB images of one size as H.264, one access unit each."""
+    encoder: GopEncoder | None = None
+    units = []
+    for image in images:
+        if encoder is None:
+            encoder = GopEncoder(
+                *image.shape[:2],
+                rate_hz=float(fps),
+                settings=options.video,
+                group_images=options.group,
+            )
+        units.append(encoder.encode(image))
+    return units
+
+
+def decode_entry_points(
+    access_units: Iterable[bytes], shape: tuple[int, ...], *, where: str
+) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
+    """Decode access units that are each decodable on their own to RGB images [h, w, 3].
+
+    Raises:
+        CorruptDataError: an access unit that cannot be decoded, or is of another size.
+    """
+    decoder = decoder_of_this_thread(*shape[:2])
+    for index, data in enumerate(access_units):
+        image = np.empty((1, *shape), dtype=np.uint8)
+        try:
+            decoder.decode([data], [0], FULL_FORM, image)
+        except CorruptDataError as error:
+            raise CorruptDataError(f"{where}: entry point {index} is damaged ({error})") from error
+        yield image[0]
