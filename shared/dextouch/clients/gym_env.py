@@ -90,7 +90,7 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
         if unknown:
             raise UnknownNameError("reset option", unknown[0], ["init"])
         start_seed = int(self.np_random.integers(2**31)) if seed is None else seed
-        self._end()
+        self.close()
         init = (options or {}).get("init")
         self._rollout = self._client.start(
             world=self.description.name,
@@ -117,9 +117,6 @@ class WorldEnv(gymnasium.Env[SeenNow, np.ndarray]):
 
     def close(self) -> None:
         """End the running rollout; the client stays open."""
-        self._end()
-
-    def _end(self) -> None:
         if self._rollout is not None:
             self._rollout.close()
             self._rollout = None

@@ -1,7 +1,7 @@
 """Factory of service applications: problem+json errors, health, metrics, access and body limits."""
 
 from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
+from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
 from http import HTTPStatus
 
 import structlog
@@ -86,15 +86,10 @@ def _started(lifespan: Lifespan | None) -> Lifespan:
 
     @asynccontextmanager
     async def around(app: FastAPI) -> AsyncIterator[None]:
-        if lifespan is None:
+        async with nullcontext() if lifespan is None else lifespan(app):
             app.state.running = True
             yield
-        else:
-            async with lifespan(app):
-                app.state.running = True
-                yield
-                app.state.running = False
-        app.state.running = False
+            app.state.running = False
 
     return around
 

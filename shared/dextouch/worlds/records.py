@@ -18,42 +18,36 @@ PLACE_TTL_S = 600.0
 
 
 @dataclass(frozen=True)
-class LastAnswer:
-    """Request and response of the newest chunk, for a client that missed the response."""
-
-    request_sha256: str
-    payload: bytes
-
-
-@dataclass(frozen=True)
 class RolloutRecord:
-    """Everything that another process needs to continue a rollout."""
+    """Everything that another process needs to continue a rollout.
+
+    `request_sha256` and `payload` are request and response of the newest chunk, for a client that
+    missed the response; None and empty before the first chunk.
+    """
 
     info: RolloutInfo
     snapshot: bytes
-    last_answer: LastAnswer | None = None
+    request_sha256: str | None = None
+    payload: bytes = b""
 
     def to_bytes(self) -> bytes:
         """Serialize the record."""
-        last = self.last_answer
         arrays = {"snapshot": np.frombuffer(self.snapshot, np.uint8)}
-        if last is not None:
-            arrays["payload"] = np.frombuffer(last.payload, np.uint8)
-        fields = {
-            "info": self.info.model_dump(mode="json"),
-            "request_sha256": None if last is None else last.request_sha256,
-        }
-        return pack(fields, arrays)
+        if self.request_sha256 is not None:
+            arrays["payload"] = np.frombuffer(self.payload, np.uint8)
+        info = self.info.model_dump(mode="json")
+        return pack({"info": info, "request_sha256": self.request_sha256}, arrays)
 
     @staticmethod
     def from_bytes(data: bytes) -> "RolloutRecord":
         """Deserialize a record."""
         fields, arrays = unpack(data, max_bytes=MAX_RECORD_BYTES)
-        last = None
-        if fields["request_sha256"] is not None:
-            last = LastAnswer(fields["request_sha256"], arrays["payload"].tobytes())
-        info = RolloutInfo.model_validate(fields["info"])
-        return RolloutRecord(info, arrays["snapshot"].tobytes(), last)
+        return RolloutRecord(
+            RolloutInfo.model_validate(fields["info"]),
+            arrays["snapshot"].tobytes(),
+            fields["request_sha256"],
+            arrays["payload"].tobytes() if "payload" in arrays else b"",
+        )
 
 
 @dataclass(frozen=True)

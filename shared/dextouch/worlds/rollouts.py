@@ -37,7 +37,7 @@ from dextouch.schemas import (
 from dextouch.serving import StateStore
 from dextouch.worlds.admission import check_answer, check_chunk, check_selector, check_start
 from dextouch.worlds.batcher import StepJob, WorldWorker
-from dextouch.worlds.records import LastAnswer, RecordStore, RolloutRecord, StoredRecord
+from dextouch.worlds.records import RecordStore, RolloutRecord, StoredRecord
 from dextouch.worlds.world import StartedRollout, World
 
 logger = structlog.get_logger(__name__)
@@ -246,8 +246,7 @@ class RolloutService:
         )
         told = outcome.stepped.info
         payload = encode_answer(info, seen, tactile=request.selector.tactile, info=told)
-        last = LastAnswer(request.sha256(), payload)
-        record = RolloutRecord(info, outcome.snapshot, last)
+        record = RolloutRecord(info, outcome.snapshot, request.sha256(), payload)
         version = await self._records.write(record, over_version=stored.version)
         self._live.put(info.id, version, outcome.stepped.state)
         return Answer(payload, queued_s=outcome.queued_s, device_s=outcome.device_s)
@@ -330,12 +329,12 @@ def _over(info: RolloutInfo) -> EndedError:
 
 def _replay(record: RolloutRecord, chunk: int, request: _ChunkRequest) -> Answer | None:
     """The stored response if the request is a repetition; None if the chunk is the next one."""
-    info, last = record.info, record.last_answer
+    info = record.info
     if chunk == info.next_chunk:
         return None
     is_newest = chunk == info.next_chunk - 1
-    if is_newest and last is not None and last.request_sha256 == request.sha256():
-        return Answer(last.payload, replayed=True)
+    if is_newest and record.request_sha256 == request.sha256():
+        return Answer(record.payload, replayed=True)
     why = "again with another body" if is_newest else "out of turn"
     raise ConflictError(
         f"rollout {info.id}: got chunk {chunk} {why}, expected chunk {info.next_chunk}",

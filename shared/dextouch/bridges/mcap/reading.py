@@ -1,6 +1,6 @@
 """Import of MCAP files written by `export_mcap`, without loss."""
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final
 
@@ -20,13 +20,7 @@ MAX_ATTRIBUTES_BYTES: Final = 1 << 24
 _BLOCK_BYTES: Final = 1 << 24
 
 
-@dataclass
-class _About:
-    """Metadata of a file that is needed before its samples."""
-
-    kind: str = ""
-    attributes: EpisodeAttributes | RecordingAttributes | None = None
-    counts: dict[str, int] = field(default_factory=dict)
+Attributes = EpisodeAttributes | RecordingAttributes
 
 
 def import_mcap(path: Path, store: EpisodeStore) -> str:
@@ -46,26 +40,26 @@ def import_mcap(path: Path, store: EpisodeStore) -> str:
         LimitExceededError: a record exceeds the size limit.
         ConflictError: the id is in the store already.
     """
-    about = _about(path)
-    attributes = about.attributes
-    if isinstance(attributes, EpisodeAttributes):
-        with store.writer(attributes=attributes) as writer:
-            _Import(path, about, writer).run()
-        return attributes.episode_id
-    if not isinstance(attributes, RecordingAttributes):
+    attributes, counts = _about(path)
+    if attributes is None:
         raise InvalidInputError(
             f"{path}: holds no attachment {ATTRIBUTES_FILE!r} of DexTouch; only files that "
             "`dextouch export --format mcap` wrote can be imported"
         )
+    if isinstance(attributes, EpisodeAttributes):
+        with store.writer(attributes=attributes) as writer:
+            _Import(path, attributes, writer).run(counts)
+        return attributes.episode_id
     # A killed import is repeated from its file; a partial one must not look like a recovered take.
     options = WriteOptions(recoverable=False)
     with store.writer(kind="recording", attributes=attributes, options=options) as writer:
-        _Import(path, about, writer).run()
+        _Import(path, attributes, writer).run(counts)
     return attributes.recording_id
 
 
-def _about(path: Path) -> _About:
-    about, text = _About(), None
+def _about(path: Path) -> tuple[Attributes | None, dict[str, int]]:
+    """What is needed before the samples: attributes, and the number of samples of each stream."""
+    kind, text, counts = "", None, {}
     for record in records(path):
         if isinstance(record, Metadata) and record.name == ABOUT:
             version = record.metadata.get("bridge_version")
@@ -74,14 +68,14 @@ def _about(path: Path) -> _About:
                     f"{path}: got bridge version {version!r}, expected {BRIDGE_VERSION!r}; "
                     "read it with the release that wrote it"
                 )
-            about.kind = record.metadata.get("kind", "")
+            kind = record.metadata.get("kind", "")
         elif isinstance(record, Metadata) and record.name == COUNTS:
-            about.counts = {name: _count(path, n) for name, n in record.metadata.items()}
+            counts = {name: _count(path, n) for name, n in record.metadata.items()}
         elif isinstance(record, Attachment) and record.name == ATTRIBUTES_FILE:
             text = record.data
-    if text is not None and about.kind in {"episode", "recording"}:
-        about.attributes = _attributes(path, about.kind, text)
-    return about
+    if text is None or kind not in {"episode", "recording"}:
+        return None, counts
+    return _attributes(path, kind, text), counts
 
 
 def _count(path: Path, text: str) -> int:
@@ -90,7 +84,7 @@ def _count(path: Path, text: str) -> int:
     return int(text)
 
 
-def _attributes(path: Path, kind: str, text: bytes) -> EpisodeAttributes | RecordingAttributes:
+def _attributes(path: Path, kind: str, text: bytes) -> Attributes:
     if len(text) > MAX_ATTRIBUTES_BYTES:
         raise CorruptDataError(f"{path}: {ATTRIBUTES_FILE} has {len(text)} bytes")
     try:
@@ -144,25 +138,23 @@ class _Pending:
 class _Import:
     """Import of one file into a writer."""
 
-    def __init__(self, path: Path, about: _About, writer: EpisodeWriter) -> None:
-        self._path, self._counts = path, about.counts
-        streams = about.attributes.streams if about.attributes else ()
+    def __init__(self, path: Path, attributes: Attributes, writer: EpisodeWriter) -> None:
+        self._path = path
+        is_episode = isinstance(attributes, EpisodeAttributes)
         self._pending = {
-            f"/{stream.name}": _Pending(
-                MessageCodec(stream), writer, is_episode=about.kind == "episode"
-            )
-            for stream in streams
+            f"/{stream.name}": _Pending(MessageCodec(stream), writer, is_episode=is_episode)
+            for stream in attributes.streams
         }
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, _Pending | None] = {}
 
-    def run(self) -> None:
-        """Read all messages, then check the count of each stream."""
+    def run(self, counts: Mapping[str, int]) -> None:
+        """Read all messages, then check the number of samples of each stream."""
         for record in records(self._path):
             self._take(record)
         for topic, pending in self._pending.items():
             pending.flush()
-            expected = self._counts.get(pending.codec.descriptor.name)
+            expected = counts.get(pending.codec.descriptor.name)
             if pending.num_samples != expected:
                 raise CorruptDataError(
                     f"{self._path}: {topic} holds {pending.num_samples} messages, expected "

@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float64
 
 from dextouch.bridges.new_file import new_file
 from dextouch.bridges.umi.layout import (
@@ -23,7 +24,7 @@ from dextouch.bridges.umi.zarr_zip import ZarrZipWriter
 from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import vector_from_rotation
-from dextouch.hands.actions import HandTrajectory, poses_from_actions
+from dextouch.hands.actions import poses_from_actions
 from dextouch.schemas import json_ready
 
 BLOCK_STEPS = 32
@@ -89,7 +90,8 @@ class _Export:
                 f"{episode_id}: got {signature}, expected {self._signature} as in the first "
                 "episode; export episodes of different cameras to different files"
             )
-        self._add_actions(reader)
+        for name, rows in _numbers(reader).items():
+            self._writer.append(name, rows)
         for start in range(0, reader.num_steps, BLOCK_STEPS):
             self._add_windows(reader, start, min(BLOCK_STEPS, reader.num_steps - start))
         self._ends.append((self._ends[-1] if self._ends else 0) + reader.num_steps)
@@ -117,33 +119,6 @@ class _Export:
 
     def _add_numbers(self, name: str, dtype: str, shape: tuple[int, ...]) -> None:
         self._writer.add_array(name, dtype=dtype, row_shape=shape, chunk_rows=CHUNK_ROWS)
-
-    def _add_actions(self, reader: EpisodeReader) -> None:
-        data = reader.read("action")
-        self._writer.append("data/t_ref_ns", data.t_ref_ns)
-        self._writer.append("data/action", data.values)
-        if self._signature and "action_commanded" in self._signature:
-            commanded = reader.read("action_commanded")
-            if not np.array_equal(commanded.t_ref_ns, data.t_ref_ns):
-                raise InvalidInputError(
-                    f"{reader.attributes.episode_id}: action_commanded is not on the grid of action"
-                )
-            self._writer.append(COMMANDED, commanded.values)
-        poses = poses_from_actions(data.values, reader.attributes.anchor.to_poses())
-        for robot, side in ROBOTS.items():
-            self._add_hand(robot, *_hand(poses, side))
-        position, vector = _parts(poses.Ts_world_camera_head)
-        self._writer.append("data/head_pos", position)
-        self._writer.append("data/head_rot_axis_angle", vector)
-
-    def _add_hand(self, robot: str, Ts_world_wrist: np.ndarray, joints_rad: np.ndarray) -> None:
-        position, vector = _parts(Ts_world_wrist)
-        both = np.concatenate([position, vector], axis=1)
-        self._writer.append(f"data/{robot}_eef_pos", position)
-        self._writer.append(f"data/{robot}_eef_rot_axis_angle", vector)
-        self._writer.append(f"data/{robot}_joint_pos", joints_rad)
-        self._writer.append(f"data/{robot}_demo_start_pose", np.broadcast_to(both[0], both.shape))
-        self._writer.append(f"data/{robot}_demo_end_pose", np.broadcast_to(both[-1], both.shape))
 
     def _add_windows(self, reader: EpisodeReader, start: int, num_steps: int) -> None:
         window = reader.window(start, num_steps, cameras=self._cameras)
@@ -173,11 +148,36 @@ class _Export:
         return self._ends[-1]
 
 
-def _hand(poses: HandTrajectory, side: str) -> tuple[np.ndarray, np.ndarray]:
-    if side == "left":
-        return poses.Ts_world_wrist_left, poses.joints_left_rad
-    return poses.Ts_world_wrist_right, poses.joints_right_rad
+def _numbers(reader: EpisodeReader) -> dict[str, np.ndarray]:
+    """Rows of an episode's arrays, except for those that `EpisodeReader.window` resamples."""
+    data = reader.read("action")
+    arrays = {"data/t_ref_ns": data.t_ref_ns, "data/action": data.values}
+    if "action_commanded" in reader.streams:
+        commanded = reader.read("action_commanded")
+        if not np.array_equal(commanded.t_ref_ns, data.t_ref_ns):
+            raise InvalidInputError(
+                f"{reader.attributes.episode_id}: action_commanded is not on the grid of action"
+            )
+        arrays[COMMANDED] = commanded.values
+    poses = poses_from_actions(data.values, reader.attributes.anchor.to_poses())
+    hands = {
+        "left": (poses.Ts_world_wrist_left, poses.joints_left_rad),
+        "right": (poses.Ts_world_wrist_right, poses.joints_right_rad),
+    }
+    for robot, side in ROBOTS.items():
+        Ts_world_wrist, joints_rad = hands[side]
+        pose = _pose_6d(Ts_world_wrist)
+        arrays |= {
+            f"data/{robot}_eef_pos": pose[:, :3],
+            f"data/{robot}_eef_rot_axis_angle": pose[:, 3:],
+            f"data/{robot}_joint_pos": joints_rad,
+            f"data/{robot}_demo_start_pose": np.broadcast_to(pose[0], pose.shape),
+            f"data/{robot}_demo_end_pose": np.broadcast_to(pose[-1], pose.shape),
+        }
+    head = _pose_6d(poses.Ts_world_camera_head)
+    return arrays | {"data/head_pos": head[:, :3], "data/head_rot_axis_angle": head[:, 3:]}
 
 
-def _parts(Ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return Ts[:, :3, 3], vector_from_rotation(Ts[:, :3, :3])
+def _pose_6d(Ts: np.ndarray) -> Float64[np.ndarray, "n 6"]:
+    """Translation in metres and rotation vector in radians."""
+    return np.concatenate([Ts[:, :3, 3], vector_from_rotation(Ts[:, :3, :3])], axis=1)
