@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -72,22 +72,14 @@ class DiskReserve:
     Args:
         folder: on the disk.
         min_free_bytes: size of the reserve.
-        free_bytes: measures free space; None queries the file system.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        *,
-        min_free_bytes: int,
-        free_bytes: Callable[[Path], int] | None = None,
-    ) -> None:
+    def __init__(self, folder: Path, *, min_free_bytes: int) -> None:
         self._folder, self._min_free = folder, min_free_bytes
-        self._measure = free_bytes
 
     def free_bytes(self) -> int:
         """Free bytes, including the reserve."""
-        return (self._measure or free_bytes_of)(self._folder)
+        return free_bytes_of(self._folder)
 
     def check_upload(self, num_bytes: int) -> None:
         """Refuse an upload that would use the reserve.

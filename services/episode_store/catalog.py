@@ -4,9 +4,7 @@ import threading
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from datetime import datetime
-from typing import Generic, TypeVar
+from typing import Any, Generic
 
 import structlog
 
@@ -21,23 +19,13 @@ from dextouch.schemas import (
     RecordingSummary,
 )
 from services.episode_store.changes import FolderChanges, Revision
-from services.episode_store.filters import CatalogFilter, EpisodeFilter, RecordingFilter
+from services.episode_store.filters import CatalogFilter, Entry, EpisodeFilter, S
 
-__all__ = ["Catalog", "EpisodeFilter", "RecordingFilter"]
+__all__ = ["Catalog", "CatalogFilter", "EpisodeFilter"]
 
 logger = structlog.get_logger(__name__)
 
 SECONDS_AN_HOUR = 3600.0
-S = TypeVar("S", EpisodeSummary, RecordingSummary)
-
-
-@dataclass(frozen=True, slots=True)
-class Entry(Generic[S]):
-    """A row, with further properties to filter by."""
-
-    summary: S
-    quality: Mapping[str, float]
-    created_at: datetime | None
 
 
 class _Shelf(Generic[S]):
@@ -109,14 +97,14 @@ class Catalog:
 
     def recordings(
         self,
-        wanted: RecordingFilter | None = None,
+        wanted: CatalogFilter | None = None,
         *,
         limit: int,
         offset: int = 0,
         after: str | None = None,
     ) -> RecordingList:
         """One page of matching finished recordings, sorted by id, after the id `after`."""
-        found = _matching(self._recordings.entries(), wanted or RecordingFilter())
+        found = _matching(self._recordings.entries(), wanted or CatalogFilter())
         page, next_after = _page(found, limit, offset, after)
         return RecordingList.model_construct(
             recordings=tuple(page), num_matching=len(found), next_after=next_after
@@ -147,17 +135,11 @@ class Catalog:
         on_grid_s = num_steps / attributes.model_rate_hz
         summary = EpisodeSummary(
             episode_id=episode_id,
-            task=attributes.task,
-            domain=attributes.domain,
             origin=attributes.origin,
-            station=attributes.station,
-            operator=attributes.operator,
-            success=attributes.success,
-            recovered=attributes.recovered,
             num_steps=num_steps,
             duration_s=on_grid_s or _nominal_duration_s(reader),
             created_at=attributes.created_at,
-            content_sha256=reader.content_sha256,
+            **_shared_fields(reader),
         )
         return Entry(summary, dict(attributes.quality), attributes.created_at)
 
@@ -166,20 +148,21 @@ class Catalog:
         attributes = reader.attributes
         summary = RecordingSummary(
             recording_id=recording_id,
-            task=attributes.task,
-            domain=attributes.domain,
-            station=attributes.station,
-            operator=attributes.operator,
             consent=attributes.consent,
-            success=attributes.success,
-            recovered=attributes.recovered,
             num_samples={name: reader.num_samples(name) for name in reader.streams},
             duration_s=_nominal_duration_s(reader),
             num_bytes=self._store.num_bytes(recording_id, kind="recording"),
             started_at=attributes.started_at,
-            content_sha256=reader.content_sha256,
+            **_shared_fields(reader),
         )
         return Entry(summary, dict(attributes.quality), attributes.started_at)
+
+
+def _shared_fields(reader: EpisodeReader | RecordingReader) -> dict[str, Any]:
+    """The fields that the summaries of both kinds have under one name."""
+    names = ("task", "domain", "station", "operator", "success", "recovered")
+    fields = {name: getattr(reader.attributes, name) for name in names}
+    return fields | {"content_sha256": reader.content_sha256}
 
 
 def _matching(entries: Mapping[str, Entry[S]], wanted: CatalogFilter) -> dict[str, S]:

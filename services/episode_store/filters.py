@@ -2,34 +2,27 @@
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from operator import attrgetter
-from typing import Annotated, Any, Protocol, runtime_checkable
+from typing import Annotated, Generic, TypeVar
 
 from pydantic import AfterValidator, AwareDatetime, Field
 
+from dextouch.errors import LimitExceededError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import Domain, Origin
+from dextouch.schemas import Domain, EpisodeSummary, Origin, RecordingSummary
+
+S = TypeVar("S", EpisodeSummary, RecordingSummary)
 
 
-@runtime_checkable
-class Filterable(Protocol):
-    """Interface of catalog entries for filters."""
+@dataclass(frozen=True, slots=True)
+class Entry(Generic[S]):
+    """A row of the catalog, with further properties to filter by."""
 
-    @property
-    def summary(self) -> Any:  # noqa: ANN401 - of either kind
-        """Row of the catalog."""
-        ...
-
-    @property
-    def quality(self) -> Mapping[str, float]:
-        """Quality figures by name."""
-        ...
-
-    @property
-    def created_at(self) -> datetime | None:
-        """Creation time."""
-        ...
+    summary: S
+    quality: Mapping[str, float]
+    created_at: datetime | None
 
 
 def quality_bound(text: str) -> tuple[str, float]:
@@ -70,7 +63,7 @@ class CatalogFilter(FrozenModel):
     created_after: AwareDatetime | None = None
     created_before: AwareDatetime | None = None
 
-    def matcher(self) -> Callable[[Filterable], bool]:
+    def matcher(self) -> Callable[[Entry[S]], bool]:
         """Compile the filter to a fast predicate."""
         fields = [name for name in self._fields() if getattr(self, name) is not None]
         get = attrgetter(*fields) if fields else None
@@ -78,7 +71,7 @@ class CatalogFilter(FrozenModel):
         bounds = [quality_bound(text) for text in self.min_quality]
         after, before = self.created_after, self.created_before
 
-        def matches(entry: Filterable) -> bool:
+        def matches(entry: Entry[S]) -> bool:
             if get is not None and get(entry.summary) != expected:
                 return False
             if any(not entry.quality.get(name, -math.inf) >= least for name, least in bounds):
@@ -98,10 +91,6 @@ class CatalogFilter(FrozenModel):
         return ("task", "operator", "station", "domain", "success", "recovered")
 
 
-class RecordingFilter(CatalogFilter):
-    """Filter of recordings."""
-
-
 class EpisodeFilter(CatalogFilter):
     """Filter of episodes."""
 
@@ -118,10 +107,25 @@ class Page(FrozenModel):
     offset: int = Field(default=0, ge=0)
     after: str | None = Field(default=None, description="only ids after this one")
 
+    def num_rows(self, max_page: int) -> int:
+        """Number of rows of the page; the maximum by default.
+
+        Raises:
+            LimitExceededError: above the maximum.
+        """
+        if self.limit is not None and self.limit > max_page:
+            raise LimitExceededError(
+                f"limit: got {self.limit}, expected at most {max_page}; "
+                "ask for the next page with after=NEXT_AFTER",
+                got=self.limit,
+                expected=max_page,
+            )
+        return self.limit or max_page
+
 
 class EpisodeQuery(EpisodeFilter, Page):
     """Filter and page of episodes."""
 
 
-class RecordingQuery(RecordingFilter, Page):
+class RecordingQuery(CatalogFilter, Page):
     """Filter and page of recordings."""

@@ -11,6 +11,7 @@ from pathlib import Path
 import structlog
 
 from dextouch.episodes import EpisodeStore, check_id
+from dextouch.episodes.care import UPLOADS
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import (
@@ -23,11 +24,10 @@ from dextouch.schemas import (
 from services.episode_store.committing import Commit, commit_spool
 from services.episode_store.locks import KeyedLocks
 from services.episode_store.quotas import idle_seconds
-from services.episode_store.upload import Upload
+from services.episode_store.upload import put_batch, upload_status
 
 logger = structlog.get_logger(__name__)
 
-UPLOADS_FOLDER = ".uploads"
 # Maximum wait for the lock of a recording, which finishing a long take holds.
 PATIENCE_S = 20.0
 
@@ -51,10 +51,10 @@ class Ingest:
         commit: Commit | None = None,
     ) -> None:
         self._store = store
-        self.folder = store.root / UPLOADS_FOLDER
+        self.folder = store.root / UPLOADS
         self._sync, self._max_open = sync, max_open_uploads
         self._commit = commit or partial(commit_spool, store)
-        self._open: OrderedDict[str, Upload] = OrderedDict()
+        self._open: OrderedDict[str, SpoolWriter] = OrderedDict()
         self._locks = KeyedLocks(patience_s=PATIENCE_S)
         self._guard = threading.Lock()
 
@@ -72,13 +72,13 @@ class Ingest:
                 return RecordingStatus(recording_id=recording_id, state="finished")
             path = self._path(recording_id)
             if path.exists():
-                upload = self._upload(recording_id)
-                _check_same(attributes, upload.attributes)
-                return upload.status()
-            upload = Upload(SpoolWriter(path, attributes, sync=self._sync))
-            self._keep(recording_id, upload)
+                spool = self._upload(recording_id)
+                _check_same(attributes, spool.attributes)
+                return upload_status(spool)
+            spool = SpoolWriter(path, attributes, sync=self._sync)
+            self._keep(recording_id, spool)
             logger.info("recording_created", recording_id=recording_id)
-            return upload.status()
+            return upload_status(spool)
 
     def status(self, recording_id: str) -> RecordingStatus:
         """Status of an upload.
@@ -89,7 +89,7 @@ class Ingest:
         with self._working_on(recording_id):
             if self._store.exists(recording_id, kind="recording"):
                 return RecordingStatus(recording_id=recording_id, state="finished")
-            return self._upload(recording_id).status()
+            return upload_status(self._upload(recording_id))
 
     def put_batch(self, recording_id: str, stream: str, number: int, data: bytes) -> BatchReceipt:
         """Store a batch; it is durable when this returns.
@@ -103,7 +103,7 @@ class Ingest:
             StorageFullError: no space; acknowledged batches are kept.
         """
         with self._working_on(recording_id):
-            return self._upload(recording_id).put(stream, number, data)
+            return put_batch(self._upload(recording_id), stream, number, data)
 
     def finish(self, recording_id: str, body: FinishRecording) -> RecordingStatus:
         """Commit a complete upload; idempotent.
@@ -117,9 +117,9 @@ class Ingest:
         """
         with self._working_on(recording_id):
             if not self._store.exists(recording_id, kind="recording"):
-                upload = self._upload(recording_id)
-                _check_complete(upload, body)
-                self._move(upload, body)
+                spool = self._upload(recording_id)
+                _check_complete(spool, body)
+                self._move(spool, body)
             shutil.rmtree(self._path(recording_id), ignore_errors=True)
         return RecordingStatus(recording_id=recording_id, state="finished")
 
@@ -134,9 +134,9 @@ class Ingest:
             if not path.exists() or idle_seconds(path) < idle_s:
                 return False
             with self._guard:
-                upload = self._open.pop(recording_id, None)
-            if upload is not None:
-                upload.abandon()
+                spool = self._open.pop(recording_id, None)
+            if spool is not None:
+                spool.abandon()
             shutil.rmtree(path)
         logger.warning("upload_expired", recording_id=recording_id)
         return True
@@ -147,8 +147,8 @@ class Ingest:
             while self._open:
                 self._open.popitem()[1].abandon()
 
-    def _move(self, upload: Upload, body: FinishRecording) -> None:
-        known = upload.attributes
+    def _move(self, spool: SpoolWriter, body: FinishRecording) -> None:
+        known = spool.attributes
         attributes = known.model_copy(
             update={
                 "success": known.success if body.success is None else body.success,
@@ -158,7 +158,7 @@ class Ingest:
         recording_id = attributes.recording_id
         with self._guard:
             self._open.pop(recording_id)
-        upload.close()
+        spool.close()
         try:
             counts = self._commit(self._path(recording_id), attributes)
         except ConflictError:
@@ -174,8 +174,8 @@ class Ingest:
         with self._locks.holding(recording_id):
             yield
 
-    def _upload(self, recording_id: str) -> Upload:
-        """The open upload; the caller holds its lock."""
+    def _upload(self, recording_id: str) -> SpoolWriter:
+        """The spool of an upload; the caller holds its lock."""
         with self._guard:
             if recording_id in self._open:
                 self._open.move_to_end(recording_id)
@@ -185,13 +185,13 @@ class Ingest:
         path = self._path(recording_id)
         if not path.exists():
             raise NotFoundError(f"recording {recording_id!r}: there is no upload with this id")
-        upload = Upload(SpoolWriter.resume(path, sync=self._sync))
-        self._keep(recording_id, upload)
-        return upload
+        spool = SpoolWriter.resume(path, sync=self._sync)
+        self._keep(recording_id, spool)
+        return spool
 
-    def _keep(self, recording_id: str, upload: Upload) -> None:
+    def _keep(self, recording_id: str, spool: SpoolWriter) -> None:
         with self._guard:
-            self._open[recording_id] = upload
+            self._open[recording_id] = spool
             idle = [other for other in self._open if not self._locks.is_wanted(other)]
             for other in idle[: max(0, len(self._open) - self._max_open)]:
                 self._open.pop(other).abandon()
@@ -210,9 +210,9 @@ def _check_same(got: RecordingAttributes, ours: RecordingAttributes) -> None:
         )
 
 
-def _check_complete(upload: Upload, body: FinishRecording) -> None:
-    recording_id = upload.attributes.recording_id
-    here = upload.status().next_batch
+def _check_complete(spool: SpoolWriter, body: FinishRecording) -> None:
+    recording_id = spool.attributes.recording_id
+    here = upload_status(spool).next_batch
     if set(body.num_batches) != set(here):
         raise InvalidInputError(
             f"finish {recording_id}: got streams {sorted(body.num_batches)}, expected "

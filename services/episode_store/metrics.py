@@ -51,13 +51,5 @@ class StoreMetrics:
 
     def register(self, registry: CollectorRegistry) -> None:
         """Add all metrics to a registry."""
-        for metric in (
-            self.batches,
-            self.bytes,
-            self.ack_seconds,
-            self.finish_seconds,
-            self.refused,
-            self.open_uploads,
-            self.free_bytes,
-        ):
+        for metric in vars(self).values():
             registry.register(metric)

@@ -33,7 +33,6 @@ class StationQuotas:
         folder: of the uploads.
         recordings: bytes of finished recordings by station.
         quota_bytes: per station, uploads and recordings together; None: unlimited.
-        clock: in seconds, for the age of the cached sums.
     """
 
     def __init__(
@@ -42,10 +41,8 @@ class StationQuotas:
         *,
         recordings: Callable[[], dict[str, int]],
         quota_bytes: int | None,
-        clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._folder, self._recordings, self._quota = folder, recordings, quota_bytes
-        self._clock = clock
         self._guard = threading.Lock()
         self._accounts: dict[str, _Account] = {
             path.name: _Account(attributes.station, folder_bytes(path))
@@ -123,7 +120,7 @@ class StationQuotas:
         return UploadList(uploads=tuple(found))
 
     def _used(self, station: str) -> int:
-        now = self._clock()
+        now = time.monotonic()
         with self._guard:
             if self._finished is None or now - self._finished[0] > REFRESH_S:
                 self._finished = (now, self._recordings())

@@ -1,75 +1,53 @@
-"""One unfinished upload: numbered batches appended to its spool."""
+"""Numbered batches of one unfinished upload, which its spool keeps."""
 
 import numpy as np
 
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
-from dextouch.errors import ConflictError, UnknownNameError
-from dextouch.schemas import BatchReceipt, RecordingAttributes, RecordingStatus
+from dextouch.errors import ConflictError
+from dextouch.schemas import BatchReceipt, RecordingStatus
 from dextouch.streams import SampleBatch, decode_batch
 
 
-class Upload:
-    """One unfinished recording; not thread-safe.
+def upload_status(spool: SpoolWriter) -> RecordingStatus:
+    """The batch that each stream expects next."""
+    names = [stream.name for stream in spool.attributes.streams]
+    return RecordingStatus(
+        recording_id=spool.attributes.recording_id,
+        state="open",
+        next_batch={name: spool.num_batches(name) for name in names},
+    )
 
-    Args:
-        spool: of the recording, open for writing.
-    """
 
-    def __init__(self, spool: SpoolWriter) -> None:
-        self._spool = spool
-        self._streams = {stream.name: stream for stream in spool.attributes.streams}
-
-    @property
-    def attributes(self) -> RecordingAttributes:
-        """Attributes given when the upload began."""
-        return self._spool.attributes
-
-    def status(self) -> RecordingStatus:
-        """The batch that each stream expects next."""
-        return RecordingStatus(
-            recording_id=self.attributes.recording_id,
-            state="open",
-            next_batch={name: self._spool.num_batches(name) for name in self._streams},
+def put_batch(spool: SpoolWriter, stream: str, number: int, data: bytes) -> BatchReceipt:
+    """Store batch `number` of a stream; raises as `Ingest.put_batch`."""
+    recording_id = spool.attributes.recording_id
+    expected = spool.num_batches(stream)
+    if number > expected:
+        raise ConflictError(
+            f"{recording_id} {stream}: got batch {number}, expected {expected}; "
+            "send the missing ones first",
+            got=number,
+            expected=expected,
         )
-
-    def put(self, stream: str, number: int, data: bytes) -> BatchReceipt:
-        """Store batch `number` of a stream; raises as `Ingest.put_batch`."""
-        if stream not in self._streams:
-            raise UnknownNameError("stream", stream, list(self._streams))
-        expected, recording_id = self._spool.num_batches(stream), self.attributes.recording_id
-        if number > expected:
-            raise ConflictError(
-                f"{recording_id} {stream}: got batch {number}, expected {expected}; "
-                "send the missing ones first",
-                got=number,
-                expected=expected,
-            )
-        batch = decode_batch(data, self._streams[stream], number=number)
-        replayed = number < expected
-        if not replayed:
-            self._spool.append(stream, batch, flush=True)
-        elif not _same(SpoolReader(self._spool.path).appended(stream, number), batch):
-            raise ConflictError(
-                f"{recording_id} {stream}: batch {number} exists with other samples; "
-                "batches are immutable",
-                got=number,
-                expected=expected,
-            )
-        return BatchReceipt(
-            recording_id=recording_id,
-            stream=stream,
-            number=number,
-            num_samples=len(batch),
-            replayed=replayed,
+    descriptor = next(known for known in spool.attributes.streams if known.name == stream)
+    batch = decode_batch(data, descriptor, number=number)
+    replayed = number < expected
+    if not replayed:
+        spool.append(stream, batch, flush=True)
+    elif not _same(SpoolReader(spool.path).appended(stream, number), batch):
+        raise ConflictError(
+            f"{recording_id} {stream}: batch {number} exists with other samples; "
+            "batches are immutable",
+            got=number,
+            expected=expected,
         )
-
-    def close(self) -> None:
-        """Mark the spool as complete and close all files."""
-        self._spool.close()
-
-    def abandon(self) -> None:
-        """Close all files; the upload can be continued."""
-        self._spool.abandon()
+    return BatchReceipt(
+        recording_id=recording_id,
+        stream=stream,
+        number=number,
+        num_samples=len(batch),
+        replayed=replayed,
+    )
 
 
 def _same(ours: SampleBatch, theirs: SampleBatch) -> bool:

@@ -40,7 +40,7 @@ from dextouch.schemas import (
     RecordingSummary,
     json_ready,
 )
-from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
+from services.episode_store.catalog import Catalog, CatalogFilter, EpisodeFilter
 from services.episode_store.commands.context import (
     EXIT_DAMAGED,
     Context,
@@ -95,14 +95,14 @@ def _list_episodes(context: Context, catalog: Catalog) -> tuple[dict[str, Any], 
 def _list_recordings(context: Context, catalog: Catalog) -> tuple[dict[str, Any], int]:
     """List matching recordings; returns them and the total number."""
     options = context.options
-    wanted = RecordingFilter(task=options.task, domain=options.domain)
+    wanted = CatalogFilter(task=options.task, domain=options.domain)
     found = catalog.recordings(wanted, limit=sys.maxsize)
     for row in found.recordings:
         context.say(
             f"{row.recording_id}  recording  {row.task}  {row.domain}  "
             f"{sum(row.num_samples.values())} samples  {_outcome(row)}"
         )
-    return json_ready(found), catalog.recordings(RecordingFilter(), limit=1).num_matching
+    return json_ready(found), catalog.recordings(CatalogFilter(), limit=1).num_matching
 
 
 def _outcome(

@@ -9,7 +9,6 @@ from services.episode_store.catalog import Catalog
 from services.episode_store.filters import EpisodeQuery
 from services.episode_store.reading import SpanQuery, StoreReader, WindowQuery
 from services.episode_store.routes.media import MSGPACK, WINDOW_MSGPACK, as_response, chosen_type
-from services.episode_store.routes.pages import page_limit
 from services.episode_store.routes.scopes import MAY_READ
 
 
@@ -20,7 +19,7 @@ def episodes_router(*, catalog: Catalog, reader: StoreReader, max_page: int) -> 
     @router.get("")
     def listing(wanted: Annotated[EpisodeQuery, Query()]) -> EpisodeList:
         """List episodes that match all filters."""
-        limit = page_limit(wanted, max_page)
+        limit = wanted.num_rows(max_page)
         return catalog.episodes(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
 
     @router.get("/{episode_id}")
@@ -35,7 +34,7 @@ def episodes_router(*, catalog: Catalog, reader: StoreReader, max_page: int) -> 
         accept: Annotated[str | None, Header()] = None,
         if_none_match: Annotated[str | None, Header()] = None,
     ) -> Response:
-        """Window of the model grid as msgpack (`dextouch.episodes.window_codec`)."""
+        """Window of the model grid as msgpack (`dextouch.episodes.decode_window`)."""
         media_type = chosen_type(accept, (WINDOW_MSGPACK, MSGPACK))
         return as_response(reader.window(episode_id, query, known=if_none_match), media_type)
 

@@ -17,7 +17,6 @@ from services.episode_store.filters import RecordingQuery
 from services.episode_store.intake import Intake
 from services.episode_store.reading import SpanQuery, StoreReader
 from services.episode_store.routes.media import MSGPACK, as_response
-from services.episode_store.routes.pages import page_limit
 from services.episode_store.routes.scopes import MAY_READ, MAY_WRITE
 
 # Room for the calibration and descriptors of a station, or the ledger of a take.
@@ -60,7 +59,7 @@ def recordings_router(
     @router.get("", dependencies=[MAY_READ])
     def listing(wanted: Annotated[RecordingQuery, Query()]) -> RecordingList:
         """List finished recordings that match all filters."""
-        limit = page_limit(wanted, max_page)
+        limit = wanted.num_rows(max_page)
         return catalog.recordings(wanted, limit=limit, offset=wanted.offset, after=wanted.after)
 
     @router.get("/{recording_id}", dependencies=[MAY_READ])

@@ -72,6 +72,19 @@ def make_held_folder(path: Path) -> int:
         os.close(descriptor)
 
 
+def try_lock(folder: Path) -> int | None:
+    """Lock a folder, as `make_held_folder` does; None if a writer holds its lock."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        os.close(descriptor)
+        if isinstance(error, BlockingIOError):
+            return None
+        raise
+    return descriptor
+
+
 def is_folder_at(descriptor: int, path: Path) -> bool:
     """Whether an open folder is still the one at `path`."""
     try:
@@ -131,7 +144,7 @@ def folder_bytes(folder: Path) -> int:
         for here, _, names in os.walk(folder):
             for name in names:
                 try:
-                    total += Path(here, name).stat().st_size
+                    total += Path(here, name).lstat().st_size
                 except FileNotFoundError:
                     continue
     return total

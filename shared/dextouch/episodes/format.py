@@ -4,18 +4,26 @@ import hashlib
 import json
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, TypeVar
 
 from pydantic import Field, ValidationError
 
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError
 from dextouch.frozen_model import FrozenModel
-from dextouch.schemas import ID_PATTERN
+from dextouch.schemas import ID_PATTERN, EpisodeAttributes, LedgerEntry, RecordingAttributes
 from dextouch.streams import H264_UNIT, JPEG_UNIT, StreamDescriptor
 
 Kind = Literal["episode", "recording"]
 KINDS: tuple[Kind, ...] = ("episode", "recording")
 Codec = Literal["zstd", "jpeg", "h264"]
+Attributes = EpisodeAttributes | RecordingAttributes
+ATTRIBUTES: Mapping[Kind, type[EpisodeAttributes] | type[RecordingAttributes]] = {
+    "episode": EpisodeAttributes,
+    "recording": RecordingAttributes,
+}
+# What parsing foreign JSON raises; the ValidationError of pydantic is a ValueError.
+MALFORMED = (ValueError, KeyError, TypeError, RecursionError)
+M = TypeVar("M", bound=FrozenModel)
 FORMAT_VERSION: Final = 2
 COMMIT_FILE = "commit.json"
 METADATA_FILE = "zarr.json"
@@ -75,6 +83,33 @@ def check_id(text: str, *, kind: str = "id") -> str:
             "the first a letter or digit"
         )
     return text
+
+
+def attributes_id(attributes: Attributes) -> str:
+    """The episode or recording id of attributes."""
+    if isinstance(attributes, EpisodeAttributes):
+        return attributes.episode_id
+    return attributes.recording_id
+
+
+def kind_of(attributes: Attributes) -> Kind:
+    """The kind of group that attributes describe."""
+    return "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
+
+
+def group_attributes(metadata: bytes, model: type[M]) -> M:
+    """Inverse of `group_metadata`; raises MALFORMED."""
+    plain = json.loads(metadata)["attributes"][ATTRIBUTES_KEY]
+    return model.model_validate_json(json.dumps(plain))
+
+
+def with_counts(attributes: Attributes, event: str, counts: Mapping[str, int]) -> Attributes:
+    """The attributes with counts of an event by stream: quality of an episode, ledger of a take."""
+    if isinstance(attributes, EpisodeAttributes):
+        figures = {f"{name}_{event}": float(count) for name, count in counts.items()}
+        return attributes.model_copy(update={"quality": attributes.quality | figures})
+    entries = (LedgerEntry(stream=name, event=event, count=n) for name, n in counts.items())
+    return attributes.model_copy(update={"ledger": (*attributes.ledger, *entries)})
 
 
 def with_rows(entry: ArrayEntry, num_rows: int) -> ArrayEntry:
@@ -190,7 +225,7 @@ def decode_commit(data: bytes, *, what: str) -> tuple[CommitRecord, str]:
         plain, digest = outer["record"], outer["sha256"]
         version = plain["format_version"]
         whole = sha256_hex(canonical_json(plain)) == digest
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except MALFORMED as error:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} is damaged ({error})") from error
     if not whole:
         raise CorruptDataError(f"{what}: {COMMIT_FILE} does not match its own sha256")

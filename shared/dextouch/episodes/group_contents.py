@@ -1,7 +1,6 @@
 """Attributes and arrays of a committed group, or of one that is still being written."""
 
 import hashlib
-import json
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -9,23 +8,23 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 import numpy as np
-from pydantic import ValidationError
 
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
-    ATTRIBUTES_KEY,
     COMMIT_FILE,
+    MALFORMED,
     METADATA_FILE,
     ArrayEntry,
     Kind,
     array_metadata,
     decode_commit,
+    group_attributes,
     sha256_hex,
     shard_path,
     stream_arrays,
     with_rows,
 )
-from dextouch.episodes.journal import journal_path, part_path, read_rows
+from dextouch.episodes.journal import log_paths, part_path, read_rows
 from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles, LocalFile, LocalGroup
 from dextouch.episodes.staged_group import read_stage
@@ -62,11 +61,7 @@ class CommittedGroup(Generic[A]):
         return self._shards[name]
 
     def verify(self) -> Verification:
-        """Read everything and compare it with the commit record.
-
-        Raises:
-            CorruptDataError: the first damaged array, by name.
-        """
+        """Read everything and compare it with the commit record."""
         num_bytes = sum(self._verify_array(name, entry) for name, entry in self.entries.items())
         return Verification(
             num_arrays=len(self.entries), num_bytes=num_bytes, content_sha256=self.content_sha256
@@ -152,10 +147,9 @@ def read_group(files: GroupFiles, kind: Kind, model: type[A]) -> CommittedGroup[
     if sha256_hex(group) != record.attributes_sha256:
         raise CorruptDataError(f"{what}: attributes do not match their sha256")
     try:
-        text = json.dumps(json.loads(group)["attributes"][ATTRIBUTES_KEY])
-        attributes = model.model_validate_json(text)
+        attributes = group_attributes(group, model)
         expected = {stream.name: stream_arrays(stream, kind) for stream in attributes.streams}
-    except (ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
+    except MALFORMED as error:
         raise StorageError(f"{what}: attributes are invalid ({error})") from error
     _check_arrays(expected, record.arrays, what)
     return CommittedGroup(files, kind, attributes, record.arrays, content_sha256, what)
@@ -250,7 +244,7 @@ def read_live(stage: Path, kind: Kind, model: type[A]) -> LiveGroup[A]:
         rows = {
             name: read_rows(stage, name)
             for name in arrays
-            if journal_path(stage, name).is_file() and part_path(stage, name).is_file()
+            if all(path.is_file() for path in log_paths(stage, name))
         }
         whole = len(rows) == len(arrays)
         count = min(int(r["num_rows"].sum()) for r in rows.values()) if whole else 0

@@ -41,6 +41,17 @@ def journal_path(folder: Path, name: str) -> Path:
     return folder / f"{name}.journal"
 
 
+def log_paths(folder: Path, name: str) -> tuple[Path, Path]:
+    """Paths of both files of a log."""
+    return part_path(folder, name), journal_path(folder, name)
+
+
+def forget_journal(folder: Path, name: str) -> None:
+    """Remove the journal of an array whose group is about to be committed."""
+    with disk_errors(f"commit array {name}"):
+        journal_path(folder, name).unlink(missing_ok=True)
+
+
 def read_rows(folder: Path, name: str) -> np.ndarray:
     """All valid rows of a journal whose payloads are complete in the part file.
 
@@ -74,43 +85,56 @@ def read_rows(folder: Path, name: str) -> np.ndarray:
 
 
 def _rows_hold(rows: np.ndarray, part_bytes: int) -> np.ndarray:
-    data, size = rows.tobytes(), rows.dtype.itemsize
-    crcs = np.array(
-        [
-            google_crc32c.value(data[i * size : (i + 1) * size - _CRC.size])
-            for i in range(len(rows))
-        ],
-        dtype=np.uint32,
-    )
     ends = rows["offset"] + rows["length"]
     follows = rows["offset"] == np.concatenate([np.zeros(1, dtype="<u8"), ends])[: len(rows)]
-    return np.asarray((crcs == rows["row_crc32c"]) & follows & (ends <= part_bytes), dtype=bool)
+    crcs_hold = _row_crcs(rows) == rows["row_crc32c"]
+    return np.asarray(crcs_hold & follows & (ends <= part_bytes), dtype=bool)
 
 
-def read_payloads(folder: Path, name: str, rows: np.ndarray) -> list[bytes]:
-    """Read the payloads of consecutive rows and verify their checksums.
+def _row_crcs(rows: np.ndarray) -> np.ndarray:
+    bodies = (row[: -_CRC.size] for row in rows.view(f"V{rows.itemsize}").tolist())
+    return np.fromiter(map(google_crc32c.value, bodies), dtype=np.uint32, count=len(rows))
+
+
+def scan_rows(folder: Path, name: str, payloads: bytes) -> tuple[np.ndarray, np.ndarray]:
+    """All rows of a journal, damaged ones too, and whether each and its payload are intact.
+
+    Args:
+        folder: of the log.
+        name: of the log.
+        payloads: contents of the part file, or of the shard that it has become.
+    """
+    path = journal_path(folder, name)
+    with disk_errors(f"read {path.name}"):
+        data = path.read_bytes()[len(JOURNAL_MAGIC) :] if path.is_file() else b""
+    rows = np.frombuffer(data, JOURNAL_ROW, count=len(data) // JOURNAL_ROW.itemsize)
+    ends = rows["offset"] + rows["length"]
+    spans = zip(rows["offset"].tolist(), ends.tolist(), strict=True)
+    crcs = [google_crc32c.value(payloads[start:stop]) for start, stop in spans]
+    hold = (_row_crcs(rows) == rows["row_crc32c"]) & (ends <= len(payloads))
+    return rows, hold & (np.array(crcs, dtype=np.uint32) == rows["payload_crc32c"])
+
+
+def read_payload(folder: Path, name: str, row: np.void) -> bytes:
+    """Read the payload of a row and verify its checksum.
 
     Raises:
-        CorruptDataError: a payload does not match its checksum.
+        CorruptDataError: it does not match its checksum.
     """
-    if not len(rows):
-        return []
-    first = int(rows["offset"][0])
-    length = int(rows["offset"][-1]) + int(rows["length"][-1]) - first
     with disk_errors(f"read {name}"), part_path(folder, name).open("rb") as file:
-        file.seek(first)
-        data = file.read(length)
-    payloads = []
-    for row in rows:
-        start = int(row["offset"]) - first
-        payload = data[start : start + int(row["length"])]
-        if google_crc32c.value(payload) != int(row["payload_crc32c"]):
-            raise CorruptDataError(
-                f"stream {name!r}: payload at byte {int(row['offset'])} does not match its "
-                "checksum; the part file is damaged"
-            )
-        payloads.append(payload)
-    return payloads
+        file.seek(int(row["offset"]))
+        payload = file.read(int(row["length"]))
+    if google_crc32c.value(payload) != int(row["payload_crc32c"]):
+        raise CorruptDataError(damaged_payload(name, row))
+    return payload
+
+
+def damaged_payload(name: str, row: np.void) -> str:
+    """Message about a payload that does not match its checksum."""
+    return (
+        f"stream {name!r}: payload at byte {int(row['offset'])} does not match its "
+        "checksum; the part file is damaged"
+    )
 
 
 class JournalWriter:
@@ -128,8 +152,8 @@ class JournalWriter:
     def __init__(self, folder: Path, name: str, *, num_rows: int | None = None) -> None:
         self.name, self._folder = name, folder
         self._part = self._journal = -1
-        self.num_rows = 0
-        self._part_bytes = 0
+        # Offset and length of each payload.
+        self.index: list[tuple[int, int]] = []
         flags = os.O_RDWR | os.O_CREAT | (os.O_EXCL if num_rows is None else 0)
         with disk_errors(f"open log {name}"):
             self._part = os.open(part_path(folder, name), flags, 0o644)
@@ -148,7 +172,8 @@ class JournalWriter:
             StorageFullError: no space; the files are unchanged.
         """
         crc = google_crc32c.value(payload)
-        body = _BODY.pack(self._part_bytes, num_rows, len(payload), crc)
+        place = self._part_bytes()
+        body = _BODY.pack(place, num_rows, len(payload), crc)
         try:
             with disk_errors(f"log {self.name}", advice="free space on the disk of the store"):
                 write_all(self._part, payload)
@@ -158,8 +183,7 @@ class JournalWriter:
             # interrupt between the two writes would misplace the next payload.
             self._cut()
             raise
-        self.num_rows += 1
-        self._part_bytes += len(payload)
+        self.index.append((place, len(payload)))
 
     def sync(self) -> None:
         """Sync everything appended to disk: payloads first, then rows."""
@@ -179,8 +203,7 @@ class JournalWriter:
                 f"stream {self.name!r}: got {len(rows)} rows, expected at least {num_rows}"
             )
         rows = rows[:num_rows]
-        self.num_rows = num_rows
-        self._part_bytes = int(rows["offset"][-1]) + int(rows["length"][-1]) if num_rows else 0
+        self.index = list(zip(rows["offset"].tolist(), rows["length"].tolist(), strict=True))
         with disk_errors(f"truncate log {self.name}"):
             self._cut()
         return rows
@@ -200,10 +223,13 @@ class JournalWriter:
             if descriptor >= 0:
                 os.close(descriptor)
 
+    def _part_bytes(self) -> int:
+        return sum(self.index[-1]) if self.index else 0
+
     def _cut(self) -> None:
         for descriptor, size in (
-            (self._part, self._part_bytes),
-            (self._journal, len(JOURNAL_MAGIC) + self.num_rows * JOURNAL_ROW.itemsize),
+            (self._part, self._part_bytes()),
+            (self._journal, len(JOURNAL_MAGIC) + len(self.index) * JOURNAL_ROW.itemsize),
         ):
             os.ftruncate(descriptor, size)
             os.lseek(descriptor, size, os.SEEK_SET)

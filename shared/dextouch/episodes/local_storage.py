@@ -8,21 +8,21 @@ from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
-from dextouch.episodes.format import COMMIT_FILE, Kind
+from dextouch.episodes.format import COMMIT_FILE, Attributes, Kind, attributes_id
 from dextouch.episodes.migration import OldGroup, is_current
 from dextouch.episodes.sources import LocalGroup
-from dextouch.episodes.staged_group import Attributes, attributes_id
-from dextouch.episodes.staging import STAGING, abandoned_stages, new_stage, sweep_stages
+from dextouch.episodes.staged_group import STAGING, abandoned_stages, new_stage
 from dextouch.episodes.staging_recovery import (
     RecoveredGroup,
     ids_below,
     raise_first,
     recover_all,
     recover_stage,
+    sweep_stages,
 )
 from dextouch.episodes.trash import put_into_trash, remove_for_good
 from dextouch.episodes.write_options import WriteOptions
-from dextouch.episodes.writer import EpisodeWriter
+from dextouch.episodes.writer import EpisodeWriter, write_blocks
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas import ID_PATTERN
 
@@ -56,19 +56,10 @@ class LocalStorage:
     """
 
     def __init__(self, root: Path) -> None:
-        self._root = root
-
-    @property
-    def root(self) -> Path:
-        """Folder of the store."""
-        return self._root
+        self.root = root
 
     def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
-        """Writer of a new group.
-
-        Raises:
-            ConflictError: the id exists already.
-        """
+        """Writer of a new group."""
         target = self._folder(kind, attributes_id(attributes))
         if target.exists():
             raise ConflictError(f"{kind} {target.name!r} exists already; choose another id")
@@ -76,12 +67,10 @@ class LocalStorage:
         return EpisodeWriter(stage=stage, target=target, attributes=attributes, options=options)
 
     def group(self, kind: Kind, item_id: str) -> LocalGroup:
-        """Files of a committed group.
-
-        Raises:
-            NotFoundError: no such id.
-        """
-        return LocalGroup(self._existing(kind, item_id))
+        """Files of a committed group."""
+        if not self.exists(kind, item_id):
+            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
+        return LocalGroup(self._folder(kind, item_id))
 
     def exists(self, kind: Kind, item_id: str) -> bool:
         """Whether an id is committed."""
@@ -89,21 +78,13 @@ class LocalStorage:
             return (self._folder(kind, item_id) / COMMIT_FILE).is_file()
 
     def revision(self, kind: Kind, item_id: str) -> int:
-        """A number that changes when an id is deleted and written again.
-
-        Raises:
-            NotFoundError: no such id.
-        """
+        """Modification time of the commit record in nanoseconds."""
         with disk_errors(f"look at {kind} {item_id}"):
-            return (self._existing(kind, item_id) / COMMIT_FILE).stat().st_mtime_ns
+            return (self.group(kind, item_id).folder / COMMIT_FILE).stat().st_mtime_ns
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
-        """Size of a committed group on disk.
-
-        Raises:
-            NotFoundError: no such id.
-        """
-        return folder_bytes(self._existing(kind, item_id))
+        """Size of a committed group on disk."""
+        return folder_bytes(self.group(kind, item_id).folder)
 
     def list(self, kind: Kind) -> list[str]:
         """Sorted committed ids."""
@@ -114,57 +95,33 @@ class LocalStorage:
             return sorted(path.name for path in folder.iterdir() if _is_committed(path))
 
     def delete(self, kind: Kind, item_id: str) -> None:
-        """Delete a group permanently; it disappears atomically and is then removed from disk.
-
-        Raises:
-            NotFoundError: no such id.
-        """
-        self._existing(kind, item_id)
+        """Delete a group permanently; it disappears atomically and is then removed from disk."""
         remove_for_good(put_into_trash(self.root, kind, item_id))
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Upgrade a group of an older format version; False if it is current.
-
-        The new group replaces the old one atomically; its lineage names the old content.
-
-        Raises:
-            NotFoundError: no such id.
-            CorruptDataError: damaged; the group is unchanged.
-            StorageError: of a newer version.
-        """
-        folder = self._existing(kind, item_id)
-        files = LocalGroup(folder)
+        """Replace a group of an older format version atomically; its lineage names the old one."""
+        files = self.group(kind, item_id)
         if is_current(files, what=f"{kind} {item_id}"):
             return False
         old = OldGroup(files, kind)
         staging, number = self.root / STAGING, uuid.uuid4().hex
         # Committed beside the store first: after a kill between the two renames below, `recover`
         # finds a complete group whose place is free.
-        whole = staging / f"migrated-{item_id}-{number}"
-        with EpisodeWriter(
-            stage=staging / f"{kind}-{item_id}-{number}",
-            target=whole,
-            attributes=old.attributes,
-            options=WriteOptions(recoverable=False),
-        ) as writer:
-            for stream in old.attributes.streams:
-                for values, stamps in old.blocks(stream):
-                    writer.append(stream.name, values=values, **stamps)
-        trash = staging / f"old-{item_id}-{number}"
+        whole, before = (
+            staging / f"migrated-{item_id}-{number}",
+            staging / f"old-{item_id}-{number}",
+        )
+        streams = ((stream.name, old.blocks(stream)) for stream in old.attributes.streams)
+        write_blocks(new_stage(self.root, kind, item_id), whole, old.attributes, streams)
         with disk_errors(f"migrate {item_id}"):
-            folder.rename(trash)
-            whole.rename(folder)
-            sync_folder(folder.parent)
-            shutil.rmtree(trash)
+            files.folder.rename(before)
+            whole.rename(files.folder)
+            sync_folder(files.folder.parent)
+            shutil.rmtree(before)
         return True
 
     def recover(self) -> builtins.list[RecoveredGroup]:
-        """Commit the stages of terminated writers, as far as they were written.
-
-        Raises:
-            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
-                completed.
-        """
+        """Commit the stages of terminated writers, as far as they were written."""
         stages = abandoned_stages(self.root)
         found, failures = recover_all(stages, lambda stage: recover_stage(stage, self.root))
         raise_first(failures, found)
@@ -177,12 +134,6 @@ class LocalStorage:
 
     def _folder(self, kind: Kind, item_id: str) -> Path:
         return self.root / f"{kind}s" / item_id
-
-    def _existing(self, kind: Kind, item_id: str) -> Path:
-        folder = self._folder(kind, item_id)
-        if not self.exists(kind, item_id):
-            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
-        return folder
 
 
 def _is_committed(folder: Path) -> bool:

@@ -9,31 +9,32 @@ from collections.abc import Iterator
 from itertools import pairwise
 
 import numpy as np
-from pydantic import ValidationError
 
 from dextouch.episodes.format import (
-    ATTRIBUTES_KEY,
+    ATTRIBUTES,
     COMMIT_FILE,
+    MALFORMED,
     METADATA_FILE,
     STAMPS,
     ArrayEntry,
+    Attributes,
     Kind,
     canonical_json,
     decode_commit,
+    group_attributes,
     sha256_hex,
     shard_path,
 )
 from dextouch.episodes.shard_reader import ShardReader
 from dextouch.episodes.sources import GroupFiles
+from dextouch.episodes.writer import Block
 from dextouch.errors import CorruptDataError, StorageError
-from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttributes
+from dextouch.schemas import LineageEntry
 from dextouch.streams import JPEG_UNIT, StreamDescriptor, encoded_values
 
 OLD_VERSION = 1
 BLOCK_SAMPLES = 256
 _JPEG_END_SUFFIX = "_end"
-
-Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 class OldGroup:
@@ -66,20 +67,14 @@ class OldGroup:
             self._entries = {
                 name: ArrayEntry.model_validate(entry) for name, entry in record["arrays"].items()
             }
-            model = EpisodeAttributes if kind == "episode" else RecordingAttributes
-            text = json.dumps(json.loads(group or b"")["attributes"][ATTRIBUTES_KEY])
-            self._attributes = model.model_validate_json(text)
-        except (ValueError, KeyError, TypeError, AttributeError, ValidationError) as error:
+            attributes: Attributes = group_attributes(group or b"", ATTRIBUTES[kind])
+        except (*MALFORMED, AttributeError) as error:
             raise CorruptDataError(
                 f"{self._what}: is not a group of version 1 ({error})"
             ) from error
-        self._content_sha256 = str(digest)
-
-    @property
-    def attributes(self) -> EpisodeAttributes | RecordingAttributes:
-        """The attributes, with the migrated content in their lineage."""
-        before = LineageEntry(kind=self._kind, id=self._files.item_id, sha256=self._content_sha256)
-        return self._attributes.model_copy(update={"lineage": (*self._attributes.lineage, before)})
+        before = LineageEntry(kind=kind, id=files.item_id, sha256=str(digest))
+        # With the migrated content in their lineage.
+        self.attributes = attributes.model_copy(update={"lineage": (*attributes.lineage, before)})
 
     def blocks(self, stream: StreamDescriptor) -> Iterator[Block]:
         """Iterate over values and stamps of a stream in blocks, verifying every byte."""

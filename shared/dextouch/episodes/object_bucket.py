@@ -2,6 +2,8 @@
 
 import os
 import re
+import threading
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -59,8 +61,40 @@ class _Runtime:
             )
 
 
+class BlockCache:
+    """LRU cache of object blocks, limited in bytes.
+
+    Args:
+        capacity: in bytes; 0 disables the cache.
+    """
+
+    def __init__(self, capacity: int) -> None:
+        self.capacity = capacity
+        self._guard = threading.Lock()
+        self._blocks: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
+        self._num_bytes = 0
+
+    def get(self, facts: ObjectFacts, number: int) -> bytes | None:
+        """A cached block of this version of an object."""
+        key = (facts.key, facts.etag, number)
+        with self._guard:
+            block = self._blocks.get(key)
+            if block is not None:
+                self._blocks.move_to_end(key)
+        return block
+
+    def put(self, facts: ObjectFacts, number: int, block: bytes) -> None:
+        """Add a block, evicting the least recently used ones."""
+        key = (facts.key, facts.etag, number)
+        with self._guard:
+            self._num_bytes += len(block) - len(self._blocks.pop(key, b""))
+            self._blocks[key] = block
+            while self._num_bytes > self.capacity:
+                self._num_bytes -= len(self._blocks.popitem(last=False)[1])
+
+
 class Bucket:
-    """One bucket below one prefix.
+    """One bucket below one prefix, with a cache of object blocks for its readers.
 
     Thread-safe, and picklable for spawned processes, not for forked ones.
     """
@@ -68,6 +102,7 @@ class Bucket:
     def __init__(self, address: ObjectAddress) -> None:
         self.address = address
         options = address.options
+        self.cache = BlockCache(options.cache_bytes)
         config: Any = {
             name: value for name in _PASSED_ON if (value := getattr(options, name)) is not None
         }

@@ -1,7 +1,6 @@
 """Cached range reads of the files of a group in a bucket."""
 
 import threading
-from collections import OrderedDict
 
 from dextouch.episodes.object_bucket import Bucket, ObjectFacts
 
@@ -14,66 +13,23 @@ MAX_READ_AHEAD = 8
 _TAIL = -1
 
 
-class BlockCache:
-    """LRU cache of object blocks, limited in bytes.
-
-    Args:
-        capacity: in bytes; 0 disables the cache.
-    """
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self._guard = threading.Lock()
-        self._blocks: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
-        self._num_bytes = 0
-
-    def get(self, facts: ObjectFacts, number: int) -> bytes | None:
-        """A cached block of this version of an object."""
-        key = (facts.key, facts.etag, number)
-        with self._guard:
-            block = self._blocks.get(key)
-            if block is not None:
-                self._blocks.move_to_end(key)
-        return block
-
-    def put(self, facts: ObjectFacts, number: int, block: bytes) -> None:
-        """Add a block, evicting the least recently used ones."""
-        key = (facts.key, facts.etag, number)
-        with self._guard:
-            self._num_bytes += len(block) - len(self._blocks.pop(key, b""))
-            self._blocks[key] = block
-            while self._num_bytes > self.capacity:
-                self._num_bytes -= len(self._blocks.popitem(last=False)[1])
-
-
-class CachedBucket:
-    """A bucket with its block cache."""
-
-    def __init__(self, bucket: Bucket) -> None:
-        self.bucket = bucket
-        self.cache = BlockCache(bucket.address.options.cache_bytes)
-
-    def __reduce__(self) -> tuple[type["CachedBucket"], tuple[Bucket]]:
-        return CachedBucket, (self.bucket,)
-
-
 class ObjectFile:
-    """One object, read by ranges.
+    """One object, read by ranges through the bucket's cache.
 
     Args:
-        place: bucket and cache.
+        bucket: of the object.
         key: of the object.
     """
 
-    def __init__(self, place: CachedBucket, key: str) -> None:
-        self._place, self._key = place, key
+    def __init__(self, bucket: Bucket, key: str) -> None:
+        self._bucket, self._key = bucket, key
         # Held during a request: a second reader then finds the first one's blocks in the cache.
         self._guard = threading.Lock()
         self._facts: ObjectFacts | None = None
         self._next_block, self._ahead = -1, 1
 
-    def __reduce__(self) -> tuple[type["ObjectFile"], tuple[CachedBucket, str]]:
-        return ObjectFile, (self._place, self._key)
+    def __reduce__(self) -> tuple[type["ObjectFile"], tuple[Bucket, str]]:
+        return ObjectFile, (self._bucket, self._key)
 
     def size(self) -> int | None:
         """Length in bytes; None if the object does not exist."""
@@ -94,8 +50,8 @@ class ObjectFile:
             stop = min(offset + length, facts.size)
             if stop <= offset:
                 return b""
-            if self._place.cache.capacity == 0:
-                return self._place.bucket.read(facts, offset, stop)
+            if self._bucket.cache.capacity == 0:
+                return self._bucket.read(facts, offset, stop)
             tail_start = max(0, facts.size - TAIL_BYTES)
             if offset >= tail_start:
                 return self._tail(facts, tail_start)[offset - tail_start : stop - tail_start]
@@ -103,23 +59,23 @@ class ObjectFile:
 
     def _look(self) -> ObjectFacts | None:
         if self._facts is None:
-            found = self._place.bucket.tail(self._key, TAIL_BYTES)
+            found = self._bucket.tail(self._key, TAIL_BYTES)
             if found is None:
                 return None
             self._facts = found[0]
-            self._place.cache.put(self._facts, _TAIL, found[1])
+            self._bucket.cache.put(self._facts, _TAIL, found[1])
         return self._facts
 
     def _tail(self, facts: ObjectFacts, start: int) -> bytes:
-        data = self._place.cache.get(facts, _TAIL)
+        data = self._bucket.cache.get(facts, _TAIL)
         if data is None:
-            data = self._place.bucket.read(facts, start, facts.size)
-            self._place.cache.put(facts, _TAIL, data)
+            data = self._bucket.read(facts, start, facts.size)
+            self._bucket.cache.put(facts, _TAIL, data)
         return data
 
     def _from_blocks(self, facts: ObjectFacts, offset: int, stop: int) -> bytes:
         first, last = offset // BLOCK_BYTES, (stop - 1) // BLOCK_BYTES
-        blocks = {n: self._place.cache.get(facts, n) for n in range(first, last + 1)}
+        blocks = {n: self._bucket.cache.get(facts, n) for n in range(first, last + 1)}
         missing = [number for number, block in blocks.items() if block is None]
         if missing:
             blocks |= self._fetch(facts, missing[0], missing[-1] + 1)
@@ -133,13 +89,13 @@ class ObjectFile:
         stop = min(max(stop, first + self._ahead), num_blocks)
         self._next_block = stop
         start = first * BLOCK_BYTES
-        data = self._place.bucket.read(facts, start, min(stop * BLOCK_BYTES, facts.size))
+        data = self._bucket.read(facts, start, min(stop * BLOCK_BYTES, facts.size))
         blocks = {
             number: data[number * BLOCK_BYTES - start : (number + 1) * BLOCK_BYTES - start]
             for number in range(first, stop)
         }
         for number, block in blocks.items():
-            self._place.cache.put(facts, number, block)
+            self._bucket.cache.put(facts, number, block)
         return blocks
 
 
@@ -147,13 +103,13 @@ class ObjectGroup:
     """The files of a committed group in a bucket.
 
     Args:
-        place: bucket and cache.
+        bucket: of the group.
         folder: prefix of its keys, `episodes/ID`.
         known: contents of files that were read already, by name.
     """
 
-    def __init__(self, place: CachedBucket, folder: str, known: dict[str, bytes]) -> None:
-        self._place, self._folder, self._known = place, folder, known
+    def __init__(self, bucket: Bucket, folder: str, known: dict[str, bytes]) -> None:
+        self._bucket, self._folder, self._known = bucket, folder, known
 
     @property
     def item_id(self) -> str:
@@ -164,8 +120,8 @@ class ObjectGroup:
         """Contents of a small file; None if it does not exist."""
         if name in self._known:
             return self._known[name]
-        return self._place.bucket.get(f"{self._folder}/{name}")
+        return self._bucket.get(f"{self._folder}/{name}")
 
     def source(self, name: str) -> ObjectFile:
         """A file for range reads."""
-        return ObjectFile(self._place, f"{self._folder}/{name}")
+        return ObjectFile(self._bucket, f"{self._folder}/{name}")

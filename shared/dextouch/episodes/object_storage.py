@@ -9,19 +9,32 @@ from functools import partial
 from pathlib import Path
 
 from dextouch.episodes.files import disk_errors, write_file
-from dextouch.episodes.format import COMMIT_FILE, KINDS, Kind, decode_commit
+from dextouch.episodes.format import (
+    COMMIT_FILE,
+    KINDS,
+    Attributes,
+    Kind,
+    attributes_id,
+    decode_commit,
+)
 from dextouch.episodes.migration import is_current
-from dextouch.episodes.object_address import ObjectAddress, parse_address
-from dextouch.episodes.object_bucket import Bucket
-from dextouch.episodes.object_files import CachedBucket, ObjectGroup
-from dextouch.episodes.staged_group import Attributes, attributes_id, read_committed, write_stage
-from dextouch.episodes.staging import abandoned_stages, new_stage, sweep_stages, unheld_folders
+from dextouch.episodes.object_address import parse_address
+from dextouch.episodes.object_bucket import Bucket, ObjectFacts
+from dextouch.episodes.object_files import ObjectGroup
+from dextouch.episodes.staged_group import (
+    abandoned_stages,
+    new_stage,
+    read_committed,
+    unheld_folders,
+    write_stage,
+)
 from dextouch.episodes.staging_recovery import (
     RecoveredGroup,
     raise_first,
     recover_all,
     recover_stage,
     samples_of,
+    sweep_stages,
 )
 from dextouch.episodes.uploads import delete_group, group_key, sweep_orphans, upload_group
 from dextouch.episodes.write_options import WriteOptions
@@ -46,20 +59,13 @@ def open_object_storage(
     Raises:
         InvalidInputError, UnknownNameError: an invalid address or option.
     """
-    address = parse_address(url, storage_options, work_folder)
-    return ObjectStorage(address, CachedBucket(Bucket(address)))
+    return ObjectStorage(Bucket(parse_address(url, storage_options, work_folder)))
 
 
 class UploadingWriter(EpisodeWriter):
-    """Writes a group in the work folder and uploads it on commit.
+    """Writes a group to the outbox in the work folder and uploads it on commit.
 
     After an interrupted upload the group stays in the outbox, from where `recover` uploads it.
-
-    Args:
-        stage: new folder.
-        target: in the outbox.
-        attributes: of an episode or a recording.
-        options: durability and speed.
     """
 
     upload: Callable[[], None]
@@ -85,19 +91,13 @@ class ObjectStorage:
     """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket.
 
     Args:
-        address: of the bucket, with the work folder.
-        place: the bucket and its block cache.
+        bucket: whose address names the work folder.
     """
 
-    def __init__(self, address: ObjectAddress, place: CachedBucket) -> None:
-        self._address, self._place, self._bucket = address, place, place.bucket
-        self._root = address.work_folder
-        self._outbox = self._root / _OUTBOX
-
-    @property
-    def root(self) -> Path:
-        """Work folder."""
-        return self._root
+    def __init__(self, bucket: Bucket) -> None:
+        self._bucket, self._address = bucket, bucket.address
+        self.root = self._address.work_folder
+        self._outbox = self.root / _OUTBOX
 
     def writer(self, kind: Kind, attributes: Attributes, options: WriteOptions) -> EpisodeWriter:
         """Writer of a new group.
@@ -116,46 +116,34 @@ class ObjectStorage:
             )
         if self.exists(kind, item_id):
             raise ConflictError(f"{kind} {item_id!r} exists already; choose another id")
-        stage = new_stage(self._root, kind, item_id)
+        stage = new_stage(self.root, kind, item_id)
         writer = UploadingWriter(stage=stage, target=target, attributes=attributes, options=options)
         writer.upload = lambda: self._upload(kind, target)
         writer.complete = self._complete
         return writer
 
     def group(self, kind: Kind, item_id: str) -> ObjectGroup:
-        """Files of a committed group.
-
-        Raises:
-            NotFoundError: no such id.
-        """
+        """Files of a committed group."""
         folder = group_key(kind, item_id)
         commit = self._bucket.get(f"{folder}/{COMMIT_FILE}")
         if commit is None:
             raise self._missing(kind, item_id)
-        return ObjectGroup(self._place, folder, {COMMIT_FILE: commit})
+        return ObjectGroup(self._bucket, folder, {COMMIT_FILE: commit})
 
     def exists(self, kind: Kind, item_id: str) -> bool:
         """Whether an id is committed."""
-        return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}") is not None
+        return self._commit_facts(kind, item_id) is not None
 
     def revision(self, kind: Kind, item_id: str) -> int:
-        """A 63-bit hash of the commit record's entity tag and modification time.
-
-        Raises:
-            NotFoundError: no such id.
-        """
-        facts = self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}")
+        """A 63-bit hash of the commit record's entity tag and modification time."""
+        facts = self._commit_facts(kind, item_id)
         if facts is None:
             raise self._missing(kind, item_id)
         text = f"{facts.etag} {facts.modified.isoformat()}"
         return int.from_bytes(hashlib.sha256(text.encode()).digest()[:8], "big") >> 1
 
     def num_bytes(self, kind: Kind, item_id: str) -> int:
-        """Size of a committed group in the bucket.
-
-        Raises:
-            NotFoundError: no such id.
-        """
+        """Size of a committed group in the bucket."""
         if not self.exists(kind, item_id):
             raise self._missing(kind, item_id)
         return sum(facts.size for facts in self._bucket.list(group_key(kind, item_id)))
@@ -166,21 +154,11 @@ class ObjectStorage:
         return sorted(parts[1] for parts in keys if len(parts) == 3 and parts[2] == COMMIT_FILE)
 
     def delete(self, kind: Kind, item_id: str) -> None:
-        """Delete a group: its commit record first, then its other objects.
-
-        Raises:
-            NotFoundError: no such id.
-        """
-        if not self.exists(kind, item_id):
-            raise self._missing(kind, item_id)
+        """Delete a group: its commit record first, then its other objects."""
         delete_group(self._bucket, kind, item_id)
 
     def migrate(self, kind: Kind, item_id: str) -> bool:
-        """Return False for a group of the current version; older ones cannot be migrated here.
-
-        Raises:
-            StorageError: a group of an older version: keys cannot be replaced atomically.
-        """
+        """Refuse a group of an older version: keys cannot be replaced atomically."""
         if is_current(self.group(kind, item_id), what=f"{kind} {item_id}"):
             return False
         raise StorageError(
@@ -192,14 +170,12 @@ class ObjectStorage:
         """Commit the stages of terminated writers, and complete interrupted uploads.
 
         Raises:
-            CorruptDataError: damage other than a torn tail; that stage is unchanged, all others are
-                completed.
             StorageError, UnavailableError: the bucket cannot be reached; try again later.
         """
-        if not self._root.is_dir():
+        if not self.root.is_dir():
             return []
         self._own_work_folder()
-        _, failures = recover_all(abandoned_stages(self._root), self._recover_stage)
+        _, failures = recover_all(abandoned_stages(self.root), self._recover_stage)
         found: builtins.list[RecoveredGroup] = []
         for kind in KINDS:
             waiting = unheld_folders(self._outbox / f"{kind}s")
@@ -212,7 +188,7 @@ class ObjectStorage:
     def sweep(self) -> int:
         """Remove stages that cannot be recovered, and objects of abandoned uploads."""
         with disk_errors("sweep"):
-            removed = sweep_stages(self._root, self._is_taken)
+            removed = sweep_stages(self.root, self._is_taken)
         return removed + sweep_orphans(self._bucket)
 
     def _upload(self, kind: Kind, folder: Path) -> None:
@@ -246,7 +222,7 @@ class ObjectStorage:
                 # It can be written again, and its writer is gone.
                 shutil.rmtree(folder, ignore_errors=True)
                 return None
-            stage = new_stage(self._root, kind, folder.name)
+            stage = new_stage(self.root, kind, folder.name)
             write_stage(folder, attributes)
             with disk_errors(f"move {folder}"):
                 stage.parent.mkdir(parents=True, exist_ok=True)
@@ -268,18 +244,21 @@ class ObjectStorage:
 
     def _own_work_folder(self) -> None:
         """Refuse a work folder of another address, whose groups belong to another bucket."""
-        owner, mine = self._root / _OWNER_FILE, self._address.fingerprint.encode()
-        with disk_errors(f"use work folder {self._root}"):
+        owner, mine = self.root / _OWNER_FILE, self._address.fingerprint.encode()
+        with disk_errors(f"use work folder {self.root}"):
             if not owner.is_file():
-                self._root.mkdir(parents=True, exist_ok=True)
-                partial = self._root / f"{_OWNER_FILE}-{uuid.uuid4().hex}"
+                self.root.mkdir(parents=True, exist_ok=True)
+                partial = self.root / f"{_OWNER_FILE}-{uuid.uuid4().hex}"
                 write_file(partial, mine)
                 partial.replace(owner)
             elif owner.read_bytes() != mine:
                 raise InvalidInputError(
-                    f"{self._address}: work folder {self._root} belongs to another address; "
+                    f"{self._address}: work folder {self.root} belongs to another address; "
                     "give each its own"
                 )
+
+    def _commit_facts(self, kind: Kind, item_id: str) -> ObjectFacts | None:
+        return self._bucket.head(f"{group_key(kind, item_id)}/{COMMIT_FILE}")
 
     def _missing(self, kind: Kind, item_id: str) -> NotFoundError:
         return NotFoundError(f"{kind} {item_id!r}: not in the store {self._address}")

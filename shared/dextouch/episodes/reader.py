@@ -1,11 +1,13 @@
 """Readers of episodes and recordings: streams by time, and windows on the model grid."""
 
-from typing import Literal, overload
+import os
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Literal, TypeVar, overload
 
 import numpy as np
 from jaxtyping import Int64
 
-from dextouch.episodes.camera_threads import each_camera
 from dextouch.episodes.format import STAMPS
 from dextouch.episodes.groups import GroupReader
 from dextouch.episodes.video import FULL_FORM, ImageForm
@@ -29,6 +31,23 @@ OWN_IMAGE_SHARE = 0.6
 # Tolerated share of dropped images; images of every second step miss more.
 MAX_UNSHOWN_SHARE = 0.05
 ACTION_STREAMS: dict[ActionKind, str] = {"measured": "action", "commanded": "action_commanded"}
+
+
+R = TypeVar("R")
+MAX_CAMERA_THREADS = 8
+_pools: list[ThreadPoolExecutor] = []
+# A forked worker does not inherit its parent's threads, so it must not reuse their pools.
+os.register_at_fork(after_in_child=_pools.clear)
+
+
+def each_camera(work: Callable[[str], R], cameras: Iterable[str]) -> dict[str, R]:
+    """Call `work` for every camera in a thread each; a single one in the caller's thread."""
+    names = list(cameras)
+    if len(names) < 2:
+        return {name: work(name) for name in names}
+    if not _pools:
+        _pools.append(ThreadPoolExecutor(MAX_CAMERA_THREADS, thread_name_prefix="camera"))
+    return dict(zip(names, _pools[0].map(work, names), strict=True))
 
 
 class RecordingReader(GroupReader[RecordingAttributes]):

@@ -10,9 +10,8 @@ from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ArrayEntry, shard_path, with_rows
 from dextouch.episodes.journal import (
     JournalWriter,
-    journal_path,
     part_path,
-    read_payloads,
+    read_payload,
     read_rows,
 )
 from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows, with_crc
@@ -39,8 +38,6 @@ class ShardWriter:
             else np.zeros(0, dtype=self._dtype)
         )
         self._num_pending = 0
-        self._index: list[tuple[int, int]] = []
-        self._offset = 0
         self._sha256 = hashlib.sha256()
         self._log = JournalWriter(stage, name)
 
@@ -80,7 +77,7 @@ class ShardWriter:
         chunk = self._chunk
         if num_whole < len(rows):
             # Rows of the interrupted append completed this storage chunk.
-            (payload,) = read_payloads(self._stage, self._name, rows[num_whole : num_whole + 1])
+            payload = read_payload(self._stage, self._name, rows[num_whole])
             chunk = decode_rows(payload[:-CRC_BYTES], self._entry, what=self._name).copy()
         self._log.truncate(num_whole)
         num_waiting = num_rows - (int(ends[num_whole - 1]) if num_whole else 0)
@@ -91,7 +88,7 @@ class ShardWriter:
     def finish(self) -> ArrayEntry:
         """Turn the log into the shard and return the array's entry of the commit record."""
         self.flush()
-        finish_shard(self._stage, self._name, self._entry, self._log, self._index)
+        finish_shard(self._stage, self._name, self._entry, self._log)
         entry = with_rows(self._entry, self.num_rows)
         return entry.model_copy(update={"sha256": self._sha256.hexdigest()})
 
@@ -107,31 +104,20 @@ class ShardWriter:
         self._num_pending = 0
 
     def _log_chunk(self, payload: bytes, num_rows: int) -> None:
-        encoded = with_crc(payload)
-        self._log.append(encoded, num_rows)
+        self._log.append(with_crc(payload), num_rows)
         if self._sync:
             self._log.sync()
-        self._index.append((self._offset, len(encoded)))
-        self._offset += len(encoded)
 
 
-def finish_shard(
-    stage: Path, name: str, entry: ArrayEntry, log: JournalWriter, index: list[tuple[int, int]]
-) -> None:
+def finish_shard(stage: Path, name: str, entry: ArrayEntry, log: JournalWriter) -> None:
     """Append the shard's index to a log's part file and rename it to the shard.
 
     The journal is kept until the whole group is committed, for recovery after a crash.
     """
-    data = np.array(index, dtype="<u8").reshape(-1, 2).tobytes()
+    data = np.array(log.index, dtype="<u8").reshape(-1, 2).tobytes()
     log.write_tail(data + google_crc32c.value(data).to_bytes(4, "little"))
     log.close()
     target = stage / name / shard_path(len(entry.shape))
     with disk_errors(f"close array {name}"):
         target.parent.mkdir(parents=True, exist_ok=True)
         part_path(stage, name).rename(target)
-
-
-def forget_journal(stage: Path, name: str) -> None:
-    """Remove the journal of an array whose group is about to be committed."""
-    with disk_errors(f"commit array {name}"):
-        journal_path(stage, name).unlink(missing_ok=True)

@@ -6,17 +6,21 @@ Images of `jpeg` and `h264` streams are object arrays of bytes.
 
 import os
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import TracebackType
 
+import google_crc32c
+
 from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
-from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
-from dextouch.episodes.recovery import RecoveryReport, lock_spool, recover
+from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
 from dextouch.episodes.spool_log import (
     LOG_FILE,
-    RecordBody,
+    LogRecords,
     SpoolLogWriter,
+    StreamRecord,
+    body_at,
+    open_log,
     read_bodies,
     read_records,
 )
@@ -42,13 +46,11 @@ __all__ = [
 
 
 @dataclass(frozen=True)
-class StreamRecord:
-    """An encoded batch of one stream, ready for a spool's log."""
+class RecoveryReport:
+    """Result of a recovery: samples by stream, and the number of bytes dropped."""
 
-    stream_name: str
-    body: RecordBody
-    first_t_host_ns: int
-    last_t_host_ns: int
+    num_samples: dict[str, int]
+    dropped_bytes: int
 
 
 class SpoolWriter:
@@ -83,17 +85,14 @@ class SpoolWriter:
         self._num_batches = dict.fromkeys(self._streams, 0)
         # The last stamp of each stream, a lower bound of the next one.
         self._last_t_host_ns: dict[str, int | None] = dict.fromkeys(self._streams)
-        end = None
-        if resume:
-            recover(path)
-            with disk_errors(f"resume spool {path.name}"):
-                (path / CLOSED_FILE).unlink(missing_ok=True)
-        else:
+        if not resume:
             _create(path, attributes)
-        self._lock = lock_spool(path)
-        if resume:
-            end = self._count()
-        self._log = SpoolLogWriter(path, end=end)
+        self._lock = _lock(path)
+        try:
+            self._log = SpoolLogWriter(path, end=self._resume() if resume else None)
+        except BaseException:
+            os.close(self._lock)
+            raise
         # Records that a crashed process wrote but did not sync count as kept from here on.
         self._is_dirty = resume
         self.flush()
@@ -144,8 +143,10 @@ class SpoolWriter:
         check_batch(descriptor, batch)
         if not len(batch):
             return None
-        body = RecordBody.of(batch_bytes(descriptor, batch), num_samples=len(batch))
-        return StreamRecord(stream_name, body, int(batch.t_host_ns[0]), int(batch.t_host_ns[-1]))
+        body, t_host_ns = batch_bytes(descriptor, batch), batch.t_host_ns
+        crc = google_crc32c.value(body)
+        first_ns, last_ns = int(t_host_ns[0]), int(t_host_ns[-1])
+        return StreamRecord(stream_name, body, crc, len(batch), first_ns, last_ns)
 
     def append_record(self, record: StreamRecord, *, flush: bool = False) -> None:
         """Append an encoded batch, as `append` does.
@@ -157,7 +158,7 @@ class SpoolWriter:
         name = record.stream_name
         check_follows(name, record.first_t_host_ns, self._last_t_host_ns[name])
         place = self._log.append(
-            record.body, stream=self._number(name), first_sample=self._num_samples[name]
+            record, stream=self._number(name), first_sample=self._num_samples[name]
         )
         self._is_dirty = True
         if flush:
@@ -166,7 +167,7 @@ class SpoolWriter:
             except StorageError:
                 self._log.undo(place)
                 raise
-        self._num_samples[name] += record.body.num_samples
+        self._num_samples[name] += record.num_samples
         self._num_batches[name] += 1
         self._last_t_host_ns[name] = record.last_t_host_ns
 
@@ -238,9 +239,11 @@ class SpoolWriter:
             raise UnknownNameError("stream", name, list(self._streams))
         return self._streams[name]
 
-    def _count(self) -> int:
-        """Count the samples of an existing log; returns its end."""
-        records = read_records(self.path)
+    def _resume(self) -> int:
+        """Count the samples of an existing log; returns where it goes on."""
+        records = _trusted_records(self.path)
+        with disk_errors(f"resume spool {self.path.name}"):
+            (self.path / CLOSED_FILE).unlink(missing_ok=True)
         for name, number in self._streams.items():
             rows = records.rows[records.rows["stream"] == number]
             self._num_samples[name] = int(rows["num_samples"].sum())
@@ -276,3 +279,53 @@ def _create(path: Path, attributes: RecordingAttributes) -> None:
         unborn.mkdir(parents=True)
         write_file(unborn / RECORDING_FILE, attributes.model_dump_json().encode())
         unborn.rename(path)
+
+
+def recover(path: Path) -> RecoveryReport:
+    """Truncate a spool to its last valid record after a crash.
+
+    Everything that `append` acknowledged is kept. The operation is idempotent.
+
+    Raises:
+        NotFoundError: no spool there.
+        ConflictError: it is being written.
+        CorruptDataError: damage other than a torn tail; nothing is changed.
+    """
+    attributes = read_attributes(path)
+    lock = _lock(path)
+    try:
+        records = _trusted_records(path)
+        SpoolLogWriter(path, end=records.end).close()
+    finally:
+        os.close(lock)
+    rows = records.rows
+    counts = {
+        stream.name: int(rows["num_samples"][rows["stream"] == number].sum())
+        for number, stream in enumerate(attributes.streams)
+    }
+    return RecoveryReport(counts, max(0, records.num_bytes - records.end))
+
+
+def _trusted_records(path: Path) -> LogRecords:
+    """The records of a log without those at its end whose body never reached the disk."""
+    if not (path / LOG_FILE).exists():
+        # The process died before it created the log.
+        SpoolLogWriter(path).close()
+    records = read_records(path)
+    num_rows = len(records.rows)
+    with open_log(path) as data:
+        while num_rows and body_at(data, records.rows[num_rows - 1]) is None:
+            num_rows -= 1
+    return replace(records, rows=records.rows[:num_rows])
+
+
+def _lock(path: Path) -> int:
+    """Lock a spool exclusively; the returned descriptor holds the lock until it is closed.
+
+    Raises:
+        ConflictError: another process is writing or recovering it.
+    """
+    lock = try_lock(path)
+    if lock is None:
+        raise ConflictError(f"spool {path.name!r}: another process is writing it")
+    return lock

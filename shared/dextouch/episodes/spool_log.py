@@ -214,17 +214,15 @@ def _next_header(data: LogBytes, place: int) -> int:
 
 
 @dataclass(frozen=True)
-class RecordBody:
-    """The body of a record with its checksum."""
+class StreamRecord:
+    """An encoded batch of one stream with its checksum, ready for a spool's log."""
 
-    data: bytes
-    crc32c: int
+    stream_name: str
+    body: bytes
+    body_crc32c: int
     num_samples: int
-
-    @staticmethod
-    def of(data: bytes, *, num_samples: int) -> "RecordBody":
-        """Compute the checksum of a body."""
-        return RecordBody(data, google_crc32c.value(data), num_samples)
+    first_t_host_ns: int
+    last_t_host_ns: int
 
 
 class SpoolLogWriter:
@@ -248,17 +246,17 @@ class SpoolLogWriter:
             os.pwrite(self._file, LOG_MAGIC, 0)
             self._cut(self._end)
 
-    def append(self, body: RecordBody, *, stream: int, first_sample: int) -> int:
+    def append(self, record: StreamRecord, *, stream: int, first_sample: int) -> int:
         """Append a record atomically and return its offset, for `undo`.
 
         Raises:
             StorageFullError: no space; the file is unchanged.
         """
-        place, length = self._end, len(body.data)
+        place, length = self._end, len(record.body)
         header = _HEADER.pack(
-            _MARK, place, first_sample, stream, body.num_samples, length, body.crc32c
+            _MARK, place, first_sample, stream, record.num_samples, length, record.body_crc32c
         )
-        parts = (header, _CRC.pack(google_crc32c.value(header)), body.data)
+        parts = (header, _CRC.pack(google_crc32c.value(header)), record.body)
         try:
             with disk_errors(
                 self._what, advice="what was recorded stays, free space and try again"

@@ -6,50 +6,80 @@ if it is recoverable.
 
 import errno
 import json
-from collections.abc import Mapping
+import os
+import uuid
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-
-from pydantic import ValidationError
 
 from dextouch.episodes.files import (
     disk_errors,
+    is_folder_at,
     partial_name,
     replace_file,
     sync_files,
     sync_folder,
+    try_lock,
     write_file,
 )
 from dextouch.episodes.format import (
-    ATTRIBUTES_KEY,
+    ATTRIBUTES,
     COMMIT_FILE,
+    MALFORMED,
     METADATA_FILE,
     ArrayEntry,
+    Attributes,
     CommitRecord,
     Kind,
     array_metadata,
+    attributes_id,
     encode_commit,
+    group_attributes,
     group_metadata,
+    kind_of,
     sha256_hex,
     shard_path,
 )
-from dextouch.episodes.shard_writer import forget_journal
+from dextouch.episodes.journal import forget_journal
+from dextouch.episodes.sources import LocalGroup
 from dextouch.errors import ConflictError, CorruptDataError
-from dextouch.schemas import EpisodeAttributes, RecordingAttributes, json_ready
+from dextouch.schemas import json_ready
 
+STAGING = ".staging"
 STAGE_FILE = "stage.json"
-Attributes = EpisodeAttributes | RecordingAttributes
+# Stage names end in a hexadecimal uuid4.
+_STAGE_NUMBER = "[0-9a-f]" * 32
 
 
-def attributes_id(attributes: Attributes) -> str:
-    """The episode or recording id of attributes."""
-    if isinstance(attributes, EpisodeAttributes):
-        return attributes.episode_id
-    return attributes.recording_id
+def new_stage(root: Path, kind: Kind, item_id: str) -> Path:
+    """A unique path for a new stage; the folder is not created."""
+    return root / STAGING / f"{kind}-{item_id}-{uuid.uuid4().hex}"
 
 
-def kind_of(attributes: Attributes) -> Kind:
-    """The kind of group that attributes describe."""
-    return "episode" if isinstance(attributes, EpisodeAttributes) else "recording"
+def stages_of(root: Path, kind: Kind, item_id: str) -> list[Path]:
+    """The stages of an id, sorted by name."""
+    return sorted((root / STAGING).glob(f"{kind}-{item_id}-{_STAGE_NUMBER}"))
+
+
+def unheld_folders(parent: Path) -> Iterator[Path]:
+    """Iterate over folders not locked by a writer, holding each one's lock meanwhile."""
+    for folder in sorted(parent.iterdir()) if parent.is_dir() else []:
+        try:
+            lock = try_lock(folder)
+        except FileNotFoundError:
+            continue  # committed since we listed
+        if lock is None:
+            continue
+        try:
+            # Its writer may have committed and unlocked it before we locked it.
+            if is_folder_at(lock, folder):
+                yield folder
+        finally:
+            os.close(lock)
+
+
+def abandoned_stages(root: Path) -> Iterator[Path]:
+    """Iterate over stages whose writer is gone, holding each one's lock meanwhile."""
+    return unheld_folders(root / STAGING)
 
 
 def write_stage(stage: Path, attributes: Attributes) -> None:
@@ -65,16 +95,13 @@ def read_stage(stage: Path) -> Attributes | None:
     Raises:
         CorruptDataError: `stage.json` is damaged.
     """
-    path = stage / STAGE_FILE
-    with disk_errors(f"read {path}"):
-        if not path.is_file():
-            return None
-        data = path.read_bytes()
+    data = LocalGroup(stage).get(STAGE_FILE)
+    if data is None:
+        return None
     try:
         known = json.loads(data)
-        model = EpisodeAttributes if known["kind"] == "episode" else RecordingAttributes
-        return model.model_validate_json(json.dumps(known["attributes"]))
-    except (ValueError, KeyError, TypeError, RecursionError, ValidationError) as error:
+        return ATTRIBUTES[known["kind"]].model_validate_json(json.dumps(known["attributes"]))
+    except MALFORMED as error:
         raise CorruptDataError(f"{stage.name}: {STAGE_FILE} is damaged ({error})") from error
 
 
@@ -82,15 +109,11 @@ def read_committed(stage: Path, kind: Kind) -> Attributes:
     """The attributes in the group metadata of a stage with a commit record.
 
     Raises:
-        CorruptDataError: they are damaged.
+        CorruptDataError: they are missing or damaged.
     """
-    path = stage / METADATA_FILE
-    with disk_errors(f"read {path}"):
-        data = path.read_bytes()
-    model = EpisodeAttributes if kind == "episode" else RecordingAttributes
     try:
-        return model.model_validate_json(json.dumps(json.loads(data)["attributes"][ATTRIBUTES_KEY]))
-    except (ValueError, KeyError, TypeError, RecursionError, ValidationError) as error:
+        return group_attributes(LocalGroup(stage).get(METADATA_FILE) or b"", ATTRIBUTES[kind])
+    except MALFORMED as error:
         raise CorruptDataError(f"{stage.name}: {METADATA_FILE} is damaged ({error})") from error
 
 

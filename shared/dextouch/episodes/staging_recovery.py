@@ -6,6 +6,7 @@ import shutil
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import reduce
+from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +16,12 @@ from dextouch.episodes.format import (
     COMMIT_FILE,
     METADATA_FILE,
     ArrayEntry,
+    Attributes,
     CommitRecord,
     Kind,
+    attributes_id,
     decode_commit,
+    kind_of,
     shard_path,
     stream_arrays,
     with_rows,
@@ -26,18 +30,17 @@ from dextouch.episodes.journal import (
     JournalWriter,
     journal_path,
     part_path,
-    read_payloads,
+    read_payload,
     read_rows,
 )
 from dextouch.episodes.shard_reader import CRC_BYTES, decode_rows
 from dextouch.episodes.shard_writer import finish_shard
+from dextouch.episodes.sources import LocalGroup
 from dextouch.episodes.staged_group import (
     STAGE_FILE,
-    Attributes,
-    attributes_id,
+    abandoned_stages,
     change_attributes,
     commit_stage,
-    kind_of,
     publish_stage,
     read_committed,
     read_stage,
@@ -177,14 +180,25 @@ def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
         return True
 
 
+def sweep_stages(root: Path, is_taken: IsTaken) -> int:
+    """Remove abandoned stages that `recover_stage` cannot recover, and return their number.
+
+    Args:
+        root: folder with the stages.
+        is_taken: whether an id is in use.
+    """
+    removed = 0
+    for stage in abandoned_stages(root):
+        if not is_recoverable(stage, is_taken):
+            shutil.rmtree(stage)
+            removed += 1
+    return removed
+
+
 def _whole_commit(stage: Path) -> CommitRecord | None:
-    path = stage / COMMIT_FILE
-    with disk_errors(f"read {path}"):
-        if not path.is_file():
-            return None
-        data = path.read_bytes()
+    data = LocalGroup(stage).get(COMMIT_FILE)
     try:
-        return decode_commit(data, what=stage.name)[0]
+        return None if data is None else decode_commit(data, what=stage.name)[0]
     except StorageError:
         # Torn by the crash: its content is recovered from the logs. Or of an older version,
         # which a migration put aside.
@@ -216,7 +230,7 @@ def _trusted_rows(stage: Path, name: str, entry: ArrayEntry) -> np.ndarray:
     # After a power loss there may be rows without their payload.
     while len(rows):
         try:
-            read_payloads(stage, name, rows[-1:])
+            read_payload(stage, name, rows[-1])
         except CorruptDataError:
             rows = rows[:-1]
         else:
@@ -235,18 +249,17 @@ def _cut_array(stage: Path, name: str, entry: ArrayEntry, num_samples: int) -> A
             f"{num_samples} samples; it was not written by this release"
         )
     if entry.codec == "zstd" and num_kept:
-        entry = _as_written(entry, read_payloads(stage, name, rows[:1])[0])
+        entry = _as_written(entry, read_payload(stage, name, rows[0]))
     digest = hashlib.sha256()
     for row in rows[:num_kept]:
-        payload = read_payloads(stage, name, np.array([row]))[0][:-CRC_BYTES]
+        payload = read_payload(stage, name, row)[:-CRC_BYTES]
         if entry.codec == "zstd":
             values = decode_rows(payload, entry, what=f"{stage.name}: array {name!r}")
             payload = values[: int(row["num_rows"])].tobytes()
         digest.update(payload)
-    index = [(int(row["offset"]), int(row["length"])) for row in rows[:num_kept]]
     log = JournalWriter(stage, name, num_rows=num_kept)
     try:
-        finish_shard(stage, name, entry, log, index)
+        finish_shard(stage, name, entry, log)
     finally:
         log.close()
     return with_rows(entry, num_samples).model_copy(update={"sha256": digest.hexdigest()})
@@ -267,9 +280,12 @@ def _as_written(entry: ArrayEntry, payload: bytes) -> ArrayEntry:
 def _as_recovered(attributes: Attributes, is_taken: IsTaken) -> Attributes:
     """The attributes marked as recovered, under another id if theirs was taken meanwhile."""
     kind, item_id = kind_of(attributes), attributes_id(attributes)
-    number = 0
-    free = item_id
-    while is_taken(kind, free):
-        number += 1
-        free = f"{item_id[:112]}-recovered-{number}"
-    return attributes.model_copy(update={f"{kind}_id": free, "recovered": True})
+    if is_taken(kind, item_id):
+        item_id = free_id(kind, item_id, "recovered", is_taken)
+    return attributes.model_copy(update={f"{kind}_id": item_id, "recovered": True})
+
+
+def free_id(kind: Kind, item_id: str, label: str, is_taken: IsTaken) -> str:
+    """The first id `ID-LABEL-1`, `ID-LABEL-2` … that is not in use."""
+    names = (f"{item_id[:112]}-{label}-{number}" for number in count(1))
+    return next(name for name in names if not is_taken(kind, name))

@@ -2,16 +2,22 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from dextouch.episodes.format import KINDS, Kind, check_id
+from dextouch.episodes.format import (
+    ATTRIBUTES,
+    KINDS,
+    Attributes,
+    Kind,
+    attributes_id,
+    check_id,
+)
 from dextouch.episodes.group_contents import read_group, read_live
 from dextouch.episodes.local_storage import LocalStorage, local_folder
 from dextouch.episodes.reader import EpisodeReader, RecordingReader
 from dextouch.episodes.sources import GroupFiles
-from dextouch.episodes.staged_group import Attributes, attributes_id
-from dextouch.episodes.staging import stages_of
+from dextouch.episodes.staged_group import stages_of
 from dextouch.episodes.staging_recovery import RecoveredGroup
-from dextouch.episodes.storage import Storage
 from dextouch.episodes.trash import (
     TrashEntry,
     TrashKind,
@@ -25,12 +31,15 @@ from dextouch.episodes.writer import EpisodeWriter
 from dextouch.errors import InvalidInputError, NotFoundError, UnavailableError, UnknownNameError
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
+if TYPE_CHECKING:
+    from dextouch.episodes.object_storage import ObjectStorage
+
 _OBJECT_SCHEME = "s3://"
 
 
 def open_storage(
     url: str | Path, storage_options: Mapping[str, str] | None, work_folder: str | Path | None
-) -> Storage:
+) -> "LocalStorage | ObjectStorage":
     """Storage backend for a URL; see `EpisodeStore` for the arguments."""
     if isinstance(url, str) and url.startswith(_OBJECT_SCHEME):
         # Imported lazily, so that a local store does not need obstore.
@@ -95,9 +104,7 @@ class EpisodeStore:
             ConflictError: the id exists already.
             InvalidInputError: attributes of the other kind.
         """
-        if kind not in KINDS:
-            raise UnknownNameError("kind", kind, list(KINDS))
-        model = EpisodeAttributes if kind == "episode" else RecordingAttributes
+        model = ATTRIBUTES[_check_kind(kind)]
         if not isinstance(attributes, model):
             raise InvalidInputError(
                 f"writer: got {type(attributes).__name__}, expected {model.__name__} for {kind!r}"
@@ -157,9 +164,7 @@ class EpisodeStore:
 
     def list(self, *, kind: Kind = "episode") -> list[str]:
         """Sorted committed ids."""
-        if kind not in KINDS:
-            raise UnknownNameError("kind", kind, list(KINDS))
-        return self._storage.list(kind)
+        return self._storage.list(_check_kind(kind))
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
         """Move an episode or recording to the trash.
@@ -172,13 +177,11 @@ class EpisodeStore:
         Raises:
             NotFoundError: no such id.
         """
-        kind, item_id = _check(kind, item_id)
+        self._storage.group(*_check(kind, item_id))
         if for_good or not isinstance(self._storage, LocalStorage):
             self._storage.delete(kind, item_id)
-            return
-        if not self.exists(item_id, kind=kind):
-            raise NotFoundError(f"{kind} {item_id!r}: not in the store {self.root}")
-        put_into_trash(self.root, kind, item_id)
+        else:
+            put_into_trash(self.root, kind, item_id)
 
     def restore(self, item_id: str, *, kind: TrashKind = "episode") -> None:
         """Restore the last deleted group of an id; raises as `restore_from_trash`."""
@@ -235,6 +238,10 @@ class EpisodeStore:
 
 def _check(kind: Kind, item_id: str) -> tuple[Kind, str]:
     """Validate a kind and an id."""
+    return _check_kind(kind), check_id(item_id, kind=f"{kind} id")
+
+
+def _check_kind(kind: Kind) -> Kind:
     if kind not in KINDS:
         raise UnknownNameError("kind", kind, list(KINDS))
-    return kind, check_id(item_id, kind=f"{kind} id")
+    return kind

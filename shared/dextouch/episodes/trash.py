@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from dextouch.episodes.files import disk_errors, sync_folder
+from dextouch.episodes.files import disk_errors, folder_bytes, sync_folder
 from dextouch.episodes.format import COMMIT_FILE, KINDS
+from dextouch.episodes.staged_group import STAGING
 from dextouch.errors import ConflictError, NotFoundError, UnknownNameError
 
 TRASH = ".trash"
@@ -24,7 +25,7 @@ HOMES: dict[TrashKind, str] = {
     "episode": "episodes",
     "recording": "recordings",
     "upload": ".uploads",
-    "stage": ".staging",
+    "stage": STAGING,
 }
 _NAME = re.compile(rf"({'|'.join(TRASH_KINDS)})\.([a-z0-9_-]+)\.([0-9]{{1,20}})")
 
@@ -79,7 +80,7 @@ def list_trash(root: Path) -> list[TrashEntry]:
             match = _NAME.fullmatch(path.name)
             if match is not None:
                 kind = next(known for known in TRASH_KINDS if known == match[1])
-                size = _num_bytes(path)
+                size = folder_bytes(path)
                 entries.append(TrashEntry(kind, match[2], int(match[3]), size, path))
     return sorted(entries, key=lambda entry: entry.deleted_at_ns)
 
@@ -144,11 +145,3 @@ def _home(kind: TrashKind) -> str:
     if kind not in HOMES:
         raise UnknownNameError("kind", kind, list(HOMES))
     return HOMES[kind]
-
-
-def _num_bytes(folder: Path) -> int:
-    total = 0
-    for path in folder.rglob("*"):
-        with contextlib.suppress(FileNotFoundError):
-            total += path.lstat().st_size if path.is_file() else 0
-    return total

@@ -1,6 +1,6 @@
 """Serialization of windows with msgpack, for the store's HTTP interface."""
 
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 
@@ -11,18 +11,21 @@ from dextouch.schemas import ActionKind
 from dextouch.streams import pack, unpack
 
 _IMAGES, _IMAGE_DT = "images/", "image_dt_ns/"
+# Type and shape of the fields that are one array each; -1 is the number of steps.
+_ARRAYS: dict[str, tuple[str, tuple[int, ...]]] = {
+    "tactile_kpa": ("float32", (-1, 2, 320)),
+    "tactile_valid": ("bool", (-1, 2)),
+    "actions": ("float64", (-1, 67)),
+    "t_ref_ns": ("int64", (-1,)),
+    "anchor": ("float64", (3, 4, 4)),
+    "K_head": ("float64", (3, 3)),
+}
 
 
 def encode_window(window: Window) -> bytes:
     """Serialize a window."""
-    arrays = {
-        "tactile_kpa": window.tactile_kpa,
-        "tactile_valid": window.tactile_valid,
-        "actions": window.actions,
-        "t_ref_ns": window.t_ref_ns,
-        "anchor": np.stack(window.anchor.as_tuple()),
-        "K_head": window.K_head,
-    }
+    arrays = {name: getattr(window, name) for name in _ARRAYS}
+    arrays["anchor"] = np.stack(window.anchor.as_tuple())
     for camera, images in window.images.items():
         arrays[_IMAGES + camera] = images
         arrays[_IMAGE_DT + camera] = window.image_dt_ns[camera]
@@ -45,31 +48,22 @@ def decode_window(data: bytes, *, max_bytes: int) -> Window:
             f"window: got action kind {action_kind!r} and instruction {instruction!r}, "
             f"expected one of {get_args(ActionKind)} and a text"
         )
-    known_kind: ActionKind = fields["action_kind"]
-    left, right, camera_head = arrays["anchor"]
+    plain: dict[str, Any] = {name: arrays[name] for name in _ARRAYS}
+    plain["anchor"] = AnchorPoses(*arrays["anchor"])
     return Window(
         images={camera: arrays[_IMAGES + camera] for camera in cameras},
         image_dt_ns={camera: arrays[_IMAGE_DT + camera] for camera in cameras},
-        tactile_kpa=arrays["tactile_kpa"],
-        tactile_valid=arrays["tactile_valid"],
-        actions=arrays["actions"],
-        action_kind=known_kind,
+        action_kind=fields["action_kind"],
         instruction=instruction,
-        t_ref_ns=arrays["t_ref_ns"],
-        anchor=AnchorPoses(left, right, camera_head),
-        K_head=arrays["K_head"],
+        **plain,
     )
 
 
 def _check_arrays(arrays: dict[str, np.ndarray], cameras: list[str]) -> None:
     n = len(arrays["t_ref_ns"]) if "t_ref_ns" in arrays and arrays["t_ref_ns"].ndim else 0
-    expected: dict[str, tuple[str, tuple[int, ...]]] = {
-        "tactile_kpa": ("float32", (n, 2, 320)),
-        "tactile_valid": ("bool", (n, 2)),
-        "actions": ("float64", (n, 67)),
-        "t_ref_ns": ("int64", (n,)),
-        "anchor": ("float64", (3, 4, 4)),
-        "K_head": ("float64", (3, 3)),
+    expected = {
+        name: (dtype, tuple(n if size < 0 else size for size in shape))
+        for name, (dtype, shape) in _ARRAYS.items()
     }
     for camera in cameras:
         # Height and width vary by camera; gray images have one channel.

@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
@@ -9,14 +10,15 @@ from types import TracebackType
 import numpy as np
 
 from dextouch.episodes.files import disk_errors, make_held_folder
-from dextouch.episodes.format import STAMPS, stream_arrays
-from dextouch.episodes.staged_group import (
+from dextouch.episodes.format import (
+    STAMPS,
     Attributes,
     attributes_id,
-    commit_stage,
     kind_of,
-    write_stage,
+    stream_arrays,
+    with_counts,
 )
+from dextouch.episodes.staged_group import commit_stage, write_stage
 from dextouch.episodes.staging_recovery import RecoveredGroup, recover_stage
 from dextouch.episodes.stream_writer import StreamWriter
 from dextouch.episodes.write_options import WriteOptions
@@ -27,7 +29,6 @@ from dextouch.errors import (
     StorageError,
     UnknownNameError,
 )
-from dextouch.schemas import EpisodeAttributes, LedgerEntry
 from dextouch.streams import (
     ENCODED_UNITS,
     MAX_STREAMS,
@@ -37,6 +38,8 @@ from dextouch.streams import (
 )
 
 DROPPED_IMAGES = "dropped_before_encoder"
+# Values, and stamps by name.
+Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 class EpisodeWriter:
@@ -264,12 +267,28 @@ class EpisodeWriter:
 
     def _with_losses(self) -> Attributes:
         """The attributes with counts of images dropped by this writer."""
-        attributes = self._with_streams()
         dropped = {name: s.num_dropped for name, s in self._streams.items() if s.num_dropped}
-        if isinstance(attributes, EpisodeAttributes):
-            figures = {f"{name}_{DROPPED_IMAGES}": float(n) for name, n in dropped.items()}
-            return attributes.model_copy(update={"quality": attributes.quality | figures})
-        entries = tuple(
-            LedgerEntry(stream=name, event=DROPPED_IMAGES, count=n) for name, n in dropped.items()
-        )
-        return attributes.model_copy(update={"ledger": attributes.ledger + entries})
+        return with_counts(self._with_streams(), DROPPED_IMAGES, dropped)
+
+
+def write_blocks(
+    stage: Path,
+    target: Path,
+    attributes: Attributes,
+    streams: Iterable[tuple[str, Iterable[Block]]],
+) -> None:
+    """Write a whole group that can be written again; after an exception nothing is left.
+
+    Args:
+        stage: new folder on the store's file system.
+        target: where the group appears.
+        attributes: of the group.
+        streams: names, and blocks of values and stamps.
+    """
+    options = WriteOptions(recoverable=False)
+    with EpisodeWriter(
+        stage=stage, target=target, attributes=attributes, options=options
+    ) as writer:
+        for name, blocks in streams:
+            for values, stamps in blocks:
+                writer.append(name, values=values, **stamps)

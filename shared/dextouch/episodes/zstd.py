@@ -13,7 +13,6 @@ from dextouch.errors import CorruptDataError
 # Far above current chunks (1 MiB, or one sample), and above the half second of raw images that
 # earlier releases wrote.
 MAX_CHUNK_BYTES = 1 << 29
-_MAGIC = bytes.fromhex("28b52ffd")
 _REPEATED = 1
 
 
@@ -62,24 +61,17 @@ def content_bytes(frame: bytes) -> int:
 
 def frame_bytes(frame: bytes) -> int | None:
     """Length of the first zstd frame, found by walking its blocks; None if it is incomplete."""
-    place, length = _size_field(frame)
-    place += length
+    try:
+        place = zstandard.frame_header_size(frame)
+        has_checksum = zstandard.get_frame_parameters(frame).has_checksum
+    except zstandard.ZstdError:
+        return None
     last = False
-    while place > 0 and not last:
+    while not last:
         header = int.from_bytes(frame[place : place + 3], "little")
         last, kind, size = bool(header & 1), header >> 1 & 3, header >> 3
         place += 3 + (1 if kind == _REPEATED else size)
         if place > len(frame):
             return None
-    place += 4 * bool(last and frame[4] & 0x04)
-    return place if 0 < place <= len(frame) else None
-
-
-def _size_field(frame: bytes) -> tuple[int, int]:
-    """Offset and width of a frame's content size field; (0, 0) if absent."""
-    if len(frame) < 6 or frame[:4] != _MAGIC:
-        return 0, 0
-    descriptor = frame[4]
-    single_segment = bool(descriptor & 0x20)
-    start = 5 + (not single_segment) + (0, 1, 2, 4)[descriptor & 0x03]
-    return start, (int(single_segment), 2, 4, 8)[descriptor >> 6]
+    place += 4 * has_checksum
+    return place if place <= len(frame) else None

@@ -82,10 +82,11 @@ def test_admission_bounds_requests_and_bytes():
         pass
 
 
-def test_the_reserve_stays_free_but_for_finishing(tmp_path):
-    reserve = DiskReserve(
-        tmp_path / "not" / "there", min_free_bytes=1000, free_bytes=lambda _: 1500
-    )
+def test_the_reserve_stays_free_but_for_finishing(tmp_path, monkeypatch):
+    real = DiskReserve(tmp_path / "not" / "there", min_free_bytes=0)
+    assert real.free_bytes() > 0
+    monkeypatch.setattr(admission_module, "free_bytes_of", lambda _: 1500)
+    reserve = DiskReserve(tmp_path / "not" / "there", min_free_bytes=1000)
     reserve.check_upload(500)
     with pytest.raises(StorageFullError, match="bytes exceed the") as caught:
         reserve.check_upload(501)
@@ -93,8 +94,6 @@ def test_the_reserve_stays_free_but_for_finishing(tmp_path):
     reserve.check_commit(1500)
     with pytest.raises(StorageFullError):
         reserve.check_commit(1501)
-    real = DiskReserve(tmp_path / "not" / "there", min_free_bytes=0)
-    assert real.free_bytes() > 0
 
 
 @pytest.mark.parametrize("bound", [{"max_batches_in_flight": 1}, {"max_bytes_in_flight": 1024}])

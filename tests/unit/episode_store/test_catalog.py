@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, LimitExceededError, StorageError
 from services.episode_store import changes as changes_module
-from services.episode_store.catalog import Catalog, EpisodeFilter, RecordingFilter
+from services.episode_store.catalog import Catalog, CatalogFilter, EpisodeFilter
 from tests.unit.episode_store.episodes import write_episode
 
 MORNING, NOON = (datetime(2026, 5, 4, hour, tzinfo=UTC) for hour in (8, 12))
@@ -163,7 +163,7 @@ def test_recordings_are_filtered_too(start, attributes, batch_of, store):
     catalog = Catalog(store)
 
     def found(**wanted):
-        rows = catalog.recordings(RecordingFilter.model_validate(wanted), limit=9).recordings
+        rows = catalog.recordings(CatalogFilter.model_validate(wanted), limit=9).recordings
         return [row.recording_id for row in rows]
 
     assert found() == ["take-0", "take-1"]

@@ -6,7 +6,7 @@ import google_crc32c
 import numpy as np
 import pytest
 
-from dextouch.episodes.journal import read_payloads, read_rows
+from dextouch.episodes.journal import read_payload, read_rows
 from dextouch.errors import CorruptDataError
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import StreamDescriptor
@@ -35,7 +35,7 @@ def test_whole_rows_are_read(tmp_path, rows):
     write_log(tmp_path, rows, b"".join(PAYLOADS))
     found = read_rows(tmp_path, "force")
     assert found["offset"].tolist() == OFFSETS
-    assert read_payloads(tmp_path, "force", found) == PAYLOADS
+    assert [read_payload(tmp_path, "force", row) for row in found] == PAYLOADS
 
 
 @pytest.mark.parametrize(

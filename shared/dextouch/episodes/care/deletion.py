@@ -4,21 +4,21 @@ The plan is journaled first (`.deletions/`), so that repeating an interrupted de
 even when the recordings that led to derived episodes are already gone.
 """
 
-import fcntl
 import json
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+
+from pydantic import BaseModel, ValidationError
 
 from dextouch.episodes.care.store_facts import PLACES, Facts, Wanted, all_facts, small_files
-from dextouch.episodes.files import disk_errors, replace_file
-from dextouch.episodes.format import sha256_hex
-from dextouch.episodes.trash import HOMES, TRASH, TrashKind, put_into_trash, remove_for_good
+from dextouch.episodes.files import disk_errors, replace_file, try_lock
+from dextouch.episodes.format import Kind, sha256_hex
+from dextouch.episodes.trash import TRASH, put_into_trash, remove_for_good
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
 RECEIPT_VERSION = 1
@@ -59,6 +59,15 @@ class Victim:
     folder: str
     sha256: str | None
     reason: str
+
+
+class _Intent(BaseModel):
+    """Journal of a deletion: the plan, and what the store held before."""
+
+    request: DeletionRequest
+    started_at: str
+    before: dict[str, list[str]]
+    victims: list[Victim]
 
 
 @dataclass(frozen=True)
@@ -117,20 +126,12 @@ def plan_deletion(
             if reason is None:
                 continue
             waiting.remove(facts)
-            found.append(
-                Victim(
-                    facts.kind,
-                    facts.item_id,
-                    facts.place,
-                    facts.folder.name,
-                    facts.content_sha256,
-                    reason,
-                )
-            )
+            name, sha256 = facts.folder.name, facts.content_sha256
+            found.append(Victim(facts.kind, facts.item_id, facts.place, name, sha256, reason))
             if spreads:
                 grown = True
                 names.add((facts.kind, facts.item_id))
-                hashes |= {facts.content_sha256} - {None}
+                hashes |= {sha256} - {None}
                 # Earlier versions, left behind by a repair or a migration.
                 names |= {(k, i) for k, i, _ in facts.lineage if _is_version(facts, k, i)}
                 hashes |= {h for k, i, h in facts.lineage if h and _is_version(facts, k, i)}
@@ -144,7 +145,8 @@ def _reason(
         if facts.operator == request.operator:
             return "operator"
         wanted = Wanted({request.operator})
-        if not facts.readable and any(_words(wanted, path) for path in small_files(facts.folder)):
+        files = ((path.name, path) for path in small_files(facts.folder))
+        if not facts.readable and _references(wanted, files):
             return "damaged, names the operator"
     elif (facts.kind, facts.item_id) == ("recording", request.recording):
         return "recording"
@@ -198,19 +200,19 @@ def delete_for_good(
         raise InvalidInputError(
             f"deletion: receipt {receipt_path} lies in the store, expected a file outside of it"
         )
-    intent = _intent_path(root, request)
-    started_at, before, known = _read_intent(intent, root)
+    path = _intent_path(root, request)
+    intent = _read_intent(path, root, request)
+    known = intent.victims
     for _ in range(_MAX_ROUNDS):
-        victims = [v for v in plan_deletion(root, request, known=known) if v not in known]
-        known += victims
+        known += [v for v in plan_deletion(root, request, known=known) if v not in known]
         if not known:
             raise NotFoundError(f"deletion: nothing in {root} stems from {_asked(request)!r}")
-        _write_intent(intent, request, started_at, before, known)
+        _write_intent(path, intent)
         went = [victim for victim in known if _remove(root, victim)]
         if not went:
             break
     words = {v.id for v in known} | {v.sha256 for v in known if v.sha256} | {_asked(request)}
-    remaining, unreadable, num_files = search(root, words, skip=intent)
+    remaining, unreadable, num_files = search(root, words, skip=path)
     if checkpoints is not None:
         more, num_more = search_checkpoints(checkpoints, words)
         remaining, num_files = remaining + more, num_files + num_more
@@ -218,9 +220,9 @@ def delete_for_good(
     deleted = tuple(v for v in known if (v.place, v.folder) not in left)
     receipt = DeletionReceipt(
         request=request,
-        started_at=started_at,
+        started_at=intent.started_at,
         finished_at=_now(),
-        before=before,
+        before=intent.before,
         after=_listing(root),
         deleted=deleted,
         remaining=tuple(remaining),
@@ -231,9 +233,9 @@ def delete_for_good(
     with disk_errors(f"write {receipt_path}"):
         replace_file(receipt_path, json.dumps(asdict(receipt), indent=2).encode() + b"\n")
         if not left:
-            intent.unlink()
+            path.unlink()
             with suppress(OSError):
-                intent.parent.rmdir()
+                path.parent.rmdir()
     return receipt
 
 
@@ -249,32 +251,23 @@ def search(
     facts = all_facts(root)
     for item in facts:
         where = f"{item.place}/{item.folder.name}"
-        named = wanted.in_text(item.item_id)
-        if named:
+        if named := wanted.in_text(item.item_id):
             found.append(Reference(where, tuple(named)))
-        for path in small_files(item.folder):
-            num_files += 1
-            if names := _words(wanted, path):
-                found.append(Reference(f"{where}/{path.name}", tuple(names)))
-    others = {p: _words(wanted, p) for p in small_files(root / INTENTS) if p != skip}
-    found += [
-        Reference(f"{INTENTS}/{p.name}", tuple(names)) for p, names in others.items() if names
-    ]
+        files = [(f"{where}/{path.name}", path) for path in small_files(item.folder)]
+        num_files += len(files)
+        found += _references(wanted, files)
+    others = ((f"{INTENTS}/{p.name}", p) for p in small_files(root / INTENTS) if p != skip)
+    found += _references(wanted, others)
     unreadable = [f"{item.place}/{item.folder.name}" for item in facts if not item.readable]
     return found, unreadable, num_files
 
 
 def search_checkpoints(folder: Path, words: set[str]) -> tuple[list[Reference], int]:
     """Find references to identifiers in checkpoints: safetensors headers and JSON beside them."""
-    wanted, found, num_files = Wanted(words), [], 0
     with disk_errors(f"search {folder}"):
-        for path in sorted(folder.rglob("*")):
-            if path.suffix not in {".safetensors", ".json"} or not path.is_file():
-                continue
-            num_files += 1
-            if names := wanted.found_in(_header(path)):
-                found.append(Reference(str(path), tuple(names)))
-    return found, num_files
+        paths = [p for p in sorted(folder.rglob("*")) if p.suffix in {".safetensors", ".json"}]
+        files = [(str(path), path) for path in paths if path.is_file()]
+        return _references(Wanted(words), files, read=_header), len(files)
 
 
 def _header(path: Path) -> bytes:
@@ -285,9 +278,19 @@ def _header(path: Path) -> bytes:
         return file.read(min(size, _MAX_HEADER_BYTES))
 
 
-def _words(wanted: Wanted, path: Path) -> list[str]:
+def _contents(path: Path) -> bytes:
     with disk_errors(f"search {path.name}"):
-        return wanted.found_in(path.read_bytes())
+        return path.read_bytes()
+
+
+def _references(
+    wanted: Wanted,
+    files: Iterable[tuple[str, Path]],
+    *,
+    read: Callable[[Path], bytes] = _contents,
+) -> list[Reference]:
+    names = ((where, tuple(wanted.found_in(read(path)))) for where, path in files)
+    return [Reference(where, found) for where, found in names if found]
 
 
 def _remove(root: Path, victim: Victim) -> bool:
@@ -295,22 +298,21 @@ def _remove(root: Path, victim: Victim) -> bool:
     folder = root / victim.place / victim.folder
     if not folder.exists() and not folder.is_symlink():
         return False
-    homes: dict[str, TrashKind] = {place: kind for kind, place in HOMES.items()}
     if victim.place == TRASH or folder.is_symlink() or not folder.is_dir():
         remove_for_good(folder)
         return True
     with disk_errors(f"delete {victim.folder}"):
-        descriptor = os.open(folder, os.O_RDONLY)
+        lock = try_lock(folder)
+    if lock is None:
+        return False
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         if victim.place in {"episodes", "recordings"}:
             # The rename makes it invisible at once, whatever happens to this process afterwards.
-            folder = put_into_trash(root, homes[victim.place], victim.folder)
+            kind: Kind = "episode" if victim.place == "episodes" else "recording"
+            folder = put_into_trash(root, kind, victim.folder)
         remove_for_good(folder)
-    except BlockingIOError:
-        return False
     finally:
-        os.close(descriptor)
+        os.close(lock)
     return True
 
 
@@ -334,34 +336,20 @@ def _intent_path(root: Path, request: DeletionRequest) -> Path:
     return root / INTENTS / f"{sha256_hex(json.dumps(asdict(request)).encode())[:32]}.json"
 
 
-def _read_intent(path: Path, root: Path) -> tuple[str, dict[str, list[str]], list[Victim]]:
+def _read_intent(path: Path, root: Path, request: DeletionRequest) -> _Intent:
     with disk_errors("read what a deletion had planned"):
         if not path.is_file():
-            return _now(), _listing(root), []
+            return _Intent(request=request, started_at=_now(), before=_listing(root), victims=[])
         data = path.read_bytes()
     try:
-        plain: dict[str, Any] = json.loads(data)
-        known = [Victim(**victim) for victim in plain["victims"]]
-        return str(plain["started_at"]), dict(plain["before"]), known
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        return _Intent.model_validate_json(data)
+    except ValidationError as error:
         raise CorruptDataError(
             f"deletion: {path} is damaged ({error}); remove it and repeat the deletion"
         ) from error
 
 
-def _write_intent(
-    path: Path,
-    request: DeletionRequest,
-    started_at: str,
-    before: dict[str, list[str]],
-    known: Sequence[Victim],
-) -> None:
-    plain = {
-        "request": asdict(request),
-        "started_at": started_at,
-        "before": before,
-        "victims": [asdict(victim) for victim in known],
-    }
+def _write_intent(path: Path, intent: _Intent) -> None:
     with disk_errors("write down what is to be deleted"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        replace_file(path, json.dumps(plain).encode())
+        replace_file(path, json.dumps(intent.model_dump()).encode())

@@ -3,17 +3,15 @@
 A reader stops at the first damage; an inspection continues and lists all of it.
 """
 
-import fcntl
 import hashlib
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import google_crc32c
 import numpy as np
 
-from dextouch.episodes.files import disk_errors
+from dextouch.episodes.files import disk_errors, try_lock
 from dextouch.episodes.format import (
     COMMIT_FILE,
     METADATA_FILE,
@@ -21,23 +19,25 @@ from dextouch.episodes.format import (
     ArrayEntry,
     Kind,
     array_metadata,
+    attributes_id,
+    kind_of,
     shard_path,
     stream_arrays,
 )
 from dextouch.episodes.group_contents import CommittedGroup, get_metadata, read_group
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.journal import journal_path, part_path, read_payloads, read_rows
+from dextouch.episodes.journal import damaged_payload, log_paths, part_path, read_rows, scan_rows
 from dextouch.episodes.shard_reader import decode_rows
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_log import body_at, find_records, open_log
 from dextouch.episodes.spool_reader import RECORDING_FILE, read_attributes
-from dextouch.episodes.staged_group import STAGE_FILE, attributes_id, kind_of, read_stage
+from dextouch.episodes.staged_group import STAGE_FILE, STAGING, read_stage
+from dextouch.episodes.trash import HOMES
 from dextouch.errors import CorruptDataError, StorageError
 from dextouch.images import jpeg_size
 from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
-UPLOADS = ".uploads"
-STAGING = ".staging"
+UPLOADS = HOMES["upload"]
 Group = CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes]
 # Called with the number of bytes read.
 Progress = Callable[[int], None]
@@ -235,53 +235,32 @@ def inspect_stage(folder: Path) -> ItemReport:
     kind = kind_of(attributes)
     names = [name for stream in attributes.streams for name in stream_arrays(stream, kind)]
     findings, num_bytes = [], 0
-    present = [n for n in names if journal_path(folder, n).is_file() and _part(folder, n)]
+    present = [n for n in names if all(p.is_file() for p in log_paths(folder, n))]
     for name in present:
         try:
-            rows = read_rows(folder, name)
+            num_rows = len(read_rows(folder, name))
+            with disk_errors(f"read {name}"):
+                rows, hold = scan_rows(folder, name, part_path(folder, name).read_bytes())
+            rows, hold = rows[:num_rows], hold[:num_rows]
+            num_bytes += int(rows["length"][hold].sum())
+            # Neither data that a live writer has not written yet nor a torn tail is damage.
+            for number in np.flatnonzero(~hold & np.logical_or.accumulate(hold[::-1])[::-1]):
+                what = f"row {number}: {damaged_payload(name, rows[number])}"
+                findings.append(Finding(f"stage {folder.name}: {what}", name, int(number)))
         except StorageError as error:
             findings.append(Finding(f"stage {folder.name}: {error.message}", name))
-            continue
-        # Neither data that a live writer has not written yet nor a torn tail is damage.
-        for number, row in enumerate(rows):
-            try:
-                (payload,) = read_payloads(folder, name, np.array([row]))
-            except StorageError as error:
-                if not _only_bad_follow(folder, name, rows[number:]):
-                    message = f"stage {folder.name}: row {number}: {error.message}"
-                    findings.append(Finding(message, name, number))
-            else:
-                num_bytes += len(payload)
     return ItemReport(
         "stage", folder.name, len(present), num_bytes, tuple(findings), is_held(folder)
-    )
-
-
-def _part(folder: Path, name: str) -> bool:
-    return part_path(folder, name).is_file()
-
-
-def _only_bad_follow(folder: Path, name: str, rows: np.ndarray) -> bool:
-    with disk_errors(f"read {name}"):
-        data = part_path(folder, name).read_bytes()
-    return not any(
-        google_crc32c.value(data[int(r["offset"]) : int(r["offset"]) + int(r["length"])])
-        == int(r["payload_crc32c"])
-        for r in rows
     )
 
 
 def is_held(folder: Path) -> bool:
     """Whether a writer holds the lock of a stage or a spool."""
     with disk_errors(f"look at {folder.name}"):
-        descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
+        lock = try_lock(folder)
+    if lock is not None:
+        os.close(lock)
+    return lock is None
 
 
 def unfinished_folders(root: Path) -> Iterator[tuple[str, Path]]:

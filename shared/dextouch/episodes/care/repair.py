@@ -4,16 +4,13 @@ Repairing is reversible: damaged groups go to the trash, from where they can be 
 """
 
 import json
-import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from pydantic import ValidationError
-
 from dextouch.episodes.care.inspection import (
-    STAGING,
     UPLOADS,
+    Group,
     ItemReport,
     inspect_group,
     inspect_upload,
@@ -26,36 +23,39 @@ from dextouch.episodes.care.salvage import (
     stage_streams,
     write_salvaged,
 )
-from dextouch.episodes.files import disk_errors, replace_file, sync_folder, write_file
+from dextouch.episodes.files import disk_errors, replace_file
 from dextouch.episodes.format import (
-    ATTRIBUTES_KEY,
+    ATTRIBUTES,
     COMMIT_FILE,
+    MALFORMED,
     METADATA_FILE,
     ArrayEntry,
+    Attributes,
     CommitRecord,
     Kind,
     array_metadata,
+    attributes_id,
     decode_commit,
+    group_attributes,
+    kind_of,
     sha256_hex,
     shard_path,
     stream_arrays,
     with_rows,
 )
-from dextouch.episodes.group_contents import CommittedGroup, get_metadata
+from dextouch.episodes.group_contents import get_metadata
 from dextouch.episodes.sources import GroupFiles, LocalGroup
 from dextouch.episodes.spool_reader import read_attributes
-from dextouch.episodes.staged_group import Attributes, attributes_id, kind_of, read_stage
-from dextouch.episodes.staging import unheld_folders
+from dextouch.episodes.staged_group import STAGING, read_stage, unheld_folders
 from dextouch.episodes.staging_recovery import recover_stage
 from dextouch.episodes.trash import TrashKind, put_into_trash
 from dextouch.errors import (
     ConflictError,
     CorruptDataError,
     DexTouchError,
-    InvalidInputError,
     StorageError,
 )
-from dextouch.schemas import EpisodeAttributes, LineageEntry, RecordingAttributes
+from dextouch.schemas import LineageEntry
 
 WHOLE, MENDED, SALVAGED, RECOVERED, LEFT = "whole", "mended", "salvaged", "recovered", "left"
 
@@ -97,7 +97,7 @@ def repair_group(
     report = inspect_group(files, kind)
     if not report.damaged:
         return RepairReport(kind, item_id, WHOLE)
-    notes = tuple(finding.message for finding in report.findings)
+    notes = _messages(report)
     if all(finding.foreign for finding in report.findings):
         return RepairReport(kind, item_id, LEFT, notes=notes)
     if copy is not None:
@@ -106,17 +106,7 @@ def repair_group(
     report = inspect_group(files, kind)
     if all(finding.foreign for finding in report.findings):
         return RepairReport(kind, item_id, MENDED, notes=notes)
-    try:
-        attributes, entries, sha256 = _known(files, kind, report)
-        source = LineageEntry(kind=kind, id=item_id, sha256=sha256)
-        streams = group_streams(folder, attributes, entries)
-        new_id, lost = _write_once(root, attributes, streams, source)
-    except (StorageError, InvalidInputError) as error:
-        # Often the inspection has already found the same.
-        notes = tuple(dict.fromkeys((*notes, error.message)))
-        return RepairReport(kind, item_id, LEFT, notes=notes)
-    put_into_trash(root, kind, item_id)
-    return RepairReport(kind, item_id, SALVAGED, new_id, lost, notes)
+    return _salvage(root, kind, folder, notes)
 
 
 def repair_unfinished(root: Path) -> list[RepairReport]:
@@ -125,53 +115,50 @@ def repair_unfinished(root: Path) -> list[RepairReport]:
     Intact uploads are unchanged, since their station continues them. The readable samples of
     damaged ones become a recording `ID-salvaged-N`, so that the station can send everything again.
     """
-    reports = []
-    for stage in unheld_folders(root / STAGING):
-        report = _repair_stage(root, stage)
-        if report is not None:
-            reports.append(report)
+    stages = (_repair_stage(root, stage) for stage in unheld_folders(root / STAGING))
+    reports = [report for report in stages if report is not None]
     for spool in unheld_folders(root / UPLOADS):
         found = inspect_upload(spool)
         if found.damaged:
-            reports.append(_salvage(root, "upload", spool, found))
+            reports.append(_salvage(root, "upload", spool, _messages(found)))
     return reports
+
+
+def _messages(report: ItemReport) -> tuple[str, ...]:
+    return tuple(finding.message for finding in report.findings)
 
 
 def _repair_stage(root: Path, stage: Path) -> RepairReport | None:
     try:
         group = recover_stage(stage, root)
     except CorruptDataError as error:
-        found = ItemReport("stage", stage.name)
-        report = _salvage(root, "stage", stage, found)
-        return RepairReport(
-            report.kind,
-            report.item_id,
-            report.action,
-            report.new_id,
-            report.lost,
-            (error.message, *report.notes),
-        )
-    if group is None:
-        return None
-    return RepairReport(group.kind, group.item_id, RECOVERED)
+        return _salvage(root, "stage", stage, (error.message,))
+    return None if group is None else RepairReport(group.kind, group.item_id, RECOVERED)
 
 
-def _salvage(root: Path, kind: TrashKind, folder: Path, found: ItemReport) -> RepairReport:
-    notes = tuple(finding.message for finding in found.findings)
+def _salvage(root: Path, kind: TrashKind, folder: Path, notes: tuple[str, ...]) -> RepairReport:
+    """Write the readable samples as a new group, and put the damaged item into the trash."""
+    attributes: Attributes | None
     try:
-        attributes: Attributes | None
+        sha256 = None
         if kind == "upload":
             attributes = read_attributes(folder)
             streams = spool_streams(folder, attributes)
-        else:
+        elif kind == "stage":
             attributes = read_stage(folder)
             if attributes is None:
                 return RepairReport(kind, folder.name, LEFT, notes=notes)
             streams = stage_streams(folder, attributes)
-        source = LineageEntry(kind=kind_of(attributes), id=attributes_id(attributes))
+        else:
+            attributes, entries, sha256 = _known(LocalGroup(folder), kind)
+            streams = group_streams(folder, attributes, entries)
+        item_id = attributes_id(attributes)
+        source = LineageEntry(kind=kind_of(attributes), id=item_id, sha256=sha256)
         new_id, lost = _write_once(root, attributes, streams, source)
     except DexTouchError as error:
-        return RepairReport(kind, folder.name, LEFT, notes=(*notes, error.message))
+        # Often the inspection has already found the same.
+        notes = tuple(dict.fromkeys((*notes, error.message)))
+        return RepairReport(kind, folder.name, LEFT, notes=notes)
     put_into_trash(root, kind, folder.name)
     return RepairReport(kind, folder.name, SALVAGED, new_id, lost, notes)
 
@@ -230,30 +217,14 @@ def _repair_from(folder: Path, kind: Kind, copy: GroupFiles) -> None:
     for name in sorted(bad_here - bad_there):
         path = f"{name}/{shard_path(len(theirs.entries[name].shape))}"
         source = copy.source(path)
-        _put_shard(folder, path, bytes(source.read(0, source.size() or 0)))
-
-
-def _put_shard(folder: Path, name: str, data: bytes) -> None:
-    # Written beside the group, so that no partial group is ever visible.
-    partial = folder.parent.parent / STAGING / f"mend-{folder.name}-{uuid.uuid4().hex}"
-    _put(folder, name, b"")
-    with disk_errors(f"repair {name} of {folder.name}"):
-        partial.mkdir(parents=True)
-        write_file(partial / "shard", data)
-        (partial / "shard").replace(folder / name)
-        sync_folder((folder / name).parent)
-        partial.rmdir()
+        _put(folder, path, bytes(source.read(0, source.size() or 0)))
 
 
 def _damaged_arrays(files: GroupFiles, kind: Kind) -> set[str]:
     return {f.array for f in inspect_group(files, kind).findings if f.array is not None}
 
 
-def _check_same_content(
-    ours: LocalGroup,
-    theirs: CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes],
-    what: str,
-) -> None:
+def _check_same_content(ours: LocalGroup, theirs: Group, what: str) -> None:
     record = _commit_of(ours, what)
     if record is not None:
         same = record[1] == theirs.content_sha256
@@ -278,7 +249,7 @@ def _commit_of(files: LocalGroup, what: str) -> tuple[CommitRecord, str] | None:
 
 
 def _known(
-    files: LocalGroup, kind: Kind, report: ItemReport
+    files: LocalGroup, kind: Kind
 ) -> tuple[Attributes, Mapping[str, ArrayEntry], str | None]:
     """Trustworthy attributes, arrays and content hash of a damaged group.
 
@@ -292,11 +263,9 @@ def _known(
             f"{what}: attributes are damaged, and samples cannot be interpreted without them; "
             "name a copy with --from, or delete it"
         )
-    model = EpisodeAttributes if kind == "episode" else RecordingAttributes
     try:
-        text = json.dumps(json.loads(group)["attributes"][ATTRIBUTES_KEY])
-        attributes = model.model_validate_json(text)
-    except (ValidationError, ValueError, KeyError, TypeError, RecursionError) as error:
+        attributes: Attributes = group_attributes(group, ATTRIBUTES[kind])
+    except MALFORMED as error:
         raise CorruptDataError(f"{what}: attributes are damaged ({error})") from error
     if attributes_id(attributes) != files.item_id:
         raise CorruptDataError(f"{what}: attributes are those of {attributes_id(attributes)!r}")

@@ -4,46 +4,45 @@ Nothing is filled in: a damaged storage chunk or sample is dropped with its stam
 `lost_to_damage`.
 """
 
-import uuid
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import google_crc32c
 import numpy as np
 
 from dextouch.episodes.batch_bytes import batch_of_bytes
-from dextouch.episodes.care.inspection import STAGING, hashed_bytes
+from dextouch.episodes.care.inspection import hashed_bytes
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
     ArrayEntry,
-    Kind,
+    Attributes,
+    attributes_id,
     codec_of,
+    kind_of,
     shard_path,
     stream_arrays,
+    with_counts,
     with_rows,
 )
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.episodes.journal import JOURNAL_MAGIC, JOURNAL_ROW, journal_path, part_path
+from dextouch.episodes.journal import part_path, scan_rows
 from dextouch.episodes.shard_index import salvaged_index
 from dextouch.episodes.shard_reader import ShardReader, decode_rows
 from dextouch.episodes.sources import LocalFile
 from dextouch.episodes.spool_log import body_at, find_records, open_log, read_bodies
-from dextouch.episodes.staged_group import Attributes, attributes_id, kind_of
-from dextouch.episodes.write_options import WriteOptions
-from dextouch.episodes.writer import EpisodeWriter
+from dextouch.episodes.staged_group import new_stage
+from dextouch.episodes.staging_recovery import free_id, ids_below
+from dextouch.episodes.writer import Block, write_blocks
 from dextouch.errors import CorruptDataError, InvalidInputError
-from dextouch.schemas import EpisodeAttributes, LedgerEntry, LineageEntry
+from dextouch.schemas import LineageEntry
 from dextouch.streams import SampleBatch, StreamDescriptor, check_batch, encoded_values
 
 LOST = "lost_to_damage"
 # The rows of these streams correspond by index: the steps of the model grid.
 GRID_STREAMS = ("action", "action_commanded")
 BLOCK_SAMPLES = 256
-
-Block = tuple[np.ndarray, dict[str, np.ndarray]]
 
 
 @dataclass(frozen=True)
@@ -136,7 +135,8 @@ def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
         # A writer or a recovery that died during its commit has closed some shards.
         closed = stage / name / shard_path(len(entry.shape))
         path = closed if closed.is_file() else part_path(stage, name)
-        rows, hold = lenient_rows(stage, name, _bytes_of(path))
+        with disk_errors(f"read {path.name}"):
+            rows, hold = scan_rows(stage, name, path.read_bytes() if path.is_file() else b"")
         numbers = np.flatnonzero(hold)
         index = np.zeros((len(rows), 2), dtype=np.uint64)
         index[hold] = np.stack([rows["offset"][hold], rows["length"][hold]], axis=1)
@@ -184,32 +184,16 @@ def write_salvaged(
     if not any(stream.kept.any() for stream in streams):
         raise InvalidInputError(f"{kind} {item_id!r}: no sample is intact; delete it")
     lost = {stream.descriptor.name: stream.num_lost for stream in streams if stream.num_lost}
-    free = _free_id(root, kind, item_id)
-    update: dict[str, object] = {f"{kind}_id": free, "recovered": True}
-    update["lineage"] = (*attributes.lineage, source)
-    if isinstance(attributes, EpisodeAttributes):
-        figures = {f"{name}_{LOST}": float(count) for name, count in lost.items()}
-        update["quality"] = attributes.quality | figures
-    else:
-        counted = (LedgerEntry(stream=n, event=LOST, count=c) for n, c in lost.items())
-        update["ledger"] = (*attributes.ledger, *counted)
-    with EpisodeWriter(
-        stage=root / STAGING / f"{kind}-{free}-{uuid.uuid4().hex}",
-        target=root / f"{kind}s" / free,
-        attributes=attributes.model_copy(update=update),
-        options=WriteOptions(recoverable=False),
-    ) as writer:
-        for stream in streams:
-            for values, stamps in stream.blocks():
-                writer.append(stream.descriptor.name, values=values, **stamps)
+    free = free_id(kind, item_id, "salvaged", ids_below(root))
+    lineage = (*attributes.lineage, source)
+    update = {f"{kind}_id": free, "recovered": True, "lineage": lineage}
+    write_blocks(
+        new_stage(root, kind, free),
+        root / f"{kind}s" / free,
+        with_counts(attributes.model_copy(update=update), LOST, lost),
+        ((stream.descriptor.name, stream.blocks()) for stream in streams),
+    )
     return free, lost
-
-
-def _free_id(root: Path, kind: Kind, item_id: str) -> str:
-    number = 1
-    while (root / f"{kind}s" / (free := f"{item_id[:112]}-salvaged-{number}")).exists():
-        number += 1
-    return free
 
 
 def _streams(
@@ -268,28 +252,6 @@ def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
         replace(s, kept=run[: len(s.kept)]) if s.descriptor.name in GRID_STREAMS else s
         for s in streams
     ]
-
-
-def lenient_rows(folder: Path, name: str, payloads: bytes) -> tuple[np.ndarray, np.ndarray]:
-    """All rows of a journal, and for each whether it and its payload are intact."""
-    data = _bytes_of(journal_path(folder, name))[len(JOURNAL_MAGIC) :]
-    size = JOURNAL_ROW.itemsize
-    rows = np.frombuffer(data[: len(data) // size * size], JOURNAL_ROW)
-    hold = np.zeros(len(rows), dtype=bool)
-    for number, row in enumerate(rows):
-        body = data[number * size : (number + 1) * size - 4]
-        start, length = int(row["offset"]), int(row["length"])
-        hold[number] = (
-            google_crc32c.value(body) == int(row["row_crc32c"])
-            and start + length <= len(payloads)
-            and google_crc32c.value(payloads[start : start + length]) == int(row["payload_crc32c"])
-        )
-    return rows, hold
-
-
-def _bytes_of(path: Path) -> bytes:
-    with disk_errors(f"read {path.name}"):
-        return path.read_bytes() if path.is_file() else b""
 
 
 def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None) -> bool:

@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from dextouch.episodes.care.inspection import STAGING, UPLOADS
+from dextouch.episodes.care.inspection import UPLOADS
 from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import ATTRIBUTES_KEY, COMMIT_FILE, METADATA_FILE
 from dextouch.episodes.spool_reader import RECORDING_FILE
-from dextouch.episodes.staged_group import STAGE_FILE
+from dextouch.episodes.staged_group import STAGE_FILE, STAGING
 from dextouch.episodes.trash import TRASH
 
 # Folders of a store and the kind of group in each.
@@ -24,6 +24,12 @@ PLACES: dict[str, str] = {
     UPLOADS: "recording",
     STAGING: "",
     TRASH: "",
+}
+# Files with attributes, and the keys under which they lie.
+_ATTRIBUTES = {
+    METADATA_FILE: ("attributes", ATTRIBUTES_KEY),
+    STAGE_FILE: ("attributes",),
+    RECORDING_FILE: (),
 }
 MAX_BYTES = 16 << 20
 _SAMPLES = (".part", ".journal", ".log")
@@ -63,31 +69,23 @@ def all_facts(root: Path) -> list[Facts]:
 
 def _facts(folder: Path, place: str) -> Facts:
     kind, item_id = _named(folder.name, place)
-    attributes: dict[str, Any] = {}
-    for name, keys in (
-        (METADATA_FILE, ("attributes", ATTRIBUTES_KEY)),
-        (STAGE_FILE, ("attributes",)),
-        (RECORDING_FILE, ()),
-    ):
-        value = _json(folder / name)
-        for key in keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        if isinstance(value, dict) and not attributes:
-            attributes = value
+    attributes = next(filter(None, (_dict(folder / n, *k) for n, k in _ATTRIBUTES.items())), {})
     for known in ("episode", "recording"):
         if isinstance(attributes.get(f"{known}_id"), str):
             kind, item_id = known, attributes[f"{known}_id"]
-    commit = _json(folder / COMMIT_FILE)
-    sha256 = commit.get("sha256") if isinstance(commit, dict) else None
-    operator = attributes.get("operator")
+    lineage = attributes.get("lineage")
     return Facts(
         folder=folder,
         place=place,
         kind=kind,
         item_id=item_id,
-        operator=operator if isinstance(operator, str) else None,
-        lineage=tuple(_lineage(attributes.get("lineage"))),
-        content_sha256=sha256 if isinstance(sha256, str) else None,
+        operator=_text(attributes.get("operator")),
+        lineage=tuple(
+            (str(entry.get("kind")), str(entry.get("id")), _text(entry.get("sha256")))
+            for entry in (lineage if isinstance(lineage, list) else [])
+            if isinstance(entry, dict)
+        ),
+        content_sha256=_text(_dict(folder / COMMIT_FILE).get("sha256")),
         readable=bool(attributes) or not any(small_files(folder)),
     )
 
@@ -103,17 +101,6 @@ def _named(name: str, place: str) -> tuple[str, str]:
     return {"upload": "recording"}.get(match[1], match[1]), match[2]
 
 
-def _lineage(value: object) -> Iterator[tuple[str, str, str | None]]:
-    for entry in value if isinstance(value, list) else []:
-        if isinstance(entry, dict):
-            sha256 = entry.get("sha256")
-            yield (
-                str(entry.get("kind")),
-                str(entry.get("id")),
-                sha256 if isinstance(sha256, str) else None,
-            )
-
-
 def small_files(folder: Path) -> Iterator[Path]:
     """Metadata files directly in a folder, without samples."""
     if folder.is_file():
@@ -124,13 +111,21 @@ def small_files(folder: Path) -> Iterator[Path]:
                 yield path
 
 
-def _json(path: Path) -> object:
+def _dict(path: Path, *keys: str) -> dict[str, Any]:
+    """The object under nested keys of a JSON file; empty where there is none."""
     with disk_errors(f"read {path.name}"):
         data = path.read_bytes() if path.is_file() else b""
     try:
-        return json.loads(data)
+        value = json.loads(data)
     except (ValueError, RecursionError):
-        return None
+        return {}
+    for key in keys:
+        value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, dict) else {}
+
+
+def _text(value: object) -> str | None:
+    return value if isinstance(value, str) else None
 
 
 class Wanted:
