@@ -14,13 +14,10 @@ FULL_RETRY_S = 30
 
 
 class Admission:
-    """Limits the batches in flight, by number and bytes (backpressure).
+    """Limits the batches in flight, by number and by the bytes of their bodies (backpressure).
 
-    A batch is admitted before its body is read, so a refused one costs no memory.
-
-    Args:
-        max_requests: maximum number of batches in flight.
-        max_bytes: of all their bodies; a single batch is always admitted.
+    A batch is admitted before its body is read, so a refused one costs no memory. A single batch is
+    always admitted.
     """
 
     def __init__(self, *, max_requests: int, max_bytes: int) -> None:
@@ -67,12 +64,7 @@ def free_bytes_of(folder: Path) -> int:
 
 
 class DiskReserve:
-    """Reserves disk space that uploads must not use, so that started writes can finish.
-
-    Args:
-        folder: on the disk.
-        min_free_bytes: size of the reserve.
-    """
+    """Reserves space on a folder's disk that uploads must not use, so that writes can finish."""
 
     def __init__(self, folder: Path, *, min_free_bytes: int) -> None:
         self._folder, self._min_free = folder, min_free_bytes

@@ -30,11 +30,7 @@ logger = structlog.get_logger(__name__)
 
 
 def create_app(settings: EpisodeStoreSettings) -> FastAPI:
-    """Create the application of one store; recovers data of crashed writers at startup.
-
-    Args:
-        settings: location of the store and limits.
-    """
+    """Create the application of one store; recovers data of crashed writers at startup."""
     store = EpisodeStore(settings.store_url)
     commit = CommitProcess(settings.store_url) if settings.commit_in_process else None
     ingest = Ingest(

@@ -20,11 +20,7 @@ RETRY_AFTER_S = 1
 
 
 class CommitProcess:
-    """A `Commit` in a child process, one spool at a time; started on first use.
-
-    Args:
-        store_url: of the store that the child opens.
-    """
+    """A `Commit` in a child process, one spool at a time; started on first use."""
 
     def __init__(self, store_url: str) -> None:
         self._store_url = store_url

@@ -29,13 +29,7 @@ CREATE_BYTES = 1 << 16
 class Intake:
     """Passes every upload through the limits to the ingest, and updates metrics.
 
-    Args:
-        ingest: stores admitted batches.
-        admission: limits batches in flight.
-        reserve: limits disk usage.
-        quotas: limits what a station may store.
-        metrics: to update.
-        num_threads: number of threads that write batches; reads and commits use others.
+    Batches are written by `num_threads` threads of their own; reads and commits use others.
     """
 
     def __init__(
@@ -76,14 +70,9 @@ class Intake:
         announced: str | None,
         read: Callable[[], Awaitable[bytes]],
     ) -> BatchReceipt:
-        """Store a batch.
+        """Store a batch of an unfinished upload.
 
-        Args:
-            recording_id: of an unfinished upload.
-            stream: one of its streams.
-            number: of the batch.
-            announced: Content-Length of the request.
-            read: reads the body; not called for a refused batch.
+        `announced` is the Content-Length of the request, whose body `read` reads.
 
         Raises:
             LimitExceededError: too many batches in flight; the body was not read.

@@ -10,11 +10,7 @@ RETRY_AFTER_S = 1
 
 
 class KeyedLocks:
-    """One lock per recording, so that recordings do not block each other.
-
-    Args:
-        patience_s: timeout for acquiring a lock.
-    """
+    """One lock per recording, so that recordings do not block each other."""
 
     def __init__(self, *, patience_s: float) -> None:
         self._patience_s = patience_s
@@ -27,7 +23,7 @@ class KeyedLocks:
         """Context manager that holds the lock of a key.
 
         Raises:
-            UnavailableError: the lock was not released in time.
+            UnavailableError: the lock was not released in `patience_s`.
         """
         with self._guard:
             lock, num_users = self._locks.get(key, (threading.Lock(), 0))

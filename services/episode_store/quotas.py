@@ -27,12 +27,9 @@ class _Account:
 
 
 class StationQuotas:
-    """Disk usage by station, checked against a quota. Thread-safe.
+    """Disk usage by station, checked against a quota (None: unlimited). Thread-safe.
 
-    Args:
-        folder: of the uploads.
-        recordings: bytes of finished recordings by station.
-        quota_bytes: per station, uploads and recordings together; None: unlimited.
+    Counts the uploads in a folder and what `recordings` says of finished recordings.
     """
 
     def __init__(

@@ -55,13 +55,7 @@ class Answer:
 
 
 class StoreReader:
-    """Reads for the routes, with size limits and conditional requests.
-
-    Args:
-        store: to read from.
-        max_window_steps: maximum length of a window.
-        max_answer_bytes: maximum size of a response, checked before reading.
-    """
+    """Reads for the routes, with conditional requests and size limits, checked before reading."""
 
     def __init__(
         self, store: EpisodeStore, *, max_window_steps: int, max_answer_bytes: int
@@ -83,12 +77,7 @@ class StoreReader:
         return self._store.recording(recording_id).attributes
 
     def window(self, episode_id: str, query: WindowQuery, *, known: str | None = None) -> Answer:
-        """One window.
-
-        Args:
-            episode_id: of a committed episode.
-            query: the window.
-            known: `If-None-Match` of the request.
+        """One window; `known` is the `If-None-Match` of the request.
 
         Raises:
             LimitExceededError: more steps or bytes of images than allowed.

@@ -37,11 +37,7 @@ def batch_of_bytes(
 ) -> SampleBatch:
     """Decode consecutive bodies of one stream to one batch, the inverse of `batch_bytes`.
 
-    Args:
-        descriptor: of the stream.
-        bodies: of the records.
-        counts: samples in each.
-        what: names the log in errors.
+    `counts` are the samples in each; `what` names the log in errors.
 
     Raises:
         CorruptDataError: the size of a body does not match its number of samples.

@@ -20,9 +20,6 @@ class GroupReader(Generic[A]):
 
     Everything is read lazily. A reader is thread-safe and picklable, so that the worker processes
     of a data loader can use it.
-
-    Args:
-        contents: of a committed group, or of one that is being written.
     """
 
     def __init__(self, contents: GroupContents[A]) -> None:

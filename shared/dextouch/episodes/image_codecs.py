@@ -61,12 +61,8 @@ class ImageChunks:
     ) -> None:
         """Decode images of storage chunk `number` into `out`, decoding no more than necessary.
 
-        Args:
-            payload: of the storage chunk.
-            number: of the storage chunk.
-            places: indices of the requested images in the chunk, ascending.
-            form: size and colours of the output.
-            out: uint8 [len(places), *form.shape(shape)].
+        `places` are the ascending indices of the requested images in the chunk, `out` is uint8
+        [len(places), *form.shape(shape)].
 
         Raises:
             CorruptDataError: invalid image data.

@@ -13,13 +13,7 @@ Work = Callable[[np.ndarray, Mapping[str, np.ndarray]], None]
 
 
 class ImageQueue:
-    """Passes blocks to `work` in order, in a background thread.
-
-    Args:
-        work: called with the images and stamps of a block.
-        name: of the stream, for the thread.
-        when_full: "wait" or "drop".
-    """
+    """Passes blocks (images and their stamps) to `work` in order, in a background thread."""
 
     def __init__(self, work: Work, *, name: str, when_full: WhenFull) -> None:
         self.num_dropped = 0

@@ -99,10 +99,7 @@ def _row_crcs(rows: np.ndarray) -> np.ndarray:
 def scan_rows(folder: Path, name: str, payloads: bytes) -> tuple[np.ndarray, np.ndarray]:
     """All rows of a journal, damaged ones too, and whether each and its payload are intact.
 
-    Args:
-        folder: of the log.
-        name: of the log.
-        payloads: contents of the part file, or of the shard that it has become.
+    `payloads` are the contents of the part file, or of the shard that it has become.
     """
     path = journal_path(folder, name)
     with disk_errors(f"read {path.name}"):
@@ -140,10 +137,7 @@ def damaged_payload(name: str, row: np.void) -> str:
 class JournalWriter:
     """Appends payloads to a log's two files; each append is two writes.
 
-    Args:
-        folder: of the log.
-        name: of the log.
-        num_rows: None for new files; otherwise the number of rows to keep and append to.
+    `num_rows` is None for new files, otherwise the number of rows to keep and append to.
 
     Raises:
         StorageError: the files exist already, or cannot be created.

@@ -28,10 +28,7 @@ from dextouch.schemas import ID_PATTERN
 
 
 def local_folder(url: str | Path) -> Path:
-    """Local folder of a store's URL.
-
-    Args:
-        url: a path, or `file:///…`.
+    """Local folder of a store's URL: a path, or `file:///…`.
 
     Raises:
         InvalidInputError: an address of another scheme, or of another host.
@@ -51,8 +48,7 @@ def local_folder(url: str | Path) -> Path:
 class LocalStorage:
     """Stores committed groups as `episodes/ID` and `recordings/ID` below one folder.
 
-    Args:
-        root: that folder; created on the first write.
+    The folder is created on the first write.
     """
 
     def __init__(self, root: Path) -> None:

@@ -40,10 +40,6 @@ _JPEG_END_SUFFIX = "_end"
 class OldGroup:
     """A group of format version 1, with the checks of its release.
 
-    Args:
-        files: of the group.
-        kind: of the group.
-
     Raises:
         CorruptDataError: the commit record, the attributes or an array is damaged.
         StorageError: another version.

@@ -62,11 +62,7 @@ class _Runtime:
 
 
 class BlockCache:
-    """LRU cache of object blocks, limited in bytes.
-
-    Args:
-        capacity: in bytes; 0 disables the cache.
-    """
+    """LRU cache of object blocks, limited to `capacity` bytes; 0 disables it."""
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity

@@ -14,12 +14,7 @@ _TAIL = -1
 
 
 class ObjectFile:
-    """One object, read by ranges through the bucket's cache.
-
-    Args:
-        bucket: of the object.
-        key: of the object.
-    """
+    """One object, read by ranges through the bucket's cache."""
 
     def __init__(self, bucket: Bucket, key: str) -> None:
         self._bucket, self._key = bucket, key
@@ -100,12 +95,9 @@ class ObjectFile:
 
 
 class ObjectGroup:
-    """The files of a committed group in a bucket.
+    """The files of a committed group in a bucket, below the prefix `episodes/ID`.
 
-    Args:
-        bucket: of the group.
-        folder: prefix of its keys, `episodes/ID`.
-        known: contents of files that were read already, by name.
+    `known` are the contents of files that were read already, by name.
     """
 
     def __init__(self, bucket: Bucket, folder: str, known: dict[str, bytes]) -> None:

@@ -88,11 +88,7 @@ class UploadingWriter(EpisodeWriter):
 
 
 class ObjectStorage:
-    """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket.
-
-    Args:
-        bucket: whose address names the work folder.
-    """
+    """Stores committed groups under the keys `episodes/ID/…` and `recordings/ID/…` of a bucket."""
 
     def __init__(self, bucket: Bucket) -> None:
         self._bucket, self._address = bucket, bucket.address

@@ -206,15 +206,8 @@ class EpisodeReader(GroupReader[EpisodeAttributes]):
     ) -> NativeWindow:
         """The time span of steps start … start + num_steps − 1 with every stream at its own rate.
 
-        Args:
-            start: first step.
-            num_steps: at least 1.
-            cameras: image streams to read.
-            streams: other streams to read; None for all.
-            form: half size or gray images.
-
-        Raises:
-            InvalidInputError, UnknownNameError, CorruptDataError: as `window`.
+        Arguments and errors are those of `window`; `streams` are the streams to read besides the
+        cameras, None for all.
         """
         self._check_steps(start, num_steps)
         self._check_cameras(cameras)

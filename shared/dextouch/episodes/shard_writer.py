@@ -21,11 +21,8 @@ from dextouch.episodes.zstd import compress
 class ShardWriter:
     """Appends rows; buffers at most one storage chunk, everything before survives a kill.
 
-    Args:
-        stage: folder that is being written.
-        name: of the array.
-        entry: of the array, with 0 rows and no hash yet.
-        sync: whether `append` waits until complete storage chunks are synced to disk.
+    The entry of the array has 0 rows and no hash yet. With `sync`, `append` waits until complete
+    storage chunks are synced to disk.
     """
 
     def __init__(self, stage: Path, name: str, entry: ArrayEntry, *, sync: bool) -> None:

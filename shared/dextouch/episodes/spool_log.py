@@ -228,9 +228,7 @@ class StreamRecord:
 class SpoolLogWriter:
     """Appends records to a spool's log; each append is one write.
 
-    Args:
-        folder: of the spool.
-        end: None for a new log; otherwise the offset to continue at, where the file is truncated.
+    `end` is None for a new log, otherwise the offset to continue at, where the file is truncated.
 
     Raises:
         StorageError: the file exists already, or cannot be created.

@@ -23,9 +23,6 @@ class SpoolReader:
 
     The log is scanned on first access; records appended later are not visible.
 
-    Args:
-        path: of the spool.
-
     Raises:
         NotFoundError: no spool there.
         CorruptDataError: its attributes are damaged.

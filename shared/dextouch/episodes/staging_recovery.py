@@ -49,6 +49,7 @@ from dextouch.episodes.zstd import content_bytes
 from dextouch.errors import CorruptDataError, DexTouchError, StorageError
 from dextouch.schemas import RecordingAttributes
 
+# Whether an id is in use.
 IsTaken = Callable[[Kind, str], bool]
 
 
@@ -99,10 +100,8 @@ def recover_stage(
 ) -> RecoveredGroup | None:
     """Truncate every stream of a stage to its last complete storage chunk and commit the stage.
 
-    Args:
-        stage: no longer locked by a writer.
-        root: folder in which the group appears.
-        is_taken: whether an id is in use; None checks for its folder in `root`.
+    No writer may hold the stage. The group appears in `root`, whose folders say which ids are in
+    use unless `is_taken` does.
 
     Returns:
         The recovered group; None if there is nothing to recover, and the stage is unchanged.
@@ -181,12 +180,7 @@ def is_recoverable(stage: Path, is_taken: IsTaken) -> bool:
 
 
 def sweep_stages(root: Path, is_taken: IsTaken) -> int:
-    """Remove abandoned stages that `recover_stage` cannot recover, and return their number.
-
-    Args:
-        root: folder with the stages.
-        is_taken: whether an id is in use.
-    """
+    """Remove abandoned stages that `recover_stage` cannot recover, and return their number."""
     removed = 0
     for stage in abandoned_stages(root):
         if not is_recoverable(stage, is_taken):

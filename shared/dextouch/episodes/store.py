@@ -95,11 +95,6 @@ class EpisodeStore:
     ) -> EpisodeWriter:
         """A context manager that writes one episode or recording.
 
-        Args:
-            kind: of the group.
-            attributes: of the same kind.
-            options: durability, speed and quality of video; None for the defaults.
-
         Raises:
             ConflictError: the id exists already.
             InvalidInputError: attributes of the other kind.
@@ -167,12 +162,9 @@ class EpisodeStore:
         return self._storage.list(_check_kind(kind))
 
     def delete(self, item_id: str, *, kind: Kind = "episode", for_good: bool = False) -> None:
-        """Move an episode or recording to the trash.
+        """Move an episode or recording to the trash, or delete it `for_good`.
 
-        Args:
-            item_id: of the group.
-            kind: of the group.
-            for_good: delete permanently; always so in object storage, which has no trash.
+        Object storage has no trash, so there it is always for good.
 
         Raises:
             NotFoundError: no such id.

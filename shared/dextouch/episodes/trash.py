@@ -42,16 +42,9 @@ class TrashEntry:
 
 
 def put_into_trash(root: Path, kind: TrashKind, item_id: str, *, now_ns: int | None = None) -> Path:
-    """Move a folder to the trash, where it can be restored until it is purged.
+    """Move a folder to the trash, where it can be restored until it is purged; returns its path.
 
-    Args:
-        root: of the store.
-        kind: of the item.
-        item_id: name of its folder.
-        now_ns: nanoseconds since 1970; None for now.
-
-    Returns:
-        Its path in the trash.
+    `now_ns` are nanoseconds since 1970, None for now.
 
     Raises:
         NotFoundError: no such item.

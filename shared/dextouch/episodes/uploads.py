@@ -31,11 +31,6 @@ def group_key(kind: Kind, item_id: str) -> str:
 def upload_group(bucket: Bucket, kind: Kind, folder: Path) -> None:
     """Upload a committed group and remove its local folder; may be repeated after a failure.
 
-    Args:
-        bucket: destination.
-        kind: of the group.
-        folder: of the group, named by its id.
-
     Raises:
         ConflictError: the id has other content there; the folder is kept.
         UnavailableError: no connection, or another writer uses the id; the folder is kept.
@@ -69,9 +64,7 @@ def delete_group(bucket: Bucket, kind: Kind, item_id: str) -> None:
 def sweep_orphans(bucket: Bucket, *, now: datetime | None = None) -> int:
     """Remove objects of abandoned uploads and deletions, and return the number of groups.
 
-    Args:
-        bucket: to scan completely.
-        now: reference time for ORPHAN_AGE; defaults to the present.
+    The whole bucket is listed. ORPHAN_AGE counts back from `now`, the present by default.
     """
     limit = (datetime.now(UTC) if now is None else now) - ORPHAN_AGE
     removed = 0

@@ -174,13 +174,9 @@ class GopDecoder:
     def decode(
         self, access_units: list[bytes], wanted: list[int], form: ImageForm, out: np.ndarray
     ) -> None:
-        """Decode images of a group into `out`.
+        """Decode images of a group into `out`, uint8 [len(wanted), *form.shape].
 
-        Args:
-            access_units: of the group, up to the last requested image.
-            wanted: indices in the group, ascending.
-            form: size and colours of the output.
-            out: uint8 [len(wanted), *form.shape].
+        `access_units` go up to the last requested image, `wanted` are ascending indices.
 
         Raises:
             CorruptDataError: invalid access units, or another number or size of images.

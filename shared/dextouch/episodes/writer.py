@@ -277,13 +277,9 @@ def write_blocks(
     attributes: Attributes,
     streams: Iterable[tuple[str, Iterable[Block]]],
 ) -> None:
-    """Write a whole group that can be written again; after an exception nothing is left.
+    """Write a group that can be written again: names of streams with blocks of their samples.
 
-    Args:
-        stage: new folder on the store's file system.
-        target: where the group appears.
-        attributes: of the group.
-        streams: names, and blocks of values and stamps.
+    Stage and target are those of `EpisodeWriter`. After an exception nothing is left.
     """
     options = WriteOptions(recoverable=False)
     with EpisodeWriter(

@@ -105,10 +105,7 @@ def plan_deletion(
 ) -> list[Victim]:
     """List everything in a store that a request covers, direct matches first.
 
-    Args:
-        root: of the store.
-        request: operator or recording.
-        known: items found by an interrupted deletion.
+    An interrupted deletion has found the `known` items already.
     """
     waiting = all_facts(root)
     spreads = request.derived or request.operator is not None

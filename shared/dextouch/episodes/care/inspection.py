@@ -39,7 +39,7 @@ from dextouch.schemas import EpisodeAttributes, RecordingAttributes
 
 UPLOADS = HOMES["upload"]
 Group = CommittedGroup[EpisodeAttributes] | CommittedGroup[RecordingAttributes]
-# Called with the number of bytes read.
+# Called after every storage chunk with the number of bytes read.
 Progress = Callable[[int], None]
 
 
@@ -80,13 +80,7 @@ def open_contents(files: GroupFiles, kind: Kind) -> Group:
 def inspect_group(
     files: GroupFiles, kind: Kind, *, progress: Progress = lambda _: None
 ) -> ItemReport:
-    """Read a committed group completely and list all damage.
-
-    Args:
-        files: of the group.
-        kind: of the group.
-        progress: called after every storage chunk.
-    """
+    """Read a committed group completely and list all damage."""
     try:
         contents = open_contents(files, kind)
     except StorageError as error:

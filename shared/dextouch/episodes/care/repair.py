@@ -81,13 +81,7 @@ class RepairReport:
 def repair_group(
     root: Path, kind: Kind, item_id: str, *, copy: GroupFiles | None = None
 ) -> RepairReport:
-    """Repair a committed group, or salvage its readable samples.
-
-    Args:
-        root: of the store.
-        kind: of the group.
-        item_id: of the group.
-        copy: a group of the same content, the source of intact arrays.
+    """Repair a committed group from a copy of the same content, or salvage its readable samples.
 
     Raises:
         ConflictError: a copy of other content.

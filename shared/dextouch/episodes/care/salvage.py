@@ -109,13 +109,7 @@ class _SalvagedArray:
 def group_streams(
     folder: Path, attributes: Attributes, entries: Mapping[str, ArrayEntry]
 ) -> list[SalvagedStream]:
-    """The readable samples of a committed group.
-
-    Args:
-        folder: of the group.
-        attributes: of the group.
-        entries: what is known of its arrays.
-    """
+    """The readable samples of a committed group; `entries` are what is known of its arrays."""
 
     def array(name: str) -> _SalvagedArray:
         entry = entries[name]
@@ -165,13 +159,7 @@ def spool_streams(spool: Path, attributes: Attributes) -> list[SalvagedStream]:
 def write_salvaged(
     root: Path, attributes: Attributes, streams: Sequence[SalvagedStream], source: LineageEntry
 ) -> tuple[str, dict[str, int]]:
-    """Write the readable samples as a new group `ID-salvaged-N` of a store.
-
-    Args:
-        root: of the store.
-        attributes: of the damaged item.
-        streams: its readable samples.
-        source: the damaged item.
+    """Write the readable samples of a damaged item, the source, as a new group `ID-salvaged-N`.
 
     Returns:
         The new id, and the number of dropped samples by stream.

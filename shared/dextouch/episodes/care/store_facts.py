@@ -129,11 +129,7 @@ def _text(value: object) -> str | None:
 
 
 class Wanted:
-    """Search for identifiers (a pseudonym, ids, hashes) as whole words.
-
-    Args:
-        words: the identifiers.
-    """
+    """Search for identifiers (a pseudonym, ids, hashes) as whole words."""
 
     def __init__(self, words: set[str]) -> None:
         self._words = words
