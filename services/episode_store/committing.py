@@ -36,11 +36,5 @@ def commit_spool(
             fitting = max(1, min(COPY_SAMPLES, COPY_BYTES // descriptor.sample_bytes()))
             num_samples = COPY_IMAGES if descriptor.unit in ENCODED_UNITS else fitting
             for batch in reader.batches(name, num_samples=num_samples):
-                writer.append(
-                    name,
-                    values=batch.values,
-                    t_host_ns=batch.t_host_ns,
-                    t_device_ns=batch.t_device_ns,
-                    sequence=batch.sequence,
-                )
+                writer.append(name, **vars(batch))
     return {name: reader.num_samples(name) for name in reader.streams}

@@ -155,17 +155,8 @@ class StoreReader:
 
 
 def _packed(reader: EpisodeReader | RecordingReader, stream: str, span: SpanQuery) -> bytes:
-    if isinstance(reader, EpisodeReader):
-        data = reader.read(stream, span.start_ns, span.stop_ns)
-        return pack({"stream": stream}, {"t_ref_ns": data.t_ref_ns, "values": data.values})
-    batch = reader.read(stream, span.start_ns, span.stop_ns)
-    arrays = {
-        "t_host_ns": batch.t_host_ns,
-        "t_device_ns": batch.t_device_ns,
-        "sequence": batch.sequence,
-        "values": batch.values,
-    }
-    return pack({"stream": stream}, arrays)
+    # The fields of both kinds of answers are arrays: stamps, then values.
+    return pack({"stream": stream}, vars(reader.read(stream, span.start_ns, span.stop_ns)))
 
 
 def etag_of(reader: EpisodeReader | RecordingReader, what: str, query: BaseModel) -> str:

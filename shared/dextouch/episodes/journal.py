@@ -96,20 +96,23 @@ def _row_crcs(rows: np.ndarray) -> np.ndarray:
     return np.fromiter(map(google_crc32c.value, bodies), dtype=np.uint32, count=len(rows))
 
 
-def scan_rows(folder: Path, name: str, payloads: bytes) -> tuple[np.ndarray, np.ndarray]:
+def scan_rows(folder: Path, name: str, part: Path) -> tuple[np.ndarray, np.ndarray]:
     """All rows of a journal, damaged ones too, and whether each and its payload are intact.
 
-    `payloads` are the contents of the part file, or of the shard that it has become.
+    `part` is the part file, or the shard that it has become.
     """
     path = journal_path(folder, name)
     with disk_errors(f"read {path.name}"):
         data = path.read_bytes()[len(JOURNAL_MAGIC) :] if path.is_file() else b""
     rows = np.frombuffer(data, JOURNAL_ROW, count=len(data) // JOURNAL_ROW.itemsize)
-    ends = rows["offset"] + rows["length"]
-    spans = zip(rows["offset"].tolist(), ends.tolist(), strict=True)
-    crcs = [google_crc32c.value(payloads[start:stop]) for start, stop in spans]
-    hold = (_row_crcs(rows) == rows["row_crc32c"]) & (ends <= len(payloads))
-    return rows, hold & (np.array(crcs, dtype=np.uint32) == rows["payload_crc32c"])
+    hold = np.zeros(len(rows), dtype=bool)
+    with disk_errors(f"read {part.name}"):
+        num_bytes = part.stat().st_size if part.is_file() else 0
+        inside = (rows["offset"] <= num_bytes) & (rows["offset"] + rows["length"] <= num_bytes)
+        for number in np.flatnonzero(inside & (_row_crcs(rows) == rows["row_crc32c"])):
+            crc = google_crc32c.value(_payload_at(part, rows[number]))
+            hold[number] = crc == int(rows["payload_crc32c"][number])
+    return rows, hold
 
 
 def read_payload(folder: Path, name: str, row: np.void) -> bytes:
@@ -118,12 +121,17 @@ def read_payload(folder: Path, name: str, row: np.void) -> bytes:
     Raises:
         CorruptDataError: it does not match its checksum.
     """
-    with disk_errors(f"read {name}"), part_path(folder, name).open("rb") as file:
-        file.seek(int(row["offset"]))
-        payload = file.read(int(row["length"]))
+    with disk_errors(f"read {name}"):
+        payload = _payload_at(part_path(folder, name), row)
     if google_crc32c.value(payload) != int(row["payload_crc32c"]):
         raise CorruptDataError(damaged_payload(name, row))
     return payload
+
+
+def _payload_at(part: Path, row: np.void) -> bytes:
+    with part.open("rb") as file:
+        file.seek(int(row["offset"]))
+        return file.read(int(row["length"]))
 
 
 def damaged_payload(name: str, row: np.void) -> str:

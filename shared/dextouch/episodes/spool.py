@@ -12,7 +12,7 @@ from types import TracebackType
 
 import google_crc32c
 
-from dextouch.episodes.batch_bytes import batch_bytes, batch_of_bytes
+from dextouch.episodes.batch_bytes import batch_bytes
 from dextouch.episodes.files import disk_errors, replace_file, sync_folder, try_lock, write_file
 from dextouch.episodes.spool_log import (
     LOG_FILE,
@@ -21,7 +21,6 @@ from dextouch.episodes.spool_log import (
     StreamRecord,
     body_at,
     open_log,
-    read_bodies,
     read_records,
 )
 from dextouch.episodes.spool_reader import (
@@ -29,6 +28,7 @@ from dextouch.episodes.spool_reader import (
     RECORDING_FILE,
     SpoolReader,
     read_attributes,
+    read_batch,
 )
 from dextouch.errors import ConflictError, InvalidInputError, StorageError, UnknownNameError
 from dextouch.schemas import RecordingAttributes
@@ -249,12 +249,7 @@ class SpoolWriter:
             self._num_samples[name] = int(rows["num_samples"].sum())
             self._num_batches[name] = len(rows)
             if len(rows):
-                last = batch_of_bytes(
-                    self.attributes.streams[number],
-                    read_bodies(self.path, rows[-1:]),
-                    rows[-1:]["num_samples"].tolist(),
-                    what=f"spool {self.path.name!r}",
-                )
+                last = read_batch(self.path, self.attributes.streams[number], rows[-1:])
                 self._last_t_host_ns[name] = int(last.t_host_ns[-1])
         return records.end
 

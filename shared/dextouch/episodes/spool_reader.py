@@ -11,7 +11,7 @@ from dextouch.episodes.files import disk_errors
 from dextouch.episodes.spool_log import read_bodies, read_records
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError, UnknownNameError
 from dextouch.schemas import RecordingAttributes
-from dextouch.streams import SampleBatch
+from dextouch.streams import SampleBatch, StreamDescriptor
 
 RECORDING_FILE = "recording.json"
 CLOSED_FILE = "closed"
@@ -61,15 +61,10 @@ class SpoolReader:
         first = int(np.searchsorted(rows["first_sample"], start, side="right")) - 1
         last = int(np.searchsorted(rows["first_sample"], stop, side="left"))
         rows = rows[max(0, first) : max(0, first, last)]
-        batch = self._batch(stream_name, rows)
+        batch = read_batch(self.path, self.streams[stream_name], rows)
         skipped = start - int(rows["first_sample"][0]) if len(rows) else 0
         wanted = slice(skipped, skipped + stop - start)
-        return SampleBatch(
-            batch.t_host_ns[wanted],
-            batch.t_device_ns[wanted],
-            batch.sequence[wanted],
-            batch.values[wanted],
-        )
+        return SampleBatch(*(column[wanted] for column in vars(batch).values()))
 
     def appended(self, stream_name: str, number: int) -> SampleBatch:
         """The samples of one append, numbered from 0.
@@ -83,7 +78,7 @@ class SpoolReader:
             raise InvalidInputError(
                 f"{stream_name}: got append {number}, expected within 0 … {len(rows) - 1}"
             )
-        return self._batch(stream_name, rows[number : number + 1])
+        return read_batch(self.path, self.streams[stream_name], rows[number : number + 1])
 
     def batches(
         self, stream_name: str, *, num_samples: int = DEFAULT_BATCH_SAMPLES, first: int = 0
@@ -99,14 +94,6 @@ class SpoolReader:
             if stop <= total or self.closed:
                 yield self.read(stream_name, start, min(stop, total))
 
-    def _batch(self, name: str, rows: np.ndarray) -> SampleBatch:
-        return batch_of_bytes(
-            self.streams[name],
-            read_bodies(self.path, rows),
-            rows["num_samples"].tolist(),
-            what=f"spool {self.path.name!r}",
-        )
-
     def _stream_rows(self, name: str) -> np.ndarray:
         if name not in self.streams:
             raise UnknownNameError("stream", name, list(self.streams))
@@ -121,6 +108,13 @@ class SpoolReader:
                 stream: rows[rows["stream"] == number] for number, stream in enumerate(self.streams)
             }
         return self._rows[name]
+
+
+def read_batch(path: Path, descriptor: StreamDescriptor, rows: np.ndarray) -> SampleBatch:
+    """The samples in consecutive records of one stream of a spool, verified."""
+    counts = rows["num_samples"].tolist()
+    bodies = read_bodies(path, rows)
+    return batch_of_bytes(descriptor, bodies, counts, what=f"spool {path.name!r}")
 
 
 def read_attributes(path: Path) -> RecordingAttributes:

@@ -116,21 +116,13 @@ def _is_committed(bucket: Bucket, group: str, content: str, name: str) -> bool:
 
 
 def _put_files(bucket: Bucket, group: str, folder: Path) -> None:
-    names = sorted(
-        path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()
-    )
+    paths = sorted(path for path in folder.rglob("*") if path.is_file())
+    files = {path.relative_to(folder).as_posix(): path for path in paths}
+    del files[COMMIT_FILE]
     with ThreadPoolExecutor(_PARALLEL_REQUESTS) as pool:
-        puts = [
-            pool.submit(bucket.put, f"{group}/{name}", folder / name)
-            for name in names
-            if name != COMMIT_FILE
-        ]
-        try:
-            for put in puts:
-                put.result()
-        finally:
-            for put in puts:
-                put.cancel()
+        # The first failure cancels what has not begun.
+        for _ in pool.map(bucket.put, [f"{group}/{name}" for name in files], files.values()):
+            pass
 
 
 def _remove_files(bucket: Bucket, group: str, keys: list[str]) -> None:

@@ -233,9 +233,8 @@ def inspect_stage(folder: Path) -> ItemReport:
     for name in present:
         try:
             num_rows = len(read_rows(folder, name))
-            with disk_errors(f"read {name}"):
-                rows, hold = scan_rows(folder, name, part_path(folder, name).read_bytes())
-            rows, hold = rows[:num_rows], hold[:num_rows]
+            found = scan_rows(folder, name, part_path(folder, name))
+            rows, hold = (column[:num_rows] for column in found)
             num_bytes += int(rows["length"][hold].sum())
             # Neither data that a live writer has not written yet nor a torn tail is damage.
             for number in np.flatnonzero(~hold & np.logical_or.accumulate(hold[::-1])[::-1]):

@@ -4,7 +4,7 @@ Nothing is filled in: a damaged storage chunk or sample is dropped with its stam
 `lost_to_damage`.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,7 +12,6 @@ import numpy as np
 
 from dextouch.episodes.batch_bytes import batch_of_bytes
 from dextouch.episodes.care.inspection import hashed_bytes
-from dextouch.episodes.files import disk_errors
 from dextouch.episodes.format import (
     GOP_IMAGES,
     STAMPS,
@@ -31,13 +30,14 @@ from dextouch.episodes.journal import part_path, scan_rows
 from dextouch.episodes.shard_index import salvaged_index
 from dextouch.episodes.shard_reader import ShardReader, decode_rows
 from dextouch.episodes.sources import LocalFile
-from dextouch.episodes.spool_log import body_at, find_records, open_log, read_bodies
+from dextouch.episodes.spool_log import body_at, find_records, open_log
+from dextouch.episodes.spool_reader import read_batch
 from dextouch.episodes.staged_group import new_stage
 from dextouch.episodes.staging_recovery import free_id, ids_below
 from dextouch.episodes.writer import Block, write_blocks
 from dextouch.errors import CorruptDataError, InvalidInputError
 from dextouch.schemas import LineageEntry
-from dextouch.streams import SampleBatch, StreamDescriptor, check_batch, encoded_values
+from dextouch.streams import StreamDescriptor, check_batch, encoded_values
 
 LOST = "lost_to_damage"
 # The rows of these streams correspond by index: the steps of the model grid.
@@ -129,8 +129,7 @@ def stage_streams(stage: Path, attributes: Attributes) -> list[SalvagedStream]:
         # A writer or a recovery that died during its commit has closed some shards.
         closed = stage / name / shard_path(len(entry.shape))
         path = closed if closed.is_file() else part_path(stage, name)
-        with disk_errors(f"read {path.name}"):
-            rows, hold = scan_rows(stage, name, path.read_bytes() if path.is_file() else b"")
+        rows, hold = scan_rows(stage, name, path)
         numbers = np.flatnonzero(hold)
         index = np.zeros((len(rows), 2), dtype=np.uint64)
         index[hold] = np.stack([rows["offset"][hold], rows["length"][hold]], axis=1)
@@ -245,19 +244,13 @@ def _on_one_grid(streams: Sequence[SalvagedStream]) -> list[SalvagedStream]:
 def _holds(streams: Sequence[StreamDescriptor], row: np.void, body: bytes | None) -> bool:
     if body is None or row["stream"] >= len(streams):
         return False
+    descriptor = streams[int(row["stream"])]
     try:
-        _batch(streams[int(row["stream"])], [body], [int(row["num_samples"])])
+        batch = batch_of_bytes(descriptor, [body], [int(row["num_samples"])], what="log")
+        check_batch(descriptor, batch)
     except (CorruptDataError, InvalidInputError):
         return False
     return True
-
-
-def _batch(
-    descriptor: StreamDescriptor, bodies: Iterable[bytes], counts: Sequence[int]
-) -> SampleBatch:
-    batch = batch_of_bytes(descriptor, bodies, counts, what="log")
-    check_batch(descriptor, batch)
-    return batch
 
 
 def _spooled(
@@ -275,7 +268,7 @@ def _spooled(
 
     def read(start: int, stop: int, wanted: np.ndarray) -> Block:
         inside = rows[(rows["first_sample"] < stop) & (ends > start)]
-        batch = _batch(descriptor, read_bodies(spool, inside), inside["num_samples"].tolist())
+        batch = read_batch(spool, descriptor, inside)
         numbers = np.concatenate(
             [np.arange(r["num_samples"]) + int(r["first_sample"]) for r in inside]
         )
