@@ -3,15 +3,12 @@
 import argparse
 import shutil
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from rich.console import Console
-from rich.progress import track
-
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import CommandParser, add_json, progress, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeReader, EpisodeStore, RecordingReader
 from dextouch.errors import (
@@ -143,14 +140,6 @@ def _open(store: EpisodeStore, kind: str, item_id: str) -> Reader:
     return store.recording(item_id) if kind == "recording" else store.open(item_id)
 
 
-def _progress(items: Iterable[str], total: int, what: str) -> Iterable[str]:
-    """Iterate with a progress bar on stderr, if it is a terminal."""
-    console = Console(stderr=True)
-    return track(
-        items, total=total, description=what, console=console, disable=not console.is_terminal
-    )
-
-
 def _export(options: argparse.Namespace) -> Report:
     store = EpisodeStore(options.store)
     if options.format in _JOINT and options.kind == "recording":
@@ -162,7 +151,7 @@ def _export(options: argparse.Namespace) -> Report:
     if options.format in _SINGLE:
         return report | {"files": _export_each(store, ids, options)}
     readers = (
-        store.open(item_id) for item_id in _progress(ids, len(ids), f"export {options.format}")
+        store.open(item_id) for item_id in progress(ids, f"export {options.format}", len(ids))
     )
     num_steps = _JOINT[options.format](readers, options)
     print(f"{options.to}  {len(ids)} episodes  {num_steps} steps")
@@ -178,7 +167,7 @@ def _export_each(
     if taken and not options.force:
         raise ConflictError(f"{taken[0]}: exists already; choose another path or add --force")
     files: list[dict[str, object]] = []
-    for item_id in _progress(ids, len(ids), f"export {options.format}"):
+    for item_id in progress(ids, f"export {options.format}", len(ids)):
         path = paths[item_id]
         count = form.export(_open(store, options.kind, item_id), path, options)
         files.append({"id": item_id, "path": str(path), "num_messages": count})
@@ -205,8 +194,8 @@ def _import(options: argparse.Namespace) -> Report:
         files = sorted(path.glob("*.mcap")) if path.is_dir() else [path]
         if not files:
             raise NotFoundError(f"{path}: holds no .mcap file")
-        names = _progress([str(file) for file in files], len(files), "import mcap")
-        ids = [import_mcap(Path(name), store) for name in names]
+        names = progress(files, "import mcap", len(files))
+        ids = [import_mcap(file, store) for file in names]
     elif options.format == "umi":
         from dextouch.bridges.umi import import_umi
 

@@ -7,9 +7,8 @@ those of other seeds. A state model draws only the images that the probe uses.
 
 import argparse
 import os
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -30,66 +29,55 @@ from services.world_model.world import open_world
 WORLD = "world_model"
 
 
-@dataclass(frozen=True)
-class Choice:
-    """Selection of episodes of a store by task and seed; None takes all.
-
-    Each process takes the selected episodes whose seed has the remainder `part` when divided by
-    `num_parts`.
-    """
-
-    tasks: tuple[str, ...] | None = None
-    seeds: range | None = None
-    part: int = 0
-    num_parts: int = 1
-
-    def takes(self, task: str, seed: int | None) -> bool:
-        """Whether an episode of this task and seed is selected."""
-        of_task = self.tasks is None or task in self.tasks
-        of_part = (seed or 0) % self.num_parts == self.part
-        return of_task and of_part and (self.seeds is None or seed in self.seeds)
+def chosen_episodes(
+    store: EpisodeStore, tasks: Collection[str] | None, seeds: range | None
+) -> list[str]:
+    """Ids of the episodes of these tasks and seeds; None takes all."""
+    entries = ((episode_id, store.open(episode_id).attributes) for episode_id in store.list())
+    return [
+        episode_id
+        for episode_id, about in entries
+        if (tasks is None or about.task in tasks) and (seeds is None or about.seed in seeds)
+    ]
 
 
-EVERYTHING = Choice()
-
-
-def imagine_all(
-    episodes: str, output: str, checkpoint: Path, choice: Choice = EVERYTHING
-) -> dict[str, int]:
+def imagine_all(episodes: str, output: str, checkpoint: Path, episode_ids: Sequence[str]) -> int:
     """Imagine robot episodes of a store; existing results are kept.
 
     Args:
         episodes: store to read.
         output: store to write.
         checkpoint: checkpoint of a world model of either kind.
-        choice: episodes to imagine.
+        episode_ids: episodes to imagine.
+
+    Returns:
+        Number of episodes.
     """
     source, target = EpisodeStore(episodes), EpisodeStore(output)
     torch.set_num_threads(1)
     world = open_world(checkpoint)
     app = create_world_app({WORLD: world}, WorldServiceSettings(), name="imagined")
-    made = 0
     with served({"imagined": app}) as urls, RolloutClient(urls["imagined"]) as client:
-        for episode_id in track(source.list(), description="imagined episodes"):
+        for episode_id in track(episode_ids, description="imagined episodes"):
             reader = source.open(episode_id)
-            if choice.takes(reader.attributes.task, reader.attributes.seed):
-                steps = judged_steps(reader) if isinstance(world, StateWorld) else None
-                imagine_episode(reader, client, WORLD, target, image_steps=steps)
-                made += 1
-    return {"imagined": made}
+            steps = judged_steps(reader) if isinstance(world, StateWorld) else None
+            imagine_episode(reader, client, WORLD, target, image_steps=steps)
+    return len(episode_ids)
 
 
 def imagine_in_parts(
-    episodes: str, output: str, checkpoint: Path, choice: Choice, num_jobs: int
-) -> dict[str, int]:
+    episodes: str, output: str, checkpoint: Path, episode_ids: Sequence[str], num_jobs: int
+) -> int:
     """Imagine episodes in several processes; arguments and result as in `imagine_all`."""
     if num_jobs == 1:
-        return imagine_all(episodes, output, checkpoint, choice)
-    parts = [replace(choice, part=part, num_parts=num_jobs) for part in range(num_jobs)]
+        return imagine_all(episodes, output, checkpoint, episode_ids)
     # Fresh interpreters: forked ones would share the threads of torch.
     with ProcessPoolExecutor(num_jobs, mp_context=get_context("spawn")) as pool:
-        running = [pool.submit(imagine_all, episodes, output, checkpoint, one) for one in parts]
-        return {"imagined": sum(done.result()["imagined"] for done in running)}
+        running = [
+            pool.submit(imagine_all, episodes, output, checkpoint, episode_ids[part::num_jobs])
+            for part in range(min(num_jobs, len(episode_ids)))
+        ]
+        return sum(done.result() for done in running)
 
 
 def judged_steps(episode: EpisodeReader) -> set[int]:
@@ -148,13 +136,10 @@ def main(argv: Sequence[str]) -> int:
     add_json(parser)
     arguments = parser.parse_args(list(argv))
     tasks = tuple(arguments.tasks.split(",")) if arguments.tasks else None
-    counts = imagine_in_parts(
-        arguments.episodes,
-        arguments.store,
-        arguments.checkpoint,
-        Choice(tasks, arguments.seeds),
-        arguments.jobs,
+    wanted = chosen_episodes(EpisodeStore(arguments.episodes), tasks, arguments.seeds)
+    count = imagine_in_parts(
+        arguments.episodes, arguments.store, arguments.checkpoint, wanted, arguments.jobs
     )
-    print(", ".join(f"{count} {name}" for name, count in counts.items()))
-    write_result(arguments.json, counts)
+    print(f"{count} imagined")
+    write_result(arguments.json, {"imagined": count})
     return 0

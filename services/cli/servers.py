@@ -3,7 +3,7 @@
 import asyncio
 import signal
 import socket
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 
@@ -82,10 +82,10 @@ async def serve_all(
     placed: Sequence[tuple[Place, FastAPI]],
     *,
     stop: asyncio.Event,
-    ready: asyncio.Event,
+    on_ready: Callable[[], None],
     grace_s: int = 10,
 ) -> None:
-    """Serve until `stop` is set; sets `ready` once all services respond.
+    """Serve until `stop` is set; `on_ready` is called once all services respond.
 
     Raises:
         UnavailableError: a service terminated unexpectedly; the others were shut down.
@@ -96,7 +96,7 @@ async def serve_all(
         for place, _ in placed
     }
     stopping = asyncio.create_task(stop.wait())
-    announcing = asyncio.create_task(_announce(list(servers.values()), ready))
+    announcing = asyncio.create_task(_announce(list(servers.values()), on_ready))
     await asyncio.wait([stopping, *tasks.values()], return_when=asyncio.FIRST_COMPLETED)
     ended = [name for name, task in tasks.items() if task.done()]
     # In reverse, so that clients stop before the services they use.
@@ -126,10 +126,10 @@ def stop_on_signals(stop: asyncio.Event) -> None:
         loop.add_signal_handler(number, on_signal, number)
 
 
-async def _announce(servers: Sequence[Server], ready: asyncio.Event) -> None:
+async def _announce(servers: Sequence[Server], on_ready: Callable[[], None]) -> None:
     for server in servers:
         await server.answers.wait()
-    ready.set()
+    on_ready()
 
 
 def _server(app: FastAPI, grace_s: int) -> Server:

@@ -58,7 +58,7 @@ class Scope:
 
 
 @dataclass(frozen=True)
-class _Order:
+class Order:
     """One episode to record, in any process."""
 
     task: str
@@ -70,12 +70,13 @@ class _Order:
 
     @property
     def episode_id(self) -> str:
+        """Id of the episode, known before it is recorded."""
         played = None if self.policy is None else self.policy.label
         return episode_id(self.task, self.domain, self.seed, self.options, played=played)
 
 
 @dataclass(frozen=True)
-class _Answer:
+class Answer:
     """Result of an order: success, None if another process was faster, or a refusal."""
 
     episode_id: str
@@ -89,7 +90,7 @@ def _stage(task: str, domain: Domain) -> Stage:
     return Stage(task, domain, TwinSettings())
 
 
-def _make(order: _Order) -> _Answer:
+def _make(order: Order) -> Answer:
     stage = _stage(order.task, order.domain)
     try:
         if order.policy is None:
@@ -99,10 +100,10 @@ def _make(order: _Order) -> _Answer:
             episode = record(stage, order.seed, order.options, played=played)
         write_episode(EpisodeStore(order.store), episode)
     except ConflictError:
-        return _Answer(order.episode_id)
+        return Answer(order.episode_id)
     except InvalidInputError as error:
-        return _Answer(order.episode_id, refusal=error.message)
-    return _Answer(order.episode_id, bool(episode.attributes.success))
+        return Answer(order.episode_id, refusal=error.message)
+    return Answer(order.episode_id, bool(episode.attributes.success))
 
 
 def make_training_data(
@@ -148,7 +149,9 @@ def make_training_data(
     counts = {"made": 0, "kept": len(orders) - len(missing), "succeeded": 0, "refused": 0}
     started_s = time.monotonic()
     with Progress("twin episodes", len(missing)) as progress:
-        for done, answer in enumerate(_answers(missing, num_jobs or os.cpu_count() or 1), start=1):
+        for done, answer in enumerate(
+            record_all(missing, num_jobs or os.cpu_count() or 1), start=1
+        ):
             if answer.refusal is not None:
                 counts["refused"] += 1
                 print(f"{answer.episode_id}: {answer.refusal}")
@@ -166,7 +169,7 @@ def make_training_data(
 
 def _orders(
     store: str, seeds: range, mix: Mix, scope: Scope, policy: PolicyChoice | None
-) -> Iterator[_Order]:
+) -> Iterator[Order]:
     for seed in seeds:
         for task in scope.tasks:
             made = TakeOptions() if policy is not None else options_of(task, seed, mix)
@@ -174,11 +177,11 @@ def _orders(
                 made, images=CAMERAS, image_every=scope.image_every, streams=scope.streams
             )
             for domain in scope.domains:
-                yield _Order(task, domain, seed, options, store, policy)
+                yield Order(task, domain, seed, options, store, policy)
 
 
-def _answers(orders: Sequence[_Order], num_jobs: int) -> Iterator[_Answer]:
-    """Answers in the order of completion."""
+def record_all(orders: Sequence[Order], num_jobs: int) -> Iterator[Answer]:
+    """Record episodes in processes of their own; yields their results as they are done."""
     if num_jobs == 1 or len(orders) < 2:
         yield from map(_make, orders)
         return

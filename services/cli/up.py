@@ -4,6 +4,7 @@ import asyncio
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -107,10 +108,7 @@ async def run(settings: UpSettings, stop: asyncio.Event | None = None) -> int:
         places = {name: bound[name] for name in builders}
         urls = {name: place.url for name, place in places.items()}
         placed = [(places[name], _build(name, settings, urls)) for name in builders]
-        ready = asyncio.Event()
-        announcing = asyncio.create_task(_announce(settings, places, ready))
-        held.callback(announcing.cancel)
-        await serve_all(placed, stop=stop, ready=ready)
+        await serve_all(placed, stop=stop, on_ready=partial(_announce, settings, places))
     return 0
 
 
@@ -150,10 +148,7 @@ def _wanted(settings: UpSettings) -> Mapping[str, Builder]:
     return {name: build for name, build in BUILDERS.items() if name not in settings.without}
 
 
-async def _announce(
-    settings: UpSettings, places: Mapping[str, Place], ready: asyncio.Event
-) -> None:
-    await ready.wait()
+def _announce(settings: UpSettings, places: Mapping[str, Place]) -> None:
     for name, place in places.items():
         print(f"{name:<14}{place.url}")
     print(f"data          {settings.data.resolve()}")

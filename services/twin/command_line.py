@@ -3,15 +3,13 @@
 import argparse
 import multiprocessing
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track
 
-from dextouch.command_line import CommandParser, add_json, write_result
+from dextouch.command_line import CommandParser, add_json, progress, write_result
 from dextouch.data_folder import default_store
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
@@ -163,18 +161,6 @@ def _work(orders: Sequence[TakeOrder], num_jobs: int) -> Iterator[TakeReport]:
         yield from pool.imap(_take, orders)
 
 
-def _shown(reports: Iterable[TakeReport], total: int, console: Console) -> list[TakeReport]:
-    return list(
-        track(
-            reports,
-            total=total,
-            description="twin record",
-            console=console,
-            disable=not console.is_terminal,
-        )
-    )
-
-
 def _summary(
     arguments: argparse.Namespace, reports: Sequence[TakeReport], seconds: float
 ) -> dict[str, object]:
@@ -195,7 +181,7 @@ def main(argv: Sequence[str]) -> int:
     arguments = _parser().parse_args(list(argv))
     start_s = time.monotonic()
     orders = _orders(arguments)
-    reports = _shown(_work(orders, arguments.jobs), len(orders), Console(stderr=True))
+    reports = list(progress(_work(orders, arguments.jobs), "twin record", len(orders)))
     summary = _summary(arguments, reports, time.monotonic() - start_s)
     write_result(arguments.json, summary)
     succeeded = sum(report.success for report in reports)

@@ -1,19 +1,20 @@
-"""Parser and JSON output that all commands share, so that they look and behave alike."""
+"""Parser, JSON output and progress that all commands share, so that they look and behave alike."""
 
 import argparse
 import json
 import re
 import sys
 import textwrap
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from contextvars import ContextVar
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, TextIO, TypeVar
 
 STANDARD_OUTPUT = Path("-")
 JSON_HELP = "also write the result as JSON to this file; - for standard output"
+Item = TypeVar("Item")
 _BOOLEANS = {"true": True, "false": False}
 _result_stream: ContextVar[TextIO | None] = ContextVar("result_stream", default=None)
 
@@ -76,6 +77,17 @@ class CommandParser(argparse.ArgumentParser):
 
 def _switched(flag: str, value: str) -> str:
     return flag if _BOOLEANS[value] else f"--no-{flag.removeprefix('--')}"
+
+
+def progress(items: Iterable[Item], what: str, total: int) -> Iterator[Item]:
+    """Iterate with a progress bar on standard error, if that is a terminal."""
+    from rich.console import Console
+    from rich.progress import track
+
+    console = Console(stderr=True)
+    yield from track(
+        items, total=total, description=what, console=console, disable=not console.is_terminal
+    )
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

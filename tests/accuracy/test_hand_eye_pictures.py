@@ -3,7 +3,6 @@
 import csv
 import json
 import sys
-from datetime import UTC, datetime
 
 import cv2
 import numpy as np
@@ -44,14 +43,13 @@ def camera():
 def given_lens(folder):
     write_entry(
         folder,
-        entry="K_head",
-        matrices={
+        "K_head",
+        {
             "K_head": CHARUCO_K,
-            "distortion_head": DISTORTION[None],
-            "image_size_head_px": np.array([CHARUCO_SIZE], dtype=float),
+            "distortion_head": DISTORTION,
+            "image_size_head_px": np.array(CHARUCO_SIZE, dtype=float),
         },
-        facts={},
-        now=datetime.now(UTC),
+        {},
     )
 
 

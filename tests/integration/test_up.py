@@ -133,7 +133,7 @@ async def test_a_port_that_was_asked_for_is_not_taken_by_another_services_defaul
     place.socket.close()
     served = []
 
-    async def serve_all(placed, *, stop, ready):
+    async def serve_all(placed, *, stop, on_ready):
         served.extend(place.url for place, _ in placed)
 
     monkeypatch.setattr(up, "serve_all", serve_all)

@@ -3,12 +3,12 @@
 import argparse
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
-from dextouch.errors import InvalidInputError
+from dextouch.command_line import progress
+from dextouch.errors import NotFoundError
 from services.alignment.calibration.board_detection import FoundBoards
 from services.alignment.calibration.intrinsics import CameraCalibration, calibrate_found
 from services.cli.calibrate.advice import Coverage, camera_coverage
@@ -22,11 +22,10 @@ from services.cli.calibrate.boards import (
     reprojection,
     usual_pattern,
 )
-from services.cli.calibrate.photos import photo_paths, progress, read_photos
+from services.cli.calibrate.photos import photo_paths, read_photos
 from services.cli.calibrate.pictures import coverage_picture, residual_picture
-from services.cli.calibrate.record import write_entry, write_picture
+from services.cli.calibrate.record import named_matrix, read_matrices, write_entry, write_picture
 
-CAMERAS = ("head", "wrist_left", "wrist_right")
 # OpenCV's pixel origin is the centre of the first pixel, DexTouch's its corner.
 PIXEL_SHIFT_PX = 0.5
 
@@ -63,8 +62,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     result = calibrate_found(corners_of(found))
     lens = Lens(result.K, result.distortion)
     residuals = [reprojection(view, lens, board_pose(view, lens)) for view in views]
-    coverage = camera_coverage(views, found.size_px, lens)
-    write_coverage(found, coverage, options.to, options.camera)
+    coverage, _ = write_coverage(views, found.size_px, options.to, options.camera, lens)
     write_picture(
         options.to,
         f"residuals_{options.camera}.svg",
@@ -82,7 +80,9 @@ def find_boards(paths: Sequence[Path], board: Board) -> Found:
     photos = read_photos(paths)
     seen = [
         find_board(path.name, photo, board)
-        for path, photo in progress(list(zip(paths, photos, strict=True)), "looking for the board")
+        for path, photo in progress(
+            zip(paths, photos, strict=True), "looking for the board", len(paths)
+        )
     ]
     pattern = usual_pattern([view for view in seen if view is not None])
     found = [view for view in seen if view is not None and view.pattern == pattern]
@@ -111,8 +111,7 @@ def corners_of(found: Found) -> FoundBoards:
 
 def report_coverage(found: Found, folder: Path, camera: str) -> dict[str, object]:
     """Print and draw the coverage of the photos, and return it as data."""
-    coverage = camera_coverage(found.views, found.size_px)
-    path = write_coverage(found, coverage, folder, camera)
+    coverage, path = write_coverage(found.views, found.size_px, folder, camera)
     print(f"board found in {len(found.views)} of {found.num_photos} photos ({found.board_kind})")
     tell_left_out(found)
     for words in coverage.todo:
@@ -137,10 +136,17 @@ def tell_left_out(found: Found) -> None:
         print(f"  {name} is blurred: left out; hold camera and board still, or give it more light")
 
 
-def write_coverage(found: Found, coverage: Coverage, folder: Path, camera: str) -> Path:
-    """Draw the coverage picture and return its path."""
-    picture = coverage_picture(found.views, coverage, found.size_px)
-    return write_picture(folder, f"coverage_{camera}.svg", picture)
+def write_coverage(
+    views: Sequence[BoardView],
+    size_px: tuple[int, int],
+    folder: Path,
+    camera: str,
+    lens: Lens | None = None,
+) -> tuple[Coverage, Path]:
+    """Coverage by these views, and the path of its picture; arguments as `camera_coverage`."""
+    coverage = camera_coverage(views, size_px, lens)
+    picture = coverage_picture(views, coverage, size_px)
+    return coverage, write_picture(folder, f"coverage_{camera}.svg", picture)
 
 
 def _keep(
@@ -165,18 +171,13 @@ def _keep(
         "image_size_px": list(found.size_px),
         "next": list(coverage.todo),
     }
-    write_entry(
-        options.to,
-        entry=name,
-        matrices={
-            name: K,
-            f"{name}_sigma_px": result.sigma_fxfycxcy_px[None],
-            f"distortion_{options.camera}": result.distortion[None],
-            f"image_size_{options.camera}_px": np.array([found.size_px], dtype=np.float64),
-        },
-        facts=facts,
-        now=datetime.now(UTC),
-    )
+    matrices = {
+        name: K,
+        f"{name}_sigma_px": result.sigma_fxfycxcy_px,
+        f"distortion_{options.camera}": result.distortion,
+        f"image_size_{options.camera}_px": np.array(found.size_px, dtype=np.float64),
+    }
+    write_entry(options.to, name, matrices, facts)
     fx, fy, cx, cy = K[[0, 1, 0, 1], [0, 1, 2, 2]]
     sigma = result.sigma_fxfycxcy_px
     print(
@@ -187,18 +188,22 @@ def _keep(
     return facts
 
 
-def lens_of(matrices: dict[str, np.ndarray], size_px: tuple[int, int]) -> Lens:
-    """OpenCV's lens from the stored matrices K [3, 3], distortion [1, 5] and image size [1, 2].
+def read_lens(folder: Path, camera: str) -> tuple[Lens, tuple[int, int]]:
+    """OpenCV's lens of a calibrated camera, and width and height of its images (px).
 
     Raises:
-        InvalidInputError: the photos differ in size from those of the calibration.
+        NotFoundError: the camera is not calibrated in this folder.
+        InvalidInputError: a matrix of another shape.
     """
-    calibrated = tuple(int(v) for v in matrices["image_size"][0])
-    if calibrated != size_px:
-        raise InvalidInputError(
-            f"photos: got {size_px[0]} by {size_px[1]} px, but K was measured at "
-            f"{calibrated[0]} by {calibrated[1]}; take the photos in the same mode of the camera"
-        )
-    K = matrices["K"].copy()
+    try:
+        matrices = read_matrices(folder)
+        K = named_matrix(matrices, f"K_{camera}", (3, 3))
+        distortion = named_matrix(matrices, f"distortion_{camera}", (1, 5))
+        width_px, height_px = named_matrix(matrices, f"image_size_{camera}_px", (1, 2))[0]
+    except NotFoundError as error:
+        raise NotFoundError(
+            f"{error.message}. First: dextouch station calibrate camera --camera {camera} "
+            f"--to {folder} …"
+        ) from error
     K[:2, 2] -= PIXEL_SHIFT_PX
-    return Lens(K, matrices["distortion"][0])
+    return Lens(K, distortion[0]), (int(width_px), int(height_px))

@@ -1,16 +1,14 @@
 """Command line `dextouch station calibrate`."""
 
 import argparse
-import json
-from collections.abc import Callable, Sequence
+import importlib
+from collections.abc import Sequence
 from pathlib import Path
 
-from dextouch.command_line import CommandParser, add_json, write_json_text
+from dextouch.command_line import CommandParser, add_json, write_result
 from dextouch.data_folder import default_spool
-from dextouch.errors import InvalidInputError
-from services.cli.calibrate.boards import BOARD_HELP, parse_board
+from services.cli.calibrate.boards import BOARD_HELP
 
-Report = dict[str, object]
 EXIT_LEVEL = 1
 
 _ABOUT = """\
@@ -121,6 +119,27 @@ examples:
     --take spool/taps --to calibration"""
 
 
+# What each command measures, its longer help, and `module:function` that runs it.
+_COMMANDS = {
+    "camera": ("photos of a board → K and distortion of a camera", _CAMERA, "live:calibrate"),
+    "hand-eye": ("photos and poses → camera on its tracker", _HAND_EYE, "hand_eye:calibrate"),
+    "glove": ("rest and known pressures → tare, gain, faults", _GLOVE, "glove:calibrate"),
+    "wrist": (
+        "flat hand → wrist axes of a glove's keypoints",
+        _WRIST,
+        "hands:calibrate_wrist_axes",
+    ),
+    "profile": ("moving hand → the person's bones and knuckles", _PROFILE, "hands:measure_person"),
+    "robot-base": (
+        "pairs of poses → the robot's base in the world",
+        _ROBOT_BASE,
+        "robot_base:calibrate",
+    ),
+    "latency": ("common motion or taps → path delay", _LATENCY, "latency:calibrate"),
+    "show": ("contents, age and accuracy of a calibration", _SHOW, "show:show"),
+}
+
+
 def main(argv: Sequence[str]) -> int:
     """Run one calibration, or show the existing ones.
 
@@ -128,154 +147,86 @@ def main(argv: Sequence[str]) -> int:
         0; for `show` 1 if something is missing or wrong (level ERROR).
     """
     options = _parser().parse_args(list(argv))
-    report = _WORDS[options.word](options)
-    write_json_text(options.json, _as_text(report))
+    module, _, function = _COMMANDS[options.word][2].partition(":")
+    run = getattr(importlib.import_module(f"services.cli.calibrate.{module}"), function)
+    report: dict[str, object] = run(options)
+    write_result(options.json, report, allow_nan=False)
     return EXIT_LEVEL if report.get("level") == "ERROR" else 0
-
-
-def _as_text(report: Report) -> str:
-    return json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False)
-
-
-def _camera(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import camera, live
-
-    board = parse_board(options.board)
-    if options.watch and options.url is not None:
-        raise InvalidInputError("got --watch and --url, expected one of the two")
-    if options.watch or options.url is not None:
-        live.run(options, board)
-    return camera.calibrate(options)
-
-
-def _hand_eye(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import hand_eye
-
-    return hand_eye.calibrate(options)
-
-
-def _glove(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import glove
-
-    return glove.calibrate(options)
-
-
-def _wrist(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import hands
-
-    return hands.calibrate_wrist_axes(options)
-
-
-def _profile(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import hands
-
-    return hands.measure_person(options)
-
-
-def _robot_base(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import robot_base
-
-    return robot_base.calibrate(options)
-
-
-def _latency(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import latency
-
-    return latency.calibrate(options)
-
-
-def _show(options: argparse.Namespace) -> Report:
-    from services.cli.calibrate import show
-
-    return show.show(options)
-
-
-_WORDS: dict[str, Callable[[argparse.Namespace], Report]] = {
-    "camera": _camera,
-    "hand-eye": _hand_eye,
-    "glove": _glove,
-    "wrist": _wrist,
-    "profile": _profile,
-    "robot-base": _robot_base,
-    "latency": _latency,
-    "show": _show,
-}
 
 
 def _parser() -> argparse.ArgumentParser:
     parser = CommandParser(prog="dextouch station calibrate", description=_ABOUT)
     words = parser.add_subparsers(dest="word", required=True, metavar="WORD")
-    _add_camera(_word(words, "camera", "photos of a board → K and distortion of a camera", _CAMERA))
-    _add_hand_eye(_word(words, "hand-eye", "photos and poses → camera on its tracker", _HAND_EYE))
-    _add_glove(_word(words, "glove", "rest and known pressures → tare, gain, faults", _GLOVE))
-    _add_hand(_word(words, "wrist", "flat hand → wrist axes of a glove's keypoints", _WRIST))
-    _add_hand(_word(words, "profile", "moving hand → the person's bones and knuckles", _PROFILE))
-    _add_robot_base(
-        _word(words, "robot-base", "pairs of poses → the robot's base in the world", _ROBOT_BASE)
-    )
-    _add_latency(_word(words, "latency", "common motion or taps → path delay", _LATENCY))
-    shown = _word(words, "show", "contents, age and accuracy of a calibration", _SHOW)
-    shown.add_argument(
+    of = {
+        name: words.add_parser(name, help=does, description=does, epilog=more)
+        for name, (does, more, _) in _COMMANDS.items()
+    }
+    for name, command in of.items():
+        add_json(command)
+        if name != "show":
+            command.add_argument(
+                "--to",
+                type=Path,
+                required=True,
+                metavar="FOLDER",
+                help="calibration folder; created if new",
+            )
+    of["show"].add_argument(
         "folder", type=Path, metavar="PATH", help="calibration folder or file, or a spooled take"
     )
+    for name in ("glove", "wrist", "profile"):
+        of[name].add_argument("--side", required=True, choices=("left", "right"), help="hand")
+    for name in ("wrist", "profile", "latency"):
+        of[name].add_argument(
+            "--take", required=True, metavar="TAKE", help="spool folder, or id of a recording"
+        )
+    for name in ("glove", "wrist", "profile", "latency"):
+        of[name].add_argument("--store", metavar="URL", help="store of recordings given by id")
+    _add_cameras(of["camera"], of["hand-eye"])
+    _add_glove(of["glove"])
+    of["robot-base"].add_argument(
+        "--poses", type=Path, required=True, metavar="FILE", help="JSON of pairs"
+    )
+    of["robot-base"].add_argument(
+        "--same-frame", action="store_true", help="tracker and effector are the same frame"
+    )
+    for flag, what in (
+        ("--stream", "stream to calibrate"),
+        ("--reference", "stream of known latency, or of latency 0 by definition"),
+    ):
+        of["latency"].add_argument(flag, required=True, metavar="STREAM", help=what)
     return parser
 
 
-def _word(
-    words: "argparse._SubParsersAction[CommandParser]", name: str, does: str, more: str
-) -> argparse.ArgumentParser:
-    parser = words.add_parser(name, help=does, description=does, epilog=more)
-    add_json(parser)
-    return parser
-
-
-def _add_common(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--to",
-        type=Path,
-        required=True,
-        metavar="FOLDER",
-        help="calibration folder; created if new",
-    )
-
-
-def _add_cameras(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--camera",
-        required=True,
-        choices=("head", "wrist_left", "wrist_right"),
-        help="camera to calibrate",
-    )
-    parser.add_argument("--check", action="store_true", help="only report what is missing")
-
-
-def _add_camera(parser: argparse.ArgumentParser) -> None:
-    _add_common(parser)
-    _add_cameras(parser)
-    parser.add_argument(
-        "--photos", type=Path, required=True, metavar="FOLDER", help="folder of photos"
-    )
-    parser.add_argument("--board", required=True, metavar="BOARD", help=BOARD_HELP)
-    parser.add_argument("--watch", action="store_true", help="watch the folder for new photos")
-    parser.add_argument("--url", metavar="URL", help="take photos from this running station")
-    parser.add_argument("--key", metavar="KEY", help="API key of the station")
-
-
-def _add_hand_eye(parser: argparse.ArgumentParser) -> None:
-    _add_common(parser)
-    _add_cameras(parser)
-    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="CSV or JSON")
-    parser.add_argument("--photos", type=Path, metavar="FOLDER", help="photos that FILE names")
-    parser.add_argument("--board", metavar="BOARD", help=BOARD_HELP)
-    parser.add_argument(
+def _add_cameras(camera: argparse.ArgumentParser, hand_eye: argparse.ArgumentParser) -> None:
+    for parser in (camera, hand_eye):
+        parser.add_argument(
+            "--camera",
+            required=True,
+            choices=("head", "wrist_left", "wrist_right"),
+            help="camera to calibrate",
+        )
+        parser.add_argument("--check", action="store_true", help="only report what is missing")
+        is_camera = parser is camera
+        parser.add_argument(
+            "--photos",
+            type=Path,
+            required=is_camera,
+            metavar="FOLDER",
+            help="folder of photos" if is_camera else "photos that FILE names",
+        )
+        parser.add_argument("--board", required=is_camera, metavar="BOARD", help=BOARD_HELP)
+    camera.add_argument("--watch", action="store_true", help="watch the folder for new photos")
+    camera.add_argument("--url", metavar="URL", help="take photos from this running station")
+    camera.add_argument("--key", metavar="KEY", help="API key of the station")
+    hand_eye.add_argument("--poses", type=Path, required=True, metavar="FILE", help="CSV or JSON")
+    hand_eye.add_argument(
         "--intrinsics", type=Path, metavar="FOLDER", help="calibration with K (default: --to)"
     )
-    parser.add_argument("--invert", choices=("tracker", "board"), help="invert these poses")
+    hand_eye.add_argument("--invert", choices=("tracker", "board"), help="invert these poses")
 
 
 def _add_glove(parser: argparse.ArgumentParser) -> None:
-    _add_common(parser)
-    parser.add_argument("--side", required=True, choices=("left", "right"), help="hand")
     parser.add_argument("--url", metavar="URL", help="running station that records the takes")
     parser.add_argument("--key", metavar="KEY", help="API key of the station")
     parser.add_argument(
@@ -287,7 +238,6 @@ def _add_glove(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--rest", metavar="TAKE", help="take of 10 s without contact")
     parser.add_argument("--presses", type=Path, metavar="CSV", help="list of takes under pressure")
-    parser.add_argument("--store", metavar="URL", help="store of recordings given by id")
     parser.add_argument(
         "--pressure-sigma",
         type=float,
@@ -301,36 +251,4 @@ def _add_glove(parser: argparse.ArgumentParser) -> None:
         default=65535.0,
         metavar="COUNTS",
         help="largest count of the glove (%(default)g)",
-    )
-
-
-def _add_take(parser: argparse.ArgumentParser) -> None:
-    _add_common(parser)
-    parser.add_argument(
-        "--take", required=True, metavar="TAKE", help="spool folder, or id of a recording"
-    )
-    parser.add_argument("--store", metavar="URL", help="store of recordings given by id")
-
-
-def _add_hand(parser: argparse.ArgumentParser) -> None:
-    _add_take(parser)
-    parser.add_argument("--side", required=True, choices=("left", "right"), help="hand")
-
-
-def _add_robot_base(parser: argparse.ArgumentParser) -> None:
-    _add_common(parser)
-    parser.add_argument("--poses", type=Path, required=True, metavar="FILE", help="JSON of pairs")
-    parser.add_argument(
-        "--same-frame", action="store_true", help="tracker and effector are the same frame"
-    )
-
-
-def _add_latency(parser: argparse.ArgumentParser) -> None:
-    _add_take(parser)
-    parser.add_argument("--stream", required=True, metavar="STREAM", help="stream to calibrate")
-    parser.add_argument(
-        "--reference",
-        required=True,
-        metavar="STREAM",
-        help="stream of known latency, or of latency 0 by definition",
     )

@@ -2,11 +2,11 @@
 
 import argparse
 from collections.abc import Sequence
-from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
 
+from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError
 from services.alignment.calibration.tactile_faults import OK, STATES
 from services.alignment.calibration.tactile_glove_calibration import (
@@ -16,7 +16,6 @@ from services.alignment.calibration.tactile_glove_calibration import (
 from services.alignment.calibration.tactile_tare import measure_tare
 from services.cli.calibrate import guided
 from services.cli.calibrate.glove_takes import PressRow, press_of, read_presses, read_take
-from services.cli.calibrate.photos import progress
 from services.cli.calibrate.pictures import glove_picture
 from services.cli.calibrate.record import MATRICES_FILE, write_entry, write_picture
 
@@ -31,7 +30,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     side = options.side
     rest, rows = _takes(options)
     tare = measure_tare(read_take(rest, options).values, side=side)
-    presses = [press_of(row, options) for row in progress(list(rows), "reading presses")]
+    presses = [press_of(row, options) for row in progress(rows, "reading presses", len(rows))]
     found = calibrate_glove(tare, presses, full_scale_counts=options.full_scale)
     picture = write_picture(options.to, f"glove_{side}.svg", glove_picture(found))
     report = _facts(found, rest, rows)
@@ -91,13 +90,12 @@ def _facts(found: GloveCalibration, rest: str, rows: Sequence[PressRow]) -> dict
 
 def _keep(found: GloveCalibration, folder: Path, facts: dict[str, object]) -> None:
     """Write tare and gain as separate entries, so that a daily tare keeps the gain."""
-    side, now = found.tare.side, datetime.now(UTC)
-    matrices = found.matrices()
+    side, matrices = found.tare.side, found.matrices()
     zero = {name: m for name, m in matrices.items() if "_tare_" in name or "_noise_" in name}
-    write_entry(folder, entry=f"tactile_{side}_tare", matrices=zero, facts=facts, now=now)
+    write_entry(folder, f"tactile_{side}_tare", zero, facts)
     rest = {name: m for name, m in matrices.items() if name not in zero}
     if rest:
-        write_entry(folder, entry=f"tactile_{side}_gain", matrices=rest, facts=facts, now=now)
+        write_entry(folder, f"tactile_{side}_gain", rest, facts)
 
 
 def _tell(report: dict[str, object], picture: Path) -> None:

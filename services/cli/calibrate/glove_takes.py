@@ -3,66 +3,74 @@
 import argparse
 import csv
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from dextouch.errors import InvalidInputError, NotFoundError
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from dextouch.errors import InvalidInputError
 from dextouch.streams import SampleBatch
 from services.alignment.calibration.tactile_gain import TaxelPress
 from services.alignment.calibration.tactile_glove_calibration import pad_taxels
+from services.cli.calibrate.poses import read_rows
 from services.cli.calibrate.takes import read_stream
 
 STANDARD_GRAVITY_M_S2 = 9.80665
-COLUMNS = ("take", "pressure_kpa", "sigma_kpa", "pads", "mass_kg", "area_cm2", "start_s", "stop_s")
+EXPECTED = (
+    "CSV with the columns take and pressure_kpa, or mass_kg and area_cm2; optional are sigma_kpa, "
+    "pads, start_s, stop_s"
+)
 
 
-@dataclass(frozen=True)
-class PressRow:
-    """One row of the list of presses; `stop_s` None means the end of the take."""
+class PressRow(BaseModel):
+    """One row of the list of presses; `stop_s` None means the end of the take.
+
+    Instead of `pressure_kpa`, a weight may be given by `mass_kg` and `area_cm2`.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     take: str
-    pressure_kpa: float
-    sigma_kpa: float
-    pads: str
-    start_s: float
-    stop_s: float | None
+    pressure_kpa: float = Field(gt=0)
+    sigma_kpa: float | None = Field(default=None, ge=0)
+    pads: str = "all"
+    start_s: float = 0.0
+    stop_s: float | None = None
+
+    @model_validator(mode="before")
+    @classmethod
+    def _pressure_of_weight(cls, given: dict[str, Any]) -> dict[str, Any]:
+        weight = {"mass_kg", "area_cm2"}
+        if not weight & given.keys():
+            return given
+        if "pressure_kpa" in given:
+            raise ValueError("got pressure_kpa and a weight, expected one of the two")
+        mass_kg, area_cm2 = float(given.get("mass_kg", 0)), float(given.get("area_cm2", 0))
+        if not (mass_kg > 0 and area_cm2 > 0):
+            raise ValueError("expected mass_kg and area_cm2, both above 0")
+        pressure_kpa = mass_kg * STANDARD_GRAVITY_M_S2 / (area_cm2 * 1e-4) / 1e3
+        others = {name: value for name, value in given.items() if name not in weight}
+        return {**others, "pressure_kpa": pressure_kpa}
+
+    def known_to(self, relative_sigma: float) -> "PressRow":
+        """The row with a sigma; without one of its own, a share of the pressure."""
+        if self.sigma_kpa is not None:
+            return self
+        return self.model_copy(update={"sigma_kpa": relative_sigma * self.pressure_kpa})
 
 
 def read_presses(path: Path, relative_sigma: float) -> list[PressRow]:
-    """Read a CSV with the columns `take` and either `pressure_kpa` or `mass_kg` with `area_cm2`.
+    """Read the list of presses; takes beside the file may be named by their folder alone.
 
     Raises:
         NotFoundError: no such file.
         InvalidInputError: invalid columns or numbers.
     """
-    if not path.is_file():
-        raise NotFoundError(f"{path}: no such list of presses")
-    try:
-        return _read_rows(path, relative_sigma)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(
-            f"{path}: no CSV in UTF-8 ({error}); expected the columns {', '.join(COLUMNS)}"
-        ) from error
-
-
-def _read_rows(path: Path, relative_sigma: float) -> list[PressRow]:
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        names = set(reader.fieldnames or ())
-        if "take" not in names or names - set(COLUMNS):
-            raise InvalidInputError(
-                f"{path}: got columns {sorted(names)}, expected take and some of "
-                f"{', '.join(COLUMNS[1:])}"
-            )
-        rows = []
-        for row in reader:
-            where = f"{path}: line {reader.line_num}"
-            try:
-                rows.append(press_row(row, relative_sigma, path.parent))
-            except (TypeError, ValueError) as error:
-                raise InvalidInputError(f"{where}: {error}") from error
-    if not rows:
-        raise InvalidInputError(f"{path}: holds no press")
+    rows = []
+    for row in read_rows(path, PressRow, "press", EXPECTED):
+        beside = path.parent / row.take
+        take = str(beside) if beside.is_dir() else row.take
+        rows.append(row.known_to(relative_sigma).model_copy(update={"take": take}))
     return rows
 
 
@@ -82,56 +90,21 @@ def read_take(take: str, options: argparse.Namespace) -> SampleBatch:
     return taken.batch
 
 
-def press_row(row: dict[str, str], relative_sigma: float, folder: Path) -> PressRow:
-    """Parse one row of the list.
-
-    Args:
-        row: as `COLUMNS`.
-        relative_sigma: default relative sigma of a pressure.
-        folder: base of relative take paths.
-
-    Raises:
-        ValueError: missing or invalid numbers.
-    """
-    take = row["take"]
-    if take and (folder / take).is_dir():
-        take = str(folder / take)
-    if row.get("pressure_kpa") and (row.get("mass_kg") or row.get("area_cm2")):
-        raise ValueError("got pressure_kpa and a weight, expected one of the two")
-    if row.get("pressure_kpa"):
-        pressure_kpa = float(row["pressure_kpa"])
-    elif row.get("mass_kg") and row.get("area_cm2"):
-        force_n = float(row["mass_kg"]) * STANDARD_GRAVITY_M_S2
-        pressure_kpa = force_n / (float(row["area_cm2"]) * 1e-4) / 1e3
-    else:
-        raise ValueError("expected pressure_kpa, or mass_kg and area_cm2")
-    given = row.get("sigma_kpa")
-    sigma_kpa = float(given) if given else relative_sigma * pressure_kpa
-    stop = row.get("stop_s")
-    return PressRow(
-        take,
-        pressure_kpa,
-        sigma_kpa,
-        row.get("pads") or "all",
-        float(row.get("start_s") or 0.0),
-        float(stop) if stop else None,
-    )
-
-
 def press_of(row: PressRow, options: argparse.Namespace) -> TaxelPress:
     """The readings of one press.
 
     Raises:
         NotFoundError: no such take, or without this glove.
         UnknownNameError: no such pad.
-        InvalidInputError: no pressure above 0, or pressures instead of counts.
+        InvalidInputError: pressures instead of counts.
     """
     batch = read_take(row.take, options)
     t_s = (batch.t_host_ns - batch.t_host_ns[:1]) * 1e-9
     wanted = t_s >= row.start_s
     if row.stop_s is not None:
         wanted &= t_s < row.stop_s
-    return TaxelPress(row.pressure_kpa, row.sigma_kpa, batch.values[wanted], pad_taxels(row.pads))
+    taxels = pad_taxels(row.pads)
+    return TaxelPress(row.pressure_kpa, row.sigma_kpa or 0.0, batch.values[wanted], taxels)
 
 
 def write_presses(path: Path, rows: Sequence[PressRow]) -> None:

@@ -5,25 +5,21 @@ import json
 import re
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import Protocol, TypeVar, runtime_checkable
+from typing import TypeVar
+
+from pydantic import ValidationError
 
 from dextouch.clients import HttpLink, Reply
+from dextouch.command_line import progress
 from dextouch.errors import InvalidInputError, NotFoundError, UnknownNameError
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_glove_calibration import calibrate_glove, pad_taxels
 from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
-from services.cli.calibrate.glove_takes import (
-    PressRow,
-    press_of,
-    press_row,
-    read_take,
-    write_presses,
-)
-from services.cli.calibrate.photos import progress
+from services.cli.calibrate.glove_takes import PressRow, press_of, read_take, write_presses
 
 REST_S, PRESS_S, TICK_S = 10.0, 5.0, 0.1
 # Timeout of an upload.
@@ -31,39 +27,31 @@ UPLOAD_S = 120.0
 TASK = "calibrate-glove"
 PRESS_HELP = "30, or 30 palm, or 30 thumb+index (kPa), or 2kg/90cm2 palm (a weight)"
 NEXT = "Next pressure (Enter alone: no more; drop: forget the last): "
+# Groups are named as the columns of the list of presses.
 _PRESS = re.compile(
-    r"(?:(?P<kpa>[0-9.]+)(?: ?kpa)?|(?P<kg>[0-9.]+) ?kg ?/ ?(?P<cm2>[0-9.]+) ?cm2)"
-    r"(?: +(?P<pads>[a-z+]+))?"
+    r"(?:(?P<pressure_kpa>[0-9.]+)(?: ?kpa)?"
+    r"|(?P<mass_kg>[0-9.]+) ?kg ?/ ?(?P<area_cm2>[0-9.]+) ?cm2)(?: +(?P<pads>[a-z+]+))?"
 )
 
 Found = TypeVar("Found")
 Ask = Callable[[str], str]
-Wait = Callable[[float], None]
 
 
-@runtime_checkable
-class Link(Protocol):
-    """The part of `HttpLink` used here."""
-
-    def request(self, method: str, path: str, *, body: bytes | None = None) -> Reply:
-        """Send a request to the station."""
-        ...
-
-
+@dataclass(frozen=True)
 class StationTakes:
     """Records takes with a running station and locates them.
 
-    Args:
-        link: connection to the station.
+    Attributes:
+        request: sends a request to the station, as `HttpLink.request`.
         spool: the station's spool, if accessible from this machine.
         has_store: whether takes may be read from the store that the station uploads to.
         wait: sleeps.
     """
 
-    def __init__(
-        self, link: Link, *, spool: Path, has_store: bool, wait: Wait = time.sleep
-    ) -> None:
-        self._link, self._spool, self._has_store, self._wait = link, spool, has_store, wait
+    request: Callable[..., Reply]
+    spool: Path
+    has_store: bool
+    wait: Callable[[float], None] = time.sleep
 
     def record(
         self, name: str, words: str, seconds: float, check: Callable[[str], Found]
@@ -87,10 +75,11 @@ class StationTakes:
         """
         self._act("arm", {"task": TASK, "instruction": words})
         self._act("record", {"recording_id": name})
-        folder, found, is_good = self._spool / name, None, False
+        folder, found, is_good = self.spool / name, None, False
         try:
-            for _ in progress(list(range(round(seconds / TICK_S))), words):
-                self._wait(TICK_S)
+            num_ticks = round(seconds / TICK_S)
+            for _ in progress(range(num_ticks), words, num_ticks):
+                self.wait(TICK_S)
             self._act("stop", {"recording_id": name})
             if folder.is_dir():
                 found = check(str(folder.resolve()))
@@ -106,21 +95,21 @@ class StationTakes:
         return stored_as, check(stored_as)
 
     def _act(self, action: str, body: dict[str, object]) -> None:
-        self._link.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
+        self.request("POST", f"/v1/recorder/{action}", body=json.dumps(body).encode())
 
     def _await_upload(self, name: str) -> str:
         """Wait for the upload and return the take's id in the store."""
-        if not self._has_store:
+        if not self.has_store:
             raise NotFoundError(
-                f"take {name!r}: not in {self._spool.resolve()}; name the station's spool with "
+                f"take {name!r}: not in {self.spool.resolve()}; name the station's spool with "
                 "--spool, or on another machine its store with --store URL"
             )
-        for _ in progress(list(range(round(UPLOAD_S))), "waiting for the upload"):
-            uploads = json.loads(self._link.request("GET", "/v1/uploads").body)
+        for _ in progress(range(round(UPLOAD_S)), "waiting for the upload", round(UPLOAD_S)):
+            uploads = json.loads(self.request("GET", "/v1/uploads").body)
             for take in uploads:
                 if take["recording_id"] == name and take["uploaded"]:
                     return str(take.get("stored_as") or name)
-            self._wait(1.0)
+            self.wait(1.0)
         raise NotFoundError(
             f"take {name!r}: the station did not upload it within {UPLOAD_S:g} s; look at its "
             "uploads, then calibrate with --rest and --presses"
@@ -130,7 +119,7 @@ class StationTakes:
 def station_takes(options: argparse.Namespace) -> StationTakes:
     """Create the helper for the station of the options."""
     link = HttpLink(options.url, api_key=options.key)
-    return StationTakes(link, spool=options.spool, has_store=options.store is not None)
+    return StationTakes(link.request, options.spool, has_store=options.store is not None)
 
 
 def walk(
@@ -205,7 +194,7 @@ class _Guide:
             except InvalidInputError as error:
                 print(f"Not used: {error.message}")
                 continue
-            rows.append(replace(wanted, take=take))
+            rows.append(wanted.model_copy(update={"take": take}))
             known.append(press)
             print(self._known_so_far(tare, known))
         return rows
@@ -225,7 +214,7 @@ class _Guide:
 
     def _press(self, tare: TaxelTare, wanted: PressRow, take: str) -> TaxelPress:
         """The press of a take, if it determines a gain on its own."""
-        press = press_of(replace(wanted, take=take), self._options)
+        press = press_of(wanted.model_copy(update={"take": take}), self._options)
         fit_gain(tare, [press], full_scale_counts=self._options.full_scale)
         return press
 
@@ -253,19 +242,13 @@ def parse_press(words: str, relative_sigma: float) -> PressRow:
         UnknownNameError: no such pad.
     """
     matched = _PRESS.fullmatch(words.strip().lower())
-    if matched is None:
-        raise InvalidInputError(f"pressure: got {words!r}, expected {PRESS_HELP}")
-    given = {name: value for name, value in matched.groupdict().items() if value}
-    columns = {"kpa": "pressure_kpa", "kg": "mass_kg", "cm2": "area_cm2", "pads": "pads"}
+    groups = matched.groupdict() if matched else {}
+    given = {name: text for name, text in groups.items() if text}
     try:
-        row = press_row(
-            {"take": ""} | {columns[name]: value for name, value in given.items()},
-            relative_sigma,
-            Path(),
-        )
-    except (ValueError, ZeroDivisionError) as error:
-        raise InvalidInputError(f"pressure: got {words!r}, expected {PRESS_HELP}") from error
-    if not row.pressure_kpa > 0:
-        raise InvalidInputError(f"pressure: got {words!r}, expected above 0")
+        row = PressRow.model_validate({"take": ""} | given)
+    except ValidationError as error:
+        raise InvalidInputError(
+            f"pressure: got {words!r}, expected {PRESS_HELP}, above 0"
+        ) from error
     pad_taxels(row.pads)
-    return row
+    return row.known_to(relative_sigma)

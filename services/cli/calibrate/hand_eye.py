@@ -1,33 +1,24 @@
 """Command `dextouch station calibrate hand-eye`: mount of a camera on its tracker."""
 
 import argparse
-import csv
-import json
 from dataclasses import dataclass, replace
-from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, NotFoundError, ShapeError, UnknownNameError
-from dextouch.geometry import invert, transform_from_pose
+from dextouch.errors import InvalidInputError, NotFoundError
+from dextouch.geometry import invert
 from services.alignment.calibration.board_views import BoardViews
 from services.alignment.calibration.hand_eye import solve_hand_eye
 from services.cli.calibrate.advice import turn_coverage
 from services.cli.calibrate.boards import board_pose, is_ambiguous, parse_board
-from services.cli.calibrate.camera import find_boards, lens_of, tell_left_out
+from services.cli.calibrate.camera import find_boards, read_lens, tell_left_out
 from services.cli.calibrate.pictures import turns_picture
-from services.cli.calibrate.record import (
-    named_matrix,
-    read_matrices,
-    write_entry,
-    write_picture,
-)
+from services.cli.calibrate.poses import pairs_of, poses_of_photos, read_json
+from services.cli.calibrate.record import write_entry, write_picture
 
 # Tracker of each camera, by the stream names of recordings.
 TRACKERS = {"head": "head", "wrist_left": "left", "wrist_right": "right"}
-POSE_COLUMNS = ("x_m", "y_m", "z_m", "qw", "qx", "qy", "qz")
 POSES_HELP = (
     "CSV with the columns image,x_m,y_m,z_m,qw,qx,qy,qz (T_world_tracker), or JSON: "
     '[{"image": "a.jpg", "T_world_tracker": 4x4}, …], or without photos '
@@ -91,17 +82,12 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         "blurred": list(views.blurred),
         "translation_mm": (X[:3, 3] * 1e3).tolist(),
     }
-    write_entry(
-        options.to,
-        entry=name,
-        matrices={
-            name: X,
-            f"{name}_sigma_rad": np.array([[result.sigma_rotation_rad]]),
-            f"{name}_sigma_m": np.array([[result.sigma_translation_m]]),
-        },
-        facts=facts,
-        now=datetime.now(UTC),
-    )
+    matrices: dict[str, np.ndarray | float] = {
+        name: X,
+        f"{name}_sigma_rad": result.sigma_rotation_rad,
+        f"{name}_sigma_m": result.sigma_translation_m,
+    }
+    write_entry(options.to, name, matrices, facts)
     print(
         f"{name}: known to {facts['sigma_rotation_deg']:.3f}° and "
         f"{facts['sigma_translation_mm']:.2f} mm; the board scatters by "
@@ -112,14 +98,15 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
 
 def read_views(options: argparse.Namespace) -> PosedViews:
     """Read poses from the file, and boards from the photos or from the same file."""
-    entries = read_json(options.poses) if options.poses.suffix.lower() == ".json" else None
+    path, entries = options.poses, None
+    if path.suffix.lower() == ".json":
+        entries = read_json(path, POSES_HELP)
     if entries is not None and all(isinstance(entry, list) for entry in entries):
-        views = _pairs(entries, options.poses)
+        pairs = pairs_of(entries, path, POSES_HELP)
+        names = tuple(f"view {index}" for index in range(len(pairs)))
+        views = PosedViews(names, pairs[:, 0], pairs[:, 1])
     else:
-        named = (
-            _csv_poses(options.poses) if entries is None else _json_poses(entries, options.poses)
-        )
-        views = _with_photos(named, options)
+        views = _with_photos(poses_of_photos(path, entries, POSES_HELP), options)
     tracker, board = views.Ts_world_tracker, views.Ts_camera_board
     if options.invert == "tracker":
         tracker = invert(tracker)
@@ -138,87 +125,6 @@ def board_scatter_mm(views: PosedViews, T_tracker_camera: np.ndarray) -> Float64
     return np.linalg.norm(places - places.mean(axis=0), axis=1) * 1e3
 
 
-def read_json(path: Path) -> list[object]:
-    """Read a list from a JSON file.
-
-    Raises:
-        NotFoundError: no such file.
-        InvalidInputError: not a JSON list, or empty.
-    """
-    if not path.is_file():
-        raise NotFoundError(f"{path}: no such file of poses; expected {POSES_HELP}")
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise InvalidInputError(f"{path}: no JSON ({error}); expected {POSES_HELP}") from error
-    if not isinstance(content, list) or not content:
-        raise InvalidInputError(f"{path}: expected a list with at least one pose: {POSES_HELP}")
-    return content
-
-
-def _pairs(entries: list[object], path: Path) -> PosedViews:
-    try:
-        pairs = np.array(entries, dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise InvalidInputError(f"{path}: {error}; expected {POSES_HELP}") from error
-    if pairs.ndim != 4 or pairs.shape[1:] != (2, 4, 4):
-        raise ShapeError(f"{path}: got {pairs.shape}, expected [n, 2, 4, 4]")
-    names = tuple(f"view {index}" for index in range(len(pairs)))
-    return PosedViews(names, pairs[:, 0], pairs[:, 1])
-
-
-def _json_poses(entries: list[object], path: Path) -> dict[str, np.ndarray]:
-    poses: dict[str, np.ndarray] = {}
-    for index, entry in enumerate(entries):
-        if not isinstance(entry, dict) or not {"image", "T_world_tracker"} <= set(entry):
-            raise InvalidInputError(f"{path}: entry {index}: expected {POSES_HELP}")
-        T = np.array(entry["T_world_tracker"], dtype=np.float64)
-        if T.shape != (4, 4):
-            raise ShapeError(f"{path}: entry {index}: got {T.shape}, expected 4 by 4")
-        _add(poses, str(entry["image"]), T, path)
-    return poses
-
-
-def _csv_poses(path: Path) -> dict[str, np.ndarray]:
-    if not path.is_file():
-        raise NotFoundError(f"{path}: no such file of poses; expected {POSES_HELP}")
-    try:
-        return _read_csv_poses(path)
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise InvalidInputError(
-            f"{path}: no CSV in UTF-8 ({error}); expected {POSES_HELP}"
-        ) from error
-
-
-def _read_csv_poses(path: Path) -> dict[str, np.ndarray]:
-    poses: dict[str, np.ndarray] = {}
-    with path.open(encoding="utf-8", newline="") as file:
-        reader = csv.DictReader(file, skipinitialspace=True)
-        missing = {"image", *POSE_COLUMNS} - set(reader.fieldnames or ())
-        if missing:
-            raise InvalidInputError(
-                f"{path}: columns {sorted(missing)} missing; expected {POSES_HELP}"
-            )
-        for row in reader:
-            try:
-                pose = np.array([float(row[column]) for column in POSE_COLUMNS])
-            except (TypeError, ValueError) as error:
-                raise InvalidInputError(f"{path}: line {reader.line_num}: {error}") from error
-            if abs(float(np.linalg.norm(pose[3:])) - 1) > 0.01:
-                raise InvalidInputError(
-                    f"{path}: line {reader.line_num}: quaternion of length "
-                    f"{np.linalg.norm(pose[3:]):.3f}, expected 1 (order w x y z)"
-                )
-            _add(poses, row["image"], transform_from_pose(pose), path)
-    return poses
-
-
-def _add(poses: dict[str, np.ndarray], name: str, T: np.ndarray, path: Path) -> None:
-    if name in poses:
-        raise InvalidInputError(f"{path}: image {name!r} is named twice")
-    poses[name] = T
-
-
 def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> PosedViews:
     if options.photos is None or options.board is None:
         raise InvalidInputError(
@@ -234,10 +140,15 @@ def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> P
     absent = [path.name for path in paths if not path.is_file()]
     if absent:
         raise NotFoundError(f"{options.photos}: has no photo {', '.join(absent[:5])}")
-    lens_matrices = _lens_matrices(options)
+    lens, calibrated_px = read_lens(options.intrinsics or options.to, options.camera)
     found = find_boards(paths, board)
     tell_left_out(found)
-    lens = lens_of(lens_matrices, found.size_px)
+    if calibrated_px != found.size_px:
+        raise InvalidInputError(
+            f"photos: got {found.size_px[0]} by {found.size_px[1]} px, but K was measured at "
+            f"{calibrated_px[0]} by {calibrated_px[1]}; take the photos in the same mode of the "
+            "camera"
+        )
     names = tuple(view.name for view in found.views)
     if not names:
         raise InvalidInputError(
@@ -256,22 +167,3 @@ def _with_photos(poses: dict[str, np.ndarray], options: argparse.Namespace) -> P
         ),
         found.blurred,
     )
-
-
-def _lens_matrices(options: argparse.Namespace) -> dict[str, np.ndarray]:
-    folder = options.intrinsics or options.to
-    camera = options.camera
-    if camera not in TRACKERS:
-        raise UnknownNameError("camera", camera, list(TRACKERS))
-    try:
-        matrices = read_matrices(folder)
-        return {
-            "K": named_matrix(matrices, f"K_{camera}", (3, 3)),
-            "distortion": named_matrix(matrices, f"distortion_{camera}", (1, 5)),
-            "image_size": named_matrix(matrices, f"image_size_{camera}_px", (1, 2)),
-        }
-    except NotFoundError as error:
-        raise NotFoundError(
-            f"{error.message}. First: dextouch station calibrate camera --camera {camera} "
-            f"--to {folder} …"
-        ) from error

@@ -1,7 +1,6 @@
 """Commands `dextouch station calibrate wrist` and `profile`: glove axes and hand sizes."""
 
 import argparse
-from datetime import UTC, datetime
 
 import numpy as np
 
@@ -38,13 +37,7 @@ def calibrate_wrist_axes(options: argparse.Namespace) -> dict[str, object]:
         "num_samples": frame.num_samples,
     }
     record = calibration_record(frame, options.side)
-    write_entry(
-        options.to,
-        entry=name,
-        matrices={key: np.array(matrix) for key, matrix in record.items()},
-        facts=facts,
-        now=_now(),
-    )
+    write_entry(options.to, name, {key: np.array(m) for key, m in record.items()}, facts)
     print(
         f"{name}: known to {facts['sigma_deg']:.1f}°; hand of size {frame.size:.2f} (1 is the mean "
         f"adult), nodes {facts['misfit_mm']:.1f} mm off the mean hand"
@@ -78,7 +71,7 @@ def measure_person(options: argparse.Namespace) -> dict[str, object]:
         "is_rigid": profile.is_rigid,
         "num_samples": len(taken.batch),
     }
-    write_entry(options.to, entry=name, matrices={name: profile.to_rows()}, facts=facts, now=_now())
+    write_entry(options.to, name, {name: profile.to_rows()}, facts)
     for finger, bones in bones_mm.items():
         print(f"  {finger:6} " + ", ".join(f"{bone:.1f}" for bone in bones) + " mm")
     print(f"{name}: bones from the knuckle outwards, from {facts['num_samples']} samples")
@@ -90,7 +83,3 @@ def _keypoints(options: argparse.Namespace) -> TakenStream:
     if not len(taken.batch):
         raise InvalidInputError(f"take {options.take!r}: keypoints_{options.side} has no sample")
     return taken
-
-
-def _now() -> datetime:
-    return datetime.now(UTC)

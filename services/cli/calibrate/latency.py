@@ -5,7 +5,6 @@ tracker record a hand that taps a table.
 """
 
 import argparse
-from datetime import UTC, datetime
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
@@ -63,16 +62,8 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         "latency_ms": latency_ns * 1e-6,
         "sigma_ms": sigma_ns * 1e-6,
     }
-    write_entry(
-        options.to,
-        entry=name,
-        matrices={
-            f"{name}_ns": np.array([[float(latency_ns)]]),
-            f"{name}_sigma_ns": np.array([[sigma_ns]]),
-        },
-        facts=facts,
-        now=datetime.now(UTC),
-    )
+    matrices = {f"{name}_ns": float(latency_ns), f"{name}_sigma_ns": sigma_ns}
+    write_entry(options.to, name, matrices, facts)
     print(
         f"{name}: {facts['latency_ms']:.2f} ± {facts['sigma_ms']:.2f} ms by {method}, where "
         f"{options.reference} has {facts['reference_latency_ms']:.2f} ms"

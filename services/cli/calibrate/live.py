@@ -9,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.clients import HttpLink
-from dextouch.errors import NotFoundError, StaleDataError
-from services.cli.calibrate.advice import camera_coverage
-from services.cli.calibrate.boards import Board, BoardView, find_board
-from services.cli.calibrate.camera import Found, write_coverage
+from dextouch.errors import InvalidInputError, NotFoundError, StaleDataError
+from services.cli.calibrate import camera
+from services.cli.calibrate.boards import Board, BoardView, find_board, parse_board
 from services.cli.calibrate.photos import SUFFIXES, decode_photo
 
 LIVE_PERIOD_S = 0.2
@@ -35,22 +34,18 @@ class Session:
     Args:
         board: board to detect.
         folder: calibration folder, also for the picture.
-        camera: name of the camera.
+        camera_name: name of the camera.
     """
 
-    def __init__(self, board: Board, folder: Path, camera: str) -> None:
+    def __init__(self, board: Board, folder: Path, camera_name: str) -> None:
         self.views: list[BoardView] = []
         self.todo: tuple[str, ...] = ("hold the board in front of the camera",)
-        self._board, self._folder, self._camera = board, folder, camera
+        self.board, self._folder, self._camera = board, folder, camera_name
 
     @property
     def is_enough(self) -> bool:
         """Whether coverage is sufficient, or the maximum number of views is reached."""
         return not self.todo or len(self.views) >= MAX_VIEWS
-
-    def find(self, name: str, photo: np.ndarray) -> BoardView | None:
-        """Detect the board in a photo; None if not found."""
-        return find_board(name, photo, self._board)
 
     def is_new(self, view: BoardView, photo: np.ndarray) -> bool:
         """Whether the view differs enough from all kept ones."""
@@ -62,9 +57,7 @@ class Session:
         """Add a view, redraw the picture and print advice."""
         self.views.append(view)
         size_px = (photo.shape[1], photo.shape[0])
-        coverage = camera_coverage(self.views, size_px)
-        found = Found(tuple(self.views), (), (), size_px, view.pattern)
-        path = write_coverage(found, coverage, self._folder, self._camera)
+        coverage, path = camera.write_coverage(self.views, size_px, self._folder, self._camera)
         if coverage.todo != self.todo or len(self.views) == 1:
             print(f"{len(self.views)} views ({path}); next: {'; '.join(coverage.todo) or 'done'}")
         self.todo = coverage.todo
@@ -88,7 +81,7 @@ def follow_folder(session: Session, arrivals: Arrivals) -> None:
     """Process photos as they appear in a folder, until coverage is sufficient."""
     for name, data in arrivals:
         photo = decode_photo(data, where=name)
-        view = session.find(name, photo)
+        view = find_board(name, photo, session.board)
         if view is None:
             print(f"{name}: no board")
         elif view.is_blurred:
@@ -113,7 +106,7 @@ def collect_live(session: Session, arrivals: Arrivals, photos: Path) -> int:
     num_before, num_idle = num_kept, 0
     for name, data in arrivals:
         photo = decode_photo(data, where=name)
-        view = session.find(name, photo)
+        view = find_board(name, photo, session.board)
         still = view is not None and before is not None and motion_px(view, before) <= MAX_MOTION_PX
         before = view
         if view is None or not still or view.is_blurred or not session.is_new(view, photo):
@@ -175,12 +168,23 @@ def station_arrivals(newest: Callable[[], bytes], *, wait: Wait = time.sleep) ->
         wait(LIVE_PERIOD_S)
 
 
-def run(options: argparse.Namespace, board: Board) -> None:
-    """Collect with `--url` or `--watch` until coverage is sufficient, or Ctrl-C.
+def calibrate(options: argparse.Namespace) -> dict[str, object]:
+    """Calibrate a camera; with `--url` or `--watch` photos are collected first.
 
     Raises:
+        InvalidInputError: both of them, or what `camera.calibrate` refuses.
         UnavailableError: the station does not respond.
     """
+    board = parse_board(options.board)
+    if options.watch and options.url is not None:
+        raise InvalidInputError("got --watch and --url, expected one of the two")
+    if options.watch or options.url is not None:
+        _collect(options, board)
+    return camera.calibrate(options)
+
+
+def _collect(options: argparse.Namespace, board: Board) -> None:
+    """Collect until coverage is sufficient, or Ctrl-C."""
     session = Session(board, options.to, options.camera)
     print("Ctrl-C ends the collection and calibrates with the photos so far")
     try:

@@ -1,17 +1,14 @@
 """Loading of photos as grey images."""
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
-from rich.console import Console
-from rich.progress import track
 
+from dextouch.command_line import progress
 from dextouch.errors import CorruptDataError, InvalidInputError, NotFoundError
 
-Item = TypeVar("Item")
 SUFFIXES = (".jpg", ".jpeg", ".png", ".bmp", ".tif", ".tiff")
 
 
@@ -29,7 +26,7 @@ def photo_paths(folder: Path) -> list[Path]:
     return paths
 
 
-def read_photos(paths: Iterable[Path]) -> list[UInt8[np.ndarray, "h w"]]:
+def read_photos(paths: Sequence[Path]) -> list[UInt8[np.ndarray, "h w"]]:
     """Read photos of equal size as grey images.
 
     Raises:
@@ -37,7 +34,7 @@ def read_photos(paths: Iterable[Path]) -> list[UInt8[np.ndarray, "h w"]]:
         InvalidInputError: photos of different sizes.
     """
     photos, size = [], None
-    for path in progress(list(paths), "reading photos"):
+    for path in progress(paths, "reading photos", len(paths)):
         photo = decode_photo(path.read_bytes(), where=str(path))
         if size is not None and photo.shape != size[1]:
             raise InvalidInputError(
@@ -62,11 +59,3 @@ def decode_photo(data: bytes, *, where: str) -> UInt8[np.ndarray, "h w"]:
     if photo is None:
         raise CorruptDataError(f"{where}: {len(data)} bytes are not an image")
     return np.asarray(photo, dtype=np.uint8)
-
-
-def progress(items: list[Item], what: str) -> Iterator[Item]:
-    """Iterate with a progress bar on stderr, if it is a terminal."""
-    console = Console(stderr=True)
-    yield from track(
-        items, total=len(items), description=what, console=console, disable=not console.is_terminal
-    )

@@ -6,10 +6,11 @@ them.
 """
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
@@ -24,7 +25,9 @@ DETAILS_FILE = "calibration_details.json"
 PICTURES = "pictures"
 MAX_AGE_S = 7 * 86_400.0
 
+Named = TypeVar("Named")
 _MATRICES: TypeAdapter[dict[str, Matrix]] = TypeAdapter(dict[str, Matrix])
+_DETAILS: TypeAdapter[dict[str, object]] = TypeAdapter(dict[str, object])
 
 # Limits of sigma (relative or absolute) above which `show` warns.
 MAX_FOCAL_SIGMA = 0.003
@@ -57,40 +60,35 @@ class Finding:
 
 def write_entry(
     folder: Path,
-    *,
     entry: str,
-    matrices: Mapping[str, np.ndarray],
+    matrices: Mapping[str, np.ndarray | float],
     facts: Mapping[str, object],
-    now: datetime,
 ) -> None:
-    """Write an entry of a calibration folder; other entries are kept.
+    """Write an entry of a calibration folder, measured now; other entries are kept.
 
     Args:
         folder: created if absent.
         entry: name of the main matrix, such as `K_head`; its time is stored as
             `<entry>_calibrated_at_unix_s`.
-        matrices: two-dimensional, finite.
+        matrices: finite; a number or a vector becomes a matrix of one row.
         facts: sigma, inputs and similar details for humans; JSON.
-        now: time of the measurement, with a time zone.
 
     Raises:
         NonFiniteError: NaN or infinity in a matrix.
         CorruptDataError: an existing file cannot be read.
     """
     for name, matrix in matrices.items():
-        if not np.isfinite(matrix).all():
+        if not np.all(np.isfinite(matrix)):
             raise NonFiniteError(f"calibration {name!r}: NaN or infinity; nothing was written")
     # Whole seconds, which are exact in float64.
-    stamp = np.array([[float(int(now.timestamp()))]])
+    now = datetime.now(UTC).replace(microsecond=0)
     old = read_matrices(folder) if (folder / MATRICES_FILE).exists() else {}
-    details = read_details(folder)
-    new = {
-        name: matrix_rows(m)
-        for name, m in {**matrices, f"{entry}_calibrated_at_unix_s": stamp}.items()
-    }
+    details = _read_details(folder)
+    stamped = {**matrices, f"{entry}_calibrated_at_unix_s": now.timestamp()}
+    new = {name: matrix_rows(np.atleast_2d(matrix)) for name, matrix in stamped.items()}
     details[entry] = {
         **facts,
-        "made_at": now.astimezone(UTC).isoformat(timespec="seconds"),
+        "made_at": now.isoformat(timespec="seconds"),
         "software": f"dextouch {__version__}",
         "matrices": sorted(new),
     }
@@ -111,30 +109,19 @@ def read_matrices(folder: Path) -> dict[str, Matrix]:
         raise NotFoundError(
             f"{path}: no calibration there; `dextouch station calibrate camera --help` begins one"
         )
-    try:
-        return _MATRICES.validate_json(path.read_bytes())
-    except ValidationError as error:
-        raise CorruptDataError(
-            f"{path}: no JSON of named matrices ({first_problems(error)})"
-        ) from error
+    return _read(path, _MATRICES.validate_json, "named matrices")
 
 
-def read_details(folder: Path) -> dict[str, object]:
-    """Read the details of each entry; empty for a folder without that file.
-
-    Raises:
-        CorruptDataError: not a JSON object.
-    """
+def _read_details(folder: Path) -> dict[str, object]:
     path = folder / DETAILS_FILE
-    if not path.is_file():
-        return {}
+    return _read(path, _DETAILS.validate_json, "details by entry") if path.is_file() else {}
+
+
+def _read(path: Path, validate: Callable[[bytes], Named], what: str) -> Named:
     try:
-        details = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise CorruptDataError(f"{path}: no JSON ({error})") from error
-    if not isinstance(details, dict):
-        raise CorruptDataError(f"{path}: got {type(details).__name__}, expected a JSON object")
-    return details
+        return validate(path.read_bytes())
+    except ValidationError as error:
+        raise CorruptDataError(f"{path}: no JSON of {what} ({first_problems(error)})") from error
 
 
 def write_picture(folder: Path, name: str, svg: str) -> Path:

@@ -1,15 +1,11 @@
 """Command `dextouch station calibrate robot-base`: pose of a robot's base in the tracked world."""
 
 import argparse
-from datetime import UTC, datetime
-from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, ShapeError
 from services.alignment.calibration.robot_base import solve_robot_base
-from services.cli.calibrate.hand_eye import read_json
+from services.cli.calibrate.poses import pairs_of, read_json
 from services.cli.calibrate.record import write_entry
 
 BASE_NAME = "T_world_base"
@@ -25,7 +21,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         InvalidInputError: too few pairs, or pairs that contradict each other.
         NotFoundError: no such file.
     """
-    pairs = _read_pairs(options.poses)
+    pairs = pairs_of(read_json(options.poses, PAIRS_HELP), options.poses, PAIRS_HELP)
     mount = np.eye(4) if options.same_frame else None
     result = solve_robot_base(pairs[:, 0], pairs[:, 1], T_effector_tracker=mount)
     left_out = list(result.left_out_pairs)
@@ -40,30 +36,15 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
         "left_out": left_out,
         "T_effector_tracker": result.T_effector_tracker.tolist(),
     }
-    write_entry(
-        options.to,
-        entry=BASE_NAME,
-        matrices={
-            BASE_NAME: result.T_world_base,
-            f"{BASE_NAME}_sigma_rad": np.array([[result.sigma_rotation_rad]]),
-            f"{BASE_NAME}_sigma_m": np.array([[result.sigma_translation_m]]),
-        },
-        facts=facts,
-        now=datetime.now(UTC),
-    )
+    matrices: dict[str, np.ndarray | float] = {
+        BASE_NAME: result.T_world_base,
+        f"{BASE_NAME}_sigma_rad": result.sigma_rotation_rad,
+        f"{BASE_NAME}_sigma_m": result.sigma_translation_m,
+    }
+    write_entry(options.to, BASE_NAME, matrices, facts)
     print(
         f"{BASE_NAME}: known to {facts['sigma_rotation_deg']:.3f}° and "
         f"{facts['sigma_translation_mm']:.2f} mm from {facts['num_pairs']} pairs; they scatter by "
         f"{facts['residual_rms_deg']:.3f}° and {facts['residual_rms_mm']:.2f} mm RMS"
     )
     return facts
-
-
-def _read_pairs(path: Path) -> Float64[np.ndarray, "n 2 4 4"]:
-    try:
-        pairs = np.array(read_json(path), dtype=np.float64)
-    except (ValueError, TypeError) as error:
-        raise InvalidInputError(f"{path}: {error}; expected {PAIRS_HELP}") from error
-    if pairs.ndim != 4 or pairs.shape[1:] != (2, 4, 4):
-        raise ShapeError(f"{path}: got {pairs.shape}, expected [n, 2, 4, 4]: {PAIRS_HELP}")
-    return pairs

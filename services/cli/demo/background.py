@@ -2,13 +2,15 @@
 
 import asyncio
 import threading
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from functools import partial
 
 from fastapi import FastAPI
 
 from dextouch.errors import UnavailableError
-from services.cli.servers import Place, bind, serve_all
+from services.cli.servers import bind, serve_all
 
 START_TIMEOUT_S = 60.0
 
@@ -21,55 +23,30 @@ def served(apps: Mapping[str, FastAPI]) -> Iterator[dict[str, str]]:
         UnavailableError: they did not start, or one terminated unexpectedly.
     """
     placed = [(bind(name, host="127.0.0.1", port=0), app) for name, app in apps.items()]
-    runner = _Runner(placed)
-    runner.start()
-    try:
-        yield {place.name: place.url for place, _ in placed}
-    finally:
-        runner.stop()
+    answering = threading.Event()
+    stopper: Future[Callable[[], object]] = Future()
 
+    async def serve() -> None:
+        stop = asyncio.Event()
+        stopper.set_result(partial(asyncio.get_running_loop().call_soon_threadsafe, stop.set))
+        await serve_all(placed, stop=stop, on_ready=answering.set)
 
-class _Runner:
-    def __init__(self, placed: list[tuple[Place, FastAPI]]) -> None:
-        self._placed = placed
-        self._ready = threading.Event()
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stop: asyncio.Event | None = None
-        self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="services", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-        if not self._ready.wait(START_TIMEOUT_S) or self._failure is not None:
-            raise UnavailableError(
-                f"services {', '.join(place.name for place, _ in self._placed)} did not start "
-                f"within {START_TIMEOUT_S:.0f} s; the log above says why"
-            ) from self._failure
-
-    def stop(self) -> None:
-        if self._loop is not None and self._stop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join()
-        if self._failure is not None:
-            raise UnavailableError("a service ended by itself") from self._failure
-
-    def _run(self) -> None:
+    with ThreadPoolExecutor(1, "services") as pool:
+        serving = pool.submit(asyncio.run, serve())
+        serving.add_done_callback(lambda _: answering.set())
+        has_begun = answering.wait(START_TIMEOUT_S) and not serving.done()
         try:
-            asyncio.run(self._serve())
-        except (UnavailableError, OSError) as error:
-            self._failure = error
+            if has_begun:
+                yield {place.name: place.url for place, _ in placed}
         finally:
-            self._ready.set()
-
-    async def _serve(self) -> None:
-        self._loop, self._stop = asyncio.get_running_loop(), asyncio.Event()
-        answering = asyncio.Event()
-        announce = asyncio.create_task(self._announce(answering))
-        try:
-            await serve_all(self._placed, stop=self._stop, ready=answering)
-        finally:
-            announce.cancel()
-
-    async def _announce(self, answering: asyncio.Event) -> None:
-        await answering.wait()
-        self._ready.set()
+            # The loop is closed where they ended by themselves.
+            with suppress(RuntimeError):
+                stopper.result()()
+            failure = serving.exception()
+            if has_begun and failure is not None:
+                raise UnavailableError("a service ended by itself") from failure
+    if not has_begun:
+        raise UnavailableError(
+            f"services {', '.join(apps)} did not start within {START_TIMEOUT_S:.0f} s; the log "
+            "above says why"
+        ) from failure

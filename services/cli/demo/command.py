@@ -1,25 +1,26 @@
 """Command line `dextouch demo`: runs all stages and writes report.json and report.html."""
 
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from fastapi import FastAPI
 
 from dextouch import __version__
 from dextouch.command_line import write_result
 from dextouch.data_folder import default_store
-from dextouch.episodes import EpisodeStore
+from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.schemas import WorldDescription
 from dextouch.serving import configure_logging
-from services.cli.demo.apps import build_apps
+from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
+from services.alignment.app import create_app as create_alignment
+from services.alignment.settings import AlignmentSettings
 from services.cli.demo.background import served
-from services.cli.demo.judging import judge, ladder
-from services.cli.demo.models import Models, committed_models, train_models, use_one_thread
+from services.cli.demo.judging import BASELINE, MODEL, judge, ladder
+from services.cli.demo.models import committed_models, refuse_trained, train_models, use_one_thread
 from services.cli.demo.pictures import collect
-from services.cli.demo.prediction import PredictionResult, measure_prediction
+from services.cli.demo.prediction import measure_prediction, read_scene
 from services.cli.demo.recording import (
     Take,
     align,
@@ -31,8 +32,12 @@ from services.cli.demo.recording import (
 from services.cli.demo.settings import DemoPlan, parse
 from services.cli.demo.table import show
 from services.cli.demo.timing import Stages
-from services.cli.demo.truth import Truth, make_truth
+from services.cli.demo.truth import make_truth
+from services.episode_store.app import create_app as create_store
+from services.episode_store.settings import EpisodeStoreSettings
 from services.evaluation.reporting import write_report
+from services.twin.settings import TwinSettings
+from services.twin.world import TwinWorld
 
 # Errors of both takes; the report shows the worse one.
 COMMON_ERRORS = ("taxel_mae_kpa", "fingertip_error_mm", "wrist_error_mm", "wrist_error_deg")
@@ -49,7 +54,7 @@ def main(argv: Sequence[str]) -> int:
     use_one_thread()
     plan.output.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="dextouch-demo-") as folder:
-        report = Demo(plan, Path(folder)).run()
+        report = run(plan, Path(folder))
     for path in (plan.output / "report.json", plan.json):
         write_result(path, report, allow_nan=False)
     show(report)
@@ -62,101 +67,90 @@ def main(argv: Sequence[str]) -> int:
     return 0
 
 
-class Demo:
-    """One run: plan, scratch folder and stages."""
+def run(plan: DemoPlan, folder: Path) -> dict[str, Any]:
+    """Run all stages and return the contents of `report.json`.
 
-    def __init__(self, plan: DemoPlan, folder: Path) -> None:
-        self.plan = plan
-        self.stages = Stages()
-        self._truth_folder = folder / "truth"
-        self._store = default_store()
-        self._spool = folder / "spool"
-        # Separate from the store, which may have a running alignment service.
-        self._jobs = folder / "alignments"
-
-    def run(self) -> dict[str, Any]:
-        """Run all stages and return the contents of `report.json`."""
-        truth = self._make_truth()
-        models = self._models()
-        apps = build_apps(self._store, self._jobs, models.world_model)
-        with served(apps) as urls:
-            takes = self._record(truth, urls)
-            prediction = self._predict(truth, models)
-            scores = self._judge(urls, models)
-        report = self._report(takes, prediction, scores, models)
-        with self.stages.stage("report", "drawing the report"):
-            write_report(
-                report, collect(takes, prediction.pictures), self.plan.output / "report.html"
-            )
-        return {**report, "stages": self.stages.rows()}
-
-    def _make_truth(self) -> Truth:
-        stage = self.stages.stage("truth", "recording the truth in the physics twin")
-        with stage, _bar("episodes") as progress:
-            return make_truth(self.plan, self._truth_folder, progress)
-
-    def _models(self) -> Models:
-        if not self.plan.train:
-            return committed_models()
-        with self.stages.stage("train", "training world model, policy and probe"):
-            return train_models(self.plan.output / "trained")
-
-    def _record(self, truth: Truth, urls: Mapping[str, str]) -> dict[str, Take]:
-        truths = EpisodeStore(self._truth_folder)
-        aligned = EpisodeStore(self._store)
-        takes = {}
-        for seed, (domain, episode_id) in enumerate(truth.takes.items()):
-            true_episode = truths.open(episode_id)
-            with self.stages.stage(f"record_{domain}", f"recording a {domain} take"):
-                recorded, devices = record_take(true_episode, self._spool, seed=seed)
-                forget_take(aligned, recorded.recording_id)
-                upload(self._spool, urls["episode_store"])
-            with self.stages.stage(f"align_{domain}", f"aligning the {domain} take"):
-                job = align(urls["alignment"], recorded.recording_id)
-                takes[domain] = measure(
-                    aligned, true_episode, recorded, job.alignment_id, devices=devices
-                )
-        return takes
-
-    def _predict(self, truth: Truth, models: Models) -> PredictionResult:
-        with self.stages.stage("predict", "predicting held-out scenes with the world model"):
-            store = EpisodeStore(self._truth_folder)
-            return measure_prediction(
-                models.world_model, store, truth.demonstrations, models.trained_on
-            )
-
-    def _judge(self, urls: Mapping[str, str], models: Models) -> dict[str, Any]:
-        with self.stages.stage("judge", "scoring policies in the twin and in the world model"):
-            policies = {**ladder(self.plan), "behaviour cloning": models.policy}
-            return judge(urls, policies, models, self.plan)
-
-    def _report(
-        self,
-        takes: Mapping[str, Take],
-        prediction: PredictionResult,
-        scores: Mapping[str, Any],
-        models: Models,
-    ) -> dict[str, Any]:
-        return {
-            "about": {
-                "version": __version__,
-                "world model": describe(models.world_model.description),
-                "held-out seeds": f"{self.plan.seeds[0]} … {self.plan.seeds[-1]}",
-            },
-            "success_probe": models.probe.metadata.metrics,
-            "stages": self.stages.rows(),
-            "errors": worst_errors({name: take.errors for name, take in takes.items()}),
-            "takes": {
-                name: {
-                    **take.errors,
-                    "devices": take.devices,
-                    "episode_id": take.episode.attributes.episode_id,
-                }
-                for name, take in takes.items()
-            },
-            "world_model": prediction.figures,
-            **scores,
+    Args:
+        plan: what to record, train and score.
+        folder: scratch folder.
+    """
+    stages, truths = Stages(), EpisodeStore(folder / "truth")
+    with stages.stage("truth", "recording the truth in the physics twin"):
+        truth = make_truth(plan, folder / "truth")
+    if plan.train:
+        with stages.stage("train", "training world model, policy and probe"):
+            models = train_models(plan.output / "trained")
+    else:
+        models = committed_models()
+    with served(_apps(folder / "alignments", models.world_model)) as urls:
+        takes: dict[str, Take] = {
+            domain: _take(truths.open(episode_id), folder / "spool", seed, urls, stages)
+            for seed, (domain, episode_id) in enumerate(truth.takes.items())
         }
+        with stages.stage("predict", "predicting held-out scenes with the world model"):
+            scenes = [read_scene(truths.open(episode_id)) for episode_id in truth.demonstrations]
+            refuse_trained(models.training_seeds, (scene.start.seed for scene in scenes))
+            prediction = measure_prediction(models.world_model, scenes)
+        with stages.stage("judge", "scoring policies in the twin and in the world model"):
+            policies = {**ladder(plan), "behaviour cloning": models.policy}
+            scores = judge(urls, policies, models, plan)
+    report = {
+        "about": {
+            "version": __version__,
+            "world model": describe(models.world_model.description),
+            "held-out seeds": f"{plan.seeds[0]} … {plan.seeds[-1]}",
+        },
+        "success_probe": models.probe.metadata.metrics,
+        "stages": stages.rows(),
+        "errors": worst_errors({name: take.errors for name, take in takes.items()}),
+        "takes": {
+            name: {
+                **take.errors,
+                "devices": take.devices,
+                "episode_id": take.episode.attributes.episode_id,
+            }
+            for name, take in takes.items()
+        },
+        "world_model": prediction.figures,
+        **scores,
+    }
+    with stages.stage("report", "drawing the report"):
+        write_report(report, collect(takes, prediction.pictures), plan.output / "report.html")
+    return {**report, "stages": stages.rows()}
+
+
+def _apps(jobs_folder: Path, world_model: World[Any]) -> dict[str, FastAPI]:
+    """Store, alignment, the twin as the real world, and the model beside a baseline.
+
+    Jobs are apart from the store, which may have a running alignment service.
+    """
+    store = default_store()
+    alignment = AlignmentSettings(
+        store_url=store, jobs_folder=jobs_folder, align_new=False, log_level="warning"
+    )
+    twin = TwinWorld(TwinSettings(cameras=("camera_head",)))
+    imagined = {MODEL: world_model, BASELINE: CopyFirstWorld.beside(world_model.description)}
+    served_worlds = WorldServiceSettings()
+    return {
+        "episode_store": create_store(EpisodeStoreSettings(store_url=store)),
+        "alignment": create_alignment(alignment),
+        "twin": create_world_app({"twin": twin}, served_worlds, name="twin"),
+        "imagined": create_world_app(imagined, served_worlds, name="imagined"),
+    }
+
+
+def _take(
+    truth: EpisodeReader, spool: Path, seed: int, urls: Mapping[str, str], stages: Stages
+) -> Take:
+    """Record, upload and align one take, which replaces that of an earlier run."""
+    domain, store = truth.attributes.domain, EpisodeStore(default_store())
+    with stages.stage(f"record_{domain}", f"recording a {domain} take"):
+        recorded, devices = record_take(truth, spool, seed=seed)
+        forget_take(store, recorded.recording_id)
+        upload(spool, urls["episode_store"])
+    with stages.stage(f"align_{domain}", f"aligning the {domain} take"):
+        job = align(urls["alignment"], recorded.recording_id)
+        return measure(store, truth, recorded, job.alignment_id, devices=devices)
 
 
 def describe(world: WorldDescription) -> str:
@@ -178,15 +172,3 @@ def worst_errors(takes: Mapping[str, Mapping[str, Any]]) -> dict[str, Any]:
         errors[name] = max(found[name] for found in takes.values())
     errors["taxel_iou"] = min(found["taxel_iou"] for found in takes.values())
     return errors
-
-
-@contextmanager
-def _bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    columns = (TextColumn("   {task.description}"), BarColumn(), MofNCompleteColumn())
-    with Progress(*columns, TimeElapsedColumn(), transient=True) as progress:
-        task = progress.add_task(what, total=None)
-
-        def advance(done: int, total: int) -> None:
-            progress.update(task, completed=done, total=total)
-
-        yield advance

@@ -5,7 +5,7 @@ from typing import Any
 
 from dextouch.clients import Policy, RolloutClient
 from dextouch.errors import DexTouchError
-from services.cli.demo.models import Models
+from services.cli.demo.models import Models, refuse_trained
 from services.cli.demo.settings import TASKS, DemoPlan
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
 from services.evaluation.policies.replay import ReplayPolicy
@@ -56,7 +56,7 @@ def judge(
     Raises:
         DexTouchError: a rollout failed.
     """
-    models.trained_on.refuse(plan.seeds)
+    refuse_trained(models.training_seeds, plan.seeds)
     twin, imagined = RolloutClient(urls["twin"]), RolloutClient(urls["imagined"])
     tasks = EvaluationPlan(
         instructions={task: get_task(task).instruction for task in TASKS},

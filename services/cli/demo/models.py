@@ -1,6 +1,6 @@
 """Pretrained or freshly trained networks for the demo."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from services.cli.main import run_command
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.settings import DEFAULT_POLICY, DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
-from services.world_model.checkpoints import default_checkpoint, read_checkpoint
-from services.world_model.state_checkpoints import is_state_checkpoint, read_state_checkpoint
+from services.world_model.checkpoints import default_checkpoint
+from services.world_model.state_checkpoints import read_state_checkpoint
 from services.world_model.world import open_world
 
 DEMONSTRATIONS = ("--mix", "demonstrations")
@@ -35,44 +35,29 @@ SMALL_STATE_MODEL = (
 
 
 @dataclass(frozen=True)
-class TrainedOn:
-    """Training data of a world model: content hashes of episodes, or seed ranges by task."""
-
-    fingerprints: tuple[str, ...] = ()
-    seeds: tuple[tuple[str, int, int], ...] = ()
-
-    @classmethod
-    def of(cls, checkpoint: Path) -> "TrainedOn":
-        """Read it from a checkpoint of either kind."""
-        if not is_state_checkpoint(checkpoint):
-            return cls(fingerprints=read_checkpoint(checkpoint).metadata.train_fingerprints)
-        ranges = read_state_checkpoint(checkpoint).metadata.training_seeds
-        return cls(seeds=tuple((task, low, high) for task, (low, high) in ranges.items()))
-
-    def refuse(self, seeds: Iterable[int]) -> None:
-        """Refuse to evaluate on seeds used in training.
-
-        Raises:
-            ConflictError: the world model was trained on some of these seeds.
-        """
-        wanted = list(seeds)
-        for task, low, high in self.seeds:
-            trained = [seed for seed in wanted if low <= seed <= high]
-            if trained:
-                raise ConflictError(
-                    f"world model: trained on {task!r} with seeds {low} … {high}, and the demo "
-                    f"evaluates on seed {trained[0]}; train it on seeds below 20000"
-                )
-
-
-@dataclass(frozen=True)
 class Models:
-    """World model of either kind, closed-loop policy and success probe."""
+    """State model with the range of its training seeds by task, closed-loop policy and probe."""
 
     world_model: BatchWorld[Any]
-    trained_on: TrainedOn
+    training_seeds: Mapping[str, tuple[int, int]]
     policy: BehaviourCloningPolicy
     probe: SuccessProbe
+
+
+def refuse_trained(training_seeds: Mapping[str, tuple[int, int]], seeds: Iterable[int]) -> None:
+    """Refuse to evaluate on seeds used in training.
+
+    Raises:
+        ConflictError: the world model was trained on some of these seeds.
+    """
+    wanted = list(seeds)
+    for task, (low, high) in training_seeds.items():
+        trained = [seed for seed in wanted if low <= seed <= high]
+        if trained:
+            raise ConflictError(
+                f"world model: trained on {task!r} with seeds {low} … {high}, and the demo "
+                f"evaluates on seed {trained[0]}; train it on seeds below 20000"
+            )
 
 
 def committed_models() -> Models:
@@ -123,7 +108,7 @@ def use_one_thread() -> None:
 def _load(world_model: Path, policy: Path, probe: Path) -> Models:
     return Models(
         open_world(world_model),
-        TrainedOn.of(world_model),
+        read_state_checkpoint(world_model).metadata.training_seeds,
         BehaviourCloningPolicy.load(policy),
         SuccessProbe.load(probe),
     )

@@ -11,18 +11,15 @@ from typing import Any, Final
 import numpy as np
 from jaxtyping import Float32, Float64, UInt8
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeReader
 from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import CAMERA_HEAD, poses_from_actions
 from dextouch.metrics import image as image_metrics
 from dextouch.metrics import tactile as tactile_metrics
 from dextouch.schemas import Observation, ReturnSelector, RolloutStart
 from dextouch.worlds import World
-from services.cli.demo.models import TrainedOn
 from services.evaluation.camera_warp import warp_over_table
 from services.evaluation.reporting import PredictionPicture
-from services.world_model.training.episodes import read_episode
-from services.world_model.training.evaluation import refuse_trained
 
 CAMERA: Final = "camera_head"
 CHUNK_STEPS: Final = 16
@@ -57,32 +54,8 @@ class Scene:
     model_rate_hz: float
 
 
-def measure_prediction(
-    world: World[Any], store: EpisodeStore, episode_ids: Sequence[str], trained_on: TrainedOn
-) -> PredictionResult:
-    """Errors over whole rollouts of held-out episodes with commanded actions.
-
-    Args:
-        world: world that starts from observations.
-        store: store of the episodes.
-        episode_ids: episodes held out from training.
-        trained_on: training data of the world.
-
-    Returns:
-        The figures of `measure_scenes`, and the first scene of every task as a picture.
-
-    Raises:
-        ConflictError, InvalidInputError: a scene that was trained on, or none at all.
-    """
-    readers = [store.open(episode_id) for episode_id in episode_ids]
-    trained_on.refuse(reader.attributes.seed or 0 for reader in readers)
-    if trained_on.fingerprints:
-        refuse_trained([read_episode(reader) for reader in readers], trained_on.fingerprints)
-    return measure_scenes(world, [read_scene(reader) for reader in readers])
-
-
-def measure_scenes(world: World[Any], scenes: Sequence[Scene]) -> PredictionResult:
-    """Errors over whole rollouts of scenes.
+def measure_prediction(world: World[Any], scenes: Sequence[Scene]) -> PredictionResult:
+    """Errors over whole rollouts of scenes that the world was not trained on.
 
     Returns:
         `psnr` (dB, mean over the images at the ends of chunks), `tactile_mse` (kPa²) and

@@ -40,7 +40,6 @@ STATION = "demo"
 class Take:
     """A recorded and aligned take with its end-to-end errors."""
 
-    truth: EpisodeReader
     episode: EpisodeReader
     errors: dict[str, Any]
     devices: list[dict[str, Any]]
@@ -182,4 +181,4 @@ def measure(
         match = match_samples(episode, truth, name, origin_in_truth_ns, NEAR_NS)
         t_s = episode.read(name).t_ref_ns[match.index] * 1e-9
         residuals[name] = np.stack([t_s, (match.offset_ns - match.mean_offset_ns) * 1e-6])
-    return Take(truth, episode, errors, devices, residuals)
+    return Take(episode, errors, devices, residuals)

@@ -1,4 +1,4 @@
-"""Result tables of the demo on the terminal."""
+"""Result tables of the demo on the terminal, of the same rows as the report page."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -6,16 +6,14 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-# Suffixes of figure names, and the predictors they denote.
-PREDICTORS = (
-    ("", "the model"),
-    ("_hands_still", "the model, only the head moves"),
-    ("_hold", "the model, nothing moves"),
-    ("_other_take", "the model, another scene's actions"),
-    ("_copy", "copy of the first step"),
-    ("_warp", "first image, moved as the camera"),
-    ("_zero", "no touch at all"),
+from services.evaluation.reporting.sections import (
+    agreement_figures,
+    comparison_bars,
+    error_rows,
+    figure,
 )
+
+AGREEMENT = ("pearson", "mmrv", "mmrv_paper")
 
 
 def show(report: Mapping[str, Any]) -> None:
@@ -55,29 +53,23 @@ def _stages(stages: list[dict[str, Any]]) -> Table:
 
 
 def _errors(errors: Mapping[str, Any]) -> Table:
-    table = _table("Recording path against the twin's truth", "error", "value")
-    worst = max(errors["clock_rms_ms"], key=lambda name: errors["clock_rms_ms"][name])
-    table.add_row(f"clock RMS, worst stream ({worst})", f"{errors['clock_rms_ms'][worst]:.3f} ms")
-    rows = (
-        ("taxel_iou", "contact IoU of taxels", ""),
-        ("taxel_mae_kpa", "taxel error", "kPa"),
-        ("wrist_error_mm", "wrist position", "mm"),
-        ("wrist_error_deg", "wrist rotation", "°"),
-        ("fingertip_error_mm", "robot fingertips", "mm"),
-    )
-    for key, name, unit in rows:
-        table.add_row(name, f"{errors[key]:.4g} {unit}".strip())
+    """Errors with their bounds; of the clocks only the worst one."""
+    table = _table("Recording path against the twin's truth", "error", "value", "bound")
+    clocks = errors["clock_rms_ms"]
+    worst = max(clocks, key=lambda name: clocks[name])
+    for row in error_rows({**errors, "clock_rms_ms": {f"{worst} (worst)": clocks[worst]}}):
+        table.add_row(row.name, f"{figure(row.value)} {row.unit}".strip(), row.bound)
     return table
 
 
 def _world_model(figures: Mapping[str, Any]) -> Table:
-    table = _table(
-        "World model, whole rollouts of held-out scenes", "", "images", "touch", "contact"
-    )
-    table.add_row("", "PSNR (dB)", "MSE (kPa²)", "F1")
-    for suffix, name in PREDICTORS:
-        keys = (f"{measure}{suffix}" for measure in ("psnr", "tactile_mse", "contact_f1"))
-        table.add_row(name, *(f"{figures[key]:.3g}" if key in figures else "" for key in keys))
+    table = _table("World model, whole rollouts of held-out scenes", "", "", "")
+    table.show_header = False
+    for group in comparison_bars(figures):
+        for index, bar in enumerate(group.bars):
+            name = f"{group.title}, {group.note}" if index == 0 else ""
+            table.add_row(name, bar.name, f"{figure(bar.value)} {group.unit}".strip())
+        table.add_section()
     return table
 
 
@@ -104,22 +96,14 @@ def rate(row: Mapping[str, Any], world: str) -> str:
 
 
 def _agreement(agreement: Mapping[str, Mapping[str, Any]]) -> Table:
-    columns = (
-        "task",
-        "policies",
-        "starts N",
-        "Pearson",
-        "MMRV, ties counted",
-        "MMRV, paper's rule",
-    )
-    table = _table("Agreement of real and imagined scores", *columns)
+    found = {
+        task: agreement_figures({name: row[name] for name in AGREEMENT})
+        for task, row in agreement.items()
+    }
+    names = [one.name for one in next(iter(found.values()), [])]
+    title = "Agreement of real and imagined scores"
+    table = _table(title, "task", "policies", "starts N", *names)
     for task, row in agreement.items():
         size = (str(row["num_policies"]), str(row["num_starts"]))
-        table.add_row(
-            task, *size, *(_maybe(row[name]) for name in ("pearson", "mmrv", "mmrv_paper"))
-        )
+        table.add_row(task, *size, *(figure(one.value) for one in found[task]))
     return table
-
-
-def _maybe(value: float | str) -> str:
-    return value if isinstance(value, str) else f"{value:.3f}"

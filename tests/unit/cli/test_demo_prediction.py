@@ -10,8 +10,8 @@ from dextouch.geometry import pinhole_matrix, transform
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
 from dextouch.schemas import EVERYTHING, Observation, RolloutStart
 from dextouch.worlds import CopyFirstWorld, SteppedRollout
-from services.cli.demo.models import TrainedOn
-from services.cli.demo.prediction import Future, Scene, measure_scenes
+from services.cli.demo.models import refuse_trained
+from services.cli.demo.prediction import Future, Scene, measure_prediction
 
 PX, NUM_STEPS = 8, 32
 DOWN = np.diag([1.0, -1.0, -1.0])
@@ -57,7 +57,7 @@ def scene(seed, depth_m):
 
 def test_figures_of_a_world_that_feels_and_does_not_see():
     scenes = [scene(1, 0.2), scene(2, 0.1)]
-    found = measure_scenes(
+    found = measure_prediction(
         PressWorld(tasks=("press",), image_height_px=PX, image_width_px=PX), scenes
     )
     figures, decibels = found.figures, 20 * np.log10(255 / 10)
@@ -77,13 +77,13 @@ def test_figures_of_a_world_that_feels_and_does_not_see():
 
 def test_a_lone_scene_has_no_other_and_no_scene_is_refused():
     world = CopyFirstWorld(tasks=("press",), image_height_px=PX, image_width_px=PX)
-    assert "psnr_other_take" not in measure_scenes(world, [scene(1, 0.1)]).figures
+    assert "psnr_other_take" not in measure_prediction(world, [scene(1, 0.1)]).figures
     with pytest.raises(InvalidInputError, match="no scene"):
-        measure_scenes(world, [])
+        measure_prediction(world, [])
 
 
 def test_seeds_of_training_are_refused():
-    trained = TrainedOn(seeds=(("press", 0, 219),))
-    trained.refuse(range(220, 230))
+    trained = {"press": (0, 219)}
+    refuse_trained(trained, range(220, 230))
     with pytest.raises(ConflictError, match=r"'press' with seeds 0 … 219.*seed 219"):
-        trained.refuse(range(219, 222))
+        refuse_trained(trained, range(219, 222))

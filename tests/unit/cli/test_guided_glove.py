@@ -122,7 +122,7 @@ def guide(bench, tmp_path, script, monkeypatch, **changed):
     ask, asked = operator(bench, script)
     given = options(tmp_path, **changed)
     takes = guided.StationTakes(
-        bench, spool=given.spool, has_store=given.store is not None, wait=bench.wait
+        bench.request, spool=given.spool, has_store=given.store is not None, wait=bench.wait
     )
     walk = guided.walk
     monkeypatch.setattr(guided, "station_takes", lambda _: takes)
@@ -191,7 +191,9 @@ def test_an_operator_is_led_to_a_calibration(bench, tmp_path, monkeypatch, capsy
 def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, capsys):
     bench.creeps = True
     ask, _ = operator(bench, [("", 20.0), ("", 0.0), ("", None)])
-    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    takes = guided.StationTakes(
+        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
+    )
     rest, rows = guided.walk(options(tmp_path), takes, ask=ask)
     assert rows == []
     assert rest.endswith("-2")
@@ -202,7 +204,9 @@ def test_a_glove_that_was_touched_rests_once_more(bench, tmp_path, monkeypatch, 
 
 def test_presses_that_do_not_hold_are_not_used(bench, tmp_path, capsys):
     ask, _ = operator(bench, [("", 0.0), ("20", None), ("", 20.0), ("", None)])
-    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    takes = guided.StationTakes(
+        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
+    )
 
     def creeping(question):
         bench.creeps = "Put" in question
@@ -217,7 +221,9 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
     def interrupted(_):
         raise KeyboardInterrupt
 
-    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=interrupted)
+    takes = guided.StationTakes(
+        bench.request, spool=tmp_path / "spool", has_store=False, wait=interrupted
+    )
     with pytest.raises(KeyboardInterrupt):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().state == "discarded"
@@ -227,7 +233,9 @@ def test_interrupted_takes_are_discarded(bench, tmp_path):
 def test_a_busy_recorder_is_left_alone(bench, tmp_path):
     bench.recorder.arm(TakePrompt(task="t", instruction="i"))
     bench.recorder.record("other")
-    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    takes = guided.StationTakes(
+        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
+    )
     with pytest.raises(ConflictError, match="while recording"):
         takes.record("take-1", "rest", 1.0, str.upper)
     assert bench.recorder.status().recording_id == "other"
@@ -235,18 +243,22 @@ def test_a_busy_recorder_is_left_alone(bench, tmp_path):
 
 def test_takes_of_another_machine_come_from_the_store(bench, tmp_path):
     takes = guided.StationTakes(
-        bench, spool=tmp_path / "not-here", has_store=False, wait=bench.wait
+        bench.request, spool=tmp_path / "not-here", has_store=False, wait=bench.wait
     )
     with pytest.raises(NotFoundError, match=r"--spool.*--store"):
         takes.record("take-1", "rest", 1.0, str.upper)
     bench.uploaded = True
-    takes = guided.StationTakes(bench, spool=tmp_path / "not-here", has_store=True, wait=bench.wait)
+    takes = guided.StationTakes(
+        bench.request, spool=tmp_path / "not-here", has_store=True, wait=bench.wait
+    )
     assert takes.record("take-2", "rest", 1.0, str.upper) == ("take-2", "TAKE-2")
     assert bench.sent[-1] == "GET /v1/uploads"
 
 
 def test_nobody_there_and_contradicting_options_are_refused(bench, tmp_path):
-    takes = guided.StationTakes(bench, spool=tmp_path / "spool", has_store=False, wait=bench.wait)
+    takes = guided.StationTakes(
+        bench.request, spool=tmp_path / "spool", has_store=False, wait=bench.wait
+    )
     with pytest.raises(InvalidInputError, match="nobody answers"):
         guided.walk(options(tmp_path), takes, ask=operator(bench, [])[0])
     with pytest.raises(InvalidInputError, match="one of the two"):

@@ -10,7 +10,14 @@ from dextouch.clients import RolloutClient
 from dextouch.episodes import EpisodeStore
 from dextouch.worlds import WorldServiceSettings, create_world_app
 from services.cli.demo.background import served
-from services.cli.imagined_data import WORLD, Choice, judged_steps, main, positive, seed_range
+from services.cli.imagined_data import (
+    WORLD,
+    chosen_episodes,
+    judged_steps,
+    main,
+    positive,
+    seed_range,
+)
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
 from services.twin.episodes import TakeOptions, record, write_episode
@@ -78,17 +85,15 @@ def test_seeds_are_written_as_a_range():
             seed_range(wrong)
 
 
-def test_a_choice_takes_its_tasks_and_seeds():
-    assert Choice().takes("stack_bowls", 5)
-    assert Choice(("stack_bowls",), range(5, 6)).takes("stack_bowls", 5)
-    assert not Choice(("stand_bottle",)).takes("stack_bowls", 5)
-    assert not Choice(seeds=range(6, 9)).takes("stack_bowls", 5)
+def test_episodes_are_chosen_by_task_and_seed(truth):
+    every = truth.list()
+    assert chosen_episodes(truth, None, None) == every
+    assert chosen_episodes(truth, ("stand_bottle",), range(4, 5)) == every
+    assert chosen_episodes(truth, ("stack_bowls",), None) == []
+    assert chosen_episodes(truth, None, range(5, 9)) == []
 
 
-def test_processes_share_the_seeds_and_leave_none_out():
-    parts = [Choice(part=part, num_parts=3) for part in range(3)]
-    for seed in range(7):
-        assert [part.takes("stack_bowls", seed) for part in parts].count(True) == 1
+def test_the_number_of_processes_is_positive():
     assert positive("2") == 2
     for wrong in ("0", "-1", "a", ""):
         with pytest.raises(argparse.ArgumentTypeError, match="at least 1"):

@@ -33,7 +33,7 @@ async def test_all_answer_and_stop_in_reverse():
         (bind(name, host="127.0.0.1", port=0), app_named(name, lives)) for name in ("store", "page")
     ]
     stop, ready = asyncio.Event(), asyncio.Event()
-    serving = asyncio.create_task(serve_all(placed, stop=stop, ready=ready))
+    serving = asyncio.create_task(serve_all(placed, stop=stop, on_ready=ready.set))
     await asyncio.wait_for(ready.wait(), 60)
     async with httpx.AsyncClient(trust_env=False) as client:
         answers = [(await client.get(place.url)).json() for place, _ in placed]
@@ -55,7 +55,7 @@ async def test_a_longer_websocket_message_ends_the_connection():
 
     place = bind("page", host="127.0.0.1", port=0)
     stop, ready = asyncio.Event(), asyncio.Event()
-    serving = asyncio.create_task(serve_all([(place, app)], stop=stop, ready=ready))
+    serving = asyncio.create_task(serve_all([(place, app)], stop=stop, on_ready=ready.set))
     await asyncio.wait_for(ready.wait(), 10)
     url = place.url.replace("http", "ws") + "/live"
     async with websockets.connect(url, proxy=None, compression=None) as client:
@@ -77,7 +77,7 @@ async def test_a_service_that_cannot_start_ends_all():
         (bind("page", host="127.0.0.1", port=0), app_named("page", lives, fails=True)),
     ]
     with pytest.raises(UnavailableError, match="ended by itself: page"):
-        await asyncio.wait_for(serve_all(placed, stop=asyncio.Event(), ready=asyncio.Event()), 60)
+        await asyncio.wait_for(serve_all(placed, stop=asyncio.Event(), on_ready=lambda: None), 60)
     assert "store down" in lives
 
 

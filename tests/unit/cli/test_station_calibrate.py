@@ -280,10 +280,9 @@ def test_show_warns_after_seven_days_and_names_what_is_missing(calibrated, tmp_p
     assert "7 days old" in old["K_head"]["reasons"][0]
     record.write_entry(
         tmp_path,
-        entry="tactile_left_tare",
-        matrices={"tactile_left_tare_counts": np.ones((1, 360))},
-        facts={},
-        now=datetime.now(UTC),
+        "tactile_left_tare",
+        {"tactile_left_tare_counts": np.ones((1, 360))},
+        {},
     )
     capsys.readouterr()
     assert main(["show", str(tmp_path)]) == 1
