@@ -2,6 +2,7 @@
 
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
+from typing import TYPE_CHECKING
 
 from fastapi import FastAPI
 from starlette.concurrency import run_in_threadpool
@@ -17,71 +18,48 @@ from services.acquisition.station import Station
 from services.acquisition.supervisor import SpoolSafety
 from services.acquisition.uploader import Uploader, recover_spool
 
-
-class _RealStation:
-    """A station of real devices with the life cycle of a mock one."""
-
-    def __init__(self, settings: AcquisitionSettings) -> None:
-        clock = RealClock()
-        self.station = Station(
-            name=settings.station,
-            drivers=build_drivers(settings.devices, clock),
-            spool_root=settings.spool,
-            clock=clock,
-            calibration=load_calibration(settings.calibration),
-            safety=_spool_safety(settings),
-        )
-
-    def start(self) -> None:
-        """Start; devices that are absent are waited for in the background."""
-        self.station.start()
-
-    def stop(self) -> None:
-        """Stop."""
-        self.station.stop()
+if TYPE_CHECKING:
+    from services.acquisition.mock_station import MockStation
 
 
-class _MockStation:
-    """A station whose mock devices play round and round."""
+def _real_station(settings: AcquisitionSettings) -> Station:
+    """A station of real devices; those that are absent are waited for in the background."""
+    clock = RealClock()
+    return Station(
+        name=settings.station,
+        drivers=build_drivers(settings.devices, clock),
+        spool_root=settings.spool,
+        clock=clock,
+        calibration=load_calibration(settings.calibration),
+        safety=_spool_safety(settings),
+    )
 
-    def __init__(self, settings: AcquisitionSettings) -> None:
-        from services.acquisition.mock_station import MockStation
-        from services.acquisition.mocks.faults import FaultScript
-        from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 
-        streams, calibration = pattern_streams(), load_calibration(settings.calibration)
-        calibration = {**pattern_calibration(), **calibration}
-        if settings.mock_store is not None and settings.mock_episode_id is not None:
-            from dextouch.episodes import EpisodeStore
-            from services.acquisition.mocks.episode import replay_calibration, replay_streams
+def _mock_station(settings: AcquisitionSettings) -> "MockStation":
+    """A station whose mock devices play an episode, or a pattern."""
+    from services.acquisition.mock_station import MockStation
+    from services.acquisition.mocks.faults import FaultScript
+    from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 
-            episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
-            streams = replay_streams(episode)
-            calibration = {**replay_calibration(episode), **calibration}
-        faults = FaultScript()
-        if settings.mock_faults == "first_light":
-            faults = FaultScript.first_light()
-        self._mock = MockStation(
-            streams,
-            faults,
-            settings.seed,
-            RealClock(),
-            spool_root=settings.spool,
-            name=settings.station,
-            calibration=calibration,
-            links=settings.mock_links,
-            safety=_spool_safety(settings),
-        )
-        self.station = self._mock.station
+    streams, known = pattern_streams(), pattern_calibration()
+    if settings.mock_store is not None and settings.mock_episode_id is not None:
+        from dextouch.episodes import EpisodeStore
+        from services.acquisition.mocks.episode import replay_calibration, replay_streams
 
-    def start(self) -> None:
-        """Start and play."""
-        self._mock.start()
-        self._mock.play_forever()
-
-    def stop(self) -> None:
-        """Stop."""
-        self._mock.stop()
+        episode = EpisodeStore(settings.mock_store).open(settings.mock_episode_id)
+        streams, known = replay_streams(episode), {**known, **replay_calibration(episode)}
+    is_disturbed = settings.mock_faults == "first_light"
+    return MockStation(
+        streams,
+        FaultScript.first_light() if is_disturbed else FaultScript(),
+        settings.seed,
+        RealClock(),
+        spool_root=settings.spool,
+        name=settings.station,
+        calibration={**known, **load_calibration(settings.calibration)},
+        links=settings.mock_links,
+        safety=_spool_safety(settings),
+    )
 
 
 def _spool_safety(settings: AcquisitionSettings) -> SpoolSafety:
@@ -119,27 +97,29 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     with disk_errors(f"make the spool {settings.spool}"):
         settings.spool.mkdir(parents=True, exist_ok=True)
     recover_spool(settings.spool)
-    running = _MockStation(settings) if settings.mock else _RealStation(settings)
+    mock = _mock_station(settings) if settings.mock else None
+    station = _real_station(settings) if mock is None else mock.station
     uploads = uploader or _make_uploader(settings)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
-        await run_in_threadpool(running.start)
+        await run_in_threadpool((mock or station).start)
+        if mock is not None:
+            mock.play_forever()
         uploads.start()
         try:
             yield
         finally:
             await run_in_threadpool(uploads.stop)
-            await run_in_threadpool(running.stop)
+            await run_in_threadpool((mock or station).stop)
 
     async def missing() -> Sequence[str]:
-        supervisors = running.station.supervisors
-        return [s.driver.name for s in supervisors if not s.counters.is_connected]
+        return [s.driver.name for s in station.supervisors if not s.connected.is_set()]
 
     return create_service_app(
         name="acquisition",
         settings=settings,
-        routers=[recorder_router(running.station), station_router(running.station, uploads)],
+        routers=[recorder_router(station), station_router(station, uploads)],
         lifespan=lifespan,
         readiness=missing,
     )

@@ -1,24 +1,19 @@
 """The check of a take: whether it is complete, what its ledger counts and its quality."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 from dextouch.schemas import LedgerEntry
 from dextouch.streams import StreamDescriptor
-from dextouch.tactile.layout import NUM_RAW_TAXELS
-from services.acquisition.counters import StreamCounters
-from services.acquisition.drivers.packet_search import DecoderStatistics
-from services.acquisition.health_taxels import TaxelCounts, count_taxels
+from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS
+from services.acquisition.health import CODES, count_taxels
 from services.acquisition.schemas import StreamTake, TakeCheck, TakeProblem
+from services.acquisition.supervisor import StreamCounters
 
-RATE_WARN = 0.02
-RATE_ERROR = 0.10
-LOSS_WARN = 0.001
+# A take may lose more than a running station before it is not worth keeping.
 LOSS_ERROR = 0.05
 # Shorter takes say nothing about rates and loss ratios.
 MIN_JUDGED_S = 1.0
-# Any taxel that is out is worth a word; with 5 % of them a take is not worth keeping.
-TAXELS_ERROR = 16
 MAX_GAP_S = {"image": 0.5}
 MAX_GAP_OTHERS_S = 0.2
 
@@ -38,11 +33,21 @@ class TakeSpan:
 
 @dataclass(frozen=True)
 class StreamFacts:
-    """One stream of a take, with what its device's decoder counted during the take."""
+    """One stream of a take, with all that its device and its reader counted during the take.
+
+    `judged` names the counts that are figures of the take's quality, too.
+    """
 
     descriptor: StreamDescriptor
     counters: StreamCounters
-    decoder: DecoderStatistics
+    events: Mapping[str, int]
+    judged: Collection[str] = ()
+
+    @property
+    def loss_ratio(self) -> float:
+        """Share of the packets that were lost."""
+        lost = self.events["lost"]
+        return lost / max(1, lost + self.events["packets"])
 
     def rate_hz(self) -> float | None:
         """Mean rate between the first and the last sample; None of less than two."""
@@ -59,17 +64,21 @@ class StreamFacts:
         edges = (first_ns - span.start_t_host_ns, span.stop_t_host_ns - last_ns)
         return max(self.counters.largest_gap_ns, *edges) / 1e9
 
-    def taxels(self) -> TaxelCounts | None:
-        """Dead, stuck and saturated taxels of the take; None for streams of other devices.
+    def taxels(self) -> dict[str, int]:
+        """Numbers of dead, stuck and saturated taxels; none for streams of other devices.
 
         Cells of other gloves are checked by health monitoring, whose findings the check includes.
         """
-        side, extremes = self.descriptor.side, self.counters.extremes
-        if side is None or extremes is None or self.descriptor.kind != "tactile":
-            return None
+        side, low, high = (
+            self.descriptor.side,
+            self.counters.low_counts,
+            self.counters.high_counts,
+        )
+        if side is None or low is None or high is None or self.descriptor.kind != "tactile":
+            return {}
         if self.descriptor.shape != (NUM_RAW_TAXELS,):
-            return None
-        return count_taxels(extremes.low_counts, extremes.high_counts, side=side)
+            return {}
+        return count_taxels(low, high, side=side)
 
 
 def check_take(facts: Sequence[StreamFacts], span: TakeSpan) -> TakeCheck:
@@ -81,8 +90,8 @@ def check_take(facts: Sequence[StreamFacts], span: TakeSpan) -> TakeCheck:
             num_samples=fact.counters.num_samples,
             rate_hz=fact.rate_hz(),
             largest_gap_s=fact.largest_gap_s(span),
-            lost=fact.decoder.lost,
-            crc_errors=fact.decoder.crc_errors,
+            lost=fact.events["lost"],
+            crc_errors=fact.events["crc_errors"],
         )
         for fact in facts
     ]
@@ -94,25 +103,14 @@ def check_take(facts: Sequence[StreamFacts], span: TakeSpan) -> TakeCheck:
     )
 
 
-def take_ledger(facts: Sequence[StreamFacts]) -> tuple[LedgerEntry, ...]:
+def take_ledger(facts: Sequence[StreamFacts]) -> list[LedgerEntry]:
     """Counted events of the take, for the recording's attributes."""
     entries = []
     for fact in facts:
-        counted: Mapping[str, int] = {
-            "lost": fact.decoder.lost,
-            "late": fact.decoder.late,
-            "crc_errors": fact.decoder.crc_errors,
-            "length_errors": fact.decoder.length_errors,
-            "resync_bytes": fact.decoder.resync_bytes,
-            "refused": fact.decoder.refused,
-            "suspects": fact.decoder.suspects,
-            "repeated": fact.decoder.repeated,
-            "restarts": fact.decoder.restarts,
-            **_taxel_events(fact),
-        }
+        counted = {**fact.events, **fact.taxels(), "packets": 0}
         name = fact.descriptor.name
         entries += [LedgerEntry(stream=name, event=e, count=n) for e, n in counted.items() if n]
-    return tuple(entries)
+    return entries
 
 
 def take_quality(facts: Sequence[StreamFacts], span: TakeSpan) -> dict[str, float]:
@@ -124,22 +122,11 @@ def take_quality(facts: Sequence[StreamFacts], span: TakeSpan) -> dict[str, floa
         if rate_hz is not None:
             quality[f"{name}_rate_hz"] = rate_hz
         if fact.descriptor.capabilities.sequence:
-            lost = fact.decoder.lost
-            quality[f"{name}_loss_ratio"] = lost / max(1, lost + fact.decoder.packets)
-        for event, count in _taxel_events(fact).items():
+            quality[f"{name}_loss_ratio"] = fact.loss_ratio
+        judged = {event: fact.events[event] for event in fact.judged}
+        for event, count in {**judged, **fact.taxels()}.items():
             quality[f"{name}_num_{event}"] = float(count)
     return quality
-
-
-def _taxel_events(fact: StreamFacts) -> dict[str, int]:
-    taxels = fact.taxels()
-    if taxels is None:
-        return {}
-    return {
-        "dead_taxels": taxels.dead,
-        "stuck_taxels": taxels.stuck,
-        "saturated_taxels": taxels.saturated,
-    }
 
 
 def _problems(fact: StreamFacts, span: TakeSpan) -> list[TakeProblem]:
@@ -155,17 +142,19 @@ def _problems(fact: StreamFacts, span: TakeSpan) -> list[TakeProblem]:
         return found
     rate_hz = fact.rate_hz() or 0.0
     off = abs(rate_hz / descriptor.nominal_rate_hz - 1.0)
-    if off > RATE_WARN:
+    if off > CODES["rate"].warn:
         text = f"{rate_hz:.1f} Hz, expected {descriptor.nominal_rate_hz:g} Hz"
-        found.append(_problem(fact, "rate", "ERROR" if off > RATE_ERROR else "WARN", text))
-    loss = fact.decoder.lost / max(1, fact.decoder.lost + fact.decoder.packets)
-    if loss > LOSS_WARN:
-        text = f"{fact.decoder.lost} packets lost ({loss:.1%}), {fact.decoder.crc_errors} corrupt"
+        level = "ERROR" if off > CODES["rate"].error else "WARN"
+        found.append(_problem(fact, "rate", level, text))
+    loss = fact.loss_ratio
+    if loss > CODES["loss"].warn:
+        lost, damaged = fact.events["lost"], fact.events["crc_errors"]
+        text = f"{lost} packets lost ({loss:.1%}), {damaged} corrupt"
         found.append(_problem(fact, "loss", "ERROR" if loss > LOSS_ERROR else "WARN", text))
-    for event, count in _taxel_events(fact).items():
+    for event, count in fact.taxels().items():
         if count:
             text = f"{count} {event.replace('_', ' ')} during the whole take"
-            level = "ERROR" if count >= TAXELS_ERROR else "WARN"
+            level = "ERROR" if count >= CODES["taxels_dead"].error * NUM_TAXELS else "WARN"
             found.append(_problem(fact, event, level, text))
     return found
 

@@ -123,7 +123,7 @@ class _DevicePath:
 
     def ask(self) -> None:
         """One exchange with a device that is there; one that was silent is left alone a while."""
-        if not self._supervisor.counters.is_connected:
+        if not self._supervisor.connected.is_set():
             return
         if self._rounds_to_skip:
             self._rounds_to_skip -= 1

@@ -110,9 +110,8 @@ class Recorder:
                 check=self._check,
             )
 
-    def accept(self, device: str, readings: Readings) -> None:
+    def accept(self, readings: Readings) -> None:
         """Spool new readings while recording (called by the reader threads)."""
-        del device
         take = self._take
         if take is not None:
             take.accept(readings)

@@ -10,13 +10,11 @@ from starlette.concurrency import run_in_threadpool
 from dextouch.schemas import StoreId
 from dextouch.serving import RequireScope
 from dextouch.streams import pack
-from services.acquisition.health_metrics import HealthCollector
+from services.acquisition.health import DiskJudge, HealthCollector, HealthEvents, StationHealth
 from services.acquisition.schemas import (
     CameraList,
-    HealthEvents,
     RecorderStatus,
     SaveTake,
-    StationHealth,
     TakeName,
     TakePrompt,
     UploadStatus,
@@ -75,7 +73,8 @@ def recorder_router(station: Station) -> APIRouter:
 
 def station_router(station: Station, uploader: Uploader) -> APIRouter:
     """Health, live views and uploads."""
-    station.health.watch_disk(station.recorder.spool_root)
+    disk = DiskJudge(station.recorder.spool_root, station.supervisors, station.clock.now_ns())
+    station.health.watch(disk.judge)
     station.health.watch_uploads(lambda: uploader.refused)
     router = APIRouter(
         prefix="/v1",

@@ -1,57 +1,12 @@
-"""The bodies of the station's routes: what an operator sends, what the station tells."""
+"""The bodies of the station's routes but its health: what an operator sends, what it tells."""
 
 from typing import Literal
 
-from pydantic import Field, FiniteFloat
+from pydantic import Field
 
 from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import Domain, StoreId
 
-Level = Literal["OK", "WARN", "ERROR", "STALE"]
-StaleCode = Literal["unplugged", "silent"]
-# What can be wrong with a stream or the station; a code never changes its meaning.
-Code = Literal[
-    "unplugged",
-    "silent",
-    "late",
-    "rate",
-    "loss",
-    "damage",
-    "refused",
-    "suspect",
-    "queue",
-    "repeated",
-    "reordered",
-    "restart",
-    "reconnect",
-    "wrong_side",
-    "wrong_version",
-    "rejected",
-    "jitter",
-    "latency",
-    "gap",
-    "clock_skew",
-    "clock_residual",
-    "clock_step",
-    "clock_stamps",
-    "latency_calibration",
-    "taxels_dead",
-    "taxels_stuck",
-    "taxels_saturated",
-    "baseline",
-    "nan",
-    "tracking",
-    "jump",
-    "pose_jitter",
-    "image_frozen",
-    "image_blurred",
-    "image_clipped",
-    "image_gap",
-    "disk",
-    "calibration_missing",
-    "calibration_age",
-    "upload_refused",
-]
 State = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
 Action = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
 
@@ -120,108 +75,9 @@ class RecorderStatus(FrozenModel):
     recording_id: str | None = None
     prompt: TakePrompt | None = None
     duration_s: float | None = None
-    num_samples: dict[str, int] = Field(default={})
+    num_samples: dict[str, int] = Field(default_factory=dict)
     problems: tuple[str, ...] = ()
     check: TakeCheck | None = None
-
-
-class HealthFinding(FrozenModel):
-    """Problem of a stream or of the station found by one evaluation."""
-
-    code: Code
-    level: Literal["WARN", "ERROR"]
-    message: str
-
-
-class RaisedFinding(FrozenModel):
-    """Something that is wrong now, since when, and what to do about it.
-
-    `lasted_s` is None where nothing was ever heard of a stream.
-    """
-
-    code: Code
-    level: Literal["WARN", "ERROR", "STALE"]
-    message: str
-    advice: str
-    lasted_s: float | None
-
-
-class StreamHealth(FrozenModel):
-    """One stream at this moment; `lost` and `received` count its device's packets since start.
-
-    `stale` says why nothing is known; it is the first of the findings then. `reasons` are their
-    messages. `figures` are the numbers behind them by their Prometheus names, none while the
-    stream is stale.
-    """
-
-    stream: str
-    device: str
-    hand: Literal["left", "right"] | None = None
-    level: Level
-    stale: StaleCode | None = None
-    reasons: tuple[str, ...]
-    findings: tuple[RaisedFinding, ...] = ()
-    figures: dict[str, FiniteFloat] = Field(default={})
-    rate_hz: float | None
-    nominal_rate_hz: float
-    age_s: float | None
-    num_samples: int = 0
-    received: int
-    lost: int
-    skew_ppm: float | None = None
-    clock_residual_ms: float | None = None
-
-
-class DeviceHealth(FrozenModel):
-    """One device and its counters since the station's start."""
-
-    device: str
-    hand: Literal["left", "right"] | None = None
-    connected: bool
-    address: str
-    packets: int
-    lost: int
-    crc_errors: int
-    length_errors: int
-    resync_bytes: int
-    refused: int
-    suspects: int = 0
-    repeated: int = 0
-    restarts: int = 0
-    queue_dropped: int = 0
-    reconnects: int
-    failures: int = 0
-    last_error: str | None
-
-
-class StationHealth(FrozenModel):
-    """All streams and devices; `level` is the worst of the streams and of `findings`.
-
-    `findings` and `figures` are those of the station itself: disk, calibration and uploads.
-    """
-
-    station: str
-    level: Level
-    findings: tuple[RaisedFinding, ...] = ()
-    figures: dict[str, FiniteFloat] = Field(default={})
-    streams: tuple[StreamHealth, ...]
-    devices: tuple[DeviceHealth, ...]
-
-
-class HealthEvent(FrozenModel):
-    """A code of a stream (or of the `station`) reached a level; OK is its end."""
-
-    t_host_ns: int
-    stream: str
-    code: Code
-    level: Level
-
-
-class HealthEvents(FrozenModel):
-    """Changes of levels, oldest first, and the station's clock now."""
-
-    now_ns: int
-    events: tuple[HealthEvent, ...]
 
 
 class CameraLive(FrozenModel):

@@ -47,8 +47,13 @@ class Station:
             DeviceSupervisor(driver, sink=self._accept, clock=clock) for driver in drivers
         ]
         self.paths = PathWatch(self.supervisors, clock=clock)
-        self.health = HealthMonitor(self.supervisors, live=self.live, clock=clock, station=name)
-        self.health.watch_paths(self.paths)
+        self.health = HealthMonitor(
+            self.supervisors,
+            station=name,
+            calibration=calibration,
+            clock=clock,
+            paths=self.paths,
+        )
         self.recorder = Recorder(
             station=name,
             spool_root=spool_root,
@@ -91,7 +96,8 @@ class Station:
     def _device_events(self) -> DeviceEvents:
         return {s.driver.name: s.events() for s in self.supervisors}
 
-    def _accept(self, device: str, readings: Readings) -> None:
-        self.recorder.accept(device, readings)
-        self.live.accept(device, readings)
+    def _accept(self, readings: Readings) -> None:
+        self.recorder.accept(readings)
+        self.live.accept(readings)
+        self.health.accept(readings)
         self.paths.accept(readings)

@@ -9,18 +9,16 @@ from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import structlog
+from jaxtyping import UInt16
 
 from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import LOG_FILE
 from dextouch.errors import DeviceError, InvalidInputError, StorageError, StorageFullError
 from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.counters import DeviceCounters
 from services.acquisition.drivers.base import Driver, Readings
-from services.acquisition.drivers.image_quality import ImageQuality
-from services.acquisition.drivers.reports import OrderFilter
-from services.acquisition.drivers.tracking import TrackingEvents
 
 logger = structlog.get_logger(__name__)
 
@@ -28,8 +26,8 @@ RETRY_NS = 200_000_000
 # What stays the same is logged once and then so rarely, with its count.
 LOG_AGAIN_NS = 60_000_000_000
 NOTHING_LOGGED = ("", 0, 0)
-# What a supervisor counts besides the decoder's statistics and the device's counters. An error of
-# a driver says which of them it is in its detail `event`.
+# What a supervisor counts besides the driver. An error of a driver says which of them it is in its
+# detail `event`.
 EVENTS = (
     "lost_device",
     "wrong_version",
@@ -42,20 +40,50 @@ EVENTS = (
     "silent_bridge",
     "driver_failure",
 )
-# What a driver noticed in its own samples and counts one by one: images by the codes that the
-# health has for them, poses and nodes that a tracker did not see.
-IMAGE_EVENTS = {
-    "image_frozen": "num_frozen",
-    "image_blurred": "num_blurred",
-    "image_clipped": "num_clipped",
-    "image_gap": "num_gaps",
-    "queue": "num_dropped",
-}
-JUDGED_EVENTS = (*IMAGE_EVENTS, "occluded", "jumped", "stale", "unseen_nodes")
-Sink = Callable[[str, Readings], None]
+Sink = Callable[[Readings], None]
 # Packets that overtake each other do so within a few; a restarted device jumps further.
 WINDOW_SAMPLES = 64
 MEBIBYTE = 2**20
+
+
+@dataclass
+class StreamCounters:
+    """One stream's counts; written by its reader thread alone.
+
+    `num_bytes` are those of the payloads. The least and greatest count of each raw cell, which show
+    a dead or pinned one, are kept where samples are raw counts of a glove, the only unsigned 16-bit
+    rows there are.
+    """
+
+    num_samples: int = 0
+    num_bytes: int = 0
+    first_t_host_ns: int | None = None
+    last_t_host_ns: int | None = None
+    largest_gap_ns: int = 0
+    low_counts: UInt16[np.ndarray, " n"] | None = None
+    high_counts: UInt16[np.ndarray, " n"] | None = None
+
+    def add(self, samples: Sequence[Sample]) -> None:
+        """Count new samples."""
+        for sample in samples:
+            if self.last_t_host_ns is None:
+                self._start(sample)
+            else:
+                gap_ns = sample.t_host_ns - self.last_t_host_ns
+                self.largest_gap_ns = max(self.largest_gap_ns, gap_ns)
+            self.last_t_host_ns = sample.t_host_ns
+            values = sample.values
+            encoded = values.dtype == np.object_
+            self.num_bytes += len(values.item()) if encoded else values.nbytes
+            if self.low_counts is not None and self.high_counts is not None:
+                np.minimum(self.low_counts, values, out=self.low_counts)
+                np.maximum(self.high_counts, values, out=self.high_counts)
+        self.num_samples += len(samples)
+
+    def _start(self, sample: Sample) -> None:
+        self.first_t_host_ns = sample.t_host_ns
+        if sample.values.dtype == np.uint16 and sample.values.ndim == 1:
+            self.low_counts, self.high_counts = sample.values.copy(), sample.values.copy()
 
 
 class DeviceSupervisor:
@@ -63,14 +91,22 @@ class DeviceSupervisor:
 
     Args:
         driver: of the device; used by the supervisor's thread alone.
-        sink: called in that thread with the device's name and its new readings.
+        sink: called in that thread with new readings.
         clock: of the station.
+
+    Attributes:
+        connected: whether the device is open.
+        reconnects: how often it was lost after it was open.
+        last_error: why it was lost, or could not be opened; None while it is open.
+        streams: counters of each of its streams.
     """
 
     def __init__(self, driver: Driver, *, sink: Sink, clock: StationClock) -> None:
         self.driver = driver
-        self.counters = DeviceCounters.of(driver)
         self.connected = threading.Event()
+        self.reconnects = 0
+        self.last_error: str | None = None
+        self.streams = {d.name: StreamCounters() for d in driver.descriptors}
         self._events = dict.fromkeys(EVENTS, 0)
         self._guards = {d.name: SequenceGuard(d) for d in driver.descriptors}
         self._sink = sink
@@ -96,57 +132,58 @@ class DeviceSupervisor:
             self._thread.join()
 
     def events(self) -> dict[str, int]:
-        """Counts of what happened to the device since the start, by name."""
-        filters = _order_filters(self.driver)
-        # All streams of a device come in the same packets; each guard has seen all of these.
-        guards = self._guards.values()
-        return {
-            **self._events,
-            "repeated": sum(f.repeated for f in filters)
-            + max((g.repeated for g in guards), default=0),
-            "late": sum(f.late for f in filters) + max((g.late for g in guards), default=0),
-            **_judged_events(self.driver),
-        }
+        """Counts of all that happened to the device since the start, by name."""
+        events = {**self.driver.events(), **self._events}
+        for guard in self._guards.values():
+            # All streams of a device come in the same packets; each guard has seen all of these.
+            events["repeated"] = max(events["repeated"], guard.repeated)
+            events["late"] = max(events["late"], guard.late)
+        return events
+
+    def count(self, readings: Readings) -> None:
+        """Count new samples (called by the reader thread)."""
+        for name, samples in readings.items():
+            self.streams[name].add(samples)
 
     def _run(self) -> None:
         while not self._stopping.is_set():
             try:
                 self._read_until_lost()
             except DeviceError as error:
-                self.counters.last_error = error.message
-                self._count(error)
+                self.last_error = error.message
+                self._count_loss(error)
                 self._log_loss(error.message)
                 self._close_and_wait()
             except Exception as error:
-                self.counters.failures += 1
                 self._events["driver_failure"] += 1
-                self.counters.last_error = f"{type(error).__name__}: {error}"
+                self.last_error = f"{type(error).__name__}: {error}"
                 logger.exception("fail_device", device=self.driver.name)
                 self._close_and_wait()
         self.driver.close()
-        self._set_connected(is_connected=False)
+        self.connected.clear()
 
     def _read_until_lost(self) -> None:
         self.driver.open()
-        self._set_connected(is_connected=True)
+        self.last_error = None
+        self.connected.set()
         self._release_waiter()
         while not self._stopping.is_set():
             readings = self._in_order(self.driver.read())
             if readings:
                 # A loss of a device that gave something is new, whatever it says.
                 self._logged = NOTHING_LOGGED
-                self.counters.add(readings)
-                self._sink(self.driver.name, readings)
+                self.count(readings)
+                self._sink(readings)
 
     def _in_order(self, readings: Readings) -> Readings:
         admitted = {name: self._guards[name].admit(samples) for name, samples in readings.items()}
         return {name: samples for name, samples in admitted.items() if samples}
 
-    def _count(self, error: DeviceError) -> None:
+    def _count_loss(self, error: DeviceError) -> None:
         event = error.details.get("event")
         if isinstance(event, str) and event in self._events:
             self._events[event] += 1
-        elif self.counters.is_connected:
+        elif self.connected.is_set():
             # Failing to open a device that is gone is no further loss.
             self._events["lost_device"] += 1
 
@@ -161,14 +198,6 @@ class DeviceSupervisor:
         self._logged = (message, now_ns, count)
         logger.warning("lose_device", device=self.driver.name, error=message, count=count)
 
-    def _set_connected(self, *, is_connected: bool) -> None:
-        self.counters.is_connected = is_connected
-        if is_connected:
-            self.counters.last_error = None
-            self.connected.set()
-        else:
-            self.connected.clear()
-
     def _close_and_wait(self) -> None:
         # The waiter comes before the closing and goes after the next opening, so that a virtual
         # clock stands still in between and a loss always costs the same time.
@@ -177,9 +206,9 @@ class DeviceSupervisor:
                 self._waiter = self._clock.waiter()
             if self._stopping.is_set():
                 self._waiter.cancel()
-        if self.counters.is_connected:
-            self.counters.reconnects += 1
-        self._set_connected(is_connected=False)
+        if self.connected.is_set():
+            self.reconnects += 1
+        self.connected.clear()
         self.driver.close()
         self._waiter.wait_until(self._clock.now_ns() + RETRY_NS)
 
@@ -189,29 +218,6 @@ class DeviceSupervisor:
                 waiter, self._waiter = self._waiter, None
                 with closing(waiter):
                     pass
-
-
-def _order_filters(driver: Driver) -> list[OrderFilter]:
-    """Where a tracker's decoder leaves repeated and late packets out by itself."""
-    inner = (getattr(driver.decoder, name, None) for name in ("poses", "connection"))
-    places = (driver.decoder, *inner)
-    found = [getattr(place, "order", None) for place in places]
-    return [each for each in found if isinstance(each, OrderFilter)]
-
-
-def _judged_events(driver: Driver) -> dict[str, int]:
-    """What a driver noticed in its own samples, where it looks at them."""
-    found: dict[str, int] = {}
-    tracking = getattr(driver.decoder, "tracking", None)
-    if isinstance(tracking, TrackingEvents):
-        found.update({str(kind): count for kind, count in tracking.packets.items()})
-    unseen_nodes = getattr(driver.decoder, "unseen_nodes", None)
-    if isinstance(unseen_nodes, int):
-        found["unseen_nodes"] = unseen_nodes
-    quality = getattr(driver, "quality", None)
-    if isinstance(quality, ImageQuality):
-        found.update({code: getattr(quality, name) for code, name in IMAGE_EVENTS.items()})
-    return found
 
 
 class SequenceGuard:

@@ -2,7 +2,8 @@
 
 import threading
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field
+from functools import partial
 
 import structlog
 
@@ -18,12 +19,10 @@ from services.acquisition.completeness import (
     take_ledger,
     take_quality,
 )
-from services.acquisition.counters import StreamCounters
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import take_gates
-from services.acquisition.drivers.packet_search import DecoderStatistics
 from services.acquisition.schemas import TakeCheck
-from services.acquisition.supervisor import JUDGED_EVENTS, SpoolFlusher, SpoolSafety
+from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, StreamCounters
 from services.acquisition.take_findings import HealthSource, TakeFindings
 
 logger = structlog.get_logger(__name__)
@@ -31,20 +30,16 @@ logger = structlog.get_logger(__name__)
 DeviceEvents = Mapping[str, Mapping[str, int]]
 
 
-def _no_events() -> DeviceEvents:
-    return {}
-
-
 @dataclass(frozen=True)
 class TakeOptions:
-    """How takes are kept, and who counts what happens to devices besides their decoders.
+    """How takes are kept, and who knows what happens to devices besides their drivers.
 
-    `device_events` gives, by device, counts of named events since the station's start; `health`
-    provides the findings of the station in the meantime.
+    `device_events` gives, by device, counts of named events since the station's start (those of the
+    drivers if None); `health` provides the findings of the station in the meantime.
     """
 
     safety: SpoolSafety = field(default_factory=SpoolSafety)
-    device_events: Callable[[], DeviceEvents] = _no_events
+    device_events: Callable[[], DeviceEvents] | None = None
     health: HealthSource | None = None
 
 
@@ -76,11 +71,9 @@ class Take:
         self.streams = {d.name: StreamCounters() for d in spool.attributes.streams}
         self._drivers = drivers
         self._clock = clock
-        self._options = options
+        self._count = options.device_events or partial(_driver_events, drivers)
         self._started_ns = clock.now_ns()
-        self._before = {name: _copy(d.statistics) for name, d in drivers.items()}
-        self._events_before = options.device_events()
-        self._events: dict[str, dict[str, int]] = {}
+        self._before = self._count()
         self._watch = HostWatch(clock)
         self._findings = TakeFindings(options.health, self._started_ns)
         self._lock = threading.Lock()
@@ -161,23 +154,18 @@ class Take:
 
     def ledger(self) -> tuple[LedgerEntry, ...]:
         """Everything that was noticed during the take, counted."""
-        entries = list(take_ledger(self.facts))
-        known = {(entry.stream, entry.event) for entry in entries}
-        for fact in self.facts:
-            name = fact.descriptor.name
-            device_events = self._events.get(fact.descriptor.device or "", {})
-            entries += [
-                LedgerEntry(stream=name, event=event, count=count)
-                for event, count in device_events.items()
-                if count and (name, event) not in known
-            ]
-            entries += [
-                LedgerEntry(
-                    stream=name, event=event, count=e.count, first_t_host_ns=e.first_t_host_ns
-                )
-                for event, e in self._watch.events.items()
-                if e.count
-            ]
+        entries = take_ledger(self.facts)
+        entries += [
+            LedgerEntry(
+                stream=fact.descriptor.name,
+                event=event,
+                count=e.count,
+                first_t_host_ns=e.first_t_host_ns,
+            )
+            for fact in self.facts
+            for event, e in self._watch.events.items()
+            if e.count
+        ]
         known = {(entry.stream, entry.event) for entry in entries}
         # Where the devices count the same event themselves, their count is the exact one.
         found = self._findings.entries(self.streams)
@@ -187,13 +175,7 @@ class Take:
         """Figures of the ended take by stream."""
         if self.span is None:
             return {}
-        judged = {
-            f"{fact.descriptor.name}_num_{event}": float(count)
-            for fact in self.facts
-            for event, count in self._events.get(fact.descriptor.device or "", {}).items()
-            if event in JUDGED_EVENTS
-        }
-        return {**self._findings.quality(), **judged, **take_quality(self.facts, self.span)}
+        return {**self._findings.quality(), **take_quality(self.facts, self.span)}
 
     def _look_around(self) -> None:
         self._watch.look()
@@ -211,39 +193,21 @@ class Take:
             self.failure = error.message
             logger.error("stop_take_by_disk", error=error.message)
         self._findings.end()
-        self._events = _grown(self._options.device_events(), self._events_before)
-        self.facts = [
-            StreamFacts(
-                descriptor,
-                self.streams[descriptor.name],
-                self._counted(name, driver),
-            )
-            for name, driver in self._drivers.items()
-            for descriptor in driver.descriptors
-        ]
+        after = self._count()
+        for name, driver in self._drivers.items():
+            before = self._before[name]
+            events = {event: count - before[event] for event, count in after[name].items()}
+            # What was missing before the take and came in it is no loss of the take, nor a gain.
+            events["lost"] = max(0, events["lost"])
+            judged = driver.events().keys() - vars(driver.statistics).keys()
+            self.facts += [
+                StreamFacts(descriptor, self.streams[descriptor.name], events, judged)
+                for descriptor in driver.descriptors
+            ]
         self.span = TakeSpan(self._started_ns, self._clock.now_ns())
         self.flusher.cancel()
         return self.span
 
-    def _counted(self, device: str, driver: Driver) -> DecoderStatistics:
-        """What the decoder counted during the take."""
-        counted = _difference(driver.statistics, self._before[device])
-        # What was missing before the take and came in it is no loss of the take, nor a gain.
-        return replace(counted, lost=max(0, counted.lost))
 
-
-def _grown(after: DeviceEvents, before: DeviceEvents) -> dict[str, dict[str, int]]:
-    return {
-        device: {name: n - before.get(device, {}).get(name, 0) for name, n in counts.items()}
-        for device, counts in after.items()
-    }
-
-
-def _copy(statistics: DecoderStatistics) -> DecoderStatistics:
-    return _difference(statistics, DecoderStatistics())
-
-
-def _difference(later: DecoderStatistics, earlier: DecoderStatistics) -> DecoderStatistics:
-    return DecoderStatistics(
-        **{f.name: getattr(later, f.name) - getattr(earlier, f.name) for f in fields(later)}
-    )
+def _driver_events(drivers: Mapping[str, Driver]) -> DeviceEvents:
+    return {name: driver.events() for name, driver in drivers.items()}

@@ -8,8 +8,8 @@ from collections.abc import Collection
 from typing import Protocol, runtime_checkable
 
 from dextouch.schemas import LedgerEntry
-from services.acquisition.health_advice import ADVICE
-from services.acquisition.schemas import HealthEvents, StationHealth, TakeProblem
+from services.acquisition.health import CODES, HealthEvents, StationHealth
+from services.acquisition.schemas import TakeProblem
 
 # What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
 # station's start.
@@ -25,8 +25,6 @@ IN_THE_CHECK: dict[str, tuple[str, ...]] = {
     "taxels_stuck": ("stuck_taxels",),
     "taxels_saturated": ("saturated_taxels",),
 }
-
-_ADVICE: dict[str, str] = {code: advice for code, advice in ADVICE.items()}  # noqa: C416 - wider keys
 
 
 @runtime_checkable
@@ -131,12 +129,13 @@ class TakeFindings:
             if any((entry.stream, code) in told for code in codes):
                 continue
             times = "once" if entry.count == 1 else f"{entry.count} times"
+            advice = CODES[entry.event].advice
             found.append(
                 TakeProblem(
                     stream=entry.stream,
                     code=entry.event,
                     level="WARN",
-                    message=f"{entry.stream}: {entry.event} found {times}. {_ADVICE[entry.event]}",
+                    message=f"{entry.stream}: {entry.event} found {times}. {advice}",
                 )
             )
         return found

@@ -102,8 +102,7 @@ class Glove:
         # goes on.
         self.watch = PathWatch([self.supervisor], clock=RealClock())
 
-    def _accept(self, device, readings):
-        del device
+    def _accept(self, readings):
         self.watch.accept(readings)
         self.arrivals += [(s.sequence, s.t_host_ns) for s in readings["tactile_left"]]
 

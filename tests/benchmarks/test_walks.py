@@ -46,7 +46,7 @@ def test_a_glove_packet_is_checked_counted_and_encoded_once():
     walk = walks.packet_to_spool("tactile_left")
     once = ("PacketDecoder._take", "check_batch", "batch_bytes", "SpoolLogWriter.append")
     assert {name: walk.num_calls(name) for name in once} == dict.fromkeys(once, NUM_PACKETS)
-    assert walk.num_calls("DeviceCounters.add") == NUM_PACKETS
+    assert walk.num_calls("DeviceSupervisor.count") == NUM_PACKETS
     assert len(walk.files) <= 22, walk.files
 
 

@@ -10,7 +10,6 @@ from services.acquisition.devices.finger_tracker.driver import DESCRIPTOR_REPORT
 from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.health import TICK_NS, HealthMonitor
-from services.acquisition.live import LiveView
 from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mocks.faults import FaultScript
@@ -46,15 +45,10 @@ class SetClock:
 class Played:
     """One device's packets with ordinary skew, delay and jitter, decoded as they arrive."""
 
-    def __init__(self, pair, clock, live, seed):
-        self.source, self.driver, self.clock, self.live = (
-            pair.device.source,
-            pair.driver,
-            clock,
-            live,
-        )
-        self.supervisor = DeviceSupervisor(pair.driver, sink=live.accept, clock=clock)
-        self.supervisor.counters.is_connected = True
+    def __init__(self, pair, clock, seed):
+        self.source, self.driver, self.clock = pair.device.source, pair.driver, clock
+        self.supervisor = DeviceSupervisor(pair.driver, sink=lambda _: None, clock=clock)
+        self.supervisor.connected.set()
         self.rng = np.random.default_rng(seed)
         self.next = 0
         self.last_ns = START_NS
@@ -72,15 +66,15 @@ class Played:
         self.last_ns = max(self.last_ns, START_NS + t_ns + round(delay_s * 1e9))
         return self.last_ns, 10**15 + t_ns + round(t_ns * SKEW_PPM * 1e-6)
 
-    def play_until(self, t_ns):
+    def play_until(self, t_ns, accept):
         while self.due_ns <= t_ns:
             self.clock.t_ns = self.due_ns
             index = self.next % len(self.source.t_ns)
             for unit in self.source.units(index, self.next, self.stamp_ns):
                 readings = self.driver.decoder.decode(unit, self.due_ns)
                 if readings:
-                    self.supervisor.counters.add(readings)
-                    self.live.accept(self.driver.name, readings)
+                    self.supervisor.count(readings)
+                    accept(readings)
             self.next += 1
             self.due_ns, self.stamp_ns = self._plan()
 
@@ -122,13 +116,13 @@ def run(names, links, minutes):
     )
     pairs = factory.build()
     calibration = {**pattern_calibration(), **factory.calibration(pairs)}
-    live = LiveView([pair.driver for pair in pairs], calibration)
-    devices = [Played(pair, clock, live, seed) for seed, pair in enumerate(pairs)]
-    monitor = HealthMonitor([d.supervisor for d in devices], live=live, clock=clock, station="s")
+    devices = [Played(pair, clock, seed) for seed, pair in enumerate(pairs)]
+    supervisors = [device.supervisor for device in devices]
+    monitor = HealthMonitor(supervisors, calibration=calibration, clock=clock, station="s")
     for tick in range(1, round(minutes * 60e9 / TICK_NS) + 1):
         end_ns = START_NS + tick * TICK_NS
         for device in devices:
-            device.play_until(end_ns)
+            device.play_until(end_ns, monitor.accept)
         clock.t_ns = end_ns
         monitor.tick()
     return monitor

@@ -9,8 +9,7 @@ import numpy as np
 from dextouch.errors import DeviceError
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.health import STATION
-from services.acquisition.health_station import DiskJudge
+from services.acquisition.health import STATION, DiskJudge, HealthEvent
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
@@ -18,7 +17,7 @@ from services.acquisition.mocks.ledger import Fate, Ledger
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import HealthEvent, TakePrompt
+from services.acquisition.schemas import TakePrompt
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 # The device with the fault stands beside a head tracker that is never disturbed.
@@ -287,12 +286,13 @@ def fill_disk(mock: MockStation, pair: MockPair) -> None:
     del pair
     health = mock.station.health
     bytes_a_s = 60 * 720 + 100 * 56
-    health._disk = DiskJudge(
+    disk = DiskJudge(
         mock.station.recorder.spool_root,
         mock.station.supervisors,
+        mock.station.clock.now_ns(),
         free_bytes=lambda: round(SHORT_OF_DISK_S * bytes_a_s),
     )
-    health._disk.judge(mock.station.clock.now_ns())
+    health.watch(disk.judge)
 
 
 def is_later(mock: MockStation, pair: MockPair) -> bool:

@@ -198,7 +198,7 @@ def record(script, fault, folder):
     station = MockStation(streams, faults, 5, VirtualClock(), spool_root=folder, links=script.links)
     with station:
         take = station.run_take(PROMPT, recording_id="take")
-        errors = {s.driver.name: s.counters.last_error or "" for s in station.station.supervisors}
+        errors = {s.driver.name: s.last_error or "" for s in station.station.supervisors}
     return take, SpoolReader(take.spool_path), errors
 
 

@@ -1,6 +1,7 @@
 """The base of every driver: reads a transport, stamps what arrives and has it decoded."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Generic, Protocol, runtime_checkable
 
@@ -8,6 +9,7 @@ from dextouch.errors import DeviceError
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
+from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.drivers.packet_search import DecoderStatistics, Found, PacketFinder
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet
 from services.acquisition.transports.base import Transport, TransportInfo
@@ -107,6 +109,18 @@ class TellsCells(Protocol):
         ...
 
 
+@runtime_checkable
+class CountsEvents(Protocol):
+    """A decoder that counts more than its statistics, such as a tracker's poses left out."""
+
+    def events(self) -> Mapping[str, int]:
+        """Counts since the start by name; the ledger of a take lists them so.
+
+        `repeated` and `late` are packets that its order filter dropped.
+        """
+        ...
+
+
 class Driver:
     """One device: opens its transport, stamps what arrives, decodes it.
 
@@ -132,9 +146,25 @@ class Driver:
         return self.decoder.statistics
 
     @property
+    def quality(self) -> ImageQuality | None:
+        """What a camera's images are like; None of other devices."""
+        return None
+
+    @property
     def info(self) -> TransportInfo:
         """Where the device is."""
         return self.transport.info
+
+    def events(self) -> dict[str, int]:
+        """All that the decoder and this driver counted since the start, by name.
+
+        What several counters see (a packet that comes twice) counts once.
+        """
+        events: dict[str, int] = dict(vars(self.statistics))
+        if isinstance(self.decoder, CountsEvents):
+            for name, count in self.decoder.events().items():
+                events[name] = max(count, events.get(name, 0))
+        return events if self.quality is None else {**events, **self.quality.events()}
 
     def open(self) -> None:
         """Open the transport.

@@ -69,6 +69,16 @@ class ImageQuality:
         """Whether the newest checked image is over- or under-exposed."""
         return self.clipped_ratio > CLIPPED_ABOVE
 
+    def events(self) -> dict[str, int]:
+        """The counters of what is wrong with images, by the codes that the health has for it."""
+        return {
+            "image_frozen": self.num_frozen,
+            "image_blurred": self.num_blurred,
+            "image_clipped": self.num_clipped,
+            "image_gap": self.num_gaps,
+            "queue": self.num_dropped,
+        }
+
 
 class SessionMedian:
     """The median of a whole session in bounded memory: evenly thinned out when it gets full."""

@@ -99,6 +99,10 @@ class OrderFilter:
         """Another device, or the same one from the start, may follow."""
         self._last = None
 
+    def counts(self) -> dict[str, int]:
+        """Packets dropped so far, by the reason."""
+        return {"repeated": self.repeated, "late": self.late}
+
     def admits(self, sequence: int) -> bool:
         """Whether the packet with this number is newer than those before."""
         if self._last is not None:

@@ -64,7 +64,7 @@ class TrackingEvents:
     def __init__(self) -> None:
         self.events: deque[TrackingEvent] = deque(maxlen=MAX_EVENTS)
         self.num_events = 0
-        self.packets: dict[EventKind, int] = {"occluded": 0, "jumped": 0, "stale": 0}
+        self.packets: dict[str, int] = {"occluded": 0, "jumped": 0, "stale": 0}
         self._going_on: TrackingEvent | None = None
 
     def leave_out(self, kind: EventKind, *, state: int, sequence: int, t_host_ns: int) -> None:
@@ -141,6 +141,10 @@ class PoseStream:
         self.order.reset()
         self.gate.reset()
         self.events.end()
+
+    def counts(self) -> dict[str, int]:
+        """Packets left out so far, by the reason."""
+        return {**self.events.packets, **self.order.counts()}
 
     def occlude(self, *, state: int, sequence: int, t_device_ns: int, t_host_ns: int) -> None:
         """The tracker is not running: whatever pose it sends is none."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from services.acquisition.health_blocks import Block
+from services.acquisition.health.samples import Block
 
 SECOND_NS = 10**9
 NONE = np.empty(0, dtype=np.int64)

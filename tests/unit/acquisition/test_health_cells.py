@@ -6,15 +6,16 @@ import pytest
 from dextouch.errors import InvalidInputError
 from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
 from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
-from services.acquisition.health_cells import CellJudge, Cells, cells_of
+from services.acquisition.drivers.base import CellLayout
+from services.acquisition.health.cells import CellJudge, cell_judge
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes
 
 
 class Sheet:
     """Cells of another maker's glove under a wave; the test changes single ones."""
 
-    def __init__(self, cells, num_cells, *, full_scale=1.0):
-        self.judge = CellJudge(cells)
+    def __init__(self, judge, num_cells, *, full_scale=1.0):
+        self.judge = judge
         self.num_cells, self.full_scale, self.second = num_cells, full_scale, 0
         self.rng = np.random.default_rng(2)
 
@@ -35,14 +36,14 @@ class GridSheet(Sheet):
     absent = np.nan
 
     def __init__(self, used=None):
-        super().__init__(Cells(1.0, (24, 32), used), 768)
+        super().__init__(CellJudge(CellLayout(1.0, (24, 32)), used), 768)
 
 
 class BareSheet(Sheet):
     absent = 0.0
 
     def __init__(self, used=None):
-        super().__init__(Cells(4095.0, None, used), 401, full_scale=4095.0)
+        super().__init__(CellJudge(CellLayout(4095.0, None), used), 401, full_scale=4095.0)
 
 
 @pytest.mark.parametrize("kind", [GridSheet, BareSheet])
@@ -103,15 +104,15 @@ def test_a_cell_that_no_taxel_uses_is_not_judged(value, is_used):
 )
 def test_the_map_of_the_calibration_says_which_cells_are_used(decoder):
     num_cells = int(np.prod(decoder.descriptors[0].shape))
-    assert cells_of(decoder, {}).used is None
+    assert cell_judge(decoder, {}).used is None
     cells = np.arange(320.0) * 2 + 1
     cells[cells >= num_cells] = -1
-    used = cells_of(decoder, {"tactile_left_cells": (tuple(cells),)}).used
+    used = cell_judge(decoder, {"tactile_left_cells": (tuple(cells),)}).used
     assert np.flatnonzero(used).tolist() == cells[cells >= 0].tolist()
     for wrong in (num_cells, -2, 0.5):
         cells[7] = wrong
         with pytest.raises(InvalidInputError, match="for taxel 7, expected a whole number"):
-            cells_of(decoder, {"tactile_left_cells": (tuple(cells),)})
+            cell_judge(decoder, {"tactile_left_cells": (tuple(cells),)})
 
 
 def test_a_hand_that_holds_still_on_a_glove_of_unknown_layout_is_no_fault():

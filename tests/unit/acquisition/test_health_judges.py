@@ -1,28 +1,22 @@
 """One judge at a time, on made-up blocks: what is found, and what is not."""
 
-from dataclasses import dataclass
-
 import numpy as np
 import pytest
 
 from dextouch.streams import Sample, StreamDescriptor
-from dextouch.tactile.layout import expand_taxels
+from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.acquisition.clock import VirtualClock
-from services.acquisition.counters import StreamCounters
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
-from services.acquisition.devices.tactile_glove.packets import glove_descriptor
 from services.acquisition.drivers.base import Driver
+from services.acquisition.drivers.image_quality import ImageQuality
 from services.acquisition.drivers.tracking import pose_descriptor
-from services.acquisition.health_blocks import SampleBlocks
-from services.acquisition.health_camera import CameraJudge
-from services.acquisition.health_taxels import (
-    GloveRecord,
-    TaxelJudge,
-    count_taxels,
-    neighbour_share,
-)
-from services.acquisition.health_tracking import FiniteJudge, PoseJudge, TrackingJudge
+from services.acquisition.glove_record import GloveRecord
+from services.acquisition.health.cells import TaxelJudge, count_taxels, neighbour_share
+from services.acquisition.health.link import TrackingJudge
+from services.acquisition.health.samples import SampleQueue
+from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
 from services.acquisition.mocks.ports import HidPort
+from services.acquisition.supervisor import StreamCounters
 from tests.unit.acquisition.health_blocks_made import SECOND_NS, block, codes
 
 TARE, GAIN = 120.0, 40.0
@@ -32,9 +26,9 @@ class Hand:
     """A left glove whose palm and tips are pressed by a bump that wanders over them."""
 
     def __init__(self, *, drift_counts=0.0, pressed=True, tare=TARE):
-        full = np.full(320, 1.0)
-        record = GloveRecord("left", full * tare, full * GAIN, full * 0.0)
-        self.judge = TaxelJudge(glove_descriptor("left"), record)
+        full = np.full(360, 1.0)
+        cells = raw_indices(side="left")
+        self.judge = TaxelJudge(GloveRecord(full * tare, full * GAIN, full * 0.0, cells))
         self.drift_counts, self.pressed = drift_counts, pressed
         self.tare = tare
         self.second = 0
@@ -149,12 +143,12 @@ def test_a_takes_extremes_name_the_same_taxels(rng):
     high = low + 800
     low[[228, 229, 250]] = high[[228, 229, 250]] = (0, 65535, 700)
     found = count_taxels(low, high, side="right")
-    assert (found.dead, found.stuck, found.saturated) == (1, 1, 1)
+    assert found == {"dead_taxels": 1, "stuck_taxels": 1, "saturated_taxels": 1}
     counters = StreamCounters()
     rows = rng.integers(100, 900, (50, 360)).astype(np.uint16)
     counters.add([Sample(index, row) for index, row in enumerate(rows)])
-    np.testing.assert_array_equal(counters.extremes.low_counts, rows.min(axis=0))
-    np.testing.assert_array_equal(counters.extremes.high_counts, rows.max(axis=0))
+    np.testing.assert_array_equal(counters.low_counts, rows.min(axis=0))
+    np.testing.assert_array_equal(counters.high_counts, rows.max(axis=0))
     assert counters.num_bytes == rows.nbytes
 
 
@@ -164,7 +158,7 @@ def test_encoded_images_count_their_bytes():
     values[0] = b"x" * 321
     counters.add([Sample(0, values.reshape(()))])
     assert counters.num_bytes == 321
-    assert counters.extremes is None
+    assert counters.low_counts is None
 
 
 def test_jumps_are_seen_by_the_devices_clock():
@@ -209,7 +203,7 @@ def driver_of(decoder, kind=Driver):
 )
 def test_what_a_trackers_decoder_leaves_out_is_judged(kind, count, expected):
     decoder = PoseTrackerDecoder("head")
-    judge = TrackingJudge(driver_of(decoder))
+    judge = TrackingJudge(driver_of(decoder).events)
     decoder.statistics.packets += 1000
     for sequence in range(count):
         decoder.tracking.leave_out(kind, state=2, sequence=sequence, t_host_ns=sequence)
@@ -227,17 +221,8 @@ def test_values_that_are_no_numbers_are_counted_where_numbers_were():
     assert verdict.figures["missing_ratio"] == pytest.approx(5 / 24 / 2)
 
 
-@dataclass
-class FakeQuality:
-    frozen: bool = False
-    blurred: bool = False
-    gap: bool = False
-    clipped_ratio: float = 0.0
-    num_dropped: int = 0
-
-
 class CheckedDriver(Driver):
-    quality = FakeQuality()
+    quality = ImageQuality()
 
 
 @pytest.mark.parametrize(
@@ -253,10 +238,10 @@ def test_bad_images_warn_and_are_an_error_after_a_second(change, code):
     driver = driver_of(PoseTrackerDecoder("head"), CheckedDriver)
     judge = CameraJudge(driver)
     assert judge.judge(block([]), 0).findings == ()
-    driver.quality = FakeQuality(**change)
+    driver.quality = ImageQuality(**change)
     seen = [codes(judge.judge(block([]), t * SECOND_NS)) for t in (1, 2)]
     assert seen == [{code: "WARN"}, {code: "ERROR"}]
-    driver.quality = FakeQuality()
+    driver.quality = ImageQuality()
     assert judge.judge(block([]), 3 * SECOND_NS).findings == ()
 
 
@@ -269,10 +254,10 @@ def test_blocks_are_bounded_and_count_what_they_lose():
         unit="pose_m_wxyz",
         nominal_rate_hz=100,
     )
-    blocks = SampleBlocks({"head": descriptor})
+    queue = SampleQueue(descriptor)
     for index in range(1000):
-        blocks.add("head", [Sample(index, np.zeros(7))])
-    assert blocks.dropped == 600
-    taken = blocks.take("head")
+        queue.add([Sample(index, np.zeros(7))], index)
+    assert queue.num_dropped == 600
+    taken = queue.take()
     assert taken.t_host_ns.tolist() == list(range(600, 1000))
-    assert len(blocks.take("head")) == 0
+    assert len(queue.take()) == 0

@@ -5,7 +5,7 @@ import threading
 import numpy as np
 
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.health_blocks import SampleBlocks
+from services.acquisition.health.samples import SampleQueue
 
 POSE = StreamDescriptor(
     name="head", kind="pose", shape=(7,), dtype="float64", unit="pose_m_wxyz", nominal_rate_hz=10
@@ -14,38 +14,23 @@ POSE = StreamDescriptor(
 SIZE = 40
 
 
-class CountingClock:
-    """Each look is one nanosecond later."""
-
-    def __init__(self):
-        self.t_ns = 0
-
-    def now_ns(self):
-        self.t_ns += 1
-        return self.t_ns
-
-    def waiter(self, *, drives_time=False):
-        raise AssertionError
-
-
 def sample(index):
     return Sample(index, np.full(7, float(index)), 2 * index, 3 * index)
 
 
 def test_what_is_taken_is_what_came_since_in_whatever_portions(rng):
-    blocks, waiting, latencies, dropped, index = SampleBlocks({"head": POSE}), [], [], 0, 0
-    clock = CountingClock()
-    blocks.time_by(clock)
+    queue, waiting, latencies, dropped, index, now_ns = SampleQueue(POSE), [], [], 0, 0, 0
     for _ in range(500):
         for _ in range(int(rng.integers(0, 12))):
             samples = [sample(index + k) for k in range(int(rng.integers(1, 8)))]
             index += len(samples)
-            blocks.add("head", samples)
+            now_ns += 1
+            queue.add(samples, now_ns)
             waiting += samples
-            latencies.append(clock.t_ns - samples[-1].t_host_ns)
+            latencies.append(now_ns - samples[-1].t_host_ns)
         dropped += max(0, len(waiting) - SIZE)
         waiting = waiting[-SIZE:]
-        block = blocks.take("head")
+        block = queue.take()
         assert block.t_host_ns.tolist() == [s.t_host_ns for s in waiting]
         assert block.t_device_ns.tolist() == [s.t_device_ns for s in waiting]
         assert block.sequence.tolist() == [s.sequence for s in waiting]
@@ -55,36 +40,36 @@ def test_what_is_taken_is_what_came_since_in_whatever_portions(rng):
         else:
             assert block.values is None
         waiting, latencies = [], []
-        assert blocks.dropped == dropped
+        assert queue.num_dropped == dropped
     assert dropped > 100
 
 
 def test_what_was_taken_does_not_change_when_more_comes():
-    blocks = SampleBlocks({"head": POSE})
-    blocks.add("head", [sample(index) for index in range(SIZE)])
-    block = blocks.take("head")
-    blocks.add("head", [sample(1000 + index) for index in range(SIZE)])
+    queue = SampleQueue(POSE)
+    queue.add([sample(index) for index in range(SIZE)], 0)
+    block = queue.take()
+    queue.add([sample(1000 + index) for index in range(SIZE)], 0)
     assert block.t_host_ns.tolist() == list(range(SIZE))
     assert block.values[:, 0].tolist() == list(range(SIZE))
 
 
 def test_nothing_is_lost_or_mixed_between_two_threads():
-    blocks, seen, count = SampleBlocks({"head": POSE}), [], 20_000
+    queue, seen, count = SampleQueue(POSE), [], 20_000
     done = threading.Event()
 
     def read():
         for index in range(count):
-            blocks.add("head", [sample(index)])
+            queue.add([sample(index)], 0)
         done.set()
 
     reader = threading.Thread(target=read)
     reader.start()
     while not done.is_set() or not seen or seen[-1] < count - 1:
-        block = blocks.take("head")
+        block = queue.take()
         if len(block):
             np.testing.assert_array_equal(block.values[:, 0], block.t_host_ns)
             np.testing.assert_array_equal(block.sequence, 3 * block.t_host_ns)
         seen += block.t_host_ns.tolist()
     reader.join()
-    assert len(seen) + blocks.dropped == count
+    assert len(seen) + queue.num_dropped == count
     assert np.all(np.diff(seen) > 0)

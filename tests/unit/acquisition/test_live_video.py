@@ -24,11 +24,11 @@ def samples():
 
 def test_the_newest_image_is_shown(samples):
     view = LiveView(build_drivers([CAMERA], RealClock()), {})
-    view.accept("camera_head", {"camera_head": samples[3:6]})
+    view.accept({"camera_head": samples[3:6]})
     with pytest.raises(NotFoundError, match="key frame"):
         view.jpeg("camera_head", 10)
     for first, stop in ((0, 3), (3, 10)):
-        view.accept("camera_head", {"camera_head": samples[first:stop]})
+        view.accept({"camera_head": samples[first:stop]})
         image = decode_jpeg(view.jpeg("camera_head", 10))
         assert abs(float(image.mean()) - 20 * stop) < 4
     assert view.cameras(10)[0].image_index == 13

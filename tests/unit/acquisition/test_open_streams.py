@@ -11,6 +11,7 @@ from services.acquisition.devices import CellLayout, DecoderStatistics, Driver, 
 from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
+from services.acquisition.glove_record import is_ours
 from services.acquisition.live import LiveView
 from services.acquisition.settings import AcquisitionSettings
 
@@ -76,18 +77,20 @@ def test_pressures_of_another_makers_glove_are_shown_by_its_calibration(small_gl
     cells[[7, 80, 319]] = [2, 0, 3]
     view = LiveView([small_glove], calibration(cells))
     counts = np.array([150, 999, 200, 30], dtype="<u2")
-    view.accept("glove_left", {"tactile_left": [Sample(1_000, counts)]})
+    view.accept({"tactile_left": [Sample(1_000, counts)]})
     (pressures,) = view.pressures_kpa(2_000).values()
     # By hand: (200 - 120) / 40, (150 - 100) / 10, and (30 - 130) / 50 is below zero.
     expected = np.zeros(320)
     expected[[7, 80, 319]] = [2.0, 5.0, 0.0]
     np.testing.assert_allclose(pressures, expected, rtol=1e-6)
     # The judge of our own gloves' 360 cells has nothing to do with it.
-    assert view.glove("tactile_left") is None
+    assert not is_ours(small_glove.descriptors[0])
 
 
 def test_a_calibration_of_another_glove_is_refused(small_glove):
-    with pytest.raises(InvalidInputError, match=r"got cells -1 … 4, expected -1 … 3"):
+    with pytest.raises(
+        InvalidInputError, match=r"got 4 for taxel 0, expected a whole number -1 … 3"
+    ):
         LiveView([small_glove], calibration([4, *[-1] * 319]))
     with pytest.raises(NotFoundError, match="got 2 numbers, expected 320"):
         LiveView([small_glove], calibration([0, 1]))

@@ -12,15 +12,14 @@ from dextouch.streams import Sample
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health import HealthMonitor
-from services.acquisition.health_metrics import HealthCollector
-from services.acquisition.health_path import PathJudge
-from services.acquisition.live import LiveView
+from services.acquisition.health import HealthCollector, HealthMonitor
+from services.acquisition.health.station import PathJudge
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
 from services.acquisition.recorder import Recorder
 from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.supervisor import DeviceSupervisor
+from tests.unit.acquisition.health_blocks_made import block
 
 SECOND_NS = 1_000_000_000
 COUNTS = np.full(360, 100, np.uint16)
@@ -84,7 +83,7 @@ class SimulatedGlove(Driver):
 def watched(glove, clock=None):
     clock = clock or RealClock()
     supervisor = DeviceSupervisor(glove, sink=lambda *_: None, clock=clock)
-    supervisor.counters.is_connected = True
+    supervisor.connected.set()
     glove.watch = PathWatch([supervisor], clock=clock)
     return supervisor
 
@@ -137,7 +136,7 @@ def test_a_driver_that_fails_is_said_and_the_others_are_still_asked(monkeypatch)
 def test_nobody_is_asked_who_is_not_there_or_cannot_answer_or_lives_in_virtual_time():
     glove = SimulatedGlove()
     supervisor = watched(glove)
-    supervisor.counters.is_connected = False
+    supervisor.connected.clear()
     glove.live_a_second()
     assert glove.num_asked == 0
     virtual = VirtualClock()
@@ -220,14 +219,18 @@ def test_a_calibration_that_the_answers_contradict_is_a_finding(off_ns, is_found
     for _ in range(15):
         glove.live_a_second()
     calibrated = {NAME: ((float(glove.latency_ns + off_ns),),), SIGMA_NAME: ((2e5,),)}
-    live = LiveView([glove], {**CALIBRATION, **calibrated})
-    monitor = HealthMonitor([supervisor], live=live, clock=RealClock(), station="bench")
-    monitor.watch_paths(glove.watch)
-    (judge,) = [j for j in monitor._streams[0].judges if isinstance(j, PathJudge)]
-    verdict = judge.judge(live.blocks.take("tactile_left"), 0)
+    judge = PathJudge("tactile_left", glove.watch, calibrated)
+    verdict = judge.judge(block([]), 0)
     found = [(finding.code, finding.level) for finding in verdict.findings]
     assert found == ([("latency_calibration", "WARN")] if is_found else [])
-    supervisor.counters.add({"tactile_left": [Sample(RealClock().now_ns(), COUNTS)]})
+    monitor = HealthMonitor(
+        [supervisor],
+        calibration={**CALIBRATION, **calibrated},
+        clock=RealClock(),
+        station="bench",
+        paths=glove.watch,
+    )
+    supervisor.count({"tactile_left": [Sample(RealClock().now_ns(), COUNTS)]})
     monitor.evaluate()
     registry = CollectorRegistry()
     registry.register(HealthCollector(monitor.report, monitor.raised))

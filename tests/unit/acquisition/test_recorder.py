@@ -54,9 +54,9 @@ def play(recorder, clock, seconds, streams=("tactile_left", "head")):
         counts = rest + np.uint16(index % 3)
         now_ns = clock.now_ns()
         if "head" in streams:
-            recorder.accept("pose_tracker_head", {"head": [Sample(now_ns, pose, 5, index)]})
+            recorder.accept({"head": [Sample(now_ns, pose, 5, index)]})
         if "tactile_left" in streams and index % 5 in (0, 1, 3):
-            recorder.accept("glove_left", {"tactile_left": [Sample(now_ns, counts, 5, index)]})
+            recorder.accept({"tactile_left": [Sample(now_ns, counts, 5, index)]})
         advance(clock, 10_000_000)
 
 
@@ -157,7 +157,7 @@ def test_a_packet_missing_since_before_the_take_is_no_gain(recorder, clock):
     counter.lost = 3
     recorder.arm(PROMPT)
     recorder.record("take")
-    recorder.accept("glove_left", {"tactile_left": [Sample(clock.now_ns(), values, 5, 1)]})
+    recorder.accept({"tactile_left": [Sample(clock.now_ns(), values, 5, 1)]})
     counter.lost, counter.late = 2, 1
     (glove, _) = recorder.stop().check.streams
     assert (glove.stream, glove.lost) == ("tactile_left", 0)

@@ -2,14 +2,9 @@
 
 import pytest
 
-from services.acquisition.schemas import (
-    HealthEvent,
-    HealthEvents,
-    RaisedFinding,
-    StationHealth,
-    StreamHealth,
-    TakeProblem,
-)
+from services.acquisition.health import HealthEvent, HealthEvents, StationHealth
+from services.acquisition.health.schemas import RaisedFinding, StreamHealth
+from services.acquisition.schemas import TakeProblem
 from services.acquisition.take_findings import TakeFindings
 
 START_NS = 10**10

@@ -11,8 +11,7 @@ import pytest
 import yaml
 
 from dextouch.serving import ServiceSettings, create_service_app
-from services.acquisition.health_metrics import STATION_FIGURES, HealthCollector
-from services.acquisition.schemas import StationHealth
+from services.acquisition.health import STATION_FIGURES, HealthCollector, StationHealth
 from services.cli.main import COMMANDS, find_command
 
 ROOT = Path(__file__).parents[3]

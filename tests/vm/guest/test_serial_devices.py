@@ -133,7 +133,7 @@ def test_a_station_reads_on_when_its_glove_is_put_back(plug, measured):
     settings = TactileGloveSettings(side="left", serial_number="GLOVE-L")
     (driver,) = build_drivers([settings], clock)
     station = DeviceSupervisor(
-        driver, sink=lambda _, readings: samples.extend(*readings.values()), clock=clock
+        driver, sink=lambda readings: samples.extend(*readings.values()), clock=clock
     )
 
     def wait_until(told):

@@ -45,6 +45,11 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
         self._ours_m = np.eye(3)
         self.unseen_nodes = 0
 
+    def events(self) -> dict[str, int]:
+        """Packets left out so far, by the reason, and nodes that were not seen."""
+        dropped = {**self.tracking.packets, **self.connection.order.counts()}
+        return {**dropped, "unseen_nodes": self.unseen_nodes}
+
     def reset(self) -> None:
         """The connection was lost."""
         super().reset()

@@ -132,6 +132,10 @@ class FingerTrackerDecoder(StreamDecoder[Packet]):
         """Whether the node order is known."""
         return self._order is not None
 
+    def events(self) -> dict[str, int]:
+        """Packets dropped so far, and nodes that were not seen."""
+        return {**self.order.counts(), "unseen_nodes": self.unseen_nodes}
+
     def reset(self) -> None:
         """Forget half a message and the node order (another device may answer now)."""
         super().reset()

@@ -61,6 +61,10 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
         self.tracking = self.poses.events
         self._frame: SenderFrame | None = None
 
+    def events(self) -> dict[str, int]:
+        """Packets left out so far, by the reason."""
+        return {**self.poses.counts(), **self.connection.order.counts()}
+
     def reset(self) -> None:
         """The connection was lost."""
         super().reset()

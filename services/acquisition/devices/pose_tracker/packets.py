@@ -38,6 +38,10 @@ class PoseTrackerDecoder(StreamDecoder[Packet]):
         self._device = f"pose_tracker_{stream}"
         self._source = source_of(stream)
 
+    def events(self) -> dict[str, int]:
+        """Packets left out so far, by the reason."""
+        return self.poses.counts()
+
     def reset(self) -> None:
         """Forget half a message and the last pose."""
         super().reset()

@@ -6,15 +6,14 @@ Silent streams are detected here, for every report; a silent stream has no figur
 from collections.abc import Mapping, Sequence
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.health_advice import ADVICE
-from services.acquisition.health_levels import worst
-from services.acquisition.health_link import queue_dropped
-from services.acquisition.schemas import DeviceHealth, RaisedFinding, StaleCode, StreamHealth
+from services.acquisition.health.codes import CODES, StaleCode
+from services.acquisition.health.levels import worst
+from services.acquisition.health.schemas import DeviceHealth, RaisedFinding, StreamHealth
 from services.acquisition.supervisor import DeviceSupervisor
 
 STALE_AFTER_NS = {"image": 500_000_000}
 STALE_AFTER_OTHERS_NS = 200_000_000
-LATE_PERIODS = 3
+LATE_PERIODS = round(CODES["late"].warn)
 
 
 def stale_after_ns(descriptor: StreamDescriptor) -> int:
@@ -30,10 +29,9 @@ def stale_code(
 
     "unplugged" when the device is not open, "silent" when it is and nothing comes.
     """
-    counters = supervisor.counters
-    if not counters.is_connected:
+    if not supervisor.connected.is_set():
         return "unplugged"
-    last_ns = counters.streams[descriptor.name].last_t_host_ns
+    last_ns = supervisor.streams[descriptor.name].last_t_host_ns
     if last_ns is None or now_ns - last_ns > stale_after_ns(descriptor):
         return "silent"
     return None
@@ -48,16 +46,17 @@ def stream_health(
     figures: Mapping[str, float],
 ) -> StreamHealth:
     """One stream at this moment."""
-    counters, statistics = supervisor.counters, supervisor.driver.statistics
-    stream = counters.streams[descriptor.name]
+    stream, statistics = supervisor.streams[descriptor.name], supervisor.driver.statistics
     age_ns = None
     if stream.last_t_host_ns is not None:
         age_ns = max(0, now_ns - stream.last_t_host_ns)
     stale = stale_code(supervisor, descriptor, now_ns)
     if stale is not None:
-        findings, figures = (_stale_finding(supervisor, stale, age_ns), *findings), {}
+        text = _words(supervisor, stale, age_ns)
+        is_stale = RaisedFinding.since(stale, "STALE", text, lasted_ns=age_ns)
+        findings, figures = (is_stale, *findings), {}
     elif not findings and age_ns is not None and age_ns > LATE_PERIODS * descriptor.period_ns():
-        findings = (_late_finding(age_ns),)
+        findings = (RaisedFinding.since("late", "WARN", "late", lasted_ns=age_ns),)
     skew, residual_s = figures.get("clock_skew_ratio"), figures.get("clock_residual_p95_seconds")
     return StreamHealth(
         stream=descriptor.name,
@@ -81,53 +80,26 @@ def stream_health(
 
 def device_health(supervisor: DeviceSupervisor) -> DeviceHealth:
     """A device's counters."""
-    driver, counters = supervisor.driver, supervisor.counters
-    statistics = driver.statistics
+    driver, events = supervisor.driver, supervisor.events()
     sides = {descriptor.side for descriptor in driver.descriptors}
-    return DeviceHealth(
-        device=driver.name,
-        hand=sides.pop() if len(sides) == 1 else None,
-        connected=counters.is_connected,
-        address=str(driver.info),
-        packets=statistics.packets,
-        lost=statistics.lost,
-        crc_errors=statistics.crc_errors,
-        length_errors=statistics.length_errors,
-        resync_bytes=statistics.resync_bytes,
-        refused=statistics.refused,
-        suspects=statistics.suspects,
-        repeated=statistics.repeated,
-        restarts=statistics.restarts,
-        queue_dropped=queue_dropped(driver),
-        reconnects=counters.reconnects,
-        failures=counters.failures,
-        last_error=counters.last_error,
-    )
-
-
-def _stale_finding(
-    supervisor: DeviceSupervisor, stale: StaleCode, age_ns: int | None
-) -> RaisedFinding:
-    return RaisedFinding(
-        code=stale,
-        level="STALE",
-        message=_words(supervisor, stale, age_ns),
-        advice=ADVICE[stale],
-        lasted_s=None if age_ns is None else age_ns / 1e9,
-    )
-
-
-def _late_finding(age_ns: int) -> RaisedFinding:
-    lasted_s = age_ns / 1e9
-    return RaisedFinding(
-        code="late", level="WARN", message="late", advice=ADVICE["late"], lasted_s=lasted_s
+    return DeviceHealth.model_validate(
+        {
+            **{name: events[name] for name in DeviceHealth.model_fields if name in events},
+            "device": driver.name,
+            "hand": sides.pop() if len(sides) == 1 else None,
+            "connected": supervisor.connected.is_set(),
+            "address": str(driver.info),
+            "queue_dropped": events.get("queue", 0),
+            "reconnects": supervisor.reconnects,
+            "failures": events["driver_failure"],
+            "last_error": supervisor.last_error,
+        }
     )
 
 
 def _words(supervisor: DeviceSupervisor, stale: StaleCode, age_ns: int | None) -> str:
-    error = supervisor.counters.last_error
-    if error is not None:
-        return error
+    if supervisor.last_error is not None:
+        return supervisor.last_error
     if stale == "unplugged":
         return "not connected"
     return "no data yet" if age_ns is None else f"no data for {age_ns * 1e-9:.1f} s"

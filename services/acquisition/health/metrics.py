@@ -7,8 +7,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
-from services.acquisition.health_levels import SEVERITY
-from services.acquisition.schemas import DeviceHealth, StationHealth, StreamHealth
+from services.acquisition.health.codes import SEVERITY
+from services.acquisition.health.schemas import StationHealth
 
 STREAM_LABELS = ("stream", "hand", "device")
 DEVICE_LABELS = ("hand", "device")
@@ -45,19 +45,20 @@ STATION_FIGURES: Final = {
     "latency_sigma_seconds": "Largest stated uncertainty of a path delay.",
     "unjudged_samples": "Samples that the health evaluation did not see.",
 }
-DEVICE_COUNTERS: Final[Mapping[str, tuple[str, Callable[[DeviceHealth], int]]]] = {
-    "packets": ("Packets decoded.", lambda device: device.packets),
-    "lost_packets": ("Packets lost by sequence.", lambda device: device.lost),
-    "crc_errors": ("Wrong checksums.", lambda device: device.crc_errors),
-    "length_errors": ("Impossible lengths.", lambda device: device.length_errors),
-    "resync_bytes": ("Bytes skipped in search of a packet.", lambda device: device.resync_bytes),
-    "refused_packets": ("Packets that hold no sample.", lambda device: device.refused),
-    "suspect_packets": ("Packets held back as suspect.", lambda device: device.suspects),
-    "repeated_packets": ("Packets that came twice.", lambda device: device.repeated),
-    "restarts": ("Steps back of the sequence.", lambda device: device.restarts),
-    "queue_dropped": ("What fell out of a driver's queue.", lambda device: device.queue_dropped),
-    "reconnects": ("Times the device was lost after it was open.", lambda d: d.reconnects),
-    "reader_failures": ("Unexpected errors in the reader.", lambda device: device.failures),
+# The field of the device's health that each counter shows.
+DEVICE_COUNTERS: Final = {
+    "packets": ("packets", "Packets decoded."),
+    "lost_packets": ("lost", "Packets lost by sequence."),
+    "crc_errors": ("crc_errors", "Wrong checksums."),
+    "length_errors": ("length_errors", "Impossible lengths."),
+    "resync_bytes": ("resync_bytes", "Bytes skipped in search of a packet."),
+    "refused_packets": ("refused", "Packets that hold no sample."),
+    "suspect_packets": ("suspects", "Packets held back as suspect."),
+    "repeated_packets": ("repeated", "Packets that came twice."),
+    "restarts": ("restarts", "Steps back of the sequence."),
+    "queue_dropped": ("queue_dropped", "What fell out of a driver's queue."),
+    "reconnects": ("reconnects", "Times the device was lost after it was open."),
+    "reader_failures": ("failures", "Unexpected errors in the reader."),
 }
 
 
@@ -85,9 +86,7 @@ class HealthCollector(Collector):
         """All metrics of one report."""
         health = self._report()
         yield from _stream_metrics(health)
-        for device in health.devices:
-            self._lost[device.device] = max(device.lost, self._lost.get(device.device, 0))
-        yield from _device_metrics(health, self._lost)
+        yield from self._device_metrics(health)
         for name, text in STATION_FIGURES.items():
             if name in health.figures:
                 family = GaugeMetricFamily(f"dextouch_{name}", text)
@@ -99,6 +98,23 @@ class HealthCollector(Collector):
         for labels, count in sorted(self._raised().items()):
             events.add_metric(labels, count)
         yield events
+
+    def _device_metrics(self, health: StationHealth) -> Iterator[Metric]:
+        connected = GaugeMetricFamily(
+            "dextouch_device_connected", "1 while the device is open.", labels=DEVICE_LABELS
+        )
+        counters = {
+            name: CounterMetricFamily(f"dextouch_{name}", text, labels=DEVICE_LABELS)
+            for name, (_, text) in DEVICE_COUNTERS.items()
+        }
+        for device in health.devices:
+            labels = (device.hand or "", device.device)
+            lost = self._lost[device.device] = max(device.lost, self._lost.get(device.device, 0))
+            counts = {**device.model_dump(), "lost": lost}
+            connected.add_metric(labels, float(device.connected))
+            for name, (field, _) in DEVICE_COUNTERS.items():
+                counters[name].add_metric(labels, counts[field])
+        yield from (connected, *counters.values())
 
     def describe(self) -> Iterator[Metric]:
         """Nothing ahead of time: registering asks for no report."""
@@ -118,7 +134,7 @@ def _stream_metrics(health: StationHealth) -> Iterator[Metric]:
         for name, text in STREAM_FIGURES.items()
     }
     for stream in health.streams:
-        labels = _labels(stream)
+        labels = (stream.stream, stream.hand or "", stream.device)
         level.add_metric(labels, SEVERITY.index(stream.level))
         samples.add_metric(labels, stream.num_samples)
         if stream.age_s is not None:
@@ -126,22 +142,3 @@ def _stream_metrics(health: StationHealth) -> Iterator[Metric]:
         for name, value in stream.figures.items():
             figures[name].add_metric(labels, value)
     yield from (level, age, samples, *figures.values())
-
-
-def _device_metrics(health: StationHealth, lost: Mapping[str, int]) -> Iterator[Metric]:
-    connected = GaugeMetricFamily(
-        "dextouch_device_connected", "1 while the device is open.", labels=DEVICE_LABELS
-    )
-    for device in health.devices:
-        connected.add_metric((device.hand or "", device.device), float(device.connected))
-    yield connected
-    for name, (text, count) in DEVICE_COUNTERS.items():
-        family = CounterMetricFamily(f"dextouch_{name}", text, labels=DEVICE_LABELS)
-        for device in health.devices:
-            value = lost[device.device] if name == "lost_packets" else count(device)
-            family.add_metric((device.hand or "", device.device), value)
-        yield family
-
-
-def _labels(stream: StreamHealth) -> tuple[str, str, str]:
-    return (stream.stream, stream.hand or "", stream.device)

@@ -1,33 +1,35 @@
-"""Health check of pressure cells without a tare: dead, stuck, saturated or gone.
+"""Health checks of pressure cells: dead, stuck, saturated, drifting or gone.
 
-`CellHistory` serves all gloves; `CellJudge` checks those of other manufacturers, which have no
-known tare: cells that are stuck, saturated, or missing. A position that never had a reading is not
-a cell. If the layout is unknown, a cell that never changed may be an unused position.
+A cell that does not change is not necessarily faulty, because a hand at rest looks the same. It is
+reported if its neighbours change while it does not, or if no load explains its reading.
+`TaxelJudge` checks our own glove by its tare. `CellJudge` checks gloves of other manufacturers,
+which have none: a position that never had a reading is not a cell, and if the layout is unknown, a
+cell that never changed may be an unused position.
 """
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float64, Shaped
 
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import Matrix
-from services.acquisition.drivers.base import Decoder, TellsCells
-from services.acquisition.health_blocks import Block
-from services.acquisition.health_levels import Verdict, above
-from services.acquisition.schemas import Code, HealthFinding
+from dextouch.tactile import CONTACT_THRESHOLD_KPA
+from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
+from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS
+from services.acquisition.drivers.base import CellLayout, Decoder, TellsCells
+from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.levels import Finding, Verdict, find
+from services.acquisition.health.samples import Block
 
-# In the calibration's map, of a taxel that no cell measures.
-NO_CELL = -1
 RECENT_NS = 500_000_000
 MIN_RECENT_SPAN_NS = 400_000_000
 QUIET_NS = 5_000_000_000
 SATURATED_NS = 1_000_000_000
 SATURATED_SHARE = 0.995
-# Any cell is worth a word; 5 % of them are an error.
-SHARE_LIMITS = (0.0, 0.05)
 # So many of the neighbours must move: at once for a quick verdict, within 5 s for a slow one.
 STRONG_SHARE = 0.75
 WEAK_SHARE = 0.5
@@ -37,6 +39,15 @@ LOADED_SHARE = 0.05
 # With fewer loaded cells than these, nothing can be said about one of them.
 MIN_LOADED = 8
 _NEVER = np.iinfo(np.int64).max
+MOVED_KPA = 1.0
+# About as much, where the glove's gain is not known.
+MOVED_COUNTS = 40
+NOTHING_SHARE = 0.5
+MIN_TARE_COUNTS = 20.0
+# A tare without a stated scatter is good to one count.
+TARE_SIGMA_COUNTS = 1.0
+MAX_TOUCHED_SHARE = 0.25
+_SCAN_COLUMNS = 20
 
 
 class CellHistory:
@@ -122,21 +133,68 @@ class CellHistory:
         self._pinned_ns = np.where(below[-1], _NEVER, began_ns)
 
 
-@dataclass(frozen=True)
-class Cells:
-    """Cells of a glove of another manufacturer.
+class TaxelJudge:
+    """Checks the 320 taxels of our own glove from its raw counts.
 
-    `grid` are rows and columns in which its cells lie, None where nothing tells; `used` says which
-    of them measure a taxel, None where no map tells.
+    Args:
+        record: calibration of the glove.
     """
 
-    full_scale: float
-    grid: tuple[int, int] | None
-    used: Bool[np.ndarray, " cells"] | None = None
+    def __init__(self, record: GloveRecord) -> None:
+        self._indices = record.cells
+        self._lines = self._indices // _SCAN_COLUMNS, self._indices % _SCAN_COLUMNS
+        self._tare_counts = record.tare_counts[self._indices]
+        self._gain_counts_per_kpa = record.gain_counts_per_kpa[self._indices]
+        sigma_counts = float(np.median(record.tare_sigma_counts[self._indices]))
+        self._sigma_counts = max(TARE_SIGMA_COUNTS, sigma_counts)
+        self._history = CellHistory(float(FULL_SCALE_COUNTS))
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del now_ns
+        history, tare = self._history, self._tare_counts
+        if block.values is not None and len(block):
+            counts = block.values[:, self._indices].astype(np.int64)
+            history.add(counts, block.t_host_ns)
+        if not history.is_enough:
+            return Verdict()
+        moved_counts = MOVED_KPA * self._gain_counts_per_kpa
+        low, high = history.extremes()
+        history.find_silent(neighbour_share(high - low >= moved_counts))
+        at_top = low >= SATURATED_SHARE * FULL_SCALE_COUNTS
+        nothing = (tare >= MIN_TARE_COUNTS) & (high < NOTHING_SHARE * tare)
+        loaded = history.last > tare + moved_counts
+        saturated = history.saturated()
+        found = {
+            "taxels_dead": nothing | (history.silent & ~loaded),
+            "taxels_stuck": history.silent & loaded & ~at_top,
+            "taxels_saturated": saturated,
+        }
+        counted = _verdict(found, NUM_TAXELS, "taxels")
+        parts = {code: whole_part(taxels, self._lines) for code, taxels in found.items()}
+        findings = [
+            Finding(code, "ERROR", f"{part} {_word(code)}") for code, part in parts.items() if part
+        ]
+        findings += [finding for finding in counted.findings if not parts[finding.code]]
+        drift = self._judge_drift()
+        waiting = bool((at_top & ~saturated).any())
+        figures = {**counted.figures, **drift.figures}
+        return Verdict((*findings, *drift.findings), figures, waiting)
+
+    def _judge_drift(self) -> Verdict:
+        """Common offset of the taxels at rest; none while much of the hand is touched."""
+        offsets = self._history.recent.mean(axis=0) - self._tare_counts
+        drift_counts = float(np.median(offsets))
+        touched = np.abs(offsets - drift_counts) > CONTACT_THRESHOLD_KPA * self._gain_counts_per_kpa
+        if touched.mean() > MAX_TOUCHED_SHARE:
+            return Verdict()
+        drift = abs(drift_counts) / self._sigma_counts
+        text = f"the zero has moved by {drift_counts:+.1f} counts since the tare; tare again"
+        return Verdict(find("baseline", drift, text), {"baseline_drift_ratio": drift})
 
 
-def cells_of(decoder: Decoder, calibration: Mapping[str, Matrix]) -> Cells | None:
-    """What is known of the cells that a decoder reads; None where it tells of none.
+def cell_judge(decoder: Decoder, calibration: Mapping[str, Matrix]) -> "CellJudge | None":
+    """The check of the cells that a decoder reads; None where it tells of none.
 
     Args:
         decoder: of a device with one stream.
@@ -146,6 +204,7 @@ def cells_of(decoder: Decoder, calibration: Mapping[str, Matrix]) -> Cells | Non
     Raises:
         InvalidInputError: the grid is not that of a sample, or the map names a cell that the glove
             has not.
+        NotFoundError: the map is of another size.
     """
     if not isinstance(decoder, TellsCells):
         return None
@@ -156,27 +215,12 @@ def cells_of(decoder: Decoder, calibration: Mapping[str, Matrix]) -> Cells | Non
             f"{descriptor.device}: got cells on a grid of {layout.grid} in a sample of {num_cells} "
             "numbers, expected as many; fix the driver of this glove"
         )
-    return Cells(layout.full_scale, layout.grid, _used_cells(decoder, calibration))
-
-
-def _used_cells(
-    decoder: Decoder, calibration: Mapping[str, Matrix]
-) -> Bool[np.ndarray, " cells"] | None:
-    (descriptor,) = decoder.descriptors
-    num_cells, name = math.prod(descriptor.shape), f"{descriptor.name}_cells"
-    if name not in calibration:
-        return None
-    cells = np.array(calibration[name], dtype=np.float64).ravel()
-    wrong = (cells != np.rint(cells)) | (cells < NO_CELL) | (cells >= num_cells)
-    if wrong.any():
-        taxel = int(np.argmax(wrong))
-        raise InvalidInputError(
-            f"calibration {name!r}: got {cells[taxel]:g} for taxel {taxel}, expected a whole "
-            f"number -1 … {num_cells - 1}, the cell of the {descriptor.side} glove that measures it"
-        )
+    cells = mapped_cells(descriptor, calibration)
+    if cells is None:
+        return CellJudge(layout)
     used = np.zeros(num_cells, dtype=np.bool_)
-    used[cells[cells != NO_CELL].astype(np.int64)] = True
-    return used
+    used[cells[cells != NO_CELL]] = True
+    return CellJudge(layout, used)
 
 
 class CellJudge:
@@ -188,14 +232,13 @@ class CellJudge:
     and are not judged themselves.
 
     Args:
-        cells: what is known of the glove.
+        layout: full scale and grid of its cells.
+        used: which of them measure a taxel; None where no map tells.
     """
 
-    def __init__(self, cells: Cells) -> None:
-        self._full_scale = cells.full_scale
-        self._grid = cells.grid
-        self._used = cells.used
-        self._history = CellHistory(cells.full_scale)
+    def __init__(self, layout: CellLayout, used: Bool[np.ndarray, " cells"] | None = None) -> None:
+        self._full_scale, self._grid, self.used = layout.full_scale, layout.grid, used
+        self._history = CellHistory(layout.full_scale)
         self._lowest = np.empty(0)
         self._highest = np.empty(0)
 
@@ -223,23 +266,24 @@ class CellJudge:
             dead, stuck = history.silent & ~loaded, history.silent & loaded
         saturated = history.saturated()
         # This maker's NaN says that there is no cell: none may come and go.
-        judged = exists if self._used is None else exists & self._used
+        judged = exists if self.used is None else exists & self.used
         gone = judged & np.isnan(history.recent).any(axis=0)
         num_cells = max(1, int(judged.sum()))
-        found: dict[Code, tuple[np.ndarray, str]] = {
-            "taxels_dead": (dead & judged & ~gone, "dead"),
-            "taxels_stuck": (stuck & judged & ~saturated, "stuck"),
-            "taxels_saturated": (saturated & judged, "saturated"),
-            "nan": (gone, "without a number"),
+        found = {
+            "taxels_dead": dead & judged & ~gone,
+            "taxels_stuck": stuck & judged & ~saturated,
+            "taxels_saturated": saturated & judged,
         }
-        findings: tuple[HealthFinding, ...] = ()
-        figures: dict[str, float] = {}
-        for code, (cells, word) in found.items():
-            count = int(cells.sum())
-            findings += above(code, count / num_cells, SHARE_LIMITS, f"{count} cells {word}")
-            if code != "nan":
-                figures[f"{word}_taxels_ratio"] = count / num_cells
-        return Verdict(findings, figures, self._is_waiting(judged & ~saturated))
+        counted = _verdict(found, num_cells, "cells")
+        findings, num_gone = counted.findings, int(gone.sum())
+        if num_gone:
+            is_error = num_gone / num_cells >= CODES["nan"].error
+            level: Literal["WARN", "ERROR"] = "ERROR" if is_error else "WARN"
+            findings += (Finding("nan", level, f"{num_gone} cells without a number"),)
+        low, _ = history.extremes()
+        pinned = low >= SATURATED_SHARE * self._full_scale
+        waiting = bool((pinned & judged & ~saturated).any())
+        return Verdict(findings, counted.figures, waiting)
 
     def _remember(self, values: np.ndarray) -> None:
         if not len(self._lowest):
@@ -266,10 +310,66 @@ class CellJudge:
         around = (sum_around(moving) - moving) / np.maximum(count, 1.0)
         return np.where(exists, around.ravel(), 0.0)
 
-    def _is_waiting(self, judged: np.ndarray) -> bool:
-        low, _ = self._history.extremes()
-        pinned = low >= SATURATED_SHARE * self._full_scale
-        return bool((pinned & judged).any())
+
+def _word(code: str) -> str:
+    return code.removeprefix("taxels_")
+
+
+def _verdict(found: Mapping[str, np.ndarray], num_cells: int, noun: str) -> Verdict:
+    """Share of the cells that each code was found in."""
+    findings: tuple[Finding, ...] = ()
+    for code, cells in found.items():
+        count = int(cells.sum())
+        findings += find(code, count / num_cells, f"{count} {noun} {_word(code)}")
+    figures = {f"{_word(code)}_taxels_ratio": c.sum() / num_cells for code, c in found.items()}
+    return Verdict(findings, {name: float(ratio) for name, ratio in figures.items()})
+
+
+def count_taxels(low_counts: np.ndarray, high_counts: np.ndarray, *, side: Side) -> dict[str, int]:
+    """How many taxels are out by the least and greatest counts [360] of a whole take.
+
+    Without a tare a taxel that reads 0 throughout is dead where the others rest above 0. One that
+    never changed although its neighbours moved is dead, too, or stuck where it stayed more than
+    `MOVED_COUNTS` above the median taxel's least reading.
+
+    Returns:
+        Numbers of `dead_taxels`, `stuck_taxels` and `saturated_taxels`.
+    """
+    indices = raw_indices(side=side)
+    low, high = low_counts[indices].astype(np.int64), high_counts[indices].astype(np.int64)
+    around = neighbour_share(high - low >= MOVED_COUNTS)
+    saturated = low >= SATURATED_SHARE * FULL_SCALE_COUNTS
+    silent = (high == low) & (around >= STRONG_SHARE) & ~saturated
+    zero = (high == 0) & (np.median(low) >= MIN_TARE_COUNTS)
+    loaded = low > np.median(low) + MOVED_COUNTS
+    dead = zero | (silent & ~loaded)
+    found = {"dead": dead, "stuck": silent & loaded, "saturated": saturated}
+    return {f"{word}_taxels": int(taxels.sum()) for word, taxels in found.items()}
+
+
+def neighbour_share(moved: Bool[np.ndarray, "320"]) -> Float64[np.ndarray, "320"]:
+    """Share of the up to 8 neighbours on its pad that moved, for each taxel."""
+    shares = []
+    for grid in split_pads(moved.astype(np.float64)):
+        around = sum_around(grid) - grid
+        count = sum_around(np.ones_like(grid)) - 1.0
+        shares.append(around / count)
+    return join_pads(shares[0], shares[1])
+
+
+def whole_part(taxels: Bool[np.ndarray, "320"], lines: tuple[np.ndarray, np.ndarray]) -> str | None:
+    """Name of a pad or scan line that consists of such taxels only; None when there is none."""
+    tips, palm = split_pads(taxels)
+    if tips.all(axis=(1, 2)).any():
+        return "a whole fingertip is"
+    if palm.all():
+        return "the whole palm is"
+    for numbers, word in zip(lines, ("row", "column"), strict=True):
+        good = np.bincount(numbers[~taxels], minlength=int(numbers.max()) + 1)
+        empty = np.flatnonzero(good[: int(numbers.max()) + 1] == 0)
+        if len(empty):
+            return f"scan {word} {empty[0]} is"
+    return None
 
 
 def sum_around(grid: np.ndarray) -> np.ndarray:

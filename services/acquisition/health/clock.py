@@ -11,20 +11,14 @@ import numpy as np
 from dextouch.clocks import CountingClock, OnlineClock
 from dextouch.errors import InvalidInputError
 from dextouch.streams import StreamDescriptor
-from services.acquisition.health_blocks import Block, Rolling
-from services.acquisition.health_levels import Verdict, above
-from services.acquisition.schemas import HealthFinding
+from services.acquisition.health.levels import Finding, Verdict, find
+from services.acquisition.health.samples import WINDOW_NS, Block, Rolling
 
-WINDOW_NS = 10_000_000_000
-SKEW_LIMITS_PPM = (200.0, 1000.0)
-# An ordinary path (0.8 ms exponential, 1 % of packets 5 ms later) scatters by 1.7 … 2.1 ms.
-RESIDUAL_LIMITS_S = (4e-3, 10e-3)
 STEP_NS = 4_000_000
 HOUR_NS = 3_600_000_000_000
 STEP_SHOWN_NS = 60_000_000_000
 # A step is detected in two ways; detections within this time are the same step.
 SAME_STEP_NS = 2_500_000_000
-STEPS_ERROR = 3
 MIN_RESIDUALS = 30
 # Before the clock has a slope of its own, two halves of so many samples give a first one.
 MIN_EARLY_SAMPLES = 40
@@ -52,6 +46,7 @@ class ClockJudge:
         self._offsets = Rolling(WINDOW_NS)
         self._steps: deque[int] = deque(maxlen=64)
         self.num_steps = 0
+        self._verdict = Verdict()
 
     def _restart(self) -> None:
         self._clock = OnlineClock(self._descriptor)
@@ -62,6 +57,15 @@ class ClockJudge:
 
     def judge(self, block: Block, now_ns: int) -> Verdict:
         """One evaluation."""
+        self._verdict = self._judge(block, now_ns)
+        return self._verdict
+
+    def repeat(self, block: Block, now_ns: int) -> Verdict:
+        """The latest verdict, which holds for all streams of the device."""
+        del block, now_ns
+        return self._verdict
+
+    def _judge(self, block: Block, now_ns: int) -> Verdict:
         if not len(block):
             return Verdict(self._judge_steps(now_ns), self._figures())
         for t_ns in self._jumps(block):
@@ -70,19 +74,19 @@ class ClockJudge:
             residuals_ns = self._follow(block)
         except InvalidInputError as error:
             self._restart()
-            finding = HealthFinding(code="clock_stamps", level="ERROR", message=error.message)
-            return Verdict((finding, *self._judge_steps(now_ns)))
+            findings = find("clock_stamps", 1, error.message)
+            return Verdict((*findings, *self._judge_steps(now_ns)))
         kept_s = self._residuals.add(block.t_host_ns, residuals_ns * 1e-9, now_ns)
         skew_ppm = self._skew_ppm(int(block.t_host_ns[-1]))
         figures = {**self._figures(), "clock_skew_ratio": skew_ppm * 1e-6}
         text = f"its clock is skewed by {skew_ppm:+.0f} ppm"
-        findings = above("clock_skew", abs(skew_ppm), SKEW_LIMITS_PPM, text)
+        findings = find("clock_skew", abs(skew_ppm), text)
         if len(kept_s) >= MIN_RESIDUALS:
             scatter_s = _scatter_s(kept_s)
             figures["clock_residual_p95_seconds"] = scatter_s
             figures["clock_sigma_seconds"] = _sigma_s(kept_s)
             text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about its clock"
-            findings += above("clock_residual", scatter_s, RESIDUAL_LIMITS_S, text)
+            findings += find("clock_residual", scatter_s, text)
         return Verdict((*findings, *self._judge_steps(now_ns)), figures)
 
     def _figures(self) -> dict[str, float]:
@@ -182,14 +186,12 @@ class ClockJudge:
         self._steps.append(t_ns)
         self.num_steps += 1
 
-    def _judge_steps(self, now_ns: int) -> tuple[HealthFinding, ...]:
+    def _judge_steps(self, now_ns: int) -> tuple[Finding, ...]:
         in_an_hour = sum(t_ns > now_ns - HOUR_NS for t_ns in self._steps)
         text = f"its clock was set or restarted {in_an_hour} times within an hour"
-        if in_an_hour >= STEPS_ERROR:
-            return (HealthFinding(code="clock_step", level="ERROR", message=text),)
-        if self._steps and self._steps[-1] > now_ns - STEP_SHOWN_NS:
-            return (HealthFinding(code="clock_step", level="WARN", message=text),)
-        return ()
+        findings = find("clock_step", in_an_hour, text)
+        is_shown = bool(self._steps) and self._steps[-1] > now_ns - STEP_SHOWN_NS
+        return tuple(finding for finding in findings if is_shown or finding.level == "ERROR")
 
 
 class CountingJudge:
@@ -202,10 +204,8 @@ class CountingJudge:
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
         self._period_ns = descriptor.period_ns()
-        self._limits_s = tuple(
-            max(limit_s, share * self._period_ns * 1e-9)
-            for limit_s, share in zip(RESIDUAL_LIMITS_S, RESIDUAL_SHARES, strict=True)
-        )
+        warn_s, error_s = (share * self._period_ns * 1e-9 for share in RESIDUAL_SHARES)
+        self._limits_s = (warn_s, error_s)
         self._residuals = Rolling(WINDOW_NS)
         self._num_resets = 0
         self._restart()
@@ -234,8 +234,8 @@ class CountingJudge:
             "clock_sigma_seconds": _sigma_s(kept_s),
         }
         text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about the count of its samples"
-        limits_s = (self._limits_s[0], self._limits_s[1])
-        return Verdict(above("clock_residual", scatter_s, limits_s, text), figures)
+        findings = find("clock_residual", scatter_s, text, at_least=self._limits_s)
+        return Verdict(findings, figures)
 
     def _follow(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
         """Arrivals of the samples that got their final time now, and how long they waited, ns."""

@@ -1,74 +1,17 @@
-"""Health checks of trackers: lost tracking, jumps, and jitter at rest."""
-
-from collections import deque
-from collections.abc import Mapping
-from typing import Protocol, runtime_checkable
+"""Health checks of values: jumps and jitter of poses, numbers that are missing, bad images."""
 
 import numpy as np
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.tracking import TrackingEvents
-from services.acquisition.health_blocks import Block, Rolling
-from services.acquisition.health_levels import Verdict, above
-from services.acquisition.schemas import Code
+from services.acquisition.health.codes import Code
+from services.acquisition.health.levels import Finding, Verdict, find
+from services.acquisition.health.samples import WINDOW_NS, Block, Rolling
 
-WINDOW_NS = 10_000_000_000
-LOST_LIMITS = (0.01, 0.05)
-# Any jump is worth a word.
-JUMP_LIMITS = (0.0, 0.05)
-# Ratios of the first moments after a start say nothing.
-MIN_PACKETS = 100
-JITTER_LIMITS_M = (1e-3, 5e-3)
 MAX_SPEED_M_S = 5.0
 REST_SPEED_M_S = 0.02
 REST_NS = 1_000_000_000
 MIN_REST_SAMPLES = 40
-
-
-@runtime_checkable
-class TellsTracking(Protocol):
-    """A decoder that drops a tracker's packets while it is not tracking."""
-
-    @property
-    def tracking(self) -> TrackingEvents:
-        """Number of dropped packets, by reason."""
-        ...
-
-
-class TrackingJudge:
-    """Checks the packets that a tracker's decoder dropped: occluded, jumped, stale."""
-
-    def __init__(self, driver: Driver) -> None:
-        self._driver = driver
-        self._counts: deque[tuple[int, int, Mapping[str, int]]] = deque()
-        self._count(0)
-
-    def judge(self, block: Block, now_ns: int) -> Verdict:
-        """One evaluation."""
-        del block
-        counts = self._counts
-        self._count(now_ns)
-        while len(counts) > 2 and counts[1][0] <= now_ns - WINDOW_NS:
-            counts.popleft()
-        left_out = {
-            kind: count - counts[0][2].get(kind, 0) for kind, count in counts[-1][2].items()
-        }
-        packets = max(MIN_PACKETS, counts[-1][1] - counts[0][1])
-        lost = (left_out.get("occluded", 0) + left_out.get("stale", 0)) / packets
-        jumped = left_out.get("jumped", 0)
-        findings = (
-            *above("tracking", lost, LOST_LIMITS, f"not tracked for {lost:.0%} of 10 s"),
-            *above("jump", jumped / packets, JUMP_LIMITS, f"{jumped} jumps dropped within 10 s"),
-        )
-        return Verdict(findings, {"tracking_lost_ratio": lost})
-
-    def _count(self, now_ns: int) -> None:
-        decoder = self._driver.decoder
-        kinds: dict[str, int] = {}
-        if isinstance(decoder, TellsTracking):
-            kinds.update(decoder.tracking.packets.items())
-        self._counts.append((now_ns, self._driver.statistics.packets, kinds))
 
 
 class PoseJudge:
@@ -91,13 +34,13 @@ class PoseJudge:
         positions_m = block.values[:, :3].astype(np.float64)
         share = self._jumped_share(times_ns, positions_m, block.t_host_ns, now_ns)
         text = f"{share:.1%} of its steps are faster than {MAX_SPEED_M_S:g} m/s"
-        findings = above("jump", share, JUMP_LIMITS, text)
+        findings = find("jump", share, text)
         figures: dict[str, float] = {}
         jitter_m = self._jitter_m(times_ns, positions_m)
         if jitter_m is not None:
             figures["stationary_jitter_meters"] = jitter_m
             text = f"jitters by {jitter_m * 1e3:.1f} mm at rest"
-            findings += above("pose_jitter", jitter_m, JITTER_LIMITS_M, text)
+            findings += find("pose_jitter", jitter_m, text)
         return Verdict(findings, figures)
 
     def _jumped_share(
@@ -155,4 +98,39 @@ class FiniteJudge:
         shares = 1.0 - finite[:, ever].mean(axis=1) if ever.any() else np.ones(len(block))
         ratio = float(self._shares.add(block.t_host_ns, shares, now_ns).mean())
         text = f"{ratio:.1%} of the {self._word}"
-        return Verdict(above(self._code, ratio, LOST_LIMITS, text), {"missing_ratio": ratio})
+        return Verdict(find(self._code, ratio, text), {"missing_ratio": ratio})
+
+
+class CameraJudge:
+    """Judges one camera: anything is a warning, and an error after a second."""
+
+    def __init__(self, driver: Driver) -> None:
+        self._driver = driver
+        self._since_ns: dict[Code, int] = {}
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del block
+        quality = self._driver.quality
+        if quality is None:
+            return Verdict()
+        clipped = quality.clipped_ratio
+        flags = {
+            "image_frozen": (quality.frozen, "the same image repeatedly"),
+            "image_blurred": (quality.blurred, "much less sharp than usual"),
+            "image_gap": (quality.gap, "images are missing according to its timestamps"),
+            "image_clipped": (quality.clipped, f"{clipped:.0%} of the image black or white"),
+        }
+        self._since_ns = {
+            code: self._since_ns.get(code, now_ns) for code, (is_bad, _) in flags.items() if is_bad
+        }
+        findings: tuple[Finding, ...] = ()
+        for code, since_ns in self._since_ns.items():
+            # What has only begun has lasted for more than nothing.
+            findings += find(code, max(1, now_ns - since_ns) / 1e9, flags[code][1])
+        figures = {
+            "image_clipped_ratio": clipped,
+            "image_frozen": float(quality.frozen),
+            "image_blurred": float(quality.blurred),
+        }
+        return Verdict(findings, figures)

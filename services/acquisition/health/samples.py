@@ -1,15 +1,16 @@
-"""Ring buffers that pass the newest samples of each stream to the health checks."""
+"""Samples and counters of the last seconds, as the health checks look at them."""
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.streams import Sample, StreamDescriptor
-from services.acquisition.clock import StationClock
 
+WINDOW_NS = 10_000_000_000
 # What is kept between two evaluations, which are a second apart.
 KEPT_S = 4.0
 MIN_ROLLING = 64
@@ -34,13 +35,15 @@ class Block:
         return len(self.t_host_ns)
 
 
-class _Queue:
+class SampleQueue:
     """A ring of one stream's newest stamps and values; any thread may add and take.
 
-    It takes its memory once, whatever waits in it.
+    A reader appends and goes on; when nobody evaluates, the oldest samples fall out and are
+    counted in `num_dropped`. It takes its memory once, whatever waits in it.
     """
 
     def __init__(self, descriptor: StreamDescriptor) -> None:
+        self.num_dropped = 0
         self._size = max(16, round(KEPT_S * descriptor.nominal_rate_hz))
         self._keeps_values = descriptor.kind in JUDGED_VALUES
         self._stamps = np.zeros((self._size, 3), dtype=np.int64)
@@ -51,8 +54,8 @@ class _Queue:
         self._num_latencies = self._num_latencies_taken = 0
         self._lock = threading.Lock()
 
-    def add(self, samples: Sequence[Sample], latency_ns: int | None) -> int:
-        """Append samples; how many older ones fell out."""
+    def add(self, samples: Sequence[Sample], now_ns: int) -> None:
+        """Append a delivery (called by the reader thread, after its samples were spooled)."""
         if self._values is None and self._keeps_values:
             first = samples[0].values
             self._values = np.zeros((self._size, *first.shape), dtype=first.dtype)
@@ -63,12 +66,11 @@ class _Queue:
                 if self._values is not None:
                     self._values[place] = sample.values
                 self._num_added += 1
-            if latency_ns is not None:
-                self._latencies_ns[self._num_latencies % self._size] = latency_ns
-                self._num_latencies += 1
-            dropped = max(0, self._num_added - self._num_taken - self._size)
-            self._num_taken += dropped
-        return dropped
+            self._latencies_ns[self._num_latencies % self._size] = now_ns - samples[-1].t_host_ns
+            self._num_latencies += 1
+            num_dropped = max(0, self._num_added - self._num_taken - self._size)
+            self._num_taken += num_dropped
+            self.num_dropped += num_dropped
 
     def take(self) -> Block:
         """Everything that waits, oldest first."""
@@ -84,32 +86,27 @@ class _Queue:
         return Block(stamps[0], stamps[1], stamps[2], latencies_ns, values)
 
 
-class SampleBlocks:
-    """Bounded queues between the readers and the health thread.
+class CountWindow:
+    """Counters that only grow, and by how much they grew within the last 10 s.
 
-    A reader appends and goes on; when nobody evaluates, the oldest samples fall out and are
-    counted in `dropped`.
+    Args:
+        count: the counters at this moment, by name.
+        now_ns: this moment.
     """
 
-    def __init__(self, descriptors: Mapping[str, StreamDescriptor]) -> None:
-        self._queues = {name: _Queue(descriptor) for name, descriptor in descriptors.items()}
-        self._clock: StationClock | None = None
-        self.dropped = 0
+    def __init__(self, count: Callable[[], Mapping[str, int]], now_ns: int = 0) -> None:
+        self._count = count
+        self.history = deque([(now_ns, count())])
 
-    def time_by(self, clock: StationClock) -> None:
-        """Measure latencies from now on."""
-        self._clock = clock
-
-    def add(self, stream: str, samples: Sequence[Sample]) -> None:
-        """Append (called by the reader threads, after the samples were spooled)."""
-        latency_ns = None
-        if self._clock is not None:
-            latency_ns = self._clock.now_ns() - samples[-1].t_host_ns
-        self.dropped += self._queues[stream].add(samples, latency_ns)
-
-    def take(self, stream: str) -> Block:
-        """Everything since the last call, oldest first."""
-        return self._queues[stream].take()
+    def growth(self, now_ns: int) -> Counter[str]:
+        """Look again; growth since the last look that is 10 s old, or since the first one."""
+        history = self.history
+        history.append((now_ns, self._count()))
+        while len(history) > 2 and history[1][0] <= now_ns - WINDOW_NS:
+            history.popleft()
+        grown = Counter(history[-1][1])
+        grown.subtract(history[0][1])
+        return grown
 
 
 class Rolling:

@@ -1,0 +1,26 @@
+"""Health of a station: faults of its devices and streams, found within about a second.
+
+`CODES` is the table of all that can be found (docs/health.md shows it), `HealthMonitor` evaluates
+the streams, and `HealthCollector` shows its report to Prometheus.
+"""
+
+from services.acquisition.health.cells import count_taxels
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
+from services.acquisition.health.monitor import STATION, TICK_NS, HealthMonitor
+from services.acquisition.health.schemas import HealthEvent, HealthEvents, StationHealth
+from services.acquisition.health.station import DiskJudge
+
+__all__ = [
+    "CODES",
+    "STATION",
+    "STATION_FIGURES",
+    "TICK_NS",
+    "DiskJudge",
+    "HealthCollector",
+    "HealthEvent",
+    "HealthEvents",
+    "HealthMonitor",
+    "StationHealth",
+    "count_taxels",
+]

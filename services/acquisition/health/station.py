@@ -1,0 +1,168 @@
+"""Health checks against the calibration, and of the station itself: disk and refused uploads."""
+
+import math
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from dextouch.schemas import Matrix
+from dextouch.streams import StreamDescriptor
+from dextouch.tactile.layout import NUM_RAW_TAXELS
+from services.acquisition.health.levels import Finding, Verdict, find
+from services.acquisition.health.samples import Block, CountWindow
+from services.acquisition.path_latency import PathWatch
+from services.acquisition.supervisor import DeviceSupervisor
+
+MIN_RATE_SPAN_NS = 900_000_000
+CALIBRATED_AT = "calibrated_at_unix_s"
+
+
+class DiskJudge:
+    """How long the spool's disk would last if everything that arrives now were recorded.
+
+    Args:
+        spool_root: folder of the takes.
+        supervisors: whose readers count payload bytes.
+        now_ns: by the station's clock; the measurement of what arrives begins here.
+        free_bytes: of the disk; asks the operating system if None.
+    """
+
+    def __init__(
+        self,
+        spool_root: Path,
+        supervisors: Sequence[DeviceSupervisor],
+        now_ns: int,
+        *,
+        free_bytes: Callable[[], int] | None = None,
+    ) -> None:
+        self._free_bytes = free_bytes or (lambda: shutil.disk_usage(spool_root).free)
+        streams = [stream for s in supervisors for stream in s.streams.values()]
+        self._arrived = CountWindow(lambda: {"bytes": sum(s.num_bytes for s in streams)}, now_ns)
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del block
+        num_bytes = self._arrived.growth(now_ns)["bytes"]
+        elapsed_ns = now_ns - self._arrived.history[0][0]
+        try:
+            free = self._free_bytes()
+        except OSError as error:
+            text = f"the spool's disk cannot be read: {error.strerror}"
+            return Verdict((Finding("disk", "ERROR", text),))
+        figures = {"disk_free_bytes": float(free)}
+        if elapsed_ns < MIN_RATE_SPAN_NS or num_bytes <= 0:
+            return Verdict((), figures)
+        left_s = free / (num_bytes / (elapsed_ns * 1e-9))
+        figures["disk_left_seconds"] = left_s
+        text = f"the disk is full in {left_s / 60:.0f} minutes; upload or delete takes"
+        return Verdict(find("disk", -left_s, text), figures)
+
+
+class CalibrationJudge:
+    """Whether the calibration that travels with recordings is there, and how old it is.
+
+    The age is judged where the record says when it was made (`calibrated_at_unix_s`, 1 × 1, or
+    the same behind a stream's name); a record that does not say gets no age, not a young one.
+    """
+
+    def __init__(
+        self,
+        descriptors: Sequence[StreamDescriptor],
+        calibration: Mapping[str, Matrix],
+        *,
+        unix_s: Callable[[], float] = time.time,
+    ) -> None:
+        self._unix_s = unix_s
+        self._missing = [
+            name for name in needed_matrices(descriptors) if not np.size(calibration.get(name, ()))
+        ]
+        numbers = {name: number(calibration, name) for name in calibration}
+        known = {name: value for name, value in numbers.items() if value is not None}
+        self._made_unix_s = [v for name, v in known.items() if name.endswith(CALIBRATED_AT)]
+        self._sigmas_ns = [v for name, v in known.items() if name.endswith("_latency_sigma_ns")]
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del block, now_ns
+        text = f"calibration lacks {', '.join(self._missing)}; calibrate the station"
+        findings = find("calibration_missing", len(self._missing), text)
+        figures = {}
+        if self._sigmas_ns:
+            figures["latency_sigma_seconds"] = max(self._sigmas_ns) * 1e-9
+        if self._made_unix_s:
+            age_s = figures["calibration_age_seconds"] = self._unix_s() - min(self._made_unix_s)
+            text = f"the oldest calibration is {age_s / 86_400:.0f} days old; calibrate again"
+            findings += find("calibration_age", age_s, text)
+        return Verdict(findings, figures)
+
+
+class PathJudge:
+    """Compares a stream's measured path delay with the station's calibration.
+
+    Args:
+        stream: name of the stream.
+        paths: gives measured delays.
+        calibration: of the station; without a delay of the stream there is nothing to compare.
+    """
+
+    def __init__(self, stream: str, paths: PathWatch, calibration: Mapping[str, Matrix]) -> None:
+        self._stream = stream
+        self._paths = paths
+        self._calibrated_ns = number(calibration, f"{stream}_latency_ns")
+        # A delay without a sigma is compared by the sigma of the measurement alone.
+        self._calibrated_sigma_ns = number(calibration, f"{stream}_latency_sigma_ns") or 0.0
+
+    def judge(self, block: Block, now_ns: int) -> Verdict:
+        """One evaluation."""
+        del block, now_ns
+        figures: dict[str, float] = {}
+        num_failures = self._paths.num_failures(self._stream)
+        if num_failures is not None:
+            figures["time_requests_failed"] = float(num_failures)
+        measured = self._paths.latencies().get(self._stream)
+        if measured is None:
+            return Verdict((), figures)
+        figures["path_latency_seconds"] = measured.latency_ns * 1e-9
+        figures["path_latency_sigma_seconds"] = measured.sigma_ns * 1e-9
+        if self._calibrated_ns is None:
+            return Verdict((), figures)
+        apart_ns = abs(measured.latency_ns - self._calibrated_ns)
+        sigma_ns = math.hypot(measured.sigma_ns, self._calibrated_sigma_ns)
+        text = (
+            f"its path delay is {measured.latency_ns * 1e-6:.1f} ms by its replies and "
+            f"{self._calibrated_ns * 1e-6:.1f} ms by the calibration, {apart_ns / sigma_ns:.1f} "
+            "sigma apart"
+        )
+        return Verdict(find("latency_calibration", apart_ns / sigma_ns, text), figures)
+
+
+def judge_uploads(refused: Mapping[str, str]) -> Verdict:
+    """Whether the store refused takes for good, by its words for each."""
+    if not refused:
+        return Verdict()
+    first, reason = next(iter(refused.items()))
+    others = f" and {len(refused) - 1} more" if len(refused) > 1 else ""
+    text = f"the store refuses take {first}{others}: {reason}"
+    return Verdict(find("upload_refused", len(refused), text))
+
+
+def number(calibration: Mapping[str, Matrix], name: str) -> float | None:
+    """The one number of a 1 × 1 matrix of the calibration; None where there is no such."""
+    matrix = calibration.get(name)
+    return None if matrix is None or np.size(matrix) != 1 else float(np.ravel(matrix)[0])
+
+
+def needed_matrices(descriptors: Sequence[StreamDescriptor]) -> list[str]:
+    """Matrices without which no episode can be made of these streams (docs/streams.md)."""
+    needed = []
+    for descriptor in descriptors:
+        if descriptor.name == "camera_head":
+            needed.append("K_head")
+        if descriptor.kind == "tactile" and descriptor.unit == "counts":
+            needed += [f"{descriptor.name}_tare_counts", f"{descriptor.name}_gain_counts_per_kpa"]
+            if descriptor.shape != (NUM_RAW_TAXELS,):
+                needed.append(f"{descriptor.name}_cells")
+    return needed
