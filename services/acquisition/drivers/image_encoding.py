@@ -9,7 +9,7 @@ import concurrent.futures
 import threading
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import replace
 from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
@@ -29,8 +29,6 @@ from dextouch.images import encode_jpeg
 from dextouch.schemas import Matrix
 from dextouch.streams import (
     H264_UNIT,
-    NO_DEVICE_TIME,
-    NO_SEQUENCE,
     Sample,
     StreamDescriptor,
     encoded_values,
@@ -38,20 +36,6 @@ from dextouch.streams import (
 
 ImageEncoding = Literal["rgb8", "jpeg", "h264"]
 MAX_WAITING_IMAGES = 8
-
-
-@dataclass(frozen=True)
-class StampedImage:
-    """An image with the stamps that its sample is going to carry."""
-
-    image: UInt8[np.ndarray, "h w 3"]
-    t_host_ns: int
-    t_device_ns: int = NO_DEVICE_TIME
-    sequence: int = NO_SEQUENCE
-
-    def sample(self, values: np.ndarray) -> Sample:
-        """The sample with these values."""
-        return Sample(self.t_host_ns, values, self.t_device_ns, self.sequence)
 
 
 @runtime_checkable
@@ -74,23 +58,16 @@ class ImageEncoder:
         encoding: `rgb8` leaves the image as it is.
         size_px: height and width; even for `h264`.
         rate_hz: nominal.
-        video: quality of `h264`.
 
     Raises:
         InvalidInputError: a size that H.264 cannot have.
     """
 
     def __init__(
-        self,
-        encoding: ImageEncoding,
-        size_px: tuple[int, int],
-        *,
-        rate_hz: float,
-        video: VideoSettings | None = None,
+        self, encoding: ImageEncoding, size_px: tuple[int, int], *, rate_hz: float
     ) -> None:
         self.encoding: ImageEncoding = encoding
         self._size_px, self._rate_hz = size_px, rate_hz
-        self._settings = video or VideoSettings()
         self._video: GopEncoder | None = None
         if encoding == "h264":
             check_video_size(*size_px)
@@ -117,7 +94,7 @@ class ImageEncoder:
         return encoded_values([self._video.encode(image)]).reshape(())
 
     def _new_video(self) -> GopEncoder:
-        return GopEncoder(*self._size_px, rate_hz=self._rate_hz, settings=self._settings)
+        return GopEncoder(*self._size_px, rate_hz=self._rate_hz, settings=VideoSettings())
 
 
 class EncodingQueue:
@@ -128,14 +105,11 @@ class EncodingQueue:
     Args:
         encoder: of the camera; used by the queue's thread alone.
         name: of the stream, for the thread.
-        max_waiting: images that may wait.
     """
 
-    def __init__(
-        self, encoder: ImageEncoder, *, name: str, max_waiting: int = MAX_WAITING_IMAGES
-    ) -> None:
+    def __init__(self, encoder: ImageEncoder, *, name: str) -> None:
         self.num_dropped = 0
-        self._encoder, self._name, self._max_waiting = encoder, name, max_waiting
+        self._encoder, self._name = encoder, name
         self._waiting: deque[concurrent.futures.Future[Sample]] = deque()
         self._thread: concurrent.futures.ThreadPoolExecutor | None = None
         self._begun = 0
@@ -152,10 +126,14 @@ class EncodingQueue:
         with self._lock:
             self._wanted += 1
 
-    def put(self, image: StampedImage) -> bool:
-        """Queue an image, whose pixels must not change any more; False when it was dropped."""
+    def put(self, image: Sample) -> bool:
+        """Queue an image, whose pixels must not change any more; False when it was dropped.
+
+        Args:
+            image: uint8 [h, w, 3], RGB, with the stamps of its sample.
+        """
         num_waiting = sum(not future.done() for future in self._waiting)
-        if num_waiting >= self._max_waiting:
+        if num_waiting >= MAX_WAITING_IMAGES:
             self.num_dropped += 1
             return False
         if self._thread is None:
@@ -189,8 +167,8 @@ class EncodingQueue:
             self._thread.shutdown()
             self._thread = None
 
-    def _encode(self, image: StampedImage, begins: bool) -> Sample:  # noqa: FBT001 - submitted
-        return image.sample(self._encoder.encode(image.image, begins=begins))
+    def _encode(self, image: Sample, begins: bool) -> Sample:  # noqa: FBT001 - submitted
+        return replace(image, values=self._encoder.encode(image.values, begins=begins))
 
 
 class GroupGate:

@@ -5,7 +5,7 @@ every third image sharpness and exposure at a quarter of the size.
 """
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import UInt8
@@ -28,7 +28,7 @@ _CHECKSUM_ROWS = 90
 _QUARTER = 4
 
 
-@dataclass(frozen=True)
+@dataclass
 class ImageQuality:
     """Quality of the newest images of one camera, and counters since the start.
 
@@ -45,8 +45,6 @@ class ImageQuality:
         num_gaps: gaps of the driver's stamps.
         num_dropped: images that found the encoder's queue full.
         largest_gap_ns: between two stamps.
-        sharpness: variance of the Laplacian of the newest checked image.
-        median_sharpness: of the session; None before there is enough to compare with.
     """
 
     frozen: bool = False
@@ -61,8 +59,6 @@ class ImageQuality:
     num_gaps: int = 0
     num_dropped: int = 0
     largest_gap_ns: int = 0
-    sharpness: float | None = None
-    median_sharpness: float | None = None
 
     @property
     def clipped(self) -> bool:
@@ -125,18 +121,17 @@ class ImageChecker:
             )
         self._period_ns = period_ns
         self._check_every = check_every
+        self._found = ImageQuality()
         self._checksum: int | None = None
         self._num_equal = 0
         self._last_t_ns: int | None = None
         self._gap_seen_ns: int | None = None
         self._median = SessionMedian()
-        self._counts = dict.fromkeys(
-            ("num_checked", "num_images", "num_frozen", "num_blurred", "num_clipped", "num_gaps"), 0
-        )
-        self._largest_gap_ns = 0
-        self._sharpness: float | None = None
-        self._is_blurred = False
-        self._clipped_ratio = 0.0
+
+    @property
+    def quality(self) -> ImageQuality:
+        """What was found so far; a copy."""
+        return replace(self._found)
 
     def check(self, image: UInt8[np.ndarray, "h w 3"], t_ns: int | None = None) -> None:
         """Look at the next image.
@@ -147,16 +142,17 @@ class ImageChecker:
         """
         step = max(1, min(image.shape[:2]) // _CHECKSUM_ROWS)
         self.note(image[::step, ::step].tobytes(), t_ns)
-        if (self._counts["num_images"] - 1) % self._check_every == 0:
+        if (self._found.num_images - 1) % self._check_every == 0:
             self.look(image)
 
     def note(self, data: bytes, t_ns: int | None = None) -> None:
         """The next image as bytes that are equal only for equal images, such as its JPEG bytes."""
-        self._counts["num_images"] += 1
+        self._found.num_images += 1
         checksum = zlib.crc32(data)
         self._num_equal = self._num_equal + 1 if checksum == self._checksum else 1
         self._checksum = checksum
-        self._counts["num_frozen"] += self._num_equal > MAX_EQUAL_IMAGES
+        self._found.frozen = self._num_equal > MAX_EQUAL_IMAGES
+        self._found.num_frozen += self._found.frozen
         if t_ns is not None:
             self._note_stamp(t_ns)
 
@@ -165,37 +161,25 @@ class ImageChecker:
         gray = quarter_size(image)
         sharpness = laplacian_variance(gray)
         clipped = int(np.count_nonzero((gray <= DARK_LEVEL) | (gray >= BRIGHT_LEVEL)))
-        self._sharpness, self._clipped_ratio = sharpness, clipped / gray.size
         median = self._median.value
-        self._is_blurred = median is not None and sharpness < BLURRED_BELOW * median
         self._median.add(sharpness)
-        self._counts["num_checked"] += 1
-        self._counts["num_blurred"] += self._is_blurred
-        self._counts["num_clipped"] += int(self._clipped_ratio > CLIPPED_ABOVE)
-
-    @property
-    def quality(self) -> ImageQuality:
-        """What was found so far."""
-        last_ns, gap_ns = self._last_t_ns, self._gap_seen_ns
-        return ImageQuality(
-            frozen=self._num_equal > MAX_EQUAL_IMAGES,
-            blurred=self._is_blurred,
-            clipped_ratio=self._clipped_ratio,
-            gap=last_ns is not None and gap_ns is not None and last_ns - gap_ns <= GAP_SHOWN_NS,
-            largest_gap_ns=self._largest_gap_ns,
-            sharpness=self._sharpness,
-            median_sharpness=self._median.value,
-            **self._counts,
-        )
+        found = self._found
+        found.blurred = median is not None and sharpness < BLURRED_BELOW * median
+        found.clipped_ratio = clipped / gray.size
+        found.num_checked += 1
+        found.num_blurred += found.blurred
+        found.num_clipped += found.clipped
 
     def _note_stamp(self, t_ns: int) -> None:
         if self._last_t_ns is not None:
             gap_ns = t_ns - self._last_t_ns
-            self._largest_gap_ns = max(self._largest_gap_ns, gap_ns)
+            self._found.largest_gap_ns = max(self._found.largest_gap_ns, gap_ns)
             if gap_ns > GAP_PERIODS * self._period_ns:
-                self._counts["num_gaps"] += 1
+                self._found.num_gaps += 1
                 self._gap_seen_ns = t_ns
         self._last_t_ns = t_ns
+        seen_ns = self._gap_seen_ns
+        self._found.gap = seen_ns is not None and t_ns - seen_ns <= GAP_SHOWN_NS
 
 
 def quarter_size(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "a b"]:

@@ -5,6 +5,7 @@ cannot be said wrongly either: such a fault is refused.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -113,19 +114,19 @@ class OurPacketEdits(PacketEdits):
                 raise _cannot("a number that can be NaN")
             start, dtype = FLOATS[magic]
             values = without_first(np.frombuffer(packet.payload, dtype=dtype, offset=start))
-            return changed(packet, payload=packet.payload[:start] + values.tobytes())
+            return replace(packet, payload=packet.payload[:start] + values.tobytes())
 
         return edit_ours(data, change)
 
     def other_side(self, data: bytes) -> bytes:
         """Left says right, and any other left."""
         return edit_ours(
-            data, lambda _, p: changed(p, source=OTHER_SIDE.get(p.source, SOURCES["left"]))
+            data, lambda _, p: replace(p, source=OTHER_SIDE.get(p.source, SOURCES["left"]))
         )
 
     def other_version(self, data: bytes) -> bytes:
         """The next version."""
-        return edit_ours(data, lambda _, p: changed(p, version=VERSION + 1))
+        return edit_ours(data, lambda _, p: replace(p, version=VERSION + 1))
 
 
 def halve_units(units: Sequence[bytes]) -> list[bytes]:
@@ -134,23 +135,6 @@ def halve_units(units: Sequence[bytes]) -> list[bytes]:
         return list(units[: len(units) // 2])
     whole = units[0]
     return [whole[: len(whole) // 2]]
-
-
-def changed(
-    packet: Packet,
-    *,
-    version: int | None = None,
-    source: int | None = None,
-    payload: bytes | None = None,
-) -> Packet:
-    """The packet with something else in it."""
-    return Packet(
-        packet.version if version is None else version,
-        packet.source if source is None else source,
-        packet.sequence,
-        packet.t_device_ns,
-        packet.payload if payload is None else payload,
-    )
 
 
 def without_first(values: np.ndarray) -> np.ndarray:

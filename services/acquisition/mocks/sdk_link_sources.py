@@ -2,14 +2,12 @@
 
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from jaxtyping import Int64
-
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.sdk_link_protocol import (
     BridgeHello,
     FrameConvention,
 )
+from services.acquisition.mocks.replay import PacketSource
 
 # A left-handed sender in centimetres, and OpenVR's own frame: y up, looking along −z.
 LEFT_HANDED = FrameConvention(handedness="left", axes=("+x", "+y", "-z"))
@@ -18,22 +16,13 @@ SOFTWARE = "dextouch mock bridge 1"
 
 
 @runtime_checkable
-class BridgeSource(Protocol):
+class BridgeSource(PacketSource, Protocol):
     """What one bridge process says."""
 
     magic: bytes
 
-    @property
-    def t_ns(self) -> Int64[np.ndarray, " n"]:
-        """When each sample is taken."""
-        ...
-
     def hello(self) -> bytes:
         """The first line of a connection."""
-        ...
-
-    def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
-        """The packet of sample `index`."""
         ...
 
 

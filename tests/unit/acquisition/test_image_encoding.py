@@ -14,7 +14,6 @@ from services.acquisition.drivers.image_encoding import (
     GroupGate,
     GroupPreview,
     ImageEncoder,
-    StampedImage,
     WholeGroups,
     take_gates,
 )
@@ -41,7 +40,7 @@ def encoded(count, *, first=0):
     queue = queue_of("h264")
     samples = []
     for index in range(first, first + count):
-        assert queue.put(StampedImage(picture(index), index, index, index))
+        assert queue.put(Sample(index, picture(index), index, index))
         samples += queue.collect(WAIT_S)
     queue.stop()
     return samples
@@ -58,7 +57,7 @@ def psnr_db(image, truth):
 @pytest.mark.parametrize("encoding", ["rgb8", "jpeg"])
 def test_still_images_keep_their_stamps(encoding):
     queue = queue_of(encoding)
-    assert queue.put(StampedImage(picture(3), 7, 8, 9))
+    assert queue.put(Sample(7, picture(3), 8, 9))
     (sample,) = queue.collect(WAIT_S)
     queue.stop()
     assert (sample.t_host_ns, sample.t_device_ns, sample.sequence) == (7, 8, 9)
@@ -75,7 +74,7 @@ def test_a_take_begins_a_group_whatever_came_before():
     for index in range(23):
         if index == 13:
             queue.begin_group()
-        assert queue.put(StampedImage(picture(index), index))
+        assert queue.put(Sample(index, picture(index)))
         samples += queue.collect(WAIT_S)
     queue.stop()
     assert keys(samples) == [0, 8, 13, 21]
@@ -86,7 +85,7 @@ def test_a_stopped_queue_goes_on_with_its_group():
     for index in range(12):
         if index == 5:
             queue.stop()
-        assert queue.put(StampedImage(picture(index), index))
+        assert queue.put(Sample(index, picture(index)))
         samples += queue.collect(WAIT_S)
     queue.stop()
     assert keys(samples) == [0, 8]
@@ -95,7 +94,7 @@ def test_a_stopped_queue_goes_on_with_its_group():
 def test_what_waits_at_a_stop_is_not_lost():
     queue = queue_of("h264")
     for index in range(5):
-        assert queue.put(StampedImage(picture(index), index))
+        assert queue.put(Sample(index, picture(index)))
     queue.stop()
     assert [sample.t_host_ns for sample in queue.collect()] == [0, 1, 2, 3, 4]
 
@@ -116,7 +115,7 @@ def test_a_slow_encoder_drops_counts_and_tears_no_group(request):
     encoder = SlowEncoder()
     queue = EncodingQueue(encoder, name="camera_head")
     request.addfinalizer(encoder.go_on.set)
-    taken = [queue.put(StampedImage(picture(index), index)) for index in range(20)]
+    taken = [queue.put(Sample(index, picture(index))) for index in range(20)]
     assert taken == [True] * MAX_WAITING_IMAGES + [False] * (20 - MAX_WAITING_IMAGES)
     assert queue.num_dropped == 20 - MAX_WAITING_IMAGES
     assert queue.collect(0.0) == []
@@ -124,7 +123,7 @@ def test_a_slow_encoder_drops_counts_and_tears_no_group(request):
     encoder.go_on.set()
     samples = queue.collect(WAIT_S)
     for index in range(20, 30):
-        assert queue.put(StampedImage(picture(index), index))
+        assert queue.put(Sample(index, picture(index)))
         samples += queue.collect(WAIT_S)
     queue.stop()
     assert [sample.t_host_ns for sample in samples] == [*range(8), *range(20, 30)]

@@ -78,7 +78,7 @@ def vendor_glove(family):
         cells = np.argsort(np.where(np.isnan(grid), np.inf, grid))[:320]
         calibration = mapped(cells, 768, 0.0, 1 / FULL_SCALE_KPA)
     else:
-        source = JustFloatGloveSource(replay, num_values=401, full_scale=4095.0)
+        source = JustFloatGloveSource(replay)
         decoder = JustFloatGloveDecoder("left", num_values=401, full_scale=4095.0, rate_hz=60.0)
         calibration = mapped(np.arange(320), 401, 0.0, COUNTS_PER_KPA)
     samples = []

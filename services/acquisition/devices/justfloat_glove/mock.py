@@ -5,7 +5,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float32
 
-from dextouch.errors import InvalidInputError
 from dextouch.tactile.layout import NUM_TAXELS
 from services.acquisition.devices.justfloat_glove.packets import TAIL, JustFloatGloveDecoder
 from services.acquisition.mocks.edits import PacketEdits, Pinned, without_first
@@ -22,12 +21,7 @@ PINNED = {"stuck": 1_000.0, "saturated": FULL_SCALE}
 
 def mock_justfloat_glove(place: MockPlace) -> MockPair:
     """A glove that sends bare float32s at the rate of the stream."""
-    source = JustFloatGloveSource(
-        place.stream,
-        num_values=NUM_VALUES,
-        full_scale=FULL_SCALE,
-        dead_taxels=place.faults.dead_taxels,
-    )
+    source = JustFloatGloveSource(place.stream, dead_taxels=place.faults.dead_taxels)
     decoder = JustFloatGloveDecoder(
         place.side,
         num_values=NUM_VALUES,
@@ -56,27 +50,16 @@ class JustFloatGloveSource:
 
     Args:
         stream: float32 [n, 320] in kPa.
-        num_values: float32s of a packet, at least 320.
-        full_scale: the largest reading.
         dead_taxels: places in the packet that read zero.
     """
 
     edits = JustFloatPacketEdits()
 
-    def __init__(
-        self,
-        stream: ReplayStream,
-        *,
-        num_values: int,
-        full_scale: float,
-        dead_taxels: Sequence[int] = (),
-    ) -> None:
-        if num_values < NUM_TAXELS:
-            raise InvalidInputError(f"num_values: got {num_values}, expected at least {NUM_TAXELS}")
+    def __init__(self, stream: ReplayStream, *, dead_taxels: Sequence[int] = ()) -> None:
         # No device sends the negative zero that rounding leaves of noise.
-        counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, full_scale) + 0.0
+        counts = np.clip(np.rint(COUNTS_PER_KPA * stream.values), 0.0, FULL_SCALE) + 0.0
         self.t_ns = stream.t_ns
-        self._values = np.zeros((len(counts), num_values), dtype="<f4")
+        self._values = np.zeros((len(counts), NUM_VALUES), dtype="<f4")
         self._values[:, :NUM_TAXELS] = counts
         self._values[:, list(dead_taxels)] = 0.0
 

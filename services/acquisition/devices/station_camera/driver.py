@@ -9,7 +9,7 @@ from dataclasses import replace
 
 from dextouch.errors import DeviceError
 from dextouch.schemas import Matrix
-from dextouch.streams import NO_DEVICE_TIME, ClockCapabilities, StreamDescriptor
+from dextouch.streams import NO_DEVICE_TIME, ClockCapabilities, Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.devices.station_camera.capture import (
     NS_PER_MS,
@@ -25,7 +25,6 @@ from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import (
     EncodingQueue,
     ImageEncoder,
-    StampedImage,
 )
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
 from services.acquisition.drivers.packet_search import DecoderStatistics
@@ -195,7 +194,7 @@ class StationCamera(Driver):
         has_time = t_driver_ns != NO_DEVICE_TIME
         self._checker.check(image, t_driver_ns if has_time else None)
         t_device_ns = self._middle_of_exposure_ns(t_driver_ns) if has_time else NO_DEVICE_TIME
-        if not self._queue.put(StampedImage(image, t_host_ns, t_device_ns, number)):
+        if not self._queue.put(Sample(t_host_ns, image, t_device_ns, number)):
             statistics.lost += 1
 
     def _middle_of_exposure_ns(self, t_driver_ns: int) -> int:

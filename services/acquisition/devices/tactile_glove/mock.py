@@ -1,7 +1,7 @@
 """Simulated glove of our own protocol, with its own offsets and gains, that answers commands."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float64
@@ -14,7 +14,7 @@ from services.acquisition.devices.tactile_glove.driver import TactileGlove
 from services.acquisition.devices.tactile_glove.mock_answers import GloveAnswers
 from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS, MAGIC
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.mocks.edits import OurPacketEdits, Pinned, changed, edit_ours
+from services.acquisition.mocks.edits import OurPacketEdits, Pinned, edit_ours
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.ports import PtyPort
@@ -102,7 +102,7 @@ class GlovePacketEdits(OurPacketEdits):
         def pinned(_: bytes, packet: Packet) -> Packet:
             counts = np.frombuffer(packet.payload, "<u2").copy()
             counts[list(cells)] = PINNED[how]
-            return changed(packet, payload=counts.tobytes())
+            return replace(packet, payload=counts.tobytes())
 
         return edit_ours(data, pinned)
 

@@ -79,7 +79,6 @@ class WujiGloveSource:
     Args:
         stream: float32 [n, 320] in kPa.
         side: which hand.
-        scale_kpa: the pressure that reads 1.
         dead_taxels: cells of the grid, row by row, that read zero.
     """
 
@@ -90,12 +89,11 @@ class WujiGloveSource:
         stream: ReplayStream,
         *,
         side: Side,
-        scale_kpa: float = FULL_SCALE_KPA,
         dead_taxels: Sequence[int] = (),
     ) -> None:
         self.t_ns = stream.t_ns
         self._hand = {name: number for number, name in HANDS.items()}[side]
-        self._cells = grid_of(np.clip(stream.values / scale_kpa, 0.0, 1.0).astype(np.float32))
+        self._cells = grid_of(np.clip(stream.values / FULL_SCALE_KPA, 0.0, 1.0).astype(np.float32))
         self._cells.reshape(len(self._cells), -1)[:, list(dead_taxels)] = 0.0
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
