@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.acquisition.families import FULL_SCALE, NUM_VALUES, make_families
+from benchmarks.acquisition.families import make_families
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
 from dextouch.hands import NUM_KEYPOINTS
@@ -27,7 +27,6 @@ from services.acquisition.devices.finger_tracker.mock import (
     BridgeFingerTrackerSource,
     FingerTrackerSource,
 )
-from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
 from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
@@ -37,8 +36,6 @@ from services.acquisition.devices.robot_state.packets import (
     RobotStateDecoder,
     robot_descriptor,
 )
-from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
-from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.drivers.base import Decoder
 from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
 from services.acquisition.drivers.tracking import pose_descriptor
@@ -127,21 +124,10 @@ def _once(talk: DeviceTalk, round_index: int) -> float:
 
 
 def _gloves(rng: np.random.Generator) -> list[DeviceTalk]:
-    makers: dict[str, Callable[[], Decoder]] = {
-        "dextouch": partial(TactileGloveDecoder, "left"),
-        "wuji": partial(WujiGloveDecoder, "left"),
-        "justfloat": partial(
-            JustFloatGloveDecoder,
-            "left",
-            num_values=NUM_VALUES,
-            full_scale=FULL_SCALE,
-            rate_hz=60.0,
-        ),
-    }
     return [
         DeviceTalk(
             f"glove {family.name}",
-            makers[family.name],
+            family.decoder,
             [[family.make(index, rng)] for index in range(NUM_PACKETS)],
         )
         for family in make_families()

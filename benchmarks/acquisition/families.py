@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, runtime_checkable
 
 import numpy as np
@@ -23,7 +24,9 @@ from services.acquisition.devices.wuji_glove.packets import (
     PACKET_BYTES,
     STAMPS,
     WujiGloveDecoder,
+    WujiPacket,
 )
+from services.acquisition.drivers.base import StreamDecoder
 from services.acquisition.drivers.packets import HEADER, OVERHEAD, SOURCES, VERSION, Packet
 from services.acquisition.drivers.packets import encode_packet as encode_ours
 
@@ -47,14 +50,20 @@ class Family:
     """A packet family on a serial line.
 
     `make` creates a packet from its index and a generator; `payload` is the span of its readings;
-    `ways` are factories of our decoder and its rivals.
+    `decoder` creates our decoder, and `rivals` are factories of others.
     """
 
     name: str
     has_checksum: bool
     make: Callable[[int, np.random.Generator], bytes]
     payload: slice
-    ways: dict[str, Callable[[], Feed]]
+    decoder: Callable[[], StreamDecoder[Packet] | StreamDecoder[WujiPacket] | StreamDecoder[bytes]]
+    rivals: dict[str, Callable[[], Feed]]
+
+    @property
+    def ways(self) -> dict[str, Callable[[], Feed]]:
+        """Our decoder beside its rivals."""
+        return {"ours": lambda: self.decoder().feed, **self.rivals}
 
 
 class FixedLength:
@@ -137,8 +146,8 @@ def make_families() -> tuple[Family, ...]:
             has_checksum=True,
             make=_make_ours,
             payload=ours_payload,
-            ways={
-                "ours": lambda: TactileGloveDecoder("left").feed,
+            decoder=partial(TactileGloveDecoder, "left"),
+            rivals={
                 "mark and length": lambda: FixedLength(MAGIC, ours_size, ours_payload),
                 "mark alone": lambda: MarkAlone(MAGIC, ours_payload),
             },
@@ -148,8 +157,8 @@ def make_families() -> tuple[Family, ...]:
             has_checksum=True,
             make=_make_wuji,
             payload=wuji_payload,
-            ways={
-                "ours": lambda: WujiGloveDecoder("left").feed,
+            decoder=partial(WujiGloveDecoder, "left"),
+            rivals={
                 "mark and length": lambda: FixedLength(MARK, PACKET_BYTES, wuji_payload),
                 "mark alone": lambda: MarkAlone(MARK, wuji_payload),
             },
@@ -159,13 +168,16 @@ def make_families() -> tuple[Family, ...]:
             has_checksum=False,
             make=_make_justfloat,
             payload=slice(0, 4 * NUM_VALUES),
-            ways={"ours": lambda: _justfloat().feed, "tail alone": lambda: TailAlone(TAIL)},
+            decoder=partial(
+                JustFloatGloveDecoder,
+                "left",
+                num_values=NUM_VALUES,
+                full_scale=FULL_SCALE,
+                rate_hz=60.0,
+            ),
+            rivals={"tail alone": lambda: TailAlone(TAIL)},
         ),
     )
-
-
-def _justfloat() -> JustFloatGloveDecoder:
-    return JustFloatGloveDecoder("left", num_values=NUM_VALUES, full_scale=FULL_SCALE, rate_hz=60.0)
 
 
 def _make_ours(index: int, rng: np.random.Generator) -> bytes:

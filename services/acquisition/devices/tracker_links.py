@@ -8,7 +8,7 @@ from dextouch.errors import InvalidInputError
 from services.acquisition.devices.kind import DeviceSettings
 from services.acquisition.transports.base import Transport
 from services.acquisition.transports.hid import HidTransport, hid_opener
-from services.acquisition.transports.socket import SocketTransport, tcp_transport, unix_transport
+from services.acquisition.transports.socket import tcp_transport, unix_transport
 from services.acquisition.transports.usb import UsbAddress, UsbTransport
 
 
@@ -41,15 +41,20 @@ class TrackerSettings(DeviceSettings):
         return self
 
 
-def report_transport(settings: TrackerSettings) -> Transport:
-    """The link to a tracker that sends reports by HID or USB, not opened.
+def tracker_transport(settings: TrackerSettings) -> Transport:
+    """The link to a tracker or to the bridge of its SDK, not opened.
 
     Raises:
-        InvalidInputError: without vendor and product id.
+        InvalidInputError: settings that were never validated, without any address.
     """
+    if settings.path is not None:
+        return unix_transport(settings.path)
+    if settings.port is not None:
+        return tcp_transport(settings.host, settings.port)
     if settings.vendor_id is None or settings.product_id is None:
         raise InvalidInputError(
-            f"{settings.kind} by {settings.link}: set its vendor_id and product_id"
+            f"{settings.kind} by {settings.link}: set its vendor_id and product_id, or the port or "
+            "path of its bridge"
         )
     address = UsbAddress(settings.vendor_id, settings.product_id, settings.serial_number)
     if settings.link == "usb":
@@ -63,16 +68,3 @@ def report_transport(settings: TrackerSettings) -> Transport:
         address=str(address),
         serial_number=settings.serial_number,
     )
-
-
-def bridge_transport(settings: TrackerSettings) -> SocketTransport:
-    """The connection to the bridge of a tracker's SDK, not opened.
-
-    Raises:
-        InvalidInputError: neither port nor path.
-    """
-    if settings.path is not None:
-        return unix_transport(settings.path)
-    if settings.port is None:
-        raise InvalidInputError(f"{settings.kind} by bridge: set its port or its path")
-    return tcp_transport(settings.host, settings.port)

@@ -52,6 +52,7 @@ class StreamDecoder(ABC, Generic[Found]):
         self.descriptors: tuple[StreamDescriptor, ...] = (descriptor,)
         self.statistics = packets.statistics
         self._packets = packets
+        self._name = descriptor.name
 
     def reset(self) -> None:
         """Forget half a packet, since the link was lost."""
@@ -67,13 +68,17 @@ class StreamDecoder(ABC, Generic[Found]):
         Raises:
             DeviceError: another version of the device, or another device than this one must be.
         """
-        found = [self._sample(packet, t_host_ns) for packet in self._packets.feed(data)]
-        return [sample for sample in found if sample is not None]
+        samples = []
+        for packet in self._packets.feed(data):
+            sample = self._sample(packet, t_host_ns)
+            if sample is not None:
+                samples.append(sample)
+        return samples
 
     def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """The same by the name of the stream."""
         samples = self.feed(data, t_host_ns)
-        return {self.descriptors[0].name: samples} if samples else {}
+        return {self._name: samples} if samples else {}
 
     @abstractmethod
     def _sample(self, packet: Found, t_host_ns: int) -> Sample | None:

@@ -4,6 +4,7 @@ import struct
 from dataclasses import dataclass
 
 from dextouch.errors import InvalidInputError
+from services.acquisition.drivers.packets import SEQUENCE_MODULUS
 
 REPORT_BYTES = 64
 DATA_REPORT = 0x01
@@ -12,7 +13,7 @@ DESCRIPTOR_REPORT = 0x02
 REPORT_HEADER = struct.Struct("<BBBBB")
 PART_BYTES = REPORT_BYTES - REPORT_HEADER.size
 MAX_PARTS = 255
-SEQUENCE_MODULUS = 1 << 32
+
 # A step back of more than this is a restart of the device, not a packet that came late.
 LATE_PACKETS = 8
 

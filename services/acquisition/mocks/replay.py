@@ -12,6 +12,7 @@ from jaxtyping import Int64, Shaped
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
+from services.acquisition.drivers.packets import SEQUENCE_MODULUS
 from services.acquisition.mocks.edits import (
     Edit,
     OurPacketEdits,
@@ -29,8 +30,6 @@ from services.acquisition.mocks.faults import (
 )
 from services.acquisition.mocks.ledger import DeviceLedger, Fate
 from services.acquisition.mocks.ports import MockPort
-
-SEQUENCE_MODULUS = 1 << 32
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,11 @@
 """A simulated bridge: a local socket that says the same to every station."""
 
 import contextlib
+import itertools
 import socket
 import threading
 from collections.abc import Callable
-from types import TracebackType
 
-from dextouch.errors import DeviceError
 from services.acquisition.clock import StationClock
 from services.acquisition.mocks.ports import SEND_TIMEOUT_S, SocketPort
 from services.acquisition.mocks.sdk_link_sources import BridgeSource, sign_of_life
@@ -66,7 +65,7 @@ class BridgeServer:
 
     Args:
         source: what is said.
-        clock: paces the signs of life.
+        clock: paces the samples.
         port: to listen on; any free one if 0.
     """
 
@@ -78,7 +77,6 @@ class BridgeServer:
         self._sequence = 0
         self._t_sent_ns = clock.now_ns()
         self._stopping = threading.Event()
-        self._waiter = clock.waiter()
         self._listener = socket.create_server(("127.0.0.1", port))
         self.port = int(self._listener.getsockname()[1])
         self._threads = [
@@ -91,25 +89,13 @@ class BridgeServer:
             thread.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.stop()
-
-    def stop(self) -> None:
-        """Close all connections and stop listening."""
+    def __exit__(self, *_: object) -> None:
         self._stopping.set()
-        self._waiter.cancel()
         with contextlib.suppress(OSError):
             self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         for thread in self._threads:
-            if thread.ident is not None:
-                thread.join()
-        self._waiter.close()
+            thread.join()
         self.disconnect()
 
     def disconnect(self) -> None:
@@ -125,26 +111,19 @@ class BridgeServer:
             for unit in self._source.units(index, self._sequence, t_device_ns):
                 self._send(unit)
 
-    def play(self, *, laps: int | None = None) -> None:
-        """Send the whole source in its own time, once or `laps` times or until the end.
-
-        Raises:
-            DeviceError: the server has been stopped before.
-        """
-        if self._stopping.is_set():
-            raise DeviceError("mock bridge: stopped")
+    def play(self) -> None:
+        """Send the whole source in its own time, round and round until the server ends."""
         waiter = self._clock.waiter(drives_time=True)
         t_ns = self._source.t_ns
-        lap_ns = int(t_ns[-1] + t_ns[-1] // max(1, len(t_ns) - 1))
-        start_ns, lap = self._clock.now_ns(), 0
-        while laps is None or lap < laps:
+        round_ns = int(t_ns[-1] + t_ns[-1] // max(1, len(t_ns) - 1))
+        start_ns = self._clock.now_ns()
+        for number in itertools.count():
             for index, sample_ns in enumerate(t_ns):
-                due_ns = start_ns + lap * lap_ns + int(sample_ns)
-                if not waiter.wait_until(due_ns) or self._stopping.is_set():
+                due_ns = start_ns + number * round_ns + int(sample_ns)
+                waiter.wait_until(due_ns)
+                if self._stopping.is_set():
                     return
                 self.send_sample(index, due_ns)
-            lap += 1
-        waiter.close()
 
     def _accept(self) -> None:
         while not self._stopping.is_set():
@@ -159,7 +138,7 @@ class BridgeServer:
                 self._connections.append(connection)
 
     def _show_life(self) -> None:
-        while self._waiter.wait_until(self._clock.now_ns() + LIFE_PERIOD_NS):
+        while not self._stopping.wait(LIFE_PERIOD_NS / 1e9):
             now_ns = self._clock.now_ns()
             with self._lock:
                 if now_ns - self._t_sent_ns >= LIFE_PERIOD_NS:

@@ -5,14 +5,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from services.acquisition.clock import StationClock, VirtualClock
+from services.acquisition.drivers.packets import SEQUENCE_MODULUS
 from services.acquisition.drivers.sdk_link_driver import BridgeDecoder, BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults, Schedule
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.ports import HidPort
-from services.acquisition.mocks.replay import (
-    SEQUENCE_MODULUS,
-    MockDevice,
-)
+from services.acquisition.mocks.replay import MockDevice
 from services.acquisition.mocks.sdk_link_server import BridgePort
 from services.acquisition.mocks.sdk_link_sources import BridgeSource, sign_of_life
 from services.acquisition.mocks.usb_backend import UsbPort

@@ -12,7 +12,7 @@ from dextouch.hands import CHAINS, FINGER_JOINTS, NO_KEYPOINT, NUM_KEYPOINTS, WR
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, StreamDecoder, check_packet
+from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
 from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
@@ -144,7 +144,7 @@ class FingerTrackerDecoder(StreamDecoder[Packet]):
         self.order.reset()
         self._order = None
 
-    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Keypoints (float32 [25, 3], m) completed by one report.
 
         Raises:
@@ -152,12 +152,12 @@ class FingerTrackerDecoder(StreamDecoder[Packet]):
         """
         message = self.reports.feed(data)
         if message is None:
-            return []
+            return {}
         report_id, body = message
         if report_id == DESCRIPTOR_REPORT:
             self._describe(body)
-            return []
-        return super().feed(body, t_host_ns)
+            return {}
+        return super().decode(body, t_host_ns)
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=self._side)

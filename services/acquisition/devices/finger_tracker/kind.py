@@ -9,8 +9,7 @@ from services.acquisition.devices.finger_tracker.driver import FingerTracker
 from services.acquisition.devices.kind import DeviceKind
 from services.acquisition.devices.tracker_links import (
     TrackerSettings,
-    bridge_transport,
-    report_transport,
+    tracker_transport,
 )
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link_driver import BridgeDriver
@@ -26,12 +25,11 @@ class FingerTrackerSettings(TrackerSettings):
 def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:
     """The driver of one tracker, by its link."""
     name = f"finger_tracker_{settings.side}"
+    transport = tracker_transport(settings)
     if settings.link == "bridge":
         decoder = BridgeFingerTrackerDecoder(settings.side, serial_number=settings.serial_number)
-        return BridgeDriver(
-            name, transport=bridge_transport(settings), decoder=decoder, clock=clock
-        )
-    return FingerTracker(name, settings.side, transport=report_transport(settings), clock=clock)
+        return BridgeDriver(name, transport=transport, decoder=decoder, clock=clock)
+    return FingerTracker(name, settings.side, transport=transport, clock=clock)
 
 
 KIND = DeviceKind(name="finger_tracker", settings=FingerTrackerSettings, build=build)

@@ -10,8 +10,7 @@ from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDe
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.devices.tracker_links import (
     TrackerSettings,
-    bridge_transport,
-    report_transport,
+    tracker_transport,
 )
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.sdk_link_driver import BridgeDriver
@@ -43,13 +42,12 @@ class PoseTrackerSettings(TrackerSettings):
 def build(settings: PoseTrackerSettings, clock: StationClock) -> Driver:
     """The driver of one tracker, by its link."""
     name = f"pose_tracker_{settings.stream}"
+    transport = tracker_transport(settings)
     if settings.link == "bridge":
         bridged = BridgePoseTrackerDecoder(settings.stream, serial_number=settings.serial_number)
-        return BridgeDriver(
-            name, transport=bridge_transport(settings), decoder=bridged, clock=clock
-        )
+        return BridgeDriver(name, transport=transport, decoder=bridged, clock=clock)
     decoder = PoseTrackerDecoder(settings.stream)
-    return Driver(name, transport=report_transport(settings), decoder=decoder, clock=clock)
+    return Driver(name, transport=transport, decoder=decoder, clock=clock)
 
 
 KIND = DeviceKind(name="pose_tracker", settings=PoseTrackerSettings, build=build)

@@ -4,7 +4,7 @@ import math
 import struct
 
 from dextouch.streams import Sample
-from services.acquisition.drivers.base import StreamDecoder, check_packet
+from services.acquisition.drivers.base import Readings, StreamDecoder, check_packet
 from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.drivers.reports import ReportReassembler
 from services.acquisition.drivers.tracking import (
@@ -48,14 +48,14 @@ class PoseTrackerDecoder(StreamDecoder[Packet]):
         self.reports.reset()
         self.poses.reset()
 
-    def feed(self, data: bytes, t_host_ns: int = 0) -> list[Sample]:
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
         """Poses (float64 [7], unit quaternion) completed by one report.
 
         Raises:
             DeviceError: another version, or a tracker that sits elsewhere.
         """
         message = self.reports.feed(data)
-        return [] if message is None else super().feed(message[1], t_host_ns)
+        return {} if message is None else super().decode(message[1], t_host_ns)
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=self._source)
