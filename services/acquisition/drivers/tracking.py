@@ -1,13 +1,11 @@
-"""Gate and events of all trackers: which poses are used, and which were dropped and why.
+"""Gate of all trackers: which poses are used, and how many were dropped and why.
 
 Of any pose source, only the running state counts, and a pose that the body cannot have
-reached since the last good one is a jump. Both leave a gap and an event, never another pose.
+reached since the last good one is a jump. Both leave a gap and are counted, never another pose.
 """
 
 import math
-from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
 from operator import mul
 from typing import Literal
@@ -26,7 +24,6 @@ MAX_SPEED_M_PER_S = 5.0
 MAX_TURN_RATE_RAD_PER_S = math.radians(2000.0)
 # Packets cannot be closer than half a period, whatever a stepped device clock says.
 MIN_STEP_NS = round(0.5e9 / NOMINAL_RATE_HZ)
-MAX_EVENTS = 256
 
 EventKind = Literal["occluded", "jumped", "stale"]
 
@@ -41,47 +38,15 @@ class TrackingState(IntEnum):
     RUNNING_OK = 200
 
 
-@dataclass(slots=True)
-class TrackingEvent:
-    """A run of packets dropped for the same reason.
-
-    `state` is the tracker's at the first of them; the times are arrivals of the first and of the
-    last (host's monotonic clock).
-    """
-
-    kind: EventKind
-    state: int
-    first_sequence: int
-    last_sequence: int
-    t_first_host_ns: int
-    t_last_host_ns: int
-    num_packets: int = 1
-
-
 class TrackingEvents:
-    """The last 256 events of one tracker and how many packets each kind has cost."""
+    """How many packets of one tracker were dropped for each reason."""
 
     def __init__(self) -> None:
-        self.events: deque[TrackingEvent] = deque(maxlen=MAX_EVENTS)
-        self.num_events = 0
         self.packets: dict[str, int] = {"occluded": 0, "jumped": 0, "stale": 0}
-        self._going_on: TrackingEvent | None = None
 
-    def leave_out(self, kind: EventKind, *, state: int, sequence: int, t_host_ns: int) -> None:
-        """Record a dropped packet."""
+    def leave_out(self, kind: EventKind) -> None:
+        """Count a dropped packet."""
         self.packets[kind] += 1
-        event = self._going_on
-        if event is not None and event.kind == kind:
-            event.last_sequence, event.t_last_host_ns = sequence, t_host_ns
-            event.num_packets += 1
-            return
-        self._going_on = TrackingEvent(kind, state, sequence, sequence, t_host_ns, t_host_ns)
-        self.events.append(self._going_on)
-        self.num_events += 1
-
-    def end(self) -> None:
-        """A sample came, or the link was lost: the next event is another one."""
-        self._going_on = None
 
 
 class PoseGate:
@@ -129,7 +94,7 @@ class PoseGate:
 
 
 class PoseStream:
-    """What all pose sources share: gate, order and events in; samples of one stream out."""
+    """Gate, order and counts of one tracker's poses, which all pose sources share."""
 
     def __init__(self) -> None:
         self.order = OrderFilter()
@@ -140,40 +105,31 @@ class PoseStream:
         """The link was lost."""
         self.order.reset()
         self.gate.reset()
-        self.events.end()
 
     def counts(self) -> dict[str, int]:
         """Packets left out so far, by the reason."""
         return {**self.events.packets, **self.order.counts()}
 
-    def occlude(self, *, state: int, sequence: int, t_device_ns: int, t_host_ns: int) -> None:
+    def occlude(self, t_device_ns: int) -> None:
         """The tracker is not running: whatever pose it sends is none."""
         self.gate.pass_time(t_device_ns)
-        self.events.leave_out("occluded", state=state, sequence=sequence, t_host_ns=t_host_ns)
+        self.events.leave_out("occluded")
 
     def take(
-        self,
-        pose: Sequence[float],
-        *,
-        state: int,
-        sequence: int,
-        t_device_ns: int,
-        t_host_ns: int,
+        self, pose: Sequence[float], *, sequence: int, t_device_ns: int, t_host_ns: int
     ) -> Sample | None:
         """The sample of a running tracker's pose; None where it jumps.
 
         Args:
             pose: x y z (m) qw qx qy qz (unit) in the world frame.
-            state: what the tracker says of it.
             sequence: of the packet.
             t_device_ns: when the pose was taken.
             t_host_ns: when it arrived.
         """
         self.gate.pass_time(t_device_ns)
         if not self.gate.admits(pose):
-            self.events.leave_out("jumped", state=state, sequence=sequence, t_host_ns=t_host_ns)
+            self.events.leave_out("jumped")
             return None
-        self.events.end()
         return Sample(t_host_ns, np.array(pose), t_device_ns, sequence)
 
 

@@ -205,8 +205,8 @@ def test_what_a_trackers_decoder_leaves_out_is_judged(kind, count, expected):
     decoder = PoseTrackerDecoder("head")
     judge = TrackingJudge(driver_of(decoder).events)
     decoder.statistics.packets += 1000
-    for sequence in range(count):
-        decoder.tracking.leave_out(kind, state=2, sequence=sequence, t_host_ns=sequence)
+    for _ in range(count):
+        decoder.tracking.leave_out(kind)
     assert codes(judge.judge(block([]), SECOND_NS)) == expected
 
 

@@ -53,7 +53,6 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
     def reset(self) -> None:
         """The connection was lost."""
         super().reset()
-        self.tracking.end()
         self._order = None
 
     def _learn(self, hello: BridgeHello) -> None:
@@ -81,9 +80,8 @@ class BridgeFingerTrackerDecoder(BridgeDecoder):
                 check_packet(packet, device=self._device, source=self._side)
             return None
         if not self.freshness.admits(packet.t_device_ns, t_host_ns):
-            self.tracking.leave_out("stale", state=0, sequence=packet.sequence, t_host_ns=t_host_ns)
+            self.tracking.leave_out("stale")
             return None
-        self.tracking.end()
         theirs, num_unseen = unpack_keypoints(packet.payload, order)
         self.unseen_nodes += num_unseen
         keypoints = (theirs.astype(np.float64) @ self._ours_m.T).astype(np.float32)

@@ -84,12 +84,10 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
             return None
         sequence, t_device_ns = packet.sequence, round(seconds * 1e9)
         if not self.freshness.admits(t_device_ns, t_host_ns):
-            self.tracking.leave_out("stale", state=result, sequence=sequence, t_host_ns=t_host_ns)
+            self.tracking.leave_out("stale")
             return None
         if result != TrackingResult.RUNNING_OK or not flag:
-            self.poses.occlude(
-                state=result, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
-            )
+            self.poses.occlude(t_device_ns)
             return None
         try:
             pose = frame.pose(numbers)
@@ -97,5 +95,5 @@ class BridgePoseTrackerDecoder(BridgeDecoder):
             self.statistics.refused += 1
             return None
         return self.poses.take(
-            pose, state=result, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
+            pose, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
         )

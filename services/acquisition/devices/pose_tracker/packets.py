@@ -25,7 +25,7 @@ class PoseTrackerDecoder(StreamDecoder[Packet]):
     """Poses [x y z qw qx qy qz] in the world frame, only while the tracker runs.
 
     Packets in another state (some trackers keep sending a drifting pose flagged as valid), and
-    poses that jump, are counted, recorded in `tracking` and dropped: a gap, never a wrong pose.
+    poses that jump, are counted in `tracking` and dropped: a gap, never a wrong pose.
     What is no pose is counted as `refused`.
     """
 
@@ -64,9 +64,7 @@ class PoseTrackerDecoder(StreamDecoder[Packet]):
         state, *numbers = PAYLOAD.unpack(packet.payload)
         sequence, t_device_ns = packet.sequence, packet.t_device_ns
         if state != TrackingState.RUNNING_OK:
-            self.poses.occlude(
-                state=state, sequence=sequence, t_device_ns=t_device_ns, t_host_ns=t_host_ns
-            )
+            self.poses.occlude(t_device_ns)
             return None
         x, y, z, w, i, j, k = numbers
         norm = math.hypot(w, i, j, k)
@@ -75,7 +73,6 @@ class PoseTrackerDecoder(StreamDecoder[Packet]):
             return None
         return self.poses.take(
             (x, y, z, w / norm, i / norm, j / norm, k / norm),
-            state=state,
             sequence=sequence,
             t_device_ns=t_device_ns,
             t_host_ns=t_host_ns,
