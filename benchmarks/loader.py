@@ -17,7 +17,7 @@ from services.cli.training_data import Scope, make_training_data
 from services.twin.tasks import TASK_NAMES
 
 if TYPE_CHECKING:
-    from services.world_model.training.pace import TrainingPace
+    from benchmarks.training_pace import TrainingPace
 
 PACKAGES = ("numpy", "torch", "zstandard")
 MIN_RATIO = 3.0
@@ -49,7 +49,7 @@ def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
     Raises:
         InvalidInputError: no episode, round or batch, or invalid numbers of workers.
     """
-    from services.world_model.training.pace import TrainingPace
+    from benchmarks.training_pace import TrainingPace
 
     plan, workers = _plan(options), _workers(options.workers)
     url = options.store or _make_episodes(folder / "episodes", plan["episodes"])

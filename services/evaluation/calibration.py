@@ -9,9 +9,10 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float64
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from dextouch.errors import InvalidInputError
+from dextouch.frozen_model import FrozenModel
 
 NUM_BINS: Final = 10
 _MAX_NEWTON_STEPS: Final = 50
@@ -23,10 +24,8 @@ UNDECIDED_RISK: Final = 0.05
 _WIDEST_BAND: Final = 0.45
 
 
-class Calibration(BaseModel):
+class Calibration(FrozenModel):
     """Probability = sigmoid(log odds / temperature + bias); undecided within `band` of 0.5."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     temperature: float = Field(default=1.0, gt=0)
     bias: float = 0.0

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import nn
 
 from dextouch.errors import InvalidInputError, LimitExceededError
+from dextouch.frozen_model import FrozenModel
 from services.networks.weight_files import (
     load_strictly,
     read_weights,
@@ -22,14 +22,12 @@ MAX_CHECKPOINT_BYTES = 8 * 2**20
 _METADATA_KEY, _PREFIX = "dextouch", "network."
 
 
-class CheckpointMetadata(BaseModel):
+class CheckpointMetadata(FrozenModel):
     """Provenance of a network.
 
     Evaluations must not contain any of `training_episodes` and `training_starts` (digests of first
     observations).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: str
     format_version: int = FORMAT_VERSION

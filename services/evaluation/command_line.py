@@ -14,7 +14,6 @@ from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.serving import load_settings
 from services.evaluation.checkpoints import Checkpoint, save_checkpoint
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate
-from services.evaluation.demonstrations import read_demonstrations
 from services.evaluation.direct_data import read_attempts
 from services.evaluation.direct_training import train_direct_judge
 from services.evaluation.endings import EndingEpisode, read_ending_episodes
@@ -27,6 +26,7 @@ from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import ReportPictures, write_report
 from services.evaluation.reporting.sections import failure_rows, figure
 from services.evaluation.results import ResultLog
+from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.settings import (
     RunSettings,
     ServedWorld,
@@ -146,7 +146,7 @@ def gather_policies(settings: RunSettings) -> tuple[dict[str, Policy], dict[str,
         )
     policies = {s.name: s.load(settings.policy_arguments.get(s.name, {})) for s in sources}
     for name, url in settings.scripts.items():
-        episodes = read_demonstrations(EpisodeStore(url), tasks=settings.tasks)
+        episodes = robot_episodes([EpisodeStore(url)], tasks=settings.tasks)
         policies[name] = ReplayPolicy.of(episodes)
     trained_on: dict[str, Sequence[str]] = {}
     if "behaviour-cloning" in settings.builtin:

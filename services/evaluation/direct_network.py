@@ -8,10 +8,10 @@ from typing import Final
 import numpy as np
 import torch
 from jaxtyping import Float32, Float64, Int64, UInt8
-from pydantic import BaseModel, ConfigDict
 from torch import nn
 
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import JOINTS_LEFT, JOINTS_RIGHT, AnchorPoses, poses_from_actions
 from dextouch.hands.robot_hand import RobotHand
 from dextouch.tactile.layout import SIDES
@@ -47,10 +47,8 @@ class Attempt:
     K_head: Float64[np.ndarray, "3 3"]
 
 
-class DirectShape(BaseModel):
+class DirectShape(FrozenModel):
     """Shape of the judge's network; stored in the checkpoint. `num_objects` is by task."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tasks: tuple[str, ...]
     num_objects: tuple[int, ...]

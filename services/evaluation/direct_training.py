@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import nn
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
+from dextouch.frozen_model import FrozenModel
 from dextouch.geometry import transform_from_pose
 from services.evaluation.calibration import Calibration, expected_calibration_error, fit_calibration
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
@@ -50,10 +51,8 @@ _UNIT_M = 0.05
 _CHECK_EVERY = 100
 
 
-class DirectSettings(BaseModel):
+class DirectSettings(FrozenModel):
     """Training settings of a direct judge; the finder gets `finder_share` of the time."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: Seed = 0
     max_cpu_s: CpuBudget = 600.0

@@ -7,10 +7,10 @@ from typing import cast
 import numpy as np
 import torch
 from jaxtyping import Bool, Float32, Int64, UInt8
-from pydantic import BaseModel, ConfigDict
 from torch import nn
 
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.frozen_model import FrozenModel
 from services.evaluation.endings import NUM_SEEN_STEPS, Ending
 from services.evaluation.features import NUM_PAD_FEATURES, pad_features
 from services.evaluation.object_features import NUM_OBJECT_FEATURES, object_features
@@ -22,13 +22,11 @@ _OBJECT_HIDDEN, _OBJECT_OUTPUT = 64, 32
 _FARTHEST = 5.0
 
 
-class ProbeShape(BaseModel):
+class ProbeShape(FrozenModel):
     """Shape of the probe's network; stored in the checkpoint.
 
     `milestones` are the further outputs of each task, in their order.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tasks: tuple[str, ...]
     hidden: int = 64

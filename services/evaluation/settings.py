@@ -5,10 +5,11 @@ import shlex
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 from pydantic_settings import BaseSettings
 
 from dextouch.command_line import JSON_HELP
+from dextouch.frozen_model import FrozenModel
 from dextouch.serving import service_config
 from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
@@ -93,10 +94,8 @@ class TrainDirectSettings(BaseSettings):
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
 
-class ServedWorld(BaseModel):
+class ServedWorld(FrozenModel):
     """A world served at a URL."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     url: str = Field(description="URL of the service")
     world: str = Field(description="name of the world")

@@ -8,9 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch.nn import functional
 
+from dextouch.frozen_model import FrozenModel
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
 from services.evaluation.endings import EndingEpisode, endings_hash, milestones_of
@@ -42,10 +43,8 @@ from services.networks.training_settings import (
 )
 
 
-class ProbeSettings(BaseModel):
+class ProbeSettings(FrozenModel):
     """Training settings of a success probe."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: Seed = 0
     # For each task.

@@ -11,13 +11,10 @@ from dextouch.geometry import pose_from_transform, transform_from_pose
 from dextouch.hands.actions import AnchorPoses, actions_from_poses, poses_from_actions
 from dextouch.schemas import EpisodeAttributes, StoredAnchor, matrix_rows
 from services.twin.bounding_boxes import object_boxes_m
-from services.twin.cameras import CAMERAS
 from services.twin.demonstrators import NUM_GRID_STEPS
 from services.twin.events import EventTimes
-from services.twin.hands import Domain
 from services.twin.motions import MotionScene, with_motion
 from services.twin.recorder import GridLog, Recorder, TruthStream, action_stream
-from services.twin.settings import TwinSettings
 from services.twin.simulation import MODEL_RATE_HZ, STEPS_PER_GRID
 from services.twin.stage import Plan, Stage, command_row
 from services.twin.take_options import PlayedActions, TakeOptions, episode_id
@@ -27,7 +24,6 @@ __all__ = [
     "PlayedActions",
     "TakeOptions",
     "TruthEpisode",
-    "demonstrate",
     "episode_id",
     "record",
     "write_episode",
@@ -49,24 +45,6 @@ class TruthEpisode:
     attributes: EpisodeAttributes
     streams: dict[str, TruthStream]
     pad_forces_n: Float64[np.ndarray, "samples 2 6"]
-
-
-def demonstrate(
-    task: str,
-    seed: int,
-    *,
-    domain: Domain = "robot",
-    noise_m: float = 0.0,
-    miss: bool = False,
-    images: tuple[str, ...] = CAMERAS,
-) -> TruthEpisode:
-    """Record one scripted take, compiling the scene; use `record` for many.
-
-    Raises:
-        UnknownNameError: unknown task, domain or camera.
-        InvalidInputError: seed or noise out of range.
-    """
-    return record(Stage(task, domain, TwinSettings()), seed, TakeOptions(noise_m, miss, images))
 
 
 def record(

@@ -1,15 +1,15 @@
 """User settings of the twin; physics and geometry are fixed by the code's version."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from dextouch.frozen_model import FrozenModel
 
 
-class TwinSettings(BaseModel):
+class TwinSettings(FrozenModel):
     """Cameras of the world, their image size, and the settling time of objects before a take.
 
     Rendering a camera takes half as long as the physics, so omit unused ones.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cameras: tuple[str, ...] = Field(
         default=("camera_head", "camera_wrist_left", "camera_wrist_right"),

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 from operator import not_
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from dextouch.frozen_model import FrozenModel
 from services.networks.weight_files import (
     half_weights,
     load_strictly,
@@ -24,15 +25,13 @@ PRETRAINED = Path(__file__).parent / "pretrained"
 STATE_MODEL, PAPER_FORM = "state.safetensors", "tiny.safetensors"
 
 
-class CheckpointMetadata(BaseModel):
+class CheckpointMetadata(FrozenModel):
     """Provenance and measured accuracy of a model, stored in its checkpoint.
 
     `initialized_from` is the digest of the checkpoint that the weights were initialized from; its
     training episodes count as training episodes here, too. None is not written, so that older
     releases can read the file.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: int = FORMAT_VERSION
     name: str
@@ -47,7 +46,7 @@ class CheckpointMetadata(BaseModel):
     data_hash: str
     heldout_episode_ids: tuple[str, ...] = ()
     initialized_from: str | None = Field(default=None, exclude_if=not_)
-    metrics: dict[str, float] = {}
+    metrics: dict[str, float] = Field(default={})
 
 
 @dataclass(frozen=True)

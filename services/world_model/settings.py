@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from pydantic_settings import BaseSettings, CliImplicitFlag
 
 from dextouch.command_line import JSON_HELP
+from dextouch.frozen_model import FrozenModel
 from dextouch.serving import service_config
 from dextouch.worlds import WorldServiceSettings
 from services.networks.training_settings import (
@@ -26,10 +27,8 @@ from services.world_model.rendering.precision import has_fast_bfloat16
 from services.world_model.rendering.training import RendererTraining
 
 
-class OptimizerSettings(BaseModel):
+class OptimizerSettings(FrozenModel):
     """Settings of the optimizer."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     batch: Batch = 8
     learning_rate: LearningRate = 2e-3
@@ -40,10 +39,8 @@ class OptimizerSettings(BaseModel):
     tactile_weight: float = Field(default=1.0, ge=0, description="lambda_tac (equation 5)")
 
 
-class WindowSettings(BaseModel):
+class WindowSettings(FrozenModel):
     """Sampling of training windows."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     commanded_fraction: float = Field(
         default=0.5,
@@ -59,10 +56,8 @@ class WindowSettings(BaseModel):
     fit_windows: int = Field(default=256, ge=4, description="windows the codecs are fitted on")
 
 
-class TrainSettings(BaseModel):
+class TrainSettings(FrozenModel):
     """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     episodes: str = Field(description="URL or folder of the episode store to train on")
     heldout: str | None = Field(
@@ -111,10 +106,8 @@ class TrainSettings(BaseModel):
     )
 
 
-class ReaderSettings(BaseModel):
+class ReaderSettings(FrozenModel):
     """Training of start readers."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_steps: NumSteps = 4000
     batch: Batch = 32
@@ -124,10 +117,8 @@ class ReaderSettings(BaseModel):
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="convolve in bfloat16")
 
 
-class CoreLossWeights(BaseModel):
+class CoreLossWeights(FrozenModel):
     """Weights of a core's training targets; 0 disables one."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     objects: float = Field(default=1.0, ge=0, description="weight of object positions and axes")
     touch: float = Field(default=6.0, ge=0, description="weight of touch latents")
@@ -136,10 +127,8 @@ class CoreLossWeights(BaseModel):
     success: float = Field(default=1.0, ge=0, description="weight of final task success")
 
 
-class CoreSettings(BaseModel):
+class CoreSettings(FrozenModel):
     """Training of recurrent cores."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     num_steps: NumSteps = 6500
     batch: Batch = 64
@@ -156,10 +145,8 @@ class CoreSettings(BaseModel):
     bfloat16: bool = Field(default_factory=has_fast_bfloat16, description="train in bfloat16")
 
 
-class StateTrainSettings(BaseModel):
+class StateTrainSettings(FrozenModel):
     """Training of a state model: an ensemble of start readers and recurrent cores."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
     tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")

@@ -3,8 +3,9 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from dextouch.frozen_model import FrozenModel
 from services.networks.weight_files import (
     half_weights,
     holds,
@@ -22,7 +23,7 @@ METADATA_KEY = "dextouch_state_model"
 _DYNAMICS, _RENDERER = "dynamics.", "renderer."
 
 
-class StateBounds(BaseModel):
+class StateBounds(FrozenModel):
     """Limits beyond which a rollout is flagged as uncertain.
 
     `disagreement_m` and `distance` are high quantiles over held-out episodes; `horizon_latents` is
@@ -30,8 +31,6 @@ class StateBounds(BaseModel):
     latent step of any 16 steps of an episode; those of older checkpoints apply to whole episodes:
     to the worst disagreement and the mean distance.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     disagreement_m: float = Field(default=1.0, ge=0, allow_inf_nan=False)
     distance: float = Field(default=1.0, gt=0, allow_inf_nan=False)
@@ -48,10 +47,8 @@ class StateBounds(BaseModel):
         return self.distance * (1 if self.of_chunks else self.horizon_latents)
 
 
-class StateMetadata(BaseModel):
+class StateMetadata(FrozenModel):
     """Provenance and measured accuracy of a state model, stored in its checkpoint."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     format_version: int = FORMAT_VERSION
     name: str
@@ -68,7 +65,7 @@ class StateMetadata(BaseModel):
     num_training_episodes: int
     training_seeds: dict[str, tuple[int, int]]
     data_hash: str
-    metrics: dict[str, float] = {}
+    metrics: dict[str, float] = Field(default={})
 
     @model_validator(mode="after")
     def _names_and_boxes_fit_the_tasks(self) -> "StateMetadata":

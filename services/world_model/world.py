@@ -246,24 +246,20 @@ class ModelWorld:
 
 
 def open_world(
-    path: Path | None = None,
-    *,
-    sampling_steps: int | None = None,
-    precision: Precision = "float32",
+    path: Path | None = None, *, sampling_steps: int | None = None
 ) -> ModelWorld | StateWorld:
     """Open the world of a checkpoint file of either kind; default: the package's own.
 
     Args:
         path: safetensors file; None for the one that ships with the package.
         sampling_steps: Euler steps of a flow-matching model; a state model has none.
-        precision: precision of a flow-matching model.
 
     Raises:
         InvalidInputError: sampling steps for a state model.
     """
     file = path if path is not None else default_checkpoint()
     if not is_state_checkpoint(file):
-        return ModelWorld(read_checkpoint(file), sampling_steps=sampling_steps, precision=precision)
+        return ModelWorld(read_checkpoint(file), sampling_steps=sampling_steps)
     if sampling_steps is not None:
         raise InvalidInputError(
             f"state model {file.name}: got {sampling_steps} sampling steps, expected none: it "

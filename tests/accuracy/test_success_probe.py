@@ -1,6 +1,7 @@
 """The shipped success probe on true endings near the border of success, recorded here and now."""
 
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -9,10 +10,9 @@ from scipy.stats import mannwhitneyu
 from dextouch.episodes import EpisodeStore
 from services.cli.data_mix import LADDER_M, MIXES
 from services.cli.training_data import Scope, make_training_data
-from services.evaluation.demonstrations import read_demonstrations
+from services.evaluation.endings import read_ending_episodes
 from services.evaluation.settings import DEFAULT_PROBE
 from services.evaluation.success_probe import SuccessProbe
-from tests.unit.evaluation.shown_endings import final_ending
 
 pytestmark = pytest.mark.slow
 # Far from the seeds of training and of the checkpoint's own held-out set.
@@ -28,11 +28,11 @@ def test_it_tells_successes_from_near_misses(tmp_path):
     probe = SuccessProbe.load(DEFAULT_PROBE)
     scope = Scope(probe.metadata.tasks)
     make_training_data(str(tmp_path), seeds, MIXES["ladder"], num_jobs=1, scope=scope)
-    episodes = read_demonstrations(EpisodeStore(tmp_path))
+    episodes = read_ending_episodes(EpisodeStore(tmp_path))
     assert not {e.start_digest for e in episodes} & set(probe.metadata.training_starts)
     for task in probe.metadata.tasks:
         mine = [e for e in episodes if e.task == task]
-        told = probe.probabilities([final_ending(e, e.num_steps - 1) for e in mine])
+        told = probe.probabilities([replace(e.final, object_poses=None) for e in mine])
         wins, losses = ([p for p, e in zip(told, mine, strict=True) if e.success is outcome]
                         for outcome in (True, False))  # fmt: skip
         auc = mannwhitneyu(wins, losses).statistic / (len(wins) * len(losses))

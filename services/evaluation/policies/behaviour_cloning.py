@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float64, UInt8
-from pydantic import BaseModel, ConfigDict
 
 from dextouch.clients import PolicyStart
 from dextouch.errors import InvalidInputError, UnknownNameError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import (
     AnchorPoses,
     actions_from_poses,
@@ -36,10 +36,8 @@ _WORLD = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
 MAX_DEVIATIONS = 5.0
 
 
-class CloningShape(BaseModel):
+class CloningShape(FrozenModel):
     """Shape of the network; stored in the checkpoint."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tasks: tuple[str, ...]
     num_components: int = 48

@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from dextouch.errors import InvalidInputError
+from dextouch.frozen_model import FrozenModel
 from dextouch.hands.actions import WRIST_LEFT, WRIST_RIGHT
 from services.evaluation.checkpoints import Checkpoint, CheckpointMetadata, network_tensors
 from services.evaluation.demonstrations import instructions_of, split_by_seed
@@ -50,10 +51,8 @@ MOMENTS_AN_EPISODE = 3
 _KEPT_AS_HALF = ("codec.basis", "head.0.weight", "head.2.weight")
 
 
-class CloningSettings(BaseModel):
+class CloningSettings(FrozenModel):
     """Training settings of behaviour cloning."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: Seed = 0
     num_training_steps: NumSteps = 3000

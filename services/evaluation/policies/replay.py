@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.clients import PolicyStart
+from dextouch.episodes import EpisodeReader
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.hands.actions import check_actions
 from dextouch.schemas import Observation
-from services.evaluation.demonstrations import Demonstration
 
 
 class ReplayPolicy:
@@ -38,21 +38,29 @@ class ReplayPolicy:
         self._playing: np.ndarray | None = None
 
     @classmethod
-    def of(cls, demonstrations: Iterable[Demonstration]) -> "ReplayPolicy":
-        """Policy that replays these episodes.
+    def of(cls, episodes: Iterable[EpisodeReader]) -> "ReplayPolicy":
+        """Policy that replays these robot episodes; their images are not read.
 
         Raises:
+            InvalidInputError: an episode without a seed.
+            UnknownNameError: an episode without commanded actions.
             ConflictError: two episodes have the same task and seed.
         """
         actions: dict[tuple[str, int], np.ndarray] = {}
-        for item in demonstrations:
-            key = (item.task, item.seed)
+        for reader in episodes:
+            about = reader.attributes
+            if about.seed is None:
+                raise InvalidInputError(
+                    f"episode {about.episode_id!r}: no seed, expected one, as in episodes of the "
+                    "twin"
+                )
+            key = (about.task, about.seed)
             if key in actions:
                 raise ConflictError(
-                    f"replay policy: two episodes of task {item.task!r} with seed {item.seed}; "
+                    f"replay policy: two episodes of task {about.task!r} with seed {about.seed}; "
                     "expected one noise level a policy"
                 )
-            actions[key] = item.commanded[1:]
+            actions[key] = reader.read("action_commanded").values[1:]
         return cls(actions)
 
     def reset(self, start: PolicyStart) -> None:

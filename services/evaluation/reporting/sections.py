@@ -5,7 +5,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-UNDEFINED = "undefined"
+from services.evaluation.comments import UNDEFINED
+
 # Key of the figure, its name on the page, its unit, and its bound, if any.
 ERRORS: tuple[tuple[str, str, str, tuple[str, float] | None], ...] = (
     ("taxel_iou", "Contact agreement (IoU)", "", ("≥", 0.98)),

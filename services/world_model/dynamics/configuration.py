@@ -2,7 +2,9 @@
 
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from dextouch.frozen_model import FrozenModel
 
 # Largest number of objects of a task; unused slots are masked.
 MAX_OBJECTS: Final = 3
@@ -10,14 +12,12 @@ MAX_OBJECTS: Final = 3
 STEPS_PER_LATENT: Final = 4
 
 
-class DynamicsConfig(BaseModel):
+class DynamicsConfig(FrozenModel):
     """Architecture of a dynamics model.
 
     `tasks` and `num_objects` form its vocabulary: a task's index selects its embedding, and its
     objects fill the first slots in the order of the episode's `object_names`.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     tasks: tuple[str, ...] = Field(min_length=1)
     num_objects: tuple[int, ...]

@@ -1,12 +1,12 @@
 """Network configuration: shape and sampling of the joint model, stored in its checkpoint."""
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from dextouch.frozen_model import FrozenModel
 
 
-class NetworkConfig(BaseModel):
+class NetworkConfig(FrozenModel):
     """Shape and sampling of the joint model; stored in every checkpoint."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     image_px: int = Field(default=64, ge=16, le=256, description="side of the square head image")
     patch_px: int = Field(default=8, description="side of a visual patch")

@@ -1,17 +1,16 @@
 """Configuration of the renderer's network; stored with its weights."""
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from dextouch.frozen_model import FrozenModel
 from services.world_model.rendering.camera_motion import Interpolation
 
 
-class RendererConfig(BaseModel):
+class RendererConfig(FrozenModel):
     """Shape of the renderer's network and of its inputs.
 
     Image sides must be divisible by 2^(number of widths); weights do not depend on the image size.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     widths: tuple[int, ...] = Field(
         default=(32, 64, 96), min_length=1, max_length=4, description="channels at 1/2, 1/4, …"

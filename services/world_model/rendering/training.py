@@ -8,11 +8,12 @@ from functools import partial
 import numpy as np
 import torch
 from jaxtyping import Float32
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
 from dextouch.errors import InvalidInputError
+from dextouch.frozen_model import FrozenModel
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from services.networks.optimizer import (
     Budget,
@@ -44,10 +45,8 @@ MIN_LEARNING_RATE_SHARE = 0.01
 _EDGE_WINDOW_PX = 7
 
 
-class RendererTraining(BaseModel):
+class RendererTraining(FrozenModel):
     """One training run; `cpu_budget_s` or `max_steps` ends it, whichever comes first."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     cpu_budget_s: CpuBudget = 540.0
     max_steps: MaxSteps = None

@@ -9,9 +9,9 @@ from jaxtyping import Float64
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import ActionKind
+from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import EpisodeArrays, TrainingEpisode
 
-CAMERA = "camera_head"
 E = TypeVar("E", bound=TrainingEpisode)
 
 

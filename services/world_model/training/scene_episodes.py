@@ -17,11 +17,9 @@ from jaxtyping import Float16, Float32, Float64, Int64, UInt8
 from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError
 from dextouch.geometry import interpolate_poses, pose_from_transform, transform_from_pose
-from dextouch.schemas import ActionKind, Domain, EpisodeAttributes, Origin
+from dextouch.schemas import ActionKind
+from services.world_model.starts import CAMERA
 
-CAMERA = "camera_head"
-TWIN_ONLY: tuple[Origin, ...] = ("twin",)
-_FROM_STEP = "_from_step"
 logger = structlog.get_logger(__name__)
 
 
@@ -33,19 +31,13 @@ class SceneEpisode:
     `measured_actions` the measured ones; both are relative to `anchor`, the poses of left wrist,
     right wrist and head camera. `tactile_kpa` is the mean over each step, `object_poses` are
     x y z (m), qw qx qy qz in the world. `images` are the head camera images at the grid steps
-    `image_steps`. `motion` is "script", "miss", "hold", "frozen", "policy", "other_scene" or the
-    name of the deviation from the script.
+    `image_steps`.
     """
 
     episode_id: str
     task: str
-    instruction: str
-    domain: Domain
     seed: int
-    motion: str
-    noise_m: float
     success: bool
-    event_times_s: dict[str, float]
     object_names: tuple[str, ...]
     object_boxes_m: Float64[np.ndarray, "objects 6"]
     action_kind: ActionKind
@@ -68,14 +60,7 @@ class SceneEpisode:
         return len(self.actions)
 
 
-def load_scene_episodes(
-    url: str,
-    *,
-    tasks: Collection[str] | None = None,
-    domains: Collection[Domain] | None = None,
-    origins: Collection[Origin] = TWIN_ONLY,
-    with_images: bool = True,
-) -> list[SceneEpisode]:
+def load_scene_episodes(url: str, *, tasks: Collection[str] | None = None) -> list[SceneEpisode]:
     """Load the true episodes of a store, in the order of their ids.
 
     The number of skipped episodes is logged by reason.
@@ -83,31 +68,20 @@ def load_scene_episodes(
     Args:
         url: URL of the store.
         tasks: tasks to load; None for all.
-        domains: domains to load; None for both.
-        origins: origins to load; "imagined" is rejected.
-        with_images: False skips the images.
 
     Raises:
-        InvalidInputError: imagined episodes are requested, or no episode remains.
+        InvalidInputError: no episode remains.
     """
-    if "imagined" in origins:
-        raise InvalidInputError(
-            "scene episodes: got origins with 'imagined', expected 'twin' or 'recorded'; "
-            "imagined episodes are not ground truth"
-        )
     store = EpisodeStore(url)
     taken: list[SceneEpisode] = []
     skipped: Counter[str] = Counter()
     for episode_id in sorted(store.list()):
         reader = store.open(episode_id)
-        attributes = reader.attributes
-        if tasks is not None and attributes.task not in tasks:
+        if tasks is not None and reader.attributes.task not in tasks:
             continue
-        if domains is not None and attributes.domain not in domains:
-            continue
-        reason = _unfit(reader, origins)
+        reason = _unfit(reader)
         if reason is None:
-            taken.append(read_scene_episode(reader, with_images=with_images))
+            taken.append(read_scene_episode(reader))
         else:
             skipped[reason] += 1
     for reason, count in sorted(skipped.items()):
@@ -120,10 +94,10 @@ def load_scene_episodes(
     return taken
 
 
-def _unfit(reader: EpisodeReader, origins: Collection[Origin]) -> str | None:
+def _unfit(reader: EpisodeReader) -> str | None:
     """Reason why an episode is not usable as ground truth, or None."""
     attributes = reader.attributes
-    if attributes.origin not in origins:
+    if attributes.origin != "twin":
         return f"origin {attributes.origin}"
     if attributes.recovered:
         return "recovered after its writer died"
@@ -135,7 +109,7 @@ def _unfit(reader: EpisodeReader, origins: Collection[Origin]) -> str | None:
     return f"without {', '.join(sorted(missing))}" if missing else None
 
 
-def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> SceneEpisode:
+def read_scene_episode(reader: EpisodeReader) -> SceneEpisode:
     """Read one episode of known success and seed.
 
     Raises:
@@ -154,18 +128,13 @@ def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> Sc
     kind: ActionKind = "commanded" if "action_commanded" in reader.streams else "measured"
     if kind == "commanded":
         actions = reader.read("action_commanded").values.astype(np.float64)
-    images, image_steps = _images(reader) if with_images else _no_images()
+    images, image_steps = _images(reader)
     boxes = np.array(attributes.object_boxes_m, dtype=np.float64).reshape(-1, 6)
     return SceneEpisode(
         episode_id=attributes.episode_id,
         task=attributes.task,
-        instruction=attributes.instruction,
-        domain=attributes.domain,
         seed=attributes.seed,
-        motion=motion_of(attributes),
-        noise_m=attributes.quality.get("noise_m", 0.0),
         success=attributes.success,
-        event_times_s=dict(attributes.event_times_s),
         object_names=attributes.object_names,
         object_boxes_m=boxes,
         action_kind=kind,
@@ -181,28 +150,10 @@ def read_scene_episode(reader: EpisodeReader, *, with_images: bool = True) -> Sc
     )
 
 
-def motion_of(attributes: EpisodeAttributes) -> str:
-    """Kind of motion, from the annotations that the twin stores in `quality`."""
-    quality = attributes.quality
-    if "played" in quality:
-        return "policy"
-    if "actions_of_seed" in quality:
-        return "other_scene"
-    for name, value in quality.items():
-        if name.endswith(_FROM_STEP):
-            motion = name.removesuffix(_FROM_STEP)
-            return "hold" if motion == "frozen" and value == 0 else motion
-    return "miss" if quality.get("miss") else "script"
-
-
-def _no_images() -> tuple[np.ndarray, np.ndarray]:
-    return np.zeros((0, 0, 0, 3), dtype=np.uint8), np.zeros(0, dtype=np.int64)
-
-
 def _images(reader: EpisodeReader) -> tuple[np.ndarray, np.ndarray]:
     """Images of the grid steps that have one, and these steps."""
     if CAMERA not in reader.streams or not reader.num_samples(CAMERA):
-        return _no_images()
+        return np.zeros((0, 0, 0, 3), dtype=np.uint8), np.zeros(0, dtype=np.int64)
     steps, images = reader.shown_steps(CAMERA)
     return reader.images(CAMERA)[images], steps
 

@@ -8,18 +8,16 @@ import multiprocessing
 from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import accumulate
 from typing import Literal
 
-import numpy as np
 import torch
 from torch.utils.data import DataLoader, Dataset
 
 from dextouch.episodes import EpisodeReader, EpisodeStore
-from dextouch.errors import InvalidInputError
 from dextouch.hands.actions import poses_from_actions, reanchor
 from dextouch.schemas import ActionKind
 from services.world_model.network.inputs import PredictionRequest
+from services.world_model.starts import CAMERA
 from services.world_model.training.dataset import (
     EpisodeArrays,
     Place,
@@ -29,7 +27,7 @@ from services.world_model.training.dataset import (
     fingerprint,
     stack_windows,
 )
-from services.world_model.training.episodes import CAMERA, check_rates, read_episode
+from services.world_model.training.episodes import check_rates, read_episode
 
 # Open readers per process; each holds an episode's timestamps and actions.
 MAX_OPEN_READERS = 512
@@ -121,38 +119,13 @@ def index_episodes(url: str) -> list[StoredEpisode]:
     return episodes
 
 
-class WindowDataset(Dataset[Window]):
-    """Every window of `num_steps` steps with measured actions, by index; others by place.
+class _Windows(Dataset[Window]):
+    """Windows of episodes by their places; works in DataLoader workers, forked or spawned."""
 
-    Windows are numbered by episode, then by start. Works in DataLoader workers, forked or spawned.
+    def __init__(self, episodes: Sequence[TrainingEpisode]) -> None:
+        self._episodes = list(episodes)
 
-    Args:
-        episodes: episodes to cut from; those shorter than a window contribute none.
-        num_steps: length of the windows accessed by index.
-    """
-
-    def __init__(self, episodes: Sequence[TrainingEpisode], *, num_steps: int) -> None:
-        self._episodes, self._num_steps = list(episodes), num_steps
-        counts = (max(0, len(episode) - num_steps + 1) for episode in self._episodes)
-        # Index of each episode's first window, and the total number at the end.
-        self._firsts = np.array(list(accumulate(counts, initial=0)), dtype=np.int64)
-
-    def __len__(self) -> int:
-        return int(self._firsts[-1])
-
-    def place(self, number: int) -> Place:
-        """Place of window `number`.
-
-        Raises:
-            InvalidInputError: no such window.
-        """
-        if not 0 <= number < len(self):
-            raise InvalidInputError(f"window: got {number}, expected 0 … {len(self) - 1}")
-        index = int(np.searchsorted(self._firsts, number, side="right")) - 1
-        return Place(index, number - int(self._firsts[index]), self._num_steps)
-
-    def __getitem__(self, wanted: int | Place) -> Window:
-        place = wanted if isinstance(wanted, Place) else self.place(wanted)
+    def __getitem__(self, place: Place) -> Window:
         return self._episodes[place.episode_index].cut(place)
 
 
@@ -172,7 +145,7 @@ def read_batches(
         start_method: start method of the processes; None for the platform's default.
     """
     loader = DataLoader(
-        WindowDataset(episodes, num_steps=1),
+        _Windows(episodes),
         batch_sampler=places,
         collate_fn=stack_windows,
         num_workers=num_workers,

@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import torch
-from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
+from pydantic import JsonValue, ValidationError
 from torch import Tensor
 
 from dextouch.errors import ConflictError, CorruptDataError
+from dextouch.frozen_model import FrozenModel
 from services.networks.weight_files import read_tensors, write_tensors
 from services.world_model.settings import TrainSettings
 
@@ -28,15 +29,13 @@ _FREE_SETTINGS: Final = {
 }  # fmt: skip
 
 
-class RunFacts(BaseModel):
+class RunFacts(FrozenModel):
     """Metadata of a state.
 
     `identity` holds the settings and data of the run, `window_numbers` the state of the generator
     that draws windows after the last completed step, as JSON. `log` has rows of step, completed
     fraction of the run, and the video and tactile losses.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     identity: dict[str, JsonValue]
     step: int

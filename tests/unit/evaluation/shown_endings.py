@@ -1,6 +1,5 @@
 """Endings of demonstrations in memory, as if they were read from a store."""
 
-from services.evaluation.demonstrations import Demonstration
 from services.evaluation.endings import (
     EARLY_ENDS,
     MIDDLE_ENDS,
@@ -8,6 +7,7 @@ from services.evaluation.endings import (
     Ending,
     EndingEpisode,
 )
+from tests.unit.evaluation.toy import Demonstration
 
 
 def final_ending(item: Demonstration, end: int) -> Ending:

@@ -13,7 +13,6 @@ from dextouch.worlds.serve import WorldServiceSettings, create_world_app
 from services.evaluation.closed_loop import EvaluationPlan, WorldAddress, evaluate, matched_start
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.hold import HoldPolicy
-from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.success_probe import SuccessProbe
 from tests.unit.evaluation import toy
 from tests.unit.worlds.running import served
@@ -58,8 +57,8 @@ def policies(trained_policies):
     good = [toy.demonstration(t, s) for t in toy.TASKS for s in SEEDS]
     poor = [toy.demonstration(t, s, noise_m=0.08) for t in toy.TASKS for s in SEEDS]
     return {
-        "script": ReplayPolicy.of(good),
-        "clumsy script": ReplayPolicy.of(poor),
+        "script": toy.replay(good),
+        "clumsy script": toy.replay(poor),
         "cloned": BehaviourCloningPolicy(trained_policies.finished),
         "hold": HoldPolicy(),
     }

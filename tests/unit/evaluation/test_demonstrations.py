@@ -6,19 +6,21 @@ from collections.abc import Sequence
 import numpy as np
 import pytest
 
+from dextouch.clients.policy import PolicyStart
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError
 from dextouch.schemas.episodes import EpisodeAttributes, StoredAnchor, matrix_rows
 from dextouch.streams.descriptors import StreamDescriptor
 from services.cli.main import run_command
-from services.evaluation.demonstrations import instructions_of, read_demonstrations
 from services.evaluation.endings import read_ending_episodes
 from services.evaluation.policies.behaviour_cloning import BehaviourCloningPolicy
 from services.evaluation.policies.cloning_episodes import (
     cloning_hash,
     read_cloning_episodes,
 )
+from services.evaluation.policies.replay import ReplayPolicy
 from services.evaluation.reporting import action_picture, episode_picture
+from services.evaluation.robot_episodes import robot_episodes
 from services.evaluation.starts import refuse_training_starts, start_digest
 from services.evaluation.success_probe import SuccessProbe
 from tests.unit.evaluation import toy
@@ -69,55 +71,52 @@ def url(tmp_path_factory):
     return str(folder)
 
 
-def test_arrays_come_back_as_they_were(url):
-    found = {d.episode_id: d for d in read_demonstrations(EpisodeStore(url))}
+def ids(*stores, **options):
+    return [reader.attributes.episode_id for reader in robot_episodes(stores, **options)]
+
+
+def test_robot_episodes_are_replayed_as_they_were_commanded(url):
+    found = list(robot_episodes([EpisodeStore(url)]))
     assert len(found) == 24
-    assert "a-person" not in found
+    assert "a-person" not in ids(EpisodeStore(url))
+    policy = ReplayPolicy.of(found)
     item = toy.demonstration("reach far", 4, noise_m=0.06)
-    back = found[item.episode_id]
-    for name in ("images", "tactile_kpa", "measured", "commanded"):
-        np.testing.assert_allclose(getattr(back, name), getattr(item, name), atol=1e-12)
-    assert (back.success, back.seed, back.start_digest) == (
-        item.success,
-        item.seed,
-        item.start_digest,
-    )
-    assert instructions_of(found.values()) == toy.INSTRUCTIONS
+    policy.reset(PolicyStart(item.task, "", item.seed, toy.ANCHOR, toy.K_HEAD))
+    world = toy.ToyWorld("judge", judge=True)
+    seen = world.reset(toy.RolloutStart(item.task, item.seed, "")).observation
+    np.testing.assert_allclose(policy.act(seen), item.commanded[1:17], atol=1e-12)
+
+
+def test_a_start_is_replayed_from_one_episode_of_known_seed(tmp_path):
+    store = EpisodeStore(tmp_path)
+    for name in ("once", "twice"):
+        write(store, toy.demonstration("reach", 4, name=name), shown=[0], success=None)
+    with pytest.raises(ConflictError, match="seed 4"):
+        ReplayPolicy.of(robot_episodes([store]))
+    write(store, toy.demonstration("reach", 5, name="no-seed"), seed=None)
+    with pytest.raises(InvalidInputError, match="no-seed"):
+        ReplayPolicy.of([store.open("no-seed")])
 
 
 def test_tasks_can_be_chosen(url):
-    chosen = read_demonstrations(EpisodeStore(url), tasks=["reach"])
-    assert {d.task for d in chosen} == {"reach"}
+    chosen = robot_episodes([EpisodeStore(url)], tasks=["reach"])
+    assert {reader.attributes.task for reader in chosen} == {"reach"}
     with pytest.raises(NotFoundError, match="juggle"):
-        read_demonstrations(EpisodeStore(url), tasks=["juggle"])
+        ids(EpisodeStore(url), tasks=["juggle"])
 
 
 def test_stores_add_up_but_no_episode_counts_twice(url, tmp_path):
     more = EpisodeStore(tmp_path)
     write(more, toy.demonstration("reach", 99))
-    assert len(read_demonstrations(EpisodeStore(url), more)) == 25
+    assert len(ids(EpisodeStore(url), more)) == 25
     with pytest.raises(ConflictError, match="in two stores"):
-        read_demonstrations(EpisodeStore(url), more, EpisodeStore(url))
+        ids(EpisodeStore(url), more, EpisodeStore(url))
     with pytest.raises(NotFoundError, match="store 2 of the 2 given"):
-        read_demonstrations(EpisodeStore(url), EpisodeStore(str(tmp_path / "typo")))
-
-
-def test_an_unknown_outcome_is_refused(tmp_path):
-    store = EpisodeStore(tmp_path)
-    write(store, toy.demonstration("reach", 1, name="who-knows"), success=None)
-    with pytest.raises(InvalidInputError, match="who-knows"):
-        read_demonstrations(store)
+        ids(EpisodeStore(url), EpisodeStore(str(tmp_path / "typo")))
 
 
 # What `dextouch train data --images 4` draws.
 SPARSE = [*range(0, 77, 4), 78, 79, 80]
-
-
-def test_images_of_every_fourth_step_are_not_taken_for_those_of_all(tmp_path):
-    store = EpisodeStore(tmp_path)
-    write(store, toy.demonstration("reach", 1), shown=SPARSE)
-    with pytest.raises(InvalidInputError, match=r"reach-1-0.*: 58 of 81 steps .*--images 1"):
-        read_demonstrations(store)
 
 
 def test_the_last_three_steps_of_sparse_images_are_enough_for_the_probe(tmp_path):

@@ -10,7 +10,6 @@ import torch
 from dextouch.errors import InvalidInputError
 from dextouch.schemas.rollouts import Doubt, Observation
 from services.evaluation.calibration import Calibration
-from services.evaluation.demonstrations import Demonstration
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.judge_network import ProbeShape, probe_batch
 from services.evaluation.success_probe import SuccessProbe
@@ -36,7 +35,7 @@ def _poses(task: str, seed: int, hand: np.ndarray) -> np.ndarray:
 
 # Both kinds and several tests take the same ones.
 @cache
-def _demonstration(task: str, seed: int) -> Demonstration:
+def _demonstration(task: str, seed: int) -> toy.Demonstration:
     return toy.demonstration(task, seed, noise_m=0.03 * (seed % 3))
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.clients.policy import Policy, PolicyStart
-from dextouch.errors import ConflictError, InvalidInputError, NonFiniteError, NotFoundError
+from dextouch.errors import InvalidInputError, NonFiniteError, NotFoundError
 from services.evaluation.policies.hold import HoldPolicy
 from services.evaluation.policies.replay import ReplayPolicy
 from tests.unit.evaluation import toy
@@ -34,7 +34,7 @@ def test_hold_keeps_the_first_pose():
 
 def test_replay_plays_the_episode_and_then_stays():
     item = toy.demonstration("reach", 4)
-    policy = ReplayPolicy.of([item])
+    policy = toy.replay([item])
     assert isinstance(policy, Policy)
     policy.reset(start(4))
     sent = np.concatenate([policy.act(observation(step)) for step in range(0, 80, 16)])
@@ -43,17 +43,14 @@ def test_replay_plays_the_episode_and_then_stays():
 
 
 def test_replay_needs_its_episode():
-    policy = ReplayPolicy.of([toy.demonstration("reach", 4)])
+    policy = toy.replay([toy.demonstration("reach", 4)])
     with pytest.raises(NotFoundError, match="seed 5"):
         policy.reset(start(5))
     with pytest.raises(InvalidInputError, match="before reset"):
         policy.act(observation(0))
 
 
-def test_replay_refuses_two_episodes_of_one_start_and_broken_ones():
-    pair = [toy.demonstration("reach", 4), toy.demonstration("reach", 4, noise_m=0.1)]
-    with pytest.raises(ConflictError, match="seed 4"):
-        ReplayPolicy.of(pair)
+def test_replay_refuses_broken_actions():
     with pytest.raises(NonFiniteError, match="seed 3"):
         ReplayPolicy({("reach", 3): np.full((16, 67), np.nan)})
 

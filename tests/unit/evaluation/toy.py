@@ -16,12 +16,13 @@ from dextouch.worlds.world import (
     SteppedRollout,
     WorldDescription,
 )
-from services.evaluation.demonstrations import Demonstration
 from services.evaluation.policies.cloning_episodes import (
     DECISION_STRIDE,
     CloningEpisode,
     Moment,
 )
+from services.evaluation.policies.replay import ReplayPolicy
+from services.evaluation.starts import start_digest
 
 SIZE = 32
 STEPS = 81
@@ -31,6 +32,33 @@ REACHED_M = 0.02
 TWO_CAMERAS = ("camera_head", "camera_wrist_left")
 K_HEAD = np.array([[40.0, 0, 16], [0, 40.0, 16], [0, 0, 1]])
 ANCHOR = AnchorPoses(np.eye(4), np.eye(4), np.eye(4))
+
+
+@dataclass(frozen=True)
+class Demonstration:
+    """One robot episode with images and touch at every step; actions are relative to step 0."""
+
+    episode_id: str
+    task: str
+    instruction: str
+    seed: int
+    success: bool
+    images: np.ndarray
+    tactile_kpa: np.ndarray
+    measured: np.ndarray
+    commanded: np.ndarray
+
+    @property
+    def num_steps(self) -> int:
+        return len(self.measured)
+
+    @property
+    def start_digest(self) -> str:
+        return start_digest(self.images[0], self.tactile_kpa[0])
+
+
+def replay(items: list[Demonstration]) -> ReplayPolicy:
+    return ReplayPolicy({(item.task, item.seed): item.commanded[1:] for item in items})
 
 
 def target_m(task: str, seed: int) -> np.ndarray:

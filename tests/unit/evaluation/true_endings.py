@@ -13,8 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from dextouch.episodes import EpisodeStore
-from services.evaluation.demonstrations import read_demonstrations
-from services.evaluation.endings import NUM_SEEN_STEPS, Ending
+from services.evaluation.endings import NUM_SEEN_STEPS, Ending, read_ending_episodes
 
 FILE = Path(__file__).with_suffix(".npz")
 
@@ -34,14 +33,14 @@ def read(task: str) -> tuple[list[Ending], np.ndarray]:
 
 def main(store: str) -> None:
     """Keep the endings of a store."""
-    episodes = read_demonstrations(EpisodeStore(store))
+    episodes = read_ending_episodes(EpisodeStore(store))
     np.savez_compressed(
         FILE,
         task=[e.task for e in episodes],
         seed=[e.seed for e in episodes],
         success=[e.success for e in episodes],
-        image=[e.images[-1] for e in episodes],
-        tactile_kpa=[e.tactile_kpa[-NUM_SEEN_STEPS:] for e in episodes],
+        image=[e.final.images[-1] for e in episodes if e.final.images is not None],
+        tactile_kpa=[e.final.tactile_kpa for e in episodes],
     )
 
 

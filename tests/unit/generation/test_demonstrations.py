@@ -13,14 +13,18 @@ from dextouch.worlds import CopyFirstWorld, SteppedRollout, WorldServiceSettings
 from services.cli.demo.background import served
 from services.evaluation.endings import read_ending_episode
 from services.generation.demonstrations import imagine_episode
-from services.twin.episodes import demonstrate, write_episode
+from services.twin.episodes import record, write_episode
+from services.twin.settings import TwinSettings
+from services.twin.stage import Stage
+from services.twin.take_options import TakeOptions
 
 
 @pytest.fixture(scope="module")
 def sources(tmp_path_factory):
     store = EpisodeStore(tmp_path_factory.mktemp("truth"))
+    head = TakeOptions(images=("camera_head",))
     ids = [
-        write_episode(store, demonstrate("stack_bowls", 3, domain=domain, images=("camera_head",)))
+        write_episode(store, record(Stage("stack_bowls", domain, TwinSettings()), 3, head))
         for domain in ("robot", "human")
     ]
     return [store.open(name) for name in ids]

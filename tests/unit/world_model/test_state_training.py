@@ -70,8 +70,7 @@ def episode(seed, num_steps=NUM_STEPS):
     poses[:, 0, :3], poses[:, 0, 3] = block_m, 1.0
     steps = np.arange(0, num_steps, 4)
     return SceneEpisode(
-        episode_id=f"toy-{seed}", task="press", instruction="press the block", domain="robot",
-        seed=seed, motion="script", noise_m=0.0, success=hits, event_times_s={},
+        episode_id=f"toy-{seed}", task="press", seed=seed, success=hits,
         object_names=("block",), object_boxes_m=np.array([[0, 0, 0, 0.02, 0.02, 0.03]]),
         action_kind="commanded", actions=actions, measured_actions=actions, anchor=anchor,
         K_head=K_HEAD, tactile_kpa=tactile, object_poses=poses,

@@ -6,7 +6,6 @@ from itertools import islice
 import numpy as np
 import pytest
 import torch
-from torch.utils.data import DataLoader
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError
@@ -16,12 +15,10 @@ from services.world_model.training.dataset import (
     Place,
     WindowSampler,
     fingerprint,
-    stack_windows,
 )
 from services.world_model.training.episodes import load_episodes
 from services.world_model.training.splits import load_split
 from services.world_model.training.streaming import (
-    WindowDataset,
     index_episodes,
     read_batches,
 )
@@ -119,45 +116,6 @@ def test_reading_ahead_leaves_the_global_random_numbers_alone(stored):
     before = torch.random.get_rng_state()
     list(read_batches(stored, [PLACES[:1]]))
     assert torch.equal(torch.random.get_rng_state(), before)
-
-
-def test_every_window_has_a_number(stored):
-    dataset = WindowDataset(stored, num_steps=17)
-    assert len(dataset) == 6 * (41 - 17 + 1)
-    assert dataset.place(0) == Place(0, 0, 17)
-    assert dataset.place(24) == Place(0, 24, 17)
-    assert dataset.place(25) == Place(1, 0, 17)
-    assert dataset.place(len(dataset) - 1) == Place(5, 24, 17)
-    for number in (-1, len(dataset)):
-        with pytest.raises(InvalidInputError, match="expected 0 … 149"):
-            dataset[number]
-
-
-def test_short_episodes_have_no_window(tmp_path, toy_episode):
-    store = EpisodeStore(tmp_path / "mixed")
-    for seed, num_steps in ((0, 20), (1, 9), (2, 17)):
-        write_episode(store, toy_episode(seed, num_steps))
-    dataset = WindowDataset(index_episodes(str(store.root)), num_steps=17)
-    places = [dataset.place(number) for number in range(len(dataset))]
-    assert [(p.episode_index, p.start) for p in places] == [(0, 0), (0, 1), (0, 2), (0, 3), (2, 0)]
-
-
-def test_a_passed_generator_shuffles_the_same_way(stored, in_memory):
-    def shuffled(episodes):
-        dataset = WindowDataset(episodes, num_steps=9)
-        generator = torch.Generator().manual_seed(8)
-        return DataLoader(
-            dataset, batch_size=16, shuffle=True, generator=generator, collate_fn=stack_windows
-        )
-
-    first, again = shuffled(stored), shuffled(in_memory)
-    pairs = list(islice(zip(first, again, strict=True), 3))
-    for ours, theirs in pairs:
-        assert_same_batch(ours, theirs)
-    plain = next(iter(DataLoader(
-        WindowDataset(stored, num_steps=9), batch_size=16, collate_fn=stack_windows
-    )))  # fmt: skip
-    assert not torch.equal(pairs[0][0].images, plain.images)
 
 
 def test_only_the_models_camera_is_decoded(stored, monkeypatch):
