@@ -14,6 +14,7 @@ from dextouch.serving import service_config
 from services.evaluation.direct_training import DirectSettings
 from services.evaluation.policies.cloning_training import CloningSettings
 from services.evaluation.success_probe_training import ProbeSettings
+from services.networks.training_settings import Stores, Tasks
 
 PRETRAINED = Path(__file__).parent / "pretrained"
 DEFAULT_POLICY = PRETRAINED / "behaviour_cloning.safetensors"
@@ -31,12 +32,12 @@ class TrainPolicySettings(BaseSettings):
 
     model_config = service_config("evaluation_train_policy", "dextouch train policy")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
+    episodes: Stores
     output: Path = Field(
         default=Path("runs/evaluation/behaviour_cloning.safetensors"),
         description="checkpoint to write",
     )
-    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
+    tasks: Tasks = ()
     early_at: float | None = Field(
         default=None,
         gt=0,
@@ -61,7 +62,7 @@ class TrainProbeSettings(BaseSettings):
 
     model_config = service_config("evaluation_train_probe", "dextouch train probe")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
+    episodes: Stores
     development: tuple[str, ...] = Field(
         default=(), description="stores to calibrate on (default: a share of the seeds)"
     )
@@ -71,7 +72,7 @@ class TrainProbeSettings(BaseSettings):
     output: Path = Field(
         default=Path("runs/evaluation/success_probe.safetensors"), description="checkpoint to write"
     )
-    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
+    tasks: Tasks = ()
     training: ProbeSettings = Field(default=ProbeSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 
@@ -85,11 +86,11 @@ class TrainDirectSettings(BaseSettings):
 
     model_config = service_config("evaluation_train_direct_judge", "dextouch train direct-judge")
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
+    episodes: Stores
     output: Path = Field(
         default=Path("runs/evaluation/direct_judge.safetensors"), description="checkpoint to write"
     )
-    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
+    tasks: Tasks = ()
     training: DirectSettings = Field(default=DirectSettings(), description="training settings")
     json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)
 

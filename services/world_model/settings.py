@@ -17,6 +17,8 @@ from services.networks.training_settings import (
     MaxGradientNorm,
     MaxSteps,
     NumSteps,
+    Stores,
+    Tasks,
     WarmupSteps,
     WeightDecay,
 )
@@ -148,8 +150,8 @@ class CoreSettings(FrozenModel):
 class StateTrainSettings(FrozenModel):
     """Training of a state model: an ensemble of start readers and recurrent cores."""
 
-    episodes: tuple[str, ...] = Field(min_length=1, description="stores (folder or file:// URL)")
-    tasks: tuple[str, ...] = Field(default=(), description="tasks to train on; default: all")
+    episodes: Stores
+    tasks: Tasks = ()
     output: Path = Field(
         default=Path("runs/world_model/state.safetensors"), description="checkpoint to write"
     )

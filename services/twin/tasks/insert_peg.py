@@ -6,13 +6,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import transform, transform_from_pose
-from dextouch.geometry.rotations import rotation_from_vector
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp, opened, pressing
 from services.twin.hands import Domain, twin_hand
 from services.twin.mjcf import numbers
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, relaxed
+from services.twin.tasks.postures import THUMB_UP, relaxed, yawed
 from services.twin.tasks.task import REST_SPEED
 
 _RADIUS_M, _HALF_LENGTH_M, _FOOT_HALF_M = 0.022, 0.090, 0.020
@@ -142,7 +141,7 @@ class InsertPeg:
 
         def hand(point_m: np.ndarray, held: np.ndarray, yaw_rad: float) -> HandPose:
             """Hand with its palm to the left, with `held` (in its own frame) at a point."""
-            R = rotation_from_vector(np.array([0.0, 0.0, yaw_rad])) @ THUMB_UP @ R_axis.T
+            R = yawed(yaw_rad) @ THUMB_UP @ R_axis.T
             return HandPose(transform(R, point_m - R @ held), open_hand)
 
         grip = object_poses[0, :3] + [0.0, 0.0, _GRIP_M]

@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import apply, transform, transform_from_pose
-from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from dextouch.geometry.rotations import quaternion_from_rotation
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, moved
 from services.twin.hands import Domain, twin_hand
 from services.twin.mjcf import numbers
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import PALM_DOWN, flat, relaxed
+from services.twin.tasks.postures import PALM_DOWN, flat, relaxed, yawed
 from services.twin.tasks.task import REST_SPEED
 
 # The cabinet's frame: on the table below the middle of its front; the drawer opens along -y.
@@ -113,7 +113,7 @@ class OpenDrawer:
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "2 7"]:
         """Cabinet right of the centre, ±3 cm and ±0.2 rad, drawer closed."""
         x, y = generator.uniform(-0.03, 0.03, size=2)
-        R = rotation_from_vector(np.array([0.0, 0.0, generator.uniform(-0.2, 0.2)]))
+        R = yawed(generator.uniform(-0.2, 0.2))
         q_wxyz = quaternion_from_rotation(R)
         cabinet = np.array([0.06 + x, 0.06 + y, 0.0])
         drawer = cabinet + np.array([0.0, 0.0, _DRAWER_Z_M])
@@ -137,7 +137,7 @@ class OpenDrawer:
         def hand(offset_m: tuple[float, float], error: WaypointNoise | None) -> HandPose:
             """Fingertips at the gap, shifted along the cabinet's y and upwards."""
             yaw = 0.0 if error is None else error.yaw_rad
-            R_yaw = rotation_from_vector(np.array([0.0, 0.0, yaw]))
+            R_yaw = yawed(yaw)
             R = R_yaw @ T_world_cabinet[:3, :3] @ PALM_DOWN
             tip = apply(T_world_cabinet, (gap + np.array([0.0, *offset_m]))[None])[0]
             if error is not None:

@@ -12,7 +12,7 @@ from services.twin.grasps import CylinderGrasp, opened, pressing
 from services.twin.hands import Domain, twin_hand
 from services.twin.mjcf import numbers
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import PALM_DOWN, relaxed
+from services.twin.tasks.postures import PALM_DOWN, relaxed, yawed
 from services.twin.tasks.task import REST_SPEED
 
 # Phone frame: x across, y towards its top, z out of the screen; origin at its centre.
@@ -51,7 +51,7 @@ _HELD: Final[dict[Domain, tuple[tuple[float, float, float], tuple[float, float, 
     "human": ((0.0001, -0.0049, -0.0019), (-0.072, 0.077, -0.156)),
 }
 # Fingers point to the left over a phone whose top points away from the viewer.
-_FINGERS_LEFT: Final = rotation_from_vector(np.array([0.0, 0.0, 0.5 * np.pi])) @ PALM_DOWN
+_FINGERS_LEFT: Final = yawed(0.5 * np.pi) @ PALM_DOWN
 
 
 def _wall(
@@ -89,10 +89,6 @@ def _stand() -> str:
         _wall("left", left, (-wall, -wall, -wall), (0.0, _CHEEK_M, _SLOT_M)),
     ]
     return f'<body name="stand" mocap="true">{"".join(parts)}</body>'
-
-
-def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
-    return rotation_from_vector(np.array([0.0, 0.0, yaw_rad]))
 
 
 def _in_cradle(simulation: Simulation) -> Float64[np.ndarray, "4 4"]:
@@ -171,7 +167,7 @@ class PlacePhone:
         start_m, over_m = generator.uniform(-0.02, 0.02, size=(2, 3))
 
         def misread(T: np.ndarray, error: WaypointNoise) -> np.ndarray:
-            return transform(_yawed(error.yaw_rad) @ T[:3, :3], T[:3, 3] + error.offset_m)
+            return transform(yawed(error.yaw_rad) @ T[:3, :3], T[:3, 3] + error.offset_m)
 
         def hand(T: np.ndarray, joints: np.ndarray) -> HandPose:
             return HandPose(T @ T_phone_wrist, joints)

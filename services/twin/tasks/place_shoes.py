@@ -6,14 +6,14 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import transform, transform_from_pose
-from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from dextouch.geometry.rotations import quaternion_from_rotation
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise, bent, moved
 from services.twin.grasps import CylinderGrasp, opened, pressing
 from services.twin.hands import Domain, twin_hand
 from services.twin.mjcf import numbers
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP
+from services.twin.tasks.postures import THUMB_UP, yawed
 from services.twin.tasks.task import REST_SPEED
 
 # A boot's frame: origin below the centre of its sole, y towards the toe, z up.
@@ -47,10 +47,6 @@ _MAX_TURN_RAD: Final = 0.30
 _MIN_UPRIGHT: Final = 0.985
 _LIFTED_M, _MAX_HEIGHT_M = 0.030, 0.006
 _LEFT, _RIGHT, _RACK = range(3)
-
-
-def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
-    return rotation_from_vector(np.array([0.0, 0.0, yaw_rad]))
 
 
 def _yaw_rad(T: Float64[np.ndarray, "4 4"]) -> float:
@@ -133,7 +129,7 @@ class PlaceShoes:
         x, y, yaw = (generator.uniform(-1.0, 1.0, size=(3, 3)) * spread).T
         poses[:, 0] = x + np.array([-_SHOES_AT_M[0], _SHOES_AT_M[0], _RACK_AT_M[0]])
         poses[:, 1] = y + np.array([_SHOES_AT_M[1], _SHOES_AT_M[1], _RACK_AT_M[1]])
-        poses[:, 3:] = [quaternion_from_rotation(_yawed(turn)) for turn in yaw]
+        poses[:, 3:] = [quaternion_from_rotation(yawed(turn)) for turn in yaw]
         return poses
 
     def script(
@@ -178,7 +174,7 @@ class PlaceShoes:
         axis_point = grasp.axis_point_m(twin_hand(side, domain))
 
         def around(T_world_shoe: np.ndarray, error: WaypointNoise) -> HandPose:
-            R_shoe = _yawed(_yaw_rad(T_world_shoe) + error.yaw_rad)
+            R_shoe = yawed(_yaw_rad(T_world_shoe) + error.yaw_rad)
             shaft = R_shoe @ np.array([0.0, _SHAFT_Y_M, _GRASP_HEIGHT_M])
             R = R_shoe @ THUMB_UP @ R_axis.T
             held_m = T_world_shoe[:3, 3] + error.offset_m + shaft

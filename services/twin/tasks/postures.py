@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import transform
+from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose
 from services.twin.hands import Domain, twin_hand
@@ -15,6 +16,11 @@ PALM_DOWN: Final = np.array([[-1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, -1.0, 0.0
 PALM_DOWN_LEFT: Final = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
 # Thumbs up, fingers forward: the right palm faces world -x, the left one +x.
 THUMB_UP: Final = np.array([[0.0, -1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
+
+
+def yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
+    """Rotation about the world's z axis."""
+    return rotation_from_vector(np.array([0.0, 0.0, yaw_rad]))
 
 
 def flat(domain: Domain) -> Float64[np.ndarray, "20"]:

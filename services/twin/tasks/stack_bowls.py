@@ -6,13 +6,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.geometry import transform, transform_from_pose
-from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.tactile.layout import Side
 from services.twin.demonstrators import HandPose, Waypoint, WaypointNoise
 from services.twin.hands import Domain, twin_hand
 from services.twin.mjcf import numbers
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import THUMB_UP, flat
+from services.twin.tasks.postures import THUMB_UP, flat, yawed
 from services.twin.tasks.task import REST_SPEED
 
 _NUM_WALLS: Final = 12
@@ -99,7 +98,7 @@ class StackBowls:
         def around(
             bowl_m: np.ndarray, height_m: float, gap_m: float, yaw_rad: float
         ) -> tuple[HandPose, HandPose]:
-            R_yaw = rotation_from_vector(np.array([0.0, 0.0, yaw_rad]))
+            R_yaw = yawed(yaw_rad)
             R = R_yaw @ THUMB_UP
             hands = []
             sides: tuple[tuple[Side, float], ...] = (("left", -1.0), ("right", 1.0))

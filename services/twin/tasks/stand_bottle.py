@@ -12,7 +12,7 @@ from services.twin.grasps import CylinderGrasp, opened, pressing
 from services.twin.hands import Domain, twin_hand
 from services.twin.mjcf import numbers
 from services.twin.simulation import Simulation
-from services.twin.tasks.postures import PALM_DOWN, relaxed
+from services.twin.tasks.postures import PALM_DOWN, relaxed, yawed
 from services.twin.tasks.task import REST_SPEED
 
 _RADIUS_M: Final = 0.025
@@ -45,10 +45,6 @@ _LIFTED_M: Final = 0.03
 # The bottle's z axis (cap) points to world -x at yaw 0.
 _LYING: Final = rotation_from_vector(np.array([0.0, -0.5 * np.pi, 0.0]))
 _ROLL_UP: Final = rotation_from_vector(np.array([0.0, 0.5 * np.pi, 0.0]))
-
-
-def _yawed(yaw_rad: float) -> Float64[np.ndarray, "3 3"]:
-    return rotation_from_vector(np.array([0.0, 0.0, yaw_rad]))
 
 
 def _turn_to_x(axis: Float64[np.ndarray, "3"]) -> Float64[np.ndarray, "3 3"]:
@@ -95,7 +91,7 @@ class StandBottle:
     def place(self, generator: np.random.Generator) -> Float64[np.ndarray, "1 7"]:
         """Lying right of the centre, ±3 cm and ±0.25 rad."""
         x, y = generator.uniform(-0.03, 0.03, size=2)
-        R = _yawed(float(generator.uniform(-0.25, 0.25))) @ _LYING
+        R = yawed(float(generator.uniform(-0.25, 0.25))) @ _LYING
         return np.array([[0.08 + x, 0.02 + y, _FOOT_RADIUS_M, *quaternion_from_rotation(R)]])
 
     def script(
@@ -121,9 +117,9 @@ class StandBottle:
         def hand(R_world_wrist: np.ndarray, bottle_m: np.ndarray, joints: np.ndarray) -> HandPose:
             return HandPose(transform(R_world_wrist, bottle_m - R_world_wrist @ offset), joints)
 
-        R_down = _yawed(yaw) @ PALM_DOWN @ R_axis.T
-        R_grasp = _yawed(yaw + noise[0].yaw_rad) @ PALM_DOWN @ R_axis.T
-        R_up = _yawed(yaw + noise[1].yaw_rad) @ _ROLL_UP @ PALM_DOWN
+        R_down = yawed(yaw) @ PALM_DOWN @ R_axis.T
+        R_grasp = yawed(yaw + noise[0].yaw_rad) @ PALM_DOWN @ R_axis.T
+        R_up = yawed(yaw + noise[1].yaw_rad) @ _ROLL_UP @ PALM_DOWN
         R_up = R_up @ _turn_to_x(np.array(_HELD_AXES[domain])) @ R_axis.T
         there = T_world_bottle[:3, 3]
         above = moved(hand(R_down, there, open_hand), start_m + np.array([0.0, -0.02, 0.14]))
