@@ -14,8 +14,12 @@ from dextouch.geometry import apply, invert, transform
 from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
 from dextouch.hands.finger_table import FingerTable, JointRow, Quaternion
 from dextouch.hands.hand_files.mapping import FingerMapping, TipMapping
-from dextouch.hands.hand_files.model_file import Joint, Link, ModelFile, vector3
+from dextouch.hands.hand_files.mjcf import MjcfModel
+from dextouch.hands.hand_files.model_file import Joint, Link, vector3
+from dextouch.hands.hand_files.urdf import UrdfModel
 
+# Links are read lazily: only those of fingers have to be valid.
+ModelFile = UrdfModel | MjcfModel
 _NO_TURN: Final = np.eye(3)
 
 

@@ -14,11 +14,10 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, UnknownNameError
 from dextouch.geometry import invert, transform
 from dextouch.hands.finger_table import FingerTable
-from dextouch.hands.hand_files.chains import finger_table, fixed_links
+from dextouch.hands.hand_files.chains import ModelFile, finger_table, fixed_links
 from dextouch.hands.hand_files.elements import Element, read_elements
 from dextouch.hands.hand_files.mapping import WristMapping, read_mapping
 from dextouch.hands.hand_files.mjcf import MjcfModel
-from dextouch.hands.hand_files.model_file import ModelFile
 from dextouch.hands.hand_files.urdf import UrdfModel
 from dextouch.hands.robot_hand import HandModel
 from dextouch.hands.skeleton import CHAINS

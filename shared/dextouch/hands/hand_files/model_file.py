@@ -1,7 +1,6 @@
-"""Common interface of URDF and MJCF models: a tree of links with joints."""
+"""What URDF and MJCF models consist of: a tree of links with joints."""
 
-from collections.abc import Mapping
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import numpy as np
 
@@ -54,31 +53,3 @@ class Link(NamedTuple):
 
     T_parent_link: np.ndarray
     joints: tuple[Joint, ...]
-
-
-@runtime_checkable
-class ModelFile(Protocol):
-    """A model whose links are read lazily: only the links of fingers have to be valid."""
-
-    @property
-    def source(self) -> str:
-        """File name, for messages."""
-        ...
-
-    @property
-    def parents(self) -> Mapping[str, str | None]:
-        """Parent of every link; None for a root."""
-        ...
-
-    @property
-    def sites(self) -> tuple[str, ...]:
-        """Names of sites (MJCF)."""
-        ...
-
-    def link(self, name: str) -> Link:
-        """A link by name."""
-        ...
-
-    def site(self, name: str) -> tuple[str, np.ndarray]:
-        """The link of a site, and T_link_site [4, 4]."""
-        ...
