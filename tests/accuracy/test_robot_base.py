@@ -42,7 +42,7 @@ def test_base_is_found_and_its_sigma_honest(is_given, capsys):
         errors.append((np.rad2deg(angle_rad), distance_m * 1e3))
         error = twist(invert(result.T_world_base) @ T_world_base)
         normalised.append(error @ np.linalg.solve(result.covariance, error) / 6)
-        assert result.left_out_pairs == ()
+        assert result.left_out_views == ()
         if is_given:
             np.testing.assert_allclose(result.T_effector_tracker, T_effector_tracker, atol=1e-12)
         else:
@@ -73,7 +73,7 @@ def test_pairs_that_are_far_off_are_left_out_and_named():
     tracker[15] = tracker[15] @ move(np.array([0.0, 0.4, 0.0, 0.0, 0.0, 0.0]))
     for given in (None, T_effector_tracker):
         result = solve_robot_base(tracker, effector, T_effector_tracker=given)
-        assert result.left_out_pairs == (7, 15)
+        assert result.left_out_views == (7, 15)
         angle_rad, distance_m = mount_difference(result.T_world_base, T_world_base)
         assert angle_rad < 3e-3
         assert distance_m < 3e-3

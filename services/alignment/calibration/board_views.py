@@ -8,7 +8,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from services.alignment.calibration.bundle import Linearised, Measurement
-from services.alignment.calibration.twists import hat, move
+from services.alignment.calibration.twists import adjoint, move
 
 MIN_CORNERS = 4
 # Poses of a board come from a solver; few steps bring them to the minimum of the pixels.
@@ -92,41 +92,21 @@ def project(
     Raises:
         InvalidInputError: a corner lies behind the camera.
     """
-    R = Ts_camera_board[:, :3, :3]
-    points = points_board @ np.swapaxes(R, 1, 2) + Ts_camera_board[:, None, :3, 3]
-    x, y, z = points[..., 0], points[..., 1], points[..., 2]
-    if (z <= 0).any():
+    import cv2
+
+    points = points_board @ np.swapaxes(Ts_camera_board[:, :3, :3], 1, 2)
+    points = points + Ts_camera_board[:, None, :3, 3]
+    if (points[..., 2] <= 0).any():
         raise InvalidInputError(
             "board views: a corner lies behind the camera; the board's pose or its corners are "
             "wrong, check which side is inverted"
         )
-    x, y = x / z, y / z
-    bent, J_bent = _bend(x, y, distortion)
-    J_plane = np.zeros((*x.shape, 2, 3))
-    J_plane[..., 0, 0] = J_plane[..., 1, 1] = 1 / z
-    J_plane[..., 0, 2], J_plane[..., 1, 2] = -x / z, -y / z
-    J_point = R[:, None] @ np.concatenate(
-        [-hat(points_board), np.broadcast_to(np.eye(3), (*x.shape, 3, 3))], axis=-1
-    )
-    return bent @ K[:2, :2].T + K[:2, 2], K[:2, :2] @ J_bent @ J_plane @ J_point
-
-
-def _bend(
-    x: np.ndarray, y: np.ndarray, distortion: np.ndarray
-) -> tuple[Float64[np.ndarray, "n k 2"], Float64[np.ndarray, "n k 2 2"]]:
-    """Radial and tangential distortion (Brown 1966) of rays with z = 1, and its Jacobian."""
-    k1, k2, p1, p2, k3 = distortion
-    r2 = x * x + y * y
-    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-    slope = k1 + r2 * (2 * k2 + 3 * k3 * r2)
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
-    v = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    across = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    J = np.empty((*x.shape, 2, 2))
-    J[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    J[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    J[..., 0, 1] = J[..., 1, 0] = across
-    return np.stack([u, v], axis=-1), J
+    still = np.zeros(3)
+    pixels, J = cv2.projectPoints(points.reshape(-1, 3), still, still, K, distortion)
+    shape = (*points.shape[:2], 2)
+    # By twists of the camera's frame, where the corners already are.
+    J_camera = np.asarray(J)[:, :6].reshape(*shape, 6)
+    return np.asarray(pixels).reshape(shape), J_camera @ adjoint(Ts_camera_board)[:, None]
 
 
 def polish(measurement: Measurement, Ts_camera_board: np.ndarray) -> Float64[np.ndarray, "n 4 4"]:

@@ -52,35 +52,32 @@ class Agreement(NamedTuple):
     X: Float64[np.ndarray, "4 4"]
     Z: Float64[np.ndarray, "4 4"]
 
+    def predicted(self, series: Series) -> Float64[np.ndarray, "n 4 4"]:
+        """Poses of the target in the mounted frame at which the body's poses put it."""
+        return invert(series.Ts_world_body @ self.X) @ self.Z
 
-def agreeing_views(series: Series) -> Agreement:
-    """Closed-form mount and target, without outlier views.
+    def left_out(self, series: Series) -> tuple[int, ...]:
+        """The views of a whole series that do not count."""
+        return tuple(sorted(set(range(len(series.Ts_world_body))) - set(self.views.tolist())))
+
+
+def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement:
+    """Mount (in closed form, unless it is given) and target, without outlier views.
 
     Raises:
         DegenerateMotionError: the views that agree show no mount.
         InvalidInputError: the views contradict each other; an inverted series is named.
     """
-    return _without_outliers(series, None)
-
-
-def agreeing_with_mount(series: Series, X: np.ndarray) -> Agreement:
-    """Target pose for a known mount X, without outlier views.
-
-    Raises:
-        InvalidInputError: the views contradict each other.
-    """
-    return _without_outliers(series, X)
-
-
-def _without_outliers(series: Series, given: np.ndarray | None) -> Agreement:
     num_views = len(series.Ts_world_body)
     views = np.arange(num_views)
     min_views = max(MIN_VIEWS, int(np.ceil((1 - MAX_OUTLIER_SHARE) * num_views)))
     while True:
         used = series.only(views)
-        X = _closed_form(used) if given is None else given
+        if mount is None:
+            check_turns(series.task, series.body, used.Ts_world_body)
+        X = park(used.Ts_world_body, used.Ts_mounted_target) if mount is None else mount
         Z, errors = view_errors(used, X)
-        if given is None:
+        if mount is None:
             check_sides(used, errors)
         ratios = (errors / np.maximum(np.median(errors, axis=0), EXACT)).max(axis=1)
         if ratios.max() <= OUTLIER_RATIO:
@@ -95,11 +92,6 @@ def _without_outliers(series: Series, given: np.ndarray | None) -> Agreement:
                 views=far_off,
             )
         views = np.delete(views, int(np.argmax(ratios)))
-
-
-def _closed_form(series: Series) -> Float64[np.ndarray, "4 4"]:
-    check_turns(series.task, series.body, series.Ts_world_body)
-    return park(series.Ts_world_body, series.Ts_mounted_target)
 
 
 def park(Ts_world_body: np.ndarray, Ts_mounted_target: np.ndarray) -> Float64[np.ndarray, "4 4"]:

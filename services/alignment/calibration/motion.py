@@ -79,7 +79,7 @@ def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
     if spread_rad[1] >= MIN_SECOND_SPREAD_RAD and ratio >= MIN_EIGENVALUE_RATIO:
         return
     is_seen = spread_rad[0] >= MIN_SECOND_SPREAD_RAD
-    names = _missing_axes(axes[1:] if is_seen else axes)
+    names = missing_axes(axes[1:] if is_seen else axes)
     told = "/".join(f"{value:.1f}" for value in np.rad2deg(spread_rad))
     seen = f" (all turns are about {np.round(axes[0], 2).tolist()})" if is_seen else ""
     raise DegenerateMotionError(
@@ -92,8 +92,8 @@ def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
     )
 
 
-def _missing_axes(missing: np.ndarray) -> list[str]:
-    """Names of the body axes closest to the m missing directions of rotation [m, 3]."""
+def missing_axes(missing: np.ndarray) -> list[str]:
+    """Names of the axes closest to the m missing directions [m, 3]."""
     depth = np.square(missing).sum(axis=0)
     deepest = sorted(np.argsort(-depth, kind="stable")[: len(missing)])
     return [AXIS_NAMES[index] for index in deepest]

@@ -24,7 +24,7 @@ def calibrate(options: argparse.Namespace) -> dict[str, object]:
     pairs = pairs_of(read_json(options.poses, PAIRS_HELP), options.poses, PAIRS_HELP)
     mount = np.eye(4) if options.same_frame else None
     result = solve_robot_base(pairs[:, 0], pairs[:, 1], T_effector_tracker=mount)
-    left_out = list(result.left_out_pairs)
+    left_out = list(result.left_out_views)
     for index in left_out:
         print(f"  pair {index} is far off: left out; did the robot stand still?")
     facts: dict[str, object] = {
