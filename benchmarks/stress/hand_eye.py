@@ -16,12 +16,12 @@ from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.hand_eye import (
-    DegenerateMotionError,
     HandEyeNoise,
     mount_difference,
     solve_hand_eye,
 )
 from services.alignment.calibration.intrinsics import calibrate_found
+from services.alignment.calibration.motion import DegenerateMotionError
 
 STAGE = StageCells("hand-eye")
 # Bounds of the accuracy tests for 20 views with 0.3 px of noise.

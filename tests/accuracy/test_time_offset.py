@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from dextouch.errors import InvalidInputError
-from services.alignment.calibration.hand_eye import DegenerateMotionError
+from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.tap_offset import estimate_tap_offset
 from services.alignment.calibration.time_offset import estimate_time_offset
 

@@ -24,9 +24,6 @@ from services.alignment.calibration.pose_estimate import (
 )
 from services.alignment.calibration.twists import adjoint
 
-__all__ = ["DegenerateMotionError", "HandEyeNoise", "HandEyeResult", "mount_difference"]
-__all__ += ["solve_hand_eye"]
-
 TASK = "hand-eye"
 
 

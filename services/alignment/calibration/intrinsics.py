@@ -16,21 +16,10 @@ from services.alignment.calibration.board_detection import (
 )
 from services.alignment.calibration.motion import DegenerateMotionError
 
-__all__ = ["CameraCalibration", "CharucoBoard", "Chessboard", "calibrate_camera"]
-__all__ += ["calibrate_found", "unseen_parts"]
-
 MIN_VIEWS = 5
 # Views from one direction alone cannot tell focal length from distance.
 MIN_TILT_SPREAD_RAD = np.deg2rad(15.0)
 MAX_FOCAL_SIGMA = 0.05
-# Recommended, more than required.
-GOOD_VIEWS = 15
-GOOD_FOCAL_SIGMA = 0.003
-PARTS = (
-    ("top left", "top", "top right"),
-    ("left", "middle", "right"),
-    ("bottom left", "bottom", "bottom right"),
-)
 
 
 @dataclass(frozen=True)
@@ -47,10 +36,6 @@ class CameraCalibration:
         rms_by_photo_px: the same by photo; a much larger one means that the photo is blurred or the
             board was bent.
         coverage: share of a 4 × 4 grid over the image in which corners were seen.
-        unseen: parts of the image (thirds both ways) in which none was.
-        advice: what would make the calibration better; empty where nothing would.
-        pattern: how the board is printed.
-        image_size_px: width, height.
         used_images: indices of the photos on which the board was found.
     """
 
@@ -61,10 +46,6 @@ class CameraCalibration:
     rms_px: float
     rms_by_photo_px: Float64[np.ndarray, " n"]
     coverage: float
-    unseen: tuple[str, ...]
-    advice: tuple[str, ...]
-    pattern: str
-    image_size_px: tuple[int, int]
     used_images: tuple[int, ...]
 
 
@@ -82,13 +63,7 @@ def calibrate_camera(
         DegenerateMotionError: the views do not show the focal length; tilt the board.
         ShapeError: no images, or of different sizes.
     """
-    found = find_boards(images, board)
-    if len(found.photos) < MIN_VIEWS:
-        raise InvalidInputError(
-            f"photos: the board is found in {len(found.photos)} of {found.num_photos}, expected at "
-            f"least {MIN_VIEWS}; check the board's size and kind ({board}), light and sharpness"
-        )
-    return calibrate_found(found)
+    return calibrate_found(find_boards(images, board))
 
 
 def calibrate_found(found: FoundBoards) -> CameraCalibration:
@@ -102,7 +77,8 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
 
     if len(found.photos) < MIN_VIEWS:
         raise InvalidInputError(
-            f"photos: got {len(found.photos)} with a board, expected at least {MIN_VIEWS}"
+            f"photos: the board is found in {len(found.photos)} of {found.num_photos}, expected at "
+            f"least {MIN_VIEWS}; check the board's size and kind, light and sharpness"
         )
     rms_px, K, distortion, turns, _, sigma, _, by_photo = cv2.calibrateCameraExtended(
         list(found.points_board),
@@ -116,7 +92,6 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
     spread_rad = _tilt_spread_rad(np.array(turns, dtype=np.float64).reshape(-1, 3))
     relative = float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1]))
     _check_views(spread_rad, relative)
-    unseen = unseen_parts(found.pixels_px, found.image_size_px)
     return CameraCalibration(
         K=K,
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:5],
@@ -124,48 +99,14 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
         sigma_distortion=sigma[4:9],
         rms_px=float(rms_px),
         rms_by_photo_px=np.asarray(by_photo, dtype=np.float64).ravel(),
-        coverage=len(_cells(found.pixels_px, found.image_size_px, 4)) / 16,
-        unseen=unseen,
-        advice=_advice(len(found.photos), unseen, relative),
-        pattern=found.pattern,
-        image_size_px=found.image_size_px,
+        coverage=_coverage(found.pixels_px, found.image_size_px),
         used_images=found.photos,
     )
 
 
-def unseen_parts(
-    pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int]
-) -> tuple[str, ...]:
-    """Names of the thirds of the image, both ways, in which no corner was seen."""
-    seen = _cells(pixels_px, image_size_px, 3)
-    return tuple(
-        name
-        for row, names in enumerate(PARTS)
-        for column, name in enumerate(names)
-        if (column, row) not in seen
-    )
-
-
-def _cells(
-    pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int], num: int
-) -> set[tuple[int, int]]:
-    """Cells (column, row) of a grid of num × num over the image in which there are corners."""
-    share = np.concatenate(list(pixels_px)) / np.array(image_size_px)
-    return {(int(x), int(y)) for x, y in (share * num).astype(int).clip(0, num - 1)}
-
-
-def _advice(num_views: int, unseen: tuple[str, ...], focal_sigma: float) -> tuple[str, ...]:
-    advice = []
-    if unseen:
-        advice.append(f"hold the board where none was seen: {', '.join(unseen)}")
-    if num_views < GOOD_VIEWS:
-        advice.append(f"take {GOOD_VIEWS - num_views} more photos, the board tilted otherwise")
-    if focal_sigma > GOOD_FOCAL_SIGMA:
-        advice.append(
-            f"the focal length is known to {focal_sigma:.2%} only: tilt the board by 30 to 45 "
-            "degrees about both its axes and bring it nearer"
-        )
-    return tuple(advice)
+def _coverage(pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int]) -> float:
+    cells = np.concatenate(list(pixels_px)) / np.array(image_size_px) * 4
+    return len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16
 
 
 def _tilt_spread_rad(turns_rad: np.ndarray) -> float:

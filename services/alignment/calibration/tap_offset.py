@@ -6,11 +6,9 @@ bend is the touch. The second difference would show the bend too early, so the h
 """
 
 import numpy as np
-from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from services.alignment.calibration.hand_eye import DegenerateMotionError
-from services.alignment.calibration.time_offset import TimeOffset
+from services.alignment.calibration.motion import DegenerateMotionError
+from services.alignment.calibration.time_offset import TimeOffset, checked_signal
 
 # The fall before and the rest after a touch that are fitted.
 BEFORE_S, AFTER_S = 0.15, 0.15
@@ -46,10 +44,12 @@ def estimate_tap_offset(
         InvalidInputError: stamps out of order.
         ShapeError, NonFiniteError: values that do not fit or hold NaN.
     """
-    t_a, pressure = _checked(t_pressure_ns, pressure_kpa, int(t_pressure_ns[0]), "pressure")
-    t_b, height = _checked(t_height_ns, height_m, int(t_pressure_ns[0]), "height")
-    onsets_s, interval_s = _onsets(t_a, pressure, threshold_kpa)
-    pairs = [(onset, _bend_s(t_b, height, onset, max_offset_s)) for onset in onsets_s]
+    start_ns = int(t_pressure_ns[0])
+    pressure, height = np.asarray(pressure_kpa)[..., None], np.asarray(height_m)[..., None]
+    t_a, pressure = checked_signal("tap offset: pressure", t_pressure_ns, pressure, start_ns)
+    t_b, height = checked_signal("tap offset: height", t_height_ns, height, start_ns)
+    onsets_s, interval_s = _onsets(t_a, pressure[:, 0], threshold_kpa)
+    pairs = [(onset, _bend_s(t_b, height[:, 0], onset, max_offset_s)) for onset in onsets_s]
     offsets_s = np.array([onset - bend for onset, bend in pairs if bend is not None])
     if not len(offsets_s):
         raise DegenerateMotionError(
@@ -64,19 +64,6 @@ def estimate_tap_offset(
     # Taps at the glove's own rhythm share their place between samples: never below a half.
     sigma_s = max(spread_s / np.sqrt(len(offsets_s)), least_s / 2)
     return TimeOffset(round(float(offsets_s.mean()) * 1e9), max(1, round(sigma_s * 1e9)))
-
-
-def _checked(
-    t_ns: np.ndarray, values: np.ndarray, reference_ns: int, name: str
-) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, " n"]]:
-    t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(values, dtype=np.float64)
-    if t_ns.ndim != 1 or t_ns.shape != values.shape:
-        raise ShapeError(f"tap offset: {name} has {t_ns.shape} stamps and {values.shape} values")
-    if not np.isfinite(values).all():
-        raise NonFiniteError(f"tap offset: {name} holds NaN or infinity")
-    if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
-        raise InvalidInputError(f"tap offset: stamps of {name} do not increase")
-    return (t_ns - reference_ns) * 1e-9, values
 
 
 def _onsets(t_s: np.ndarray, pressure: np.ndarray, threshold: float) -> tuple[list[float], float]:

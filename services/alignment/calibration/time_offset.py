@@ -14,7 +14,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import butter, sosfiltfilt
 
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
-from services.alignment.calibration.hand_eye import DegenerateMotionError
+from services.alignment.calibration.motion import DegenerateMotionError
 
 CUTOFF_HZ = 8.0
 MIN_OVERLAP_S = 2.0
@@ -57,8 +57,14 @@ def estimate_time_offset(
         InvalidInputError: stamps out of order, or less than two seconds in common.
         ShapeError, NonFiniteError: signals that do not fit or hold NaN.
     """
-    t_a, a = _checked(t_a_ns, signal_a, int(t_a_ns[0]), "a")
-    t_b, b = _checked(t_b_ns, signal_b, int(t_a_ns[0]), "b")
+    t_a, a = checked_signal("time offset: stream a", t_a_ns, signal_a, int(t_a_ns[0]))
+    t_b, b = checked_signal("time offset: stream b", t_b_ns, signal_b, int(t_a_ns[0]))
+    for name, t_s in (("a", t_a), ("b", t_b)):
+        if t_s[-1] - t_s[0] < MIN_OVERLAP_S:
+            raise InvalidInputError(
+                f"time offset: stream {name} lasts {t_s[-1] - t_s[0]:.2f} s, expected "
+                f"{MIN_OVERLAP_S}"
+            )
     if a.shape[1] != b.shape[1]:
         raise ShapeError(f"time offset: got {a.shape[1]} and {b.shape[1]} components")
     step_s = 0.5 * min(float(np.median(np.diff(t_a))), float(np.median(np.diff(t_b))))
@@ -75,26 +81,27 @@ def estimate_time_offset(
     return TimeOffset(round(offset_s * 1e9), max(1, round(sigma_s * 1e9)))
 
 
-def _checked(
-    t_ns: np.ndarray, signal: np.ndarray, reference_ns: int, name: str
+def checked_signal(
+    what: str, t_ns: np.ndarray, signal: np.ndarray, reference_ns: int
 ) -> tuple[Float64[np.ndarray, " n"], Float64[np.ndarray, "n k"]]:
+    """Times of a signal in seconds after a reference, and its values [n] or [n, k] as [n, k].
+
+    Raises:
+        InvalidInputError: fewer than two stamps, or stamps out of order.
+        ShapeError, NonFiniteError: values that do not fit or hold NaN.
+    """
     t_ns, values = np.asarray(t_ns, dtype=np.int64), np.asarray(signal, dtype=np.float64)
     values = values[:, None] if values.ndim == 1 else values
     if values.ndim != 2 or t_ns.shape != values.shape[:1]:
         raise ShapeError(
-            f"time offset: stream {name} has {t_ns.shape} stamps and {values.shape} values, "
-            "expected [n] and [n] or [n, k]"
+            f"{what} has {t_ns.shape} stamps and {values.shape} values, expected [n] and [n] or "
+            "[n, k]"
         )
     if not np.isfinite(values).all():
-        raise NonFiniteError(f"time offset: stream {name} holds NaN or infinity")
+        raise NonFiniteError(f"{what} holds NaN or infinity")
     if len(t_ns) < 2 or (np.diff(t_ns) <= 0).any():
-        raise InvalidInputError(f"time offset: stamps of stream {name} do not increase")
-    t_s = (t_ns - reference_ns) * 1e-9
-    if t_s[-1] - t_s[0] < MIN_OVERLAP_S:
-        raise InvalidInputError(
-            f"time offset: stream {name} lasts {t_s[-1] - t_s[0]:.2f} s, expected {MIN_OVERLAP_S}"
-        )
-    return t_s, values
+        raise InvalidInputError(f"{what}: stamps do not increase")
+    return (t_ns - reference_ns) * 1e-9, values
 
 
 def _low_passed(

@@ -1,13 +1,14 @@
-"""Checks that tracked keypoints are a human hand in metres, in our order of nodes.
+"""Checks that tracked keypoints are the expected human hand in metres, in our order of nodes.
 
 Distances that no posture changes reveal the unit and the order of nodes. Other orders, which
 trackers and their users are known to produce, are compared with the mean hand as well: the best is
-named.
+named. A mirror image keeps all distances; the direction in which fingers curl distinguishes left
+from right.
 """
 
 from functools import lru_cache
 from itertools import combinations, pairwise, permutations, product
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -15,6 +16,7 @@ from jaxtyping import Float64, Int64
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import (
     CHAINS,
+    FINGER_CHAINS,
     KNUCKLE_NODES,
     METACARPAL_NODES,
     NODE_INDEX,
@@ -24,6 +26,7 @@ from dextouch.hands import (
     chain_indices,
     mean_hand_m,
 )
+from dextouch.tactile.layout import Side
 
 # Many samples say no more about a shape than some hundred do.
 MAX_SAMPLES: Final = 300
@@ -43,17 +46,10 @@ MAX_PULL: Final = 5.0
 # at least 0.7, and among all orders the right one was always best.
 MAX_MISFIT: Final = 1.5
 BETTER_ORDER: Final = 0.7
-
-
-class HandShape(NamedTuple):
-    """How a tracked hand compares with the mean hand.
-
-    `size` is its scale (1: the mean adult), `misfit` how far distances of its nodes are off, in
-    spreads between people.
-    """
-
-    size: float
-    misfit: float
+# Mean signed sine between bones of a finger. Stretched fingers may bend back by several degrees, so
+# less than this shows no side.
+MIN_CURL: Final = 0.15
+MIN_THUMB_HEIGHT_M: Final = 0.003
 
 
 def seen_nodes(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
@@ -91,8 +87,8 @@ def _thinned(samples: np.ndarray, most: int) -> np.ndarray:
     return samples[np.linspace(0, len(samples) - 1, min(most, len(samples))).round().astype(int)]
 
 
-def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> HandShape:
-    """Refuse keypoints that are not a human hand in metres, in our order of nodes.
+def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> float:
+    """Size of a hand (1: the mean adult); refuses what is none in metres, in our order of nodes.
 
     Args:
         keypoints_m: [T ≥ 1, 25, 3], any axes, of either hand; NaN where a node is not seen.
@@ -105,15 +101,15 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> Ha
     """
     distances = _median_distances(seen_samples(keypoints_m, where=where))
     sizes, misfits = _compared(distances, _places_of_orders())
-    shape = HandShape(float(sizes[0]), float(misfits[0]))
-    if np.isnan(shape.misfit):
+    size, misfit = float(sizes[0]), float(misfits[0])
+    if np.isnan(misfit):
         raise InvalidInputError(
             f"{where}: got too few nodes that are seen together, expected {MIN_PAIRS} bones or "
             "distances of the palm; record the hand where it is seen",
             fault="unseen",
         )
     best = int(np.nanargmin(misfits))
-    if misfits[best] < min(BETTER_ORDER * shape.misfit, MAX_MISFIT):
+    if misfits[best] < min(BETTER_ORDER * misfit, MAX_MISFIT):
         name = _orders()[best][0]
         raise InvalidInputError(
             f"{where}: got nodes in another order: {name}; expected that of "
@@ -122,28 +118,85 @@ def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> Ha
             fault="node_order",
             found=name,
         )
-    if shape.misfit > MAX_MISFIT:
+    if misfit > MAX_MISFIT:
         raise InvalidInputError(
-            f"{where}: got bones and distances that are off those of a hand by {shape.misfit:.1f} "
+            f"{where}: got bones and distances that are off those of a hand by {misfit:.1f} "
             f"spreads between people, expected at most {MAX_MISFIT}; check unit and order of nodes",
             fault="no_hand",
         )
-    _check_size(shape.size, where)
-    return shape
-
-
-def _check_size(size: float, where: str) -> None:
     low, high = SIZE_RANGE
-    if low <= size <= high:
-        return
-    units = [name for name, factor in UNITS.items() if low <= size / factor <= high]
-    told = f"these look like {units[0]}" if units else "no unit that we know makes it a hand"
-    raise InvalidInputError(
-        f"{where}: got a hand {size:.3g} times as large as an adult's mean hand, expected "
-        f"{low} … {high}: {told}; send metres",
-        fault="unit",
-        found=units[0] if units else None,
-    )
+    if not low <= size <= high:
+        units = [name for name, factor in UNITS.items() if low <= size / factor <= high]
+        told = f"these look like {units[0]}" if units else "no unit that we know makes it a hand"
+        raise InvalidInputError(
+            f"{where}: got a hand {size:.3g} times as large as an adult's mean hand, expected "
+            f"{low} … {high}: {told}; send metres",
+            fault="unit",
+            found=units[0] if units else None,
+        )
+    return size
+
+
+def check_handedness(
+    keypoints_m: np.ndarray, side: Side, *, where: str = "keypoints"
+) -> Side | None:
+    """The side that a hand shows, None where it shows neither; refuses the mirror image.
+
+    Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
+    hand and away from it on a left one. If they hardly bend, the base of the thumb is used, which
+    is on the palm's side of the metacarpals.
+
+    Args:
+        keypoints_m: [T ≥ 1, 25, 3], any axes; NaN where a node is not seen.
+        side: which hand they should be of.
+        where: stream and recording, for the message.
+
+    Raises:
+        InvalidInputError: they are of the other hand.
+        ShapeError: not [T ≥ 1, 25, 3].
+    """
+    samples = seen_samples(keypoints_m, where=where)
+    across = samples[:, KNUCKLE_NODES[0]] - samples[:, KNUCKLE_NODES[-1]]
+    fingers = samples[:, [chain_indices(chain)[1:] for chain in FINGER_CHAINS]]
+    bones = np.diff(fingers, axis=2)
+    lengths = np.linalg.norm(bones, axis=-1)
+    turns = np.cross(bones[:, :, :-1], bones[:, :, 1:])
+    scale = lengths[..., :-1] * lengths[..., 1:] * np.linalg.norm(across, axis=-1)[:, None, None]
+    curl = _mean_ratio(np.einsum("tfjx,tx->tfj", turns, across), scale)
+    found: Side | None = None
+    if abs(curl) >= MIN_CURL:
+        found = "right" if curl > 0 else "left"
+    elif abs(height := _thumb_height_m(samples, across)) >= MIN_THUMB_HEIGHT_M:
+        found = "right" if height > 0 else "left"
+    if found not in (None, side):
+        raise InvalidInputError(
+            f"{where}: got a {found} hand, expected a {side} one (bones curl by {curl:+.2f}, a "
+            "right hand's above zero); are the gloves or their streams swapped, or are the "
+            "tracker's axes left-handed, which mirrors the hand?",
+            fault="side",
+            found=found,
+        )
+    return found
+
+
+def _thumb_height_m(samples: np.ndarray, across: np.ndarray) -> float:
+    """Height of the thumb's base over wrist and knuckles, along a right hand's palm normal.
+
+    At the size of the mean hand.
+    """
+    knuckles = samples[:, KNUCKLE_NODES].mean(axis=1)
+    palm = knuckles - samples[:, WRIST_NODE]
+    normal = np.cross(across, palm)
+    up = np.einsum("tx,tx->t", samples[:, NODE_INDEX["thumb", "metacarpal"]] - knuckles, normal)
+    scale = np.linalg.norm(normal, axis=-1) * np.linalg.norm(palm, axis=-1)
+    return _mean_ratio(up, scale) * float(np.linalg.norm(_MEAN_HAND_M[KNUCKLE_NODES[1]]))
+
+
+def _mean_ratio(values: np.ndarray, scale: np.ndarray) -> float:
+    """Mean of the finite ratios; zero if there are none."""
+    ratios = np.divide(values, scale, out=np.full_like(scale, np.nan), where=scale > 0)
+    known = ratios[np.isfinite(ratios)]
+    return float(known.mean()) if known.size else 0.0
 
 
 def _rigid_pairs() -> Int64[np.ndarray, "pairs 2"]:

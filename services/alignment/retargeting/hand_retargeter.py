@@ -9,28 +9,21 @@ from jaxtyping import Bool, Float64, UInt8
 from dextouch.errors import InvalidInputError, ShapeError
 from dextouch.hands import NUM_KEYPOINTS
 from dextouch.hands.robot_hand import HandModel, RobotHand
-from services.alignment.retargeting.finger_points import checked_keypoints, finger_points
 from services.alignment.retargeting.hand_arrays import hand_arrays, joint_places
 from services.alignment.retargeting.hand_profile import HandProfile
 from services.alignment.retargeting.options import RetargetOptions
 from services.alignment.retargeting.profile_fit import (
+    checked_keypoints,
     measure_profile,
     person_arrays,
     robot_bone_m,
     unknown_person,
 )
 from services.alignment.retargeting.solver import arrays
-from services.alignment.retargeting.solver.arrays import (
-    MAX_JOINTS,
-    SCRATCH,
-    Memory,
-    Output,
-)
+from services.alignment.retargeting.solver.arrays import SCRATCH, Memory, Output
 from services.alignment.retargeting.solver.solve import retarget_samples
 
 NOMINAL_PERIOD_S = arrays.NOMINAL_PERIOD_S
-ALL_TRUSTED = np.ones((1, NUM_KEYPOINTS), dtype=bool)
-IMPLAUSIBLE = arrays.IMPLAUSIBLE
 
 
 class RetargetStatus(IntEnum):
@@ -99,8 +92,7 @@ class HandRetargeter:
         self._arrays = hand_arrays(self.hand)
         self._is_joint = joint_places(self.hand)
         self._tuning = self.options.tuning()
-        self._live = self._tuning.copy()
-        self._live["is_live"] = True
+        self._live = self.options.tuning(is_live=True)
         self._person = self._person_of(profile)
         self._memory = self._blank()
         self._was_sent = False
@@ -136,7 +128,6 @@ class HandRetargeter:
     def step(
         self,
         keypoints_m: np.ndarray,
-        valid: np.ndarray | None = None,
         elapsed_s: float = NOMINAL_PERIOD_S,
     ) -> RetargetResult:
         """Joint angles of the next sample, live; fingers that are not tracked hold their angles.
@@ -148,14 +139,13 @@ class HandRetargeter:
 
         Args:
             keypoints_m: [25, 3], metres, wrist axes; NaN marks a missing node.
-            valid: bool [25], validity reported by the tracker; None trusts every finite node.
             elapsed_s: since the sample before.
 
         Returns:
             A result of one sample (T = 1).
 
         Raises:
-            ShapeError: wrong shapes.
+            ShapeError: wrong shape.
             InvalidInputError: elapsed time not positive and finite.
         """
         keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
@@ -163,26 +153,21 @@ class HandRetargeter:
             raise ShapeError(f"keypoints: got shape {keypoints.shape}, expected [25, 3]")
         if not 0 < elapsed_s < np.inf:
             raise InvalidInputError(f"elapsed_s: got {elapsed_s}, expected a positive time")
-        trusted = ALL_TRUSTED
-        if valid is not None:
-            trusted = _trusted(keypoints[None], np.asarray(valid)[None])
         self._elapsed_s[0] = elapsed_s
         tuning = self._live if self._was_sent else self._tuning
         self._was_sent = True
         tables = (self._arrays, self._person, tuning, self._scratch)
-        return self._follow(tables, (keypoints[None], trusted, self._elapsed_s), self._memory)
+        return self._follow(tables, (keypoints[None], self._elapsed_s), self._memory)
 
     def retarget(
         self,
         keypoints_m: np.ndarray,
-        valid: np.ndarray | None = None,
         t_s: np.ndarray | None = None,
     ) -> RetargetResult:
         """Joint angles of a whole recording; untracked stretches are interpolated in time.
 
         Args:
             keypoints_m: [T, 25, 3], metres, wrist axes; NaN marks a missing node.
-            valid: bool [T, 25], validity reported by the tracker; None trusts every finite node.
             t_s: [T] rising times, relative to any moment; None takes 60 Hz.
 
         Raises:
@@ -191,18 +176,15 @@ class HandRetargeter:
                 in any sample.
         """
         keypoints = checked_keypoints(keypoints_m)
-        trusted = _trusted(keypoints, valid)
         elapsed_s = _elapsed_s(len(keypoints), t_s)
         person = self._person
         if self.profile is None:
-            person = self._person_of(measure_profile(finger_points(keypoints, valid), self.hand))
+            person = self._person_of(measure_profile(keypoints, self.hand))
         # Of slow trackers, not every sample is a loss.
-        tuning = self._tuning.copy()
-        tuning["reacquire_after_s"] = max(
-            self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s))
-        )
+        lost_s = max(self.options.reacquire_after_s, 1.5 * float(np.median(elapsed_s)))
+        tuning = replace(self.options, reacquire_after_s=lost_s).tuning()
         tables = (self._arrays, person, tuning, np.zeros(1, dtype=SCRATCH))
-        result = self._follow(tables, (keypoints, trusted, elapsed_s), self._blank())
+        result = self._follow(tables, (keypoints, elapsed_s), self._blank())
         never = np.asarray(~result.solved.any(axis=0))
         if never.any():
             names = ", ".join(
@@ -215,18 +197,17 @@ class HandRetargeter:
             )
         return replace(result, joints_rad=self._fill(result, np.cumsum(elapsed_s)))
 
-    def measure(self, keypoints_m: np.ndarray, valid: np.ndarray | None = None) -> HandProfile:
+    def measure(self, keypoints_m: np.ndarray) -> HandProfile:
         """Measure the profile of a person from calibration samples.
 
         Args:
             keypoints_m: [T, 25, 3] of an open, closing and spreading hand.
-            valid: bool [T, 25].
 
         Raises:
-            ShapeError: wrong shapes.
+            ShapeError: wrong shape.
             InvalidInputError: wrong unit, or a finger that is complete in no sample.
         """
-        return measure_profile(finger_points(keypoints_m, valid), self.hand)
+        return measure_profile(keypoints_m, self.hand)
 
     def _person_of(self, profile: HandProfile | None) -> np.ndarray:
         if profile is None:
@@ -235,10 +216,7 @@ class HandRetargeter:
 
     def _blank(self) -> Memory:
         rest = np.clip(0.0, self._arrays["lower_rad"][0], self._arrays["upper_rad"][0])
-        num = len(self.hand.fingers)
-        return Memory(
-            rest[:num], rest[:num].copy(), np.full(num, np.inf), np.zeros(num, dtype=np.uint8)
-        )
+        return Memory.starting_at(rest[: len(self.hand.fingers)])
 
     def _follow(
         self,
@@ -246,20 +224,14 @@ class HandRetargeter:
         samples: tuple[np.ndarray, ...],
         memory: Memory,
     ) -> RetargetResult:
-        num, num_fingers = len(samples[0]), len(self.hand.fingers)
-        output = Output(
-            joints_rad=np.empty((num, num_fingers, MAX_JOINTS)),
-            finger_status=np.empty((num, num_fingers), dtype=np.uint8),
-            status=np.empty(num, dtype=np.uint8),
-            tip_error_m=np.empty((num, num_fingers)),
-        )
+        output = Output.of(len(samples[0]), len(self.hand.fingers))
         retarget_samples(tables, samples, memory, output)
         return RetargetResult(
             joints_rad=output.joints_rad[:, self._is_joint],
             status=output.status,
             finger_status=output.finger_status,
             tip_error_m=output.tip_error_m,
-            solved=output.finger_status < IMPLAUSIBLE,
+            solved=output.finger_status < arrays.IMPLAUSIBLE,
         )
 
     def _fill(self, result: RetargetResult, t_s: np.ndarray) -> Float64[np.ndarray, "time joints"]:
@@ -282,16 +254,6 @@ def warm_up() -> None:
     """Compile the solver, or load it from numba's cache: seconds once a machine, then a moment."""
     keypoints = np.full((1, NUM_KEYPOINTS, 3), np.nan)
     HandRetargeter("right").step(keypoints[0])
-
-
-def _trusted(keypoints_m: np.ndarray, valid: np.ndarray | None) -> Bool[np.ndarray, "time 25"]:
-    if valid is None:
-        return np.ones(keypoints_m.shape[:2], dtype=bool)
-    if np.shape(valid) != keypoints_m.shape[:2]:
-        raise ShapeError(
-            f"keypoints: got valid {np.shape(valid)}, expected {keypoints_m.shape[:2]}"
-        )
-    return np.ascontiguousarray(valid, dtype=bool)
 
 
 def _elapsed_s(num_samples: int, t_s: np.ndarray | None) -> Float64[np.ndarray, " time"]:

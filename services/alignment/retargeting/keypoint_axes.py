@@ -5,8 +5,7 @@ never turned by guess: only a calibration rotates them, and the result is checke
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -24,21 +23,15 @@ from services.alignment.retargeting.wrist_frame import WristFrame, wrist_frame
 MAX_OFF_RAD: Final = float(np.deg2rad(20.0))
 
 
-@dataclass(frozen=True)
-class KeypointAxes:
-    """Keypoints in wrist axes, with the facts of their conversion.
+class KeypointAxes(NamedTuple):
+    """Keypoints in wrist axes, and the palm's pose in them.
 
     Attributes:
-        keypoints_m: [T, 25, 3] in wrist axes (fingers along -z, thumb side +x), metres; not
-            finite where a node was not seen.
-        is_calibrated: whether the recording's calibration turned them; else they came so.
-        off_rad: how far the palm, compared with the mean one, still is from wrist axes.
-        frame: orientation of the palm after the rotation: size, sigma, turns of single samples.
+        keypoints_m: [T, 25, 3], metres; not finite where a node was not seen.
+        frame: of the palm, compared with the mean one: size, sigma, turns of single samples.
     """
 
     keypoints_m: Float64[np.ndarray, "time 25 3"]
-    is_calibrated: bool
-    off_rad: float
     frame: WristFrame
 
 
@@ -106,7 +99,7 @@ def hand_axes_check(
     off_rad = float(rotation_angle(R_wrist_palm))
     if off_rad > MAX_OFF_RAD:
         _refuse_axes(R_wrist_palm, off_rad, side, is_calibrated=T_keypoints_wrist is not None)
-    return KeypointAxes(keypoints, T_keypoints_wrist is not None, off_rad, frame)
+    return KeypointAxes(keypoints, frame)
 
 
 def _refuse_axes(R: np.ndarray, off_rad: float, side: Side, *, is_calibrated: bool) -> None:

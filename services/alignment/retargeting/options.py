@@ -1,12 +1,12 @@
 """Options of retargeting: weights, limits and thresholds of the solver."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 
 from dextouch.errors import InvalidInputError
 from services.alignment.retargeting.hand_arrays import STARTS
-from services.alignment.retargeting.solver.arrays import TUNING
+from services.alignment.retargeting.solver.arrays import PINCH_WEIGHT_FAR
 
 
 @dataclass(frozen=True)
@@ -63,27 +63,16 @@ class RetargetOptions:
         if wrong:
             raise InvalidInputError(f"retargeting options: got {', '.join(wrong)}")
 
-    def tuning(self) -> np.ndarray:
-        """The numbers that the compiled solver reads: one record `TUNING`, shape [1]."""
-        record = np.zeros(1, dtype=TUNING)
-        record["temporal_weight_m2"] = self.temporal_weight_m2
-        record["velocity_limit_rad_s"] = self.velocity_limit_rad_s
-        record["max_step_rad"] = self.max_step_rad
-        record["pinch_near_m"] = self.pinch_near_m
-        record["pinch_far_m"] = self.pinch_far_m
-        record["pinch_weight_near"] = self.pinch_weight
-        record["pinch_weight_far"] = PINCH_WEIGHT_FAR
-        record["posture_weight_m2"] = self.posture_weight_m2
-        record["reacquire_after_s"] = self.reacquire_after_s
-        record["num_starts"] = self.num_starts
-        record["max_bend_cosine"] = MAX_BEND_COSINE
-        record["keeps_fingers_apart"] = self.keeps_fingers_apart
-        return record
+    def tuning(self, *, is_live: bool = False) -> np.ndarray:
+        """The options as the record, shape [1], that the compiled solver reads.
+
+        Args:
+            is_live: every output is sent to motors, so no joint goes further than `max_step_rad`.
+        """
+        types = [(field.name, field.type) for field in fields(self)]
+        return np.array([(*astuple(self), is_live)], dtype=[*types, ("is_live", bool)])
 
 
-PINCH_WEIGHT_FAR = 1e-3
 # Beyond, products of weights and distances drown what the points say.
 MAX_WEIGHT = 1e6
 LEAST = 1e-6
-# Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
-MAX_BEND_COSINE = -0.766

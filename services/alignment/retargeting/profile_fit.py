@@ -3,10 +3,9 @@
 import numpy as np
 from jaxtyping import Float64
 
-from dextouch.errors import InvalidInputError
-from dextouch.hands import CHAINS
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.hands import CHAINS, NUM_KEYPOINTS, solver_indices
 from dextouch.hands.robot_hand import HandModel
-from services.alignment.retargeting.finger_points import FingerPoints
 from services.alignment.retargeting.hand_arrays import (
     hand_arrays,
     joint_places,
@@ -29,6 +28,7 @@ from services.alignment.retargeting.solver.arrays import (
 )
 from services.alignment.retargeting.solver.solve import retarget_samples
 
+_NODES = np.array([solver_indices(chain) for chain in CHAINS])
 # Samples that are looked at, spread over the recording: 240 know a bone to a tenth of the noise.
 NUM_SAMPLES = 240
 # Below this a tracker's noise makes no difference, and ratios of zeros would come up (metres).
@@ -107,21 +107,36 @@ def robot_bone_m(hand: HandModel) -> Float64[np.ndarray, "fingers 3"]:
     return np.asarray(np.linalg.norm(np.diff(zero_points_m(hand), axis=1), axis=-1))
 
 
-def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
+def checked_keypoints(keypoints_m: np.ndarray) -> Float64[np.ndarray, "time 25 3"]:
+    """The keypoints as contiguous float64.
+
+    Raises:
+        ShapeError: not [T ≥ 1, 25, 3].
+    """
+    keypoints = np.ascontiguousarray(keypoints_m, dtype=np.float64)
+    if keypoints.ndim != 3 or keypoints.shape[1:] != (NUM_KEYPOINTS, 3) or not len(keypoints):
+        raise ShapeError(f"keypoints: got shape {keypoints.shape}, expected [T ≥ 1, 25, 3]")
+    return keypoints
+
+
+def measure_profile(keypoints_m: np.ndarray, hand: HandModel) -> HandProfile:
     """Medians of bones and knuckles, and how the knuckles travel when fingers bend.
 
     Args:
-        points: any samples of the hand; those with whole fingers count.
+        keypoints_m: [T, 25, 3] any samples of the hand; those with whole fingers count.
         hand: the robot hand of the same side, whose axes define how far fingers are bent.
 
     Raises:
+        ShapeError: wrong shape.
         InvalidInputError: a finger is complete in no sample, or its bone lengths are invalid (unit,
             order).
     """
-    whole = np.asarray(points.usable.all(axis=-1))
+    # Knuckle, PIP, DIP and tip of thumb … little (of the thumb: CMC, MCP, IP, tip).
+    points_m = checked_keypoints(keypoints_m)[:, _NODES]
+    whole = np.asarray(np.isfinite(points_m).all(axis=(-1, -2)))
     _check_seen(whole, hand.side)
-    lengths = np.linalg.norm(np.diff(points.points_m, axis=2), axis=-1)
-    lengths = np.where(whole[..., None], lengths, np.nan)
+    points_m[~whole] = np.nan
+    lengths = np.linalg.norm(np.diff(points_m, axis=2), axis=-1)
     index_finger = CHAINS.index("index")
     check_bone_unit(float(np.nanmedian(lengths[:, index_finger, 0])), where="keypoints")
     low, high = BONE_RANGE_M
@@ -132,7 +147,7 @@ def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
     # The length of a bone has the noise of two points along it.
     point_sigma_m = float(np.median(spread_m) / np.sqrt(2))
     rows = _spread(np.flatnonzero(whole.any(axis=1)))
-    moved_m = _knuckle_motion(points.points_m[rows], whole[rows], hand)
+    moved_m = _knuckle_motion(points_m[rows], hand)
     usable = whole[rows] & np.isfinite(moved_m).all(axis=-1)
     knuckle_m, travel, sigma_m = np.zeros((NUM_FINGERS, 3)), np.zeros(5), np.zeros(5)
     for finger in range(NUM_FINGERS):
@@ -140,7 +155,7 @@ def measure_profile(points: FingerPoints, hand: HandModel) -> HandProfile:
         if not kept.any():
             kept = whole[rows, finger]
         knuckle_m[finger], travel[finger], left_m = _fit_knuckle(
-            points.points_m[rows][kept, finger, 0], moved_m[kept, finger]
+            points_m[rows][kept, finger, 0], moved_m[kept, finger]
         )
         least_m = max(LEAST_KNUCKLE_SIGMA_M, LEAST_SIGMA_SHARE * point_sigma_m)
         sigma_m[finger] = max(np.sqrt(max(left_m**2 - point_sigma_m**2, 0.0)), least_m)
@@ -163,21 +178,12 @@ def _spread(rows: np.ndarray) -> np.ndarray:
     return np.asarray(rows[chosen])
 
 
-def _knuckle_motion(
-    points_m: np.ndarray, whole: np.ndarray, hand: HandModel
-) -> Float64[np.ndarray, "n 5 3"]:
+def _knuckle_motion(points_m: np.ndarray, hand: HandModel) -> Float64[np.ndarray, "n 5 3"]:
     """Knuckles of the robot when its fingers point like the tracked ones; NaN if unknown."""
-    # The solver takes keypoints by their number: here there are just the fingers' own, in turn.
-    own, rows = hand_arrays(hand), chains_of(hand)
-    nodes = own["nodes"][0, : len(rows)]
-    nodes[:] = np.where(nodes >= 0, np.arange(20).reshape(5, 4)[rows], -1)
-    num = len(points_m)
-    output = Output(
-        joints_rad=np.zeros((num, len(rows), MAX_JOINTS)),
-        finger_status=np.zeros((num, len(rows)), dtype=np.uint8),
-        status=np.zeros(num, dtype=np.uint8),
-        tip_error_m=np.zeros((num, len(rows))),
-    )
+    own, rows, num = hand_arrays(hand), chains_of(hand), len(points_m)
+    keypoints = np.full((num, NUM_KEYPOINTS, 3), np.nan)
+    keypoints[:, _NODES] = points_m
+    output = Output.of(num, len(rows))
     retarget_samples(
         (
             own,
@@ -185,13 +191,8 @@ def _knuckle_motion(
             EVERY_SAMPLE_ALONE.tuning(),
             np.zeros(1, dtype=SCRATCH),
         ),
-        (points_m.reshape(num, 20, 3), np.repeat(whole, 4, axis=1), np.full(num, np.inf)),
-        Memory(
-            np.zeros((len(rows), MAX_JOINTS)),
-            np.zeros((len(rows), MAX_JOINTS)),
-            np.full(len(rows), np.inf),
-            np.zeros(len(rows), dtype=np.uint8),
-        ),
+        (keypoints, np.full(num, np.inf)),
+        Memory.starting_at(np.zeros((len(rows), MAX_JOINTS))),
         output,
     )
     is_joint = joint_places(hand)

@@ -19,10 +19,10 @@ from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import (
     MIN_PALM_NODES,
     check_hand_shape,
+    check_handedness,
     seen_nodes,
     seen_samples,
 )
-from services.alignment.retargeting.hand_side import check_handedness
 
 # Part of the samples in which a node must be seen to count.
 MIN_SEEN_PART: Final = 0.1

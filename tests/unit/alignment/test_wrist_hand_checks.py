@@ -14,8 +14,7 @@ from dextouch.hands import (
     chain_indices,
     mean_hand_m,
 )
-from services.alignment.retargeting.hand_checks import check_hand_shape
-from services.alignment.retargeting.hand_side import check_handedness
+from services.alignment.retargeting.hand_checks import check_hand_shape, check_handedness
 from services.twin.hands import HumanHand
 from tests.unit.alignment.tracked_hands import (
     any_rotation,
@@ -55,9 +54,8 @@ def test_hands_of_people_are_taken(side, make):
     for seed in range(12):
         for noise_m in (1e-3, 3e-3):
             keypoints = tracked(side, seed, make=make, noise_m=noise_m)
-            shape = check_hand_shape(keypoints)
-            assert 0.6 < shape.size < 1.4
-            assert check_handedness(keypoints, side).side in (side, None)
+            assert 0.6 < check_hand_shape(keypoints) < 1.4
+            assert check_handedness(keypoints, side) in (side, None)
             # As a tracker of 21 nodes sees it.
             keypoints[:, METACARPAL_NODES] = np.nan
             check_hand_shape(keypoints)
@@ -146,7 +144,7 @@ def test_the_other_hand_is_recognised_and_named(side, make):
     num_found = 0
     for seed in range(20):
         keypoints = tracked(side, seed, make=make)
-        found = check_handedness(keypoints, side).side
+        found = check_handedness(keypoints, side)
         if make is moving_hand:
             assert found == side
         if found is None:
@@ -166,7 +164,7 @@ def test_a_flat_hand_without_thumb_shows_no_side():
     keypoints = tracked("left", 3, make=flat_hand)
     keypoints[:, NODE_INDEX["thumb", "metacarpal"]] = np.nan
     for side in SIDES:
-        assert check_handedness(keypoints, side).side is None
+        assert check_handedness(keypoints, side) is None
 
 
 def test_what_is_no_hand_is_refused():

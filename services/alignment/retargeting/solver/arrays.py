@@ -13,6 +13,8 @@ NUM_POINTS: Final = 4
 MAX_STARTS: Final = 8
 # The rate at which `temporal_weight_m2` is stated.
 NOMINAL_PERIOD_S: Final = 1 / 60
+# Of a pinch that begins.
+PINCH_WEIGHT_FAR: Final = 1e-3
 
 # What became of a finger in a sample; see `RetargetStatus`.
 SOLVED, PARTIAL, REACQUIRED, UNCONVERGED, IMPLAUSIBLE, MISSING = range(6)
@@ -69,26 +71,6 @@ PERSON: Final = np.dtype(
         # Further off, bones and knuckles are not this person's.
         ("bone_tolerance_m", np.float64, (_F, 3)),
         ("knuckle_tolerance_m", np.float64, (_F,)),
-    ]
-)
-
-# `RetargetOptions` as numbers.
-TUNING: Final = np.dtype(
-    [
-        ("temporal_weight_m2", np.float64),
-        ("velocity_limit_rad_s", np.float64),
-        # Live, every output is sent to motors: a joint goes no further from one to the next.
-        ("is_live", np.bool_),
-        ("max_step_rad", np.float64),
-        ("pinch_near_m", np.float64),
-        ("pinch_far_m", np.float64),
-        ("pinch_weight_near", np.float64),
-        ("pinch_weight_far", np.float64),
-        ("posture_weight_m2", np.float64),
-        ("reacquire_after_s", np.float64),
-        ("num_starts", np.int64),
-        ("max_bend_cosine", np.float64),
-        ("keeps_fingers_apart", np.bool_),
     ]
 )
 
@@ -157,11 +139,29 @@ class Memory(NamedTuple):
     unsolved_s: np.ndarray
     is_behind: np.ndarray
 
+    @staticmethod
+    def starting_at(joints_rad: np.ndarray) -> "Memory":
+        """Before the first sample."""
+        num = len(joints_rad)
+        unsolved_s, is_behind = np.full(num, np.inf), np.zeros(num, dtype=np.uint8)
+        return Memory(joints_rad, joints_rad.copy(), unsolved_s, is_behind)
+
 
 class Output(NamedTuple):
-    """Results: angles [T, 5, 6], status [T, 5] and of the sample [T], tip error [T, 5]."""
+    """Results: angles [T, F, 6], status [T, F] and of the sample [T], tip error [T, F]."""
 
     joints_rad: np.ndarray
     finger_status: np.ndarray
     status: np.ndarray
     tip_error_m: np.ndarray
+
+    @staticmethod
+    def of(num_samples: int, num_fingers: int) -> "Output":
+        """Room for the results of so many samples."""
+        shape = num_samples, num_fingers
+        return Output(
+            joints_rad=np.zeros((*shape, MAX_JOINTS)),
+            finger_status=np.zeros(shape, dtype=np.uint8),
+            status=np.zeros(num_samples, dtype=np.uint8),
+            tip_error_m=np.zeros(shape),
+        )

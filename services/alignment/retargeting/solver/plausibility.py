@@ -9,23 +9,25 @@ from services.alignment.retargeting.solver.arrays import (
     MISSING,
     NUM_POINTS,
     PARTIAL,
+    PINCH_WEIGHT_FAR,
     SOLVED,
 )
 from services.alignment.retargeting.solver.compiled import compiled
 from services.alignment.retargeting.solver.points import place_joints
 
+# Two bones bent by more than 140° are an error of the tracker: hands and robot stop at 120°.
+MAX_BEND_COSINE = -0.766
+
 
 @compiled
 @no_type_check
-def read_sample(hand, work, keypoints, valid):
+def read_sample(hand, work, keypoints):
     """The points of every finger into the scratch; a missing one is zero."""
     for finger in range(hand.num_fingers):
         for index in range(NUM_POINTS):
             node = hand.nodes[finger, index]
             x, y, z = keypoints[node, 0], keypoints[node, 1], keypoints[node, 2]
-            seen = (
-                node >= 0 and valid[node] and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
-            )
+            seen = node >= 0 and np.isfinite(x) and np.isfinite(y) and np.isfinite(z)
             work.usable[finger, index] = seen
             point = work.measured[finger, index]
             point[0] = x if seen else 0.0
@@ -78,7 +80,7 @@ def check_finger(hand, person, tuning, work, finger, memory):
         cosine = 0.0
         for k in range(3):
             cosine += bones[bone, k] * bones[bone + 1, k]
-        if cosine < tuning.max_bend_cosine:
+        if cosine < MAX_BEND_COSINE:
             return IMPLAUSIBLE
     if person.is_known and usable[0]:
         error_m = knuckle_error_m(hand, person, tuning, work, finger, memory)
@@ -132,7 +134,7 @@ def find_pinches(hand, tuning, work, status):
             continue
         apart = max(gap - tuning.pinch_near_m, 0.0) / (tuning.pinch_far_m - tuning.pinch_near_m)
         work.pinch_weight[finger] = (
-            tuning.pinch_weight_near * (tuning.pinch_weight_far / tuning.pinch_weight_near) ** apart
+            tuning.pinch_weight * (PINCH_WEIGHT_FAR / tuning.pinch_weight) ** apart
         )
         work.members[count] = finger
         work.is_near[finger] = work.is_near[thumb] = 1

@@ -189,19 +189,19 @@ def retarget_samples(tables, samples, memory, output):
 
     Args:
         tables: (hand, person, tuning, scratch), records of one element each.
-        samples: (keypoints [T, K, 3] m in wrist axes, NaN or infinite where missing; valid bool
-            [T, K]; elapsed_s [T], since the sample before).
+        samples: (keypoints [T, K, 3] m in wrist axes, NaN or infinite where missing; elapsed_s
+            [T], since the sample before).
         memory: `Memory`, of the sample before the first; afterwards of the last.
         output: `Output`, filled.
     """
-    keypoints, valid, elapsed_s = samples
+    keypoints, elapsed_s = samples
     hand, person, tuning, work = tables[0][0], tables[1][0], tables[2][0], tables[3][0]
     num_fingers = hand.num_fingers
     joints = memory.joints_rad
     for t in range(len(keypoints)):
         status = output.finger_status[t]
         found = (status, output.tip_error_m[t])
-        read_sample(hand, work, keypoints[t], valid[t])
+        read_sample(hand, work, keypoints[t])
         work.elapsed_s = elapsed_s[t]
         for finger in range(num_fingers):
             for joint in range(hand.num_joints[finger]):
