@@ -20,15 +20,15 @@ from dextouch.schemas import ClockReport, EpisodeAttributes, StoredAnchor
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
-from services.alignment.synchronization.episode_streams import cut_stream, made_stream
+from services.alignment.synchronization.episode_streams import EpisodeStream, cut_stream
 from services.alignment.synchronization.grid_actions import (
     REQUIRED,
     GriddedStreams,
     make_actions,
     place_streams,
 )
-from services.alignment.synchronization.progress import STAGES
-from services.alignment.synchronization.recorded_streams import DatedStream, date_stream
+from services.alignment.synchronization.progress import STAGE_BEGINS
+from services.alignment.synchronization.recorded_streams import Block, DatedStream, date_stream
 from services.alignment.synchronization.resampling import grid_times_ns
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 from services.cli.demo.recording import measure
@@ -119,7 +119,7 @@ def _run(recorded: RecordedTake, method: str, folder: Path, round_index: int) ->
     end_s, wall_s = time.process_time(), time.perf_counter() - wall_s
     # After the alignment, when the same files were just read.
     fits_s = _clock_fits_s(store.recording(recording_id))
-    edges = [begin_s, *(marks[stage] for stage in STAGES[1:]), end_s]
+    edges = [begin_s, *(marks[stage] for stage in list(STAGE_BEGINS)[1:]), end_s]
     dating_s, *others_s = np.diff(edges).tolist()
     times = [storing_s, fits_s if method == OURS else 0.0, max(dating_s - fits_s, 0.0), *others_s]
     errors = {} if round_index else _errors(store, recorded, episode_id)
@@ -178,11 +178,11 @@ def align_by_arrivals(
         nominal_rate_hz=OPTIONS.model_rate_hz,
     )
     last_ns = int(gridded.grid_ns[-1])
-    made = [made_stream(action, gridded.grid_ns, actions.measured)]
+    made = EpisodeStream(action, iter([Block(gridded.grid_ns, actions.measured)]))
     with store.writer(kind="episode", attributes=attributes) as writer:
-        for stream in (*made, *(cut_stream(one, start_ns, last_ns) for one in streams.values())):
+        for stream in (made, *(cut_stream(one, start_ns, last_ns) for one in streams.values())):
             writer.add_stream(stream.descriptor)
-            for block in stream.blocks():
+            for block in stream.blocks:
                 writer.append(stream.descriptor.name, values=block.values, t_ref_ns=block.t_ns)
     return attributes.episode_id
 
@@ -192,7 +192,7 @@ def _by_arrival(stream: DatedStream) -> DatedStream:
     arrival_ns = stream.recording.stamps(stream.name).t_host_ns
     kept = first_arrivals(arrival_ns)
     report = ClockReport(stream=stream.name, method="arrival", num_samples=len(kept))
-    return replace(stream, timing=TimedStream(kept, arrival_ns[kept], report, 0, "arrival"))
+    return replace(stream, timing=TimedStream(kept, arrival_ns[kept], report))
 
 
 def first_arrivals(arrival_ns: Int64[np.ndarray, " n"]) -> Int64[np.ndarray, " k"]:

@@ -11,11 +11,10 @@ import numpy as np
 from benchmarks.calibration.rivals import METHODS, Method
 from benchmarks.figures import Figure
 from benchmarks.rounds import interleaved
-from benchmarks.simulated.board_scenes import Scene
+from benchmarks.simulated.board_scenes import Scene, mount_difference
 from benchmarks.stages import Bar
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import invert
-from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.twists import twist
 
 

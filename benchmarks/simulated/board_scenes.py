@@ -7,7 +7,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import LimitExceededError
 from dextouch.geometry import invert, transform
-from dextouch.geometry.rotations import rotation_from_vector
+from dextouch.geometry.rotations import rotation_angle, rotation_from_vector
 from services.alignment.calibration.board_detection import CHESSBOARD, FoundBoards
 from services.alignment.calibration.board_views import BoardViews, project
 from services.alignment.calibration.twists import move
@@ -121,6 +121,14 @@ def simulated_boards(seed: int, num_views: int) -> FoundBoards:
         num_views,
         CHESSBOARD,
     )
+
+
+def mount_difference(
+    T_tracker_camera_a: np.ndarray, T_tracker_camera_b: np.ndarray
+) -> tuple[float, float]:
+    """Angle (rad) and distance (m) between two mounts."""
+    T_a_b = invert(T_tracker_camera_a) @ T_tracker_camera_b
+    return float(rotation_angle(T_a_b[:3, :3])), float(np.linalg.norm(T_a_b[:3, 3]))
 
 
 def _seen_boards(rng: np.random.Generator, motion: Motion) -> tuple[np.ndarray, np.ndarray]:

@@ -9,6 +9,7 @@ from benchmarks.simulated.board_scenes import (
     Motion,
     Scene,
     make_scene,
+    mount_difference,
     simulated_boards,
 )
 from benchmarks.stress.cells import Check, StageCells
@@ -17,7 +18,6 @@ from dextouch.geometry import transform
 from dextouch.geometry.rotations import rotation_from_vector
 from services.alignment.calibration.hand_eye import (
     HandEyeNoise,
-    mount_difference,
     solve_hand_eye,
 )
 from services.alignment.calibration.intrinsics import calibrate_found

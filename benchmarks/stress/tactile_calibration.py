@@ -6,7 +6,7 @@ from benchmarks.stress.cells import Check, StageCells
 from dextouch.errors import NonFiniteError
 from dextouch.tactile import pad_forces_n
 from dextouch.tactile.layout import NUM_TAXELS, raw_indices
-from services.alignment.calibration.tactile_baseline import TactileCalibration
+from services.alignment.calibration.tactile_baseline import TactileCalibration, TaxelSurvey
 from services.alignment.calibration.tactile_faults import SATURATED, STATES
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain
 from services.alignment.calibration.tactile_tare import TaxelTare, measure_tare
@@ -41,7 +41,9 @@ def _non_finite(check: Check) -> None:
     counts = _take(10.0)
     counts[:, _CELLS[3]] = np.nan
     found = _calibration(np.full(360, _GAIN))
-    refused = found.refused_taxels(counts)
+    survey = TaxelSurvey(found)
+    survey.add(counts)
+    refused = survey.refused()
     kpa = found.to_kpa(counts, refused=refused)
     check.true("an absent taxel is named and zero", refused[3] > 0 and not kpa[:, 3].any())
     check.finite("pressures", kpa)

@@ -1,7 +1,6 @@
 """Command line of `dextouch align`: align recordings, report on them, retarget other hands."""
 
 import argparse
-import math
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -20,9 +19,10 @@ from dextouch.serving import load_settings
 from services.alignment.batch import OnRecordingProgress, Outcome, align_batch, not_aligned
 from services.alignment.jobs import episode_id_of
 from services.alignment.options import AlignmentOptions
-from services.alignment.other_hand import SOLVED, retarget_other_hand
+from services.alignment.other_hand import retarget_other_hand, save_motion
 from services.alignment.report import AlignmentReport, report_of
 from services.alignment.report_page import report_line, report_page
+from services.alignment.retargeting import RetargetStatus
 from services.alignment.settings import AlignmentSettings, usable_cores
 from services.alignment.synchronization.progress import Progress
 
@@ -188,22 +188,22 @@ def _report(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
 def _retarget(parsed: argparse.Namespace, settings: AlignmentSettings) -> int:
     hand = load_hand(parsed.model, parsed.mapping)
     episode = find_episode(EpisodeStore(parsed.store), parsed.id, settings.options)
-    motion = retarget_other_hand(episode, hand)
-    motion.save(parsed.to)
-    tip_error_mm = float(motion.tip_error_m[motion.status == SOLVED].mean() * 1e3)
+    t_ref_ns, motion = retarget_other_hand(episode, hand)
+    save_motion(parsed.to, hand, t_ref_ns, motion)
+    solved = motion.status == RetargetStatus.SOLVED
     facts = {
         "episode_id": episode.attributes.episode_id,
-        "side": motion.side,
-        "num_samples": len(motion.t_ref_ns),
-        "joint_names": list(motion.joint_names),
-        "share_solved": motion.share_solved,
-        "tip_error_mm": tip_error_mm if math.isfinite(tip_error_mm) else None,
+        "side": hand.side,
+        "num_samples": len(solved),
+        "joint_names": list(hand.joint_names),
+        "share_solved": float(solved.mean()),
+        "tip_error_mm": float(motion.tip_error_m[solved].mean() * 1e3) if solved.any() else None,
         "path": str(parsed.to),
     }
     write_result(parsed.json, facts)
     print(
-        f"{parsed.to}: {len(motion.joint_names)} joints of the {motion.side} hand in "
-        f"{len(motion.t_ref_ns)} samples, {motion.share_solved:.1%} solved"
+        f"{parsed.to}: {len(hand.joint_names)} joints of the {hand.side} hand in "
+        f"{len(solved)} samples, {solved.mean():.1%} solved"
     )
     return 0
 

@@ -133,7 +133,7 @@ def _write_streams(writer: EpisodeWriter, episode: BuiltEpisode, on_progress: On
     num_streams = len(episode.streams)
     for number, stream in enumerate(episode.streams):
         name, announced = stream.descriptor.name, False
-        for block in stream.blocks():
+        for block in stream.blocks:
             if not announced:
                 writer.add_stream(stream.descriptor)
                 announced = True

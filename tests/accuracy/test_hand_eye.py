@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from benchmarks.simulated import board_scenes as scenes
-from benchmarks.simulated.board_scenes import Motion
+from benchmarks.simulated.board_scenes import Motion, mount_difference
 from dextouch.errors import InvalidInputError, NonFiniteError
 from dextouch.geometry import invert, transform
 from services.alignment.calibration.closed_form import park
 from services.alignment.calibration.hand_eye import (
     HandEyeNoise,
-    mount_difference,
     solve_hand_eye,
 )
 from services.alignment.calibration.motion import DegenerateMotionError

@@ -20,7 +20,7 @@ from services.alignment.calibration.board_detection import (
     FoundBoards,
     find_boards,
 )
-from services.alignment.calibration.intrinsics import calibrate_camera, calibrate_found
+from services.alignment.calibration.intrinsics import calibrate_found
 from services.alignment.calibration.motion import DegenerateMotionError
 
 PHOTOS = Path(__file__).parents[3] / "shared/data/camera_chessboard"
@@ -60,7 +60,7 @@ def render(rng, *, tilt_rad):
 
 def test_rendered_camera_is_found_within_its_sigmas(capsys):
     rng = np.random.default_rng(2)
-    found = calibrate_camera([render(rng, tilt_rad=0.6) for _ in range(14)], BOARD)
+    found = calibrate_found(find_boards([render(rng, tilt_rad=0.6) for _ in range(14)], BOARD))
     error_px = found.K[[0, 1, 0, 1], [0, 1, 2, 2]] - K[[0, 1, 0, 1], [0, 1, 2, 2]]
     sigmas = np.abs(error_px) / found.sigma_fxfycxcy_px
     with capsys.disabled():
@@ -77,24 +77,24 @@ def test_flat_views_and_missing_boards_are_refused():
     rng = np.random.default_rng(3)
     flat = [render(rng, tilt_rad=0.02) for _ in range(6)]
     with pytest.raises(DegenerateMotionError, match="tilted"):
-        calibrate_camera(flat, BOARD)
+        calibrate_found(find_boards(flat, BOARD))
     with pytest.raises(InvalidInputError, match="found in 0 of 6"):
-        calibrate_camera([np.full((480, 640), 128, dtype=np.uint8)] * 6, BOARD)
+        calibrate_found(find_boards([np.full((480, 640), 128, dtype=np.uint8)] * 6, BOARD))
     with pytest.raises(ShapeError):
-        calibrate_camera([], BOARD)
+        calibrate_found(find_boards([], BOARD))
     with pytest.raises(ShapeError):
-        calibrate_camera([flat[0], flat[1][:100]], BOARD)
+        calibrate_found(find_boards([flat[0], flat[1][:100]], BOARD))
     with pytest.raises(InvalidInputError):
-        calibrate_camera(flat, CharucoBoard(5, 7, 0.02, 0.03))
+        calibrate_found(find_boards(flat, CharucoBoard(5, 7, 0.02, 0.03)))
     with pytest.raises(InvalidInputError, match="DICT_5X5_250"):
-        calibrate_camera(flat, CharucoBoard(5, 7, 0.03, 0.02, "DICT_1"))
+        calibrate_found(find_boards(flat, CharucoBoard(5, 7, 0.03, 0.02, "DICT_1")))
 
 
 @pytest.mark.skipif(not PHOTOS.is_dir(), reason="no recordings in ../shared/data")
 def test_real_photos_agree_with_themselves(capsys):
     photos = [cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in sorted(PHOTOS.glob("*.jpg"))]
-    whole = calibrate_camera(photos, BOARD)
-    halves = [calibrate_camera(photos[k::2], BOARD) for k in (0, 1)]
+    whole = calibrate_found(find_boards(photos, BOARD))
+    halves = [calibrate_found(find_boards(photos[k::2], BOARD)) for k in (0, 1)]
     apart = np.abs(halves[0].K - halves[1].K)[[0, 1, 0, 1], [0, 1, 2, 2]]
     sigmas = apart / np.hypot(halves[0].sigma_fxfycxcy_px, halves[1].sigma_fxfycxcy_px)
     with capsys.disabled():
@@ -114,7 +114,7 @@ def test_real_charuco_board_is_found_but_one_view_is_not_enough():
     photo = cv2.imread(str(CHARUCO_PHOTO))
     board = CharucoBoard(5, 7, 0.03, 0.02)
     with pytest.raises(DegenerateMotionError, match="tilted"):
-        calibrate_camera([photo] * 5, board)
+        calibrate_found(find_boards([photo] * 5, board))
     found = find_boards([photo], board)
     assert found.pattern == EITHER_CHARUCO
     assert len(found.pixels_px[0]) >= 20

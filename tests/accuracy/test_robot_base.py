@@ -5,10 +5,10 @@ import sys
 import numpy as np
 import pytest
 
+from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.alignment.calibration.robot_base import RobotBaseNoise, solve_robot_base
 from services.alignment.calibration.twists import move, twist

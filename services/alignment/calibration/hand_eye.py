@@ -11,8 +11,6 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import ShapeError
-from dextouch.geometry import invert
-from dextouch.geometry.rotations import rotation_angle
 from services.alignment.calibration.board_views import BoardViews, polish
 from services.alignment.calibration.closed_form import Series, agreeing_views
 from services.alignment.calibration.motion import AXIS_NAMES, DegenerateMotionError, checked_poses
@@ -149,11 +147,3 @@ def _check_budget(result: HandEyeResult) -> None:
         f"{others}, take more views, and move the board closer",
         missing_axes=[name for name in AXIS_NAMES if name != axis],
     )
-
-
-def mount_difference(
-    T_tracker_camera_a: np.ndarray, T_tracker_camera_b: np.ndarray
-) -> tuple[float, float]:
-    """Angle (rad) and distance (m) between two mounts."""
-    T_a_b = invert(T_tracker_camera_a) @ T_tracker_camera_b
-    return float(rotation_angle(T_a_b[:3, :3])), float(np.linalg.norm(T_a_b[:3, 3]))

@@ -8,12 +8,7 @@ from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.board_detection import (
-    CharucoBoard,
-    Chessboard,
-    FoundBoards,
-    find_boards,
-)
+from services.alignment.calibration.board_detection import FoundBoards
 from services.alignment.calibration.motion import DegenerateMotionError
 
 MIN_VIEWS = 5
@@ -49,28 +44,11 @@ class CameraCalibration:
     used_images: tuple[int, ...]
 
 
-def calibrate_camera(
-    images: Sequence[np.ndarray], board: Chessboard | CharucoBoard
-) -> CameraCalibration:
+def calibrate_found(found: FoundBoards) -> CameraCalibration:
     """Intrinsics from photos of one board in different tilts and places.
 
-    Args:
-        images: uint8 [h, w] or [h, w, 3], all of one size; photos without the board are ignored.
-        board: what is on the photos.
-
     Raises:
-        InvalidInputError: the board is found in too few photos, or the board is no board.
-        DegenerateMotionError: the views do not show the focal length; tilt the board.
-        ShapeError: no images, or of different sizes.
-    """
-    return calibrate_found(find_boards(images, board))
-
-
-def calibrate_found(found: FoundBoards) -> CameraCalibration:
-    """Intrinsics from corners that are already detected.
-
-    Raises:
-        InvalidInputError: too few photos.
+        InvalidInputError: the board is found in too few photos.
         DegenerateMotionError: the views do not show the focal length; tilt the board.
     """
     import cv2

@@ -96,20 +96,6 @@ class TactileCalibration:
         state[has_cell] = _states(record, f"{glove}_taxel_state", num_cells)[cells[has_cell]]
         return cls(side, tare, gain, cells, state)
 
-    def refused_taxels(self, counts: np.ndarray) -> UInt8[np.ndarray, "320"]:
-        """Reason why each taxel is unusable in a take, as index into `REASONS`; 0 for usable.
-
-        In addition to taxels refused by the calibration: cells that are constant but not at their
-        tare (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the
-        samples.
-
-        Args:
-            counts: [T, cells] raw readings of the glove; NaN where it sent none.
-        """
-        survey = TaxelSurvey(self)
-        survey.add(counts)
-        return survey.refused()
-
     def to_kpa(
         self, counts: np.ndarray, *, refused: np.ndarray | None = None
     ) -> Float32[np.ndarray, "time 320"]:
@@ -117,8 +103,8 @@ class TactileCalibration:
 
         Args:
             counts: [T, cells] raw readings of the glove.
-            refused: uint8 [320] from `refused_taxels`, taxels that are set to zero; by default
-                those that the calibration refuses.
+            refused: uint8 [320] of a `TaxelSurvey`, taxels that are set to zero; by default those
+                that the calibration refuses.
 
         Raises:
             ShapeError: not [T, cells].
@@ -148,10 +134,11 @@ class TactileCalibration:
 
 
 class TaxelSurvey:
-    """Incremental detection of unusable taxels in a take that is read in pieces.
+    """Detection of unusable taxels in a take, which may be read in pieces.
 
-    Args:
-        calibration: of the glove.
+    In addition to those that the glove's calibration refuses: cells that are constant but not at
+    their tare (dead at zero, stuck elsewhere), and cells that are NaN in more than a tenth of the
+    samples.
     """
 
     def __init__(self, calibration: TactileCalibration) -> None:
@@ -179,7 +166,7 @@ class TaxelSurvey:
         self._num_samples += len(taxels)
 
     def refused(self) -> UInt8[np.ndarray, "320"]:
-        """Reasons for everything added so far; see `refused_taxels`."""
+        """Why each taxel is unusable, index into `REASONS`, by all that was added; 0 if usable."""
         calibration = self._calibration
         reasons = calibration.state.copy()
         if self._first is None or self._num_samples < MIN_SAMPLES_TO_JUDGE:

@@ -13,7 +13,6 @@ from services.alignment.options import AlignmentOptions
 from services.alignment.synchronization.episode_streams import (
     EpisodeStream,
     cut_stream,
-    made_stream,
 )
 from services.alignment.synchronization.grid_actions import (
     COMMANDED_STREAMS,
@@ -25,6 +24,7 @@ from services.alignment.synchronization.grid_actions import (
 )
 from services.alignment.synchronization.progress import OnProgress, progress_within
 from services.alignment.synchronization.recorded_streams import (
+    Block,
     DatedStream,
     LoadedStream,
     Recording,
@@ -268,7 +268,7 @@ def _action_streams(
                 unit="action",
                 nominal_rate_hz=options.model_rate_hz,
             )
-            yield made_stream(descriptor, grid_ns, values)
+            yield EpisodeStream(descriptor, iter([Block(grid_ns, values)]))
 
 
 def _stream_quality(
@@ -278,8 +278,8 @@ def _stream_quality(
     for name, stream in streams.items():
         quality |= stream.quality
         quality[f"{name}_num_gaps"] = float((np.diff(stream.t_ns) > options.max_gap_ns).sum())
-        if stream.timing.num_steps:
-            quality[f"{name}_num_clock_steps"] = float(stream.timing.num_steps)
+        if stream.timing.report.num_steps:
+            quality[f"{name}_num_clock_steps"] = float(stream.timing.report.num_steps)
     return quality
 
 

@@ -21,23 +21,12 @@ IMAGES_AT_ONCE = 8 * GOP_IMAGES
 class EpisodeStream:
     """One stream of an episode, whose samples are produced while they are written.
 
-    `quality` is complete when all blocks were taken.
+    `blocks` are in order, with times of the episode; `quality` is complete when all were taken.
     """
 
     descriptor: StreamDescriptor
-    source: Iterator[Block]
+    blocks: Iterator[Block]
     quality: dict[str, float] = field(default_factory=dict)
-
-    def blocks(self) -> Iterator[Block]:
-        """The samples in order, once, with times of the episode."""
-        return self.source
-
-
-def made_stream(
-    descriptor: StreamDescriptor, t_ref_ns: np.ndarray, values: np.ndarray
-) -> EpisodeStream:
-    """A stream that alignment itself computes, such as actions."""
-    return EpisodeStream(descriptor, iter([Block(t_ref_ns, values)]))
 
 
 def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
@@ -57,12 +46,8 @@ def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStre
         source = _complete_blocks(stream, (first, stop), quality)
     else:
         source = _image_blocks(stream, first, stop, quality)
-    return EpisodeStream(stream.descriptor, _from_origin(source, origin_ns), quality)
-
-
-def _from_origin(blocks: Iterator[Block], origin_ns: int) -> Iterator[Block]:
-    for block in blocks:
-        yield Block(block.t_ns - origin_ns, block.values)
+    blocks = (Block(block.t_ns - origin_ns, block.values) for block in source)
+    return EpisodeStream(stream.descriptor, blocks, quality)
 
 
 def _complete_blocks(

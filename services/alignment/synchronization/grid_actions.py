@@ -77,8 +77,7 @@ def make_actions(
     """
     left, right, head = (_poses(gridded, name) for name in POSE_STREAMS)
     if domain == "human":
-        hands = retarget_hands(gridded.streams, gridded.at, calibration)
-        joints, quality = hands.joints_rad, hands.quality
+        joints, quality = retarget_hands(gridded.streams, gridded.at, calibration)
     else:
         joints, quality = _joints(gridded, "joints_measured"), {}
     trajectory = _trajectory((left, right, head), joints)

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64, UInt8
@@ -24,20 +23,14 @@ NS_PER_S = 1e9
 MAX_CHECKED = 2000
 
 
-@dataclass(frozen=True)
-class HandJoints:
-    """Joint angles of both hands on the grid, left before right, with quality figures."""
-
-    joints_rad: Float64[np.ndarray, "n 40"]
-    quality: dict[str, float]
-
-
 def retarget_hands(
     streams: Mapping[str, LoadedStream],
     at: Mapping[str, GridPlacement],
     calibration: Mapping[str, Matrix],
-) -> HandJoints:
-    """Retarget both hands, each in its own thread, and resample the joints onto the grid.
+) -> tuple[Float64[np.ndarray, "n 40"], dict[str, float]]:
+    """Joint angles of both hands, left before right, on the grid, and quality figures.
+
+    Each hand is retargeted in its own thread.
 
     Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
     take the line between their two neighbours, which `at` has found to be in no gap.
@@ -64,7 +57,7 @@ def retarget_hands(
             )
         )
     joints_rad = np.concatenate([joints for joints, _ in hands], axis=1)
-    return HandJoints(joints_rad, hands[0][1] | hands[1][1])
+    return joints_rad, hands[0][1] | hands[1][1]
 
 
 def _retarget(

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 Stage = Literal["dating", "placing", "retargeting", "writing"]
-STAGES: tuple[Stage, ...] = ("dating", "placing", "retargeting", "writing")
 # Where each stage begins, as a share of the whole; by the seconds of an hour's recording.
 STAGE_BEGINS: dict[Stage, float] = {
     "dating": 0.0,
@@ -26,14 +25,7 @@ OnProgress = Callable[[Progress], None]
 
 
 def progress_within(stage: Stage, done: float, stream: str | None = None) -> Progress:
-    """Progress of one stage.
-
-    Args:
-        stage: that is at work.
-        done: of this stage, 0 … 1.
-        stream: that is worked on.
-    """
-    number = STAGES.index(stage)
+    """Progress where a share `done`, 0 … 1, of one stage is done."""
     begin = STAGE_BEGINS[stage]
-    end = STAGE_BEGINS[STAGES[number + 1]] if number + 1 < len(STAGES) else 1.0
+    end = min((other for other in STAGE_BEGINS.values() if other > begin), default=1.0)
     return Progress(begin + min(max(done, 0.0), 1.0) * (end - begin), stage, stream)

@@ -34,15 +34,11 @@ class TimedStream:
         kept: indices of the samples that have a time of their own; duplicates are dropped.
         t_host_ns: their times on the host's clock, strictly increasing.
         report: of the clock fit.
-        num_steps: how often the device's clock was stepped.
-        method: what dates the samples, as in the report.
     """
 
     kept: Int64[np.ndarray, " n"]
     t_host_ns: Int64[np.ndarray, " n"]
     report: ClockReport
-    num_steps: int
-    method: ClockMethod
 
 
 @dataclass(frozen=True)
@@ -104,7 +100,7 @@ def time_stream(
         num_steps=dated.num_steps,
         warnings=_warnings(dated, descriptor.period_ns()),
     )
-    return TimedStream(kept, t_host_ns[kept], report, dated.num_steps, dated.method)
+    return TimedStream(kept, t_host_ns[kept], report)
 
 
 def _warnings(dated: _Dated, period_ns: int) -> tuple[ClockWarning, ...]:

@@ -6,6 +6,7 @@ from argparse import Namespace
 import numpy as np
 import pytest
 
+from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import InvalidInputError, NotFoundError, ShapeError
 from dextouch.geometry import pose_from_transform, transform
@@ -13,7 +14,6 @@ from dextouch.geometry.rotations import rotation_from_vector
 from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.devices import load_calibration
-from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.motion import DegenerateMotionError
 from services.cli import main as command_line
 from services.cli.calibrate.command import main

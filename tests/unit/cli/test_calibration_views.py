@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.errors import (
     InvalidInputError,
     StaleDataError,
@@ -15,7 +16,6 @@ from dextouch.errors import (
 )
 from dextouch.geometry import invert, transform
 from dextouch.geometry.rotations import rotation_from_vector
-from services.alignment.calibration.hand_eye import mount_difference
 from services.cli.calibrate import advice, boards, live
 from services.cli.calibrate.command import main
 from tests.unit.cli.rendered_boards import (

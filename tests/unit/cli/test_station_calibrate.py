@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.simulated.board_scenes import mount_difference
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import (
     CorruptDataError,
@@ -23,7 +24,6 @@ from dextouch.schemas import RecordingAttributes
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.devices import load_calibration
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
-from services.alignment.calibration.hand_eye import mount_difference
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.cli import main as command_line
 from services.cli.calibrate import record
