@@ -76,7 +76,7 @@ def test_joints_beyond_the_last_sample_stay_in_their_limits(end):
         )
         at[name] = place_on_grid(t_ns, grid_ns, period_ns=16_666_667, max_gap_ns=50 * MS)
         assert at[name].valid.all()
-    found = retarget_hands(streams, at, {}).joints_rad.reshape(3, 2, 20)
+    found = retarget_hands(streams, at, {})[0].reshape(3, 2, 20)
     row = 2 if end == "last" else 0
     for side_index, side in enumerate(("left", "right")):
         assert (found[:, side_index] <= upper_rad[side]).all()

@@ -50,7 +50,7 @@ def take(*, stamps, numbers, period_ns=PERIOD_NS):
 def test_the_report_names_the_method_and_the_latency(given, method):
     batch, descriptor = take(**given)
     timed = time_stream(batch, descriptor, latency_ns=3_000_000, latency_sigma_ns=250_000.0)
-    assert (timed.method, timed.report.method) == (method, method)
+    assert timed.report.method == method
     assert timed.report.latency_ms == 3.0
     assert timed.report.latency_sigma_ms == 0.25
     assert time_stream(batch, descriptor).report.latency_sigma_ms is None
@@ -71,7 +71,7 @@ def test_a_device_that_stood_still_is_dated_right_on_both_sides(stamps, stop_s):
     )
     timed = time_stream(batch, descriptor)
     np.testing.assert_allclose(timed.t_host_ns - true_ns, 0, atol=100_000)
-    assert (timed.num_steps, timed.report.num_steps, timed.report.warnings) == (1, 1, ("stop",))
+    assert (timed.report.num_steps, timed.report.warnings) == (1, ("stop",))
 
 
 @pytest.mark.parametrize(
