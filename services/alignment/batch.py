@@ -1,9 +1,9 @@
 """Alignment of many recordings in parallel worker processes, as `dextouch align run` does it."""
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
-from queue import SimpleQueue
 
 from dextouch.episodes import EpisodeStore
 from dextouch.errors import DexTouchError, InvalidInputError
@@ -36,29 +36,24 @@ def align_batch(
 ) -> Iterator[Outcome]:
     """Align recordings in parallel; yields outcomes as they complete. Failures do not stop others.
 
-    Args:
-        store_url: of recordings and episodes.
-        recording_ids: of finished recordings.
-        options: of all of them.
-        num_workers: recordings aligned at the same time, each in its own process.
-        on_progress: called with the progress of each, from several threads.
+    `num_workers` are aligned at the same time, each in its own process; `on_progress` is called
+    from several threads.
     """
-    free: SimpleQueue[AlignmentWorker] = SimpleQueue()
-    workers = [AlignmentWorker(store_url) for _ in range(min(num_workers, len(recording_ids)))]
-    for worker in workers:
-        free.put(worker)
+    workers: list[AlignmentWorker] = []
+    mine = threading.local()
+
+    def start() -> None:
+        mine.worker = AlignmentWorker(store_url)
+        workers.append(mine.worker)
 
     def align(recording_id: str) -> Outcome:
-        worker = free.get()
         try:
-            report = worker.run(recording_id, options, lambda p: on_progress(recording_id, p))
+            report = mine.worker.run(recording_id, options, lambda p: on_progress(recording_id, p))
             return Outcome(recording_id, report)
         except DexTouchError as error:
             return Outcome(recording_id, None, error)
-        finally:
-            free.put(worker)
 
-    threads = ThreadPoolExecutor(max(len(workers), 1), thread_name_prefix="align")
+    threads = ThreadPoolExecutor(num_workers, thread_name_prefix="align", initializer=start)
     try:
         for ready in as_completed([threads.submit(align, one) for one in recording_ids]):
             yield ready.result()

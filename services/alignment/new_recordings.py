@@ -126,8 +126,13 @@ class NewRecordings:
 
 def _aligned(store: EpisodeStore) -> dict[str, list[str]]:
     """Ids of episodes by the id of their recording, including episodes in the trash."""
+    try:
+        # What was deleted must not be made again.
+        deleted = [entry.item_id for entry in store.trash_list() if entry.kind == "episode"]
+    except InvalidInputError:
+        deleted = []  # a store in a bucket has no trash
     found: dict[str, list[str]] = {}
-    for episode_id in _episode_ids(store):
+    for episode_id in [*store.list(), *deleted]:
         if match := EPISODE_ID.fullmatch(episode_id):
             found.setdefault(match[1], []).append(episode_id)
     return found
@@ -144,12 +149,3 @@ def _has_episode(
             if any(entry.sha256 == recording.content_sha256 for entry in lineage):
                 return True
     return False
-
-
-def _episode_ids(store: EpisodeStore) -> list[str]:
-    """All episodes, and those in the trash, which must not be made again."""
-    try:
-        deleted = [entry.item_id for entry in store.trash_list() if entry.kind == "episode"]
-    except InvalidInputError:
-        deleted = []  # a store in a bucket has no trash
-    return [*store.list(), *deleted]

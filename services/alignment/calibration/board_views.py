@@ -79,7 +79,7 @@ class BoardViews:
             left = ((projected - pixels) * weights).reshape(len(points), -1, 1)
             J = (J * weights[..., None]).reshape(len(points), -1, 6)
             J_T = np.swapaxes(J, 1, 2)
-            return Linearised(J_T @ J, (J_T @ left)[..., 0], np.square(left).sum(axis=(1, 2)))
+            return Linearised(J_T @ J, (J_T @ left)[..., 0])
 
         return linearise
 

@@ -29,12 +29,10 @@ class Linearised(NamedTuple):
     Attributes:
         information: [n, 6, 6].
         gradient: [n, 6], of half the weighted squares.
-        squares: weighted sum of squares [n].
     """
 
     information: Float64[np.ndarray, "n 6 6"]
     gradient: Float64[np.ndarray, "n 6"]
-    squares: Float64[np.ndarray, " n"]
 
 
 Measurement = Callable[[np.ndarray], Linearised]
@@ -65,8 +63,7 @@ def pose_measurement(Ts_measured: np.ndarray, information: np.ndarray) -> Measur
         left, J = twist(E), twist_jacobian(E)
         weighted = np.swapaxes(J, 1, 2) @ information
         gradient = (weighted @ left[..., None])[..., 0]
-        squares = (left[:, None, :] @ information @ left[..., None]).ravel()
-        return Linearised(weighted @ J, gradient, squares)
+        return Linearised(weighted @ J, gradient)
 
     return linearise
 

@@ -81,7 +81,7 @@ def agreeing_views(series: Series, mount: np.ndarray | None = None) -> Agreement
             check_sides(used, errors)
         ratios = (errors / np.maximum(np.median(errors, axis=0), EXACT)).max(axis=1)
         if ratios.max() <= OUTLIER_RATIO:
-            check_noise(series.task, errors)
+            _check_noise(series.task, errors)
             return Agreement(views, X, Z)
         if len(views) <= min_views:
             far_off = views[ratios > OUTLIER_RATIO].tolist()
@@ -155,12 +155,8 @@ def check_sides(series: Series, errors: np.ndarray) -> None:
     )
 
 
-def check_noise(task: str, errors: np.ndarray) -> None:
-    """Refuse views that contradict each other by more than any noise.
-
-    Raises:
-        InvalidInputError: says by how much.
-    """
+def _check_noise(task: str, errors: np.ndarray) -> None:
+    """Refuse views that contradict each other by more than any noise."""
     rms = _rms(errors)
     if rms[0] > MAX_ROTATION_RMS_RAD or rms[1] > MAX_TRANSLATION_RMS_M:
         raise InvalidInputError(

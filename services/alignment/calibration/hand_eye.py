@@ -48,11 +48,9 @@ class HandEyeResult(PoseEstimate):
 
     Attributes:
         T_tracker_camera: the mount.
-        T_world_board: where the board stood.
     """
 
     T_tracker_camera: Float64[np.ndarray, "4 4"]
-    T_world_board: Float64[np.ndarray, "4 4"]
 
 
 def solve_hand_eye(
@@ -106,7 +104,6 @@ def solve_hand_eye(
         noise=sigmas,
         left_out_views=agreed.left_out(series),
         T_tracker_camera=bundle.X,
-        T_world_board=bundle.Z,
     )
     _check_budget(result)
     return result

@@ -27,11 +27,6 @@ class Component:
     sigma: float
     shapes: Float64[np.ndarray, "n 6 6"]
 
-    @property
-    def covariances(self) -> Float64[np.ndarray, "n 6 6"]:
-        """Contribution of the source to each view's covariance."""
-        return self.sigma**2 * self.shapes
-
 
 def sensor_components(
     sensor: str, maps: np.ndarray, sigmas: tuple[float, float]

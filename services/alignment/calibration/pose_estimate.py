@@ -114,7 +114,7 @@ def weighted_bundle(
     found = estimate_sigmas(left_over, unknowns, list(components.values()))
     sigmas = dict(zip(components, found.tolist(), strict=True))
     if corners is None:
-        shares = [Component(sigmas[name], own[name].shapes).covariances for name in own]
+        shares = [sigmas[name] ** 2 * own[name].shapes for name in own]
         information = np.linalg.inv(np.sum(shares, axis=0))
         measurement = pose_measurement(series.Ts_mounted_target, information)
     else:

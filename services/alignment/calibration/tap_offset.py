@@ -15,6 +15,8 @@ BEFORE_S, AFTER_S = 0.15, 0.15
 SEARCH_STEP_S = 0.001
 MIN_FALL_M_PER_S = 0.05
 MIN_REST_S = 0.5
+TOUCH_KPA = 2.0
+MAX_OFFSET_S = 0.2
 
 
 def estimate_tap_offset(
@@ -22,19 +24,14 @@ def estimate_tap_offset(
     pressure_kpa: np.ndarray,
     t_height_ns: np.ndarray,
     height_m: np.ndarray,
-    *,
-    threshold_kpa: float = 2.0,
-    max_offset_s: float = 0.2,
 ) -> TimeOffset:
     """Estimate the offset between pressure and height from taps at least 0.5 s apart.
 
     Args:
         t_pressure_ns: stamps [n], int64, strictly increasing.
-        pressure_kpa: the tapping pad's pressure [n]; below the threshold in the air.
+        pressure_kpa: the tapping pad's pressure [n]; below 2 kPa in the air.
         t_height_ns: stamps [m] of the tracker.
         height_m: height [m] above the table, of a point of the hand.
-        threshold_kpa: pressure that counts as a touch.
-        max_offset_s: largest offset to search.
 
     Returns:
         The offset to add to the tracker's timestamps to align them with the glove's.
@@ -48,8 +45,8 @@ def estimate_tap_offset(
     pressure, height = np.asarray(pressure_kpa)[..., None], np.asarray(height_m)[..., None]
     t_a, pressure = checked_signal("tap offset: pressure", t_pressure_ns, pressure, start_ns)
     t_b, height = checked_signal("tap offset: height", t_height_ns, height, start_ns)
-    onsets_s, interval_s = _onsets(t_a, pressure[:, 0], threshold_kpa)
-    pairs = [(onset, _bend_s(t_b, height[:, 0], onset, max_offset_s)) for onset in onsets_s]
+    onsets_s, interval_s = _onsets(t_a, pressure[:, 0])
+    pairs = [(onset, _bend_s(t_b, height[:, 0], onset)) for onset in onsets_s]
     offsets_s = np.array([onset - bend for onset, bend in pairs if bend is not None])
     if not len(offsets_s):
         raise DegenerateMotionError(
@@ -66,9 +63,9 @@ def estimate_tap_offset(
     return TimeOffset(round(float(offsets_s.mean()) * 1e9), max(1, round(sigma_s * 1e9)))
 
 
-def _onsets(t_s: np.ndarray, pressure: np.ndarray, threshold: float) -> tuple[list[float], float]:
+def _onsets(t_s: np.ndarray, pressure_kpa: np.ndarray) -> tuple[list[float], float]:
     """Midpoints of the sample intervals in which touches begin, and the usual interval."""
-    touching = pressure > threshold
+    touching = pressure_kpa > TOUCH_KPA
     starts = np.flatnonzero(touching[1:] & ~touching[:-1]) + 1
     onsets: list[float] = []
     for start in starts.tolist():
@@ -78,11 +75,9 @@ def _onsets(t_s: np.ndarray, pressure: np.ndarray, threshold: float) -> tuple[li
     return onsets, float(np.median(np.diff(t_s)))
 
 
-def _bend_s(
-    t_s: np.ndarray, height: np.ndarray, onset_s: float, max_offset_s: float
-) -> float | None:
+def _bend_s(t_s: np.ndarray, height: np.ndarray, onset_s: float) -> float | None:
     """Time at which a fall near a touch stops; None without a fall."""
-    bends = np.arange(onset_s - max_offset_s, onset_s + max_offset_s, SEARCH_STEP_S)
+    bends = np.arange(onset_s - MAX_OFFSET_S, onset_s + MAX_OFFSET_S, SEARCH_STEP_S)
     best, found = np.inf, None
     for bend in bends.tolist():
         near = (t_s >= bend - BEFORE_S) & (t_s <= bend + AFTER_S)

@@ -16,7 +16,7 @@ from dextouch.geometry.rotations import rotation_angle, vector_from_rotation
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.tactile.layout import Side
 from services.alignment.retargeting.hand_checks import seen_nodes
-from services.alignment.retargeting.wrist import rigid_transform
+from services.alignment.retargeting.wrist import calibrated_transform
 from services.alignment.retargeting.wrist_frame import WristFrame, wrist_frame
 
 # What people's palms differ from the mean one's, and what a grip adds, stays below this.
@@ -49,20 +49,6 @@ def calibration_record(frame: WristFrame, side: Side) -> dict[str, Matrix]:
     }
 
 
-def calibrated_frame(
-    calibration: Mapping[str, Matrix], side: Side
-) -> Float64[np.ndarray, "4 4"] | None:
-    """T_keypoints_wrist of a recording's calibration; None if it has none.
-
-    Raises:
-        ShapeError, NonFiniteError, InvalidInputError: it is no rigid transform.
-    """
-    name = calibration_name(side)
-    if name not in calibration:
-        return None
-    return rigid_transform(calibration[name], what=f"calibration {name!r}")
-
-
 def to_wrist_axes(
     keypoints_m: np.ndarray, T_keypoints_wrist: np.ndarray
 ) -> Float64[np.ndarray, "time 25 3"]:
@@ -89,7 +75,7 @@ def hand_axes_check(
         ShapeError: not [T ≥ 1, 25, 3], or a calibration that is not 4 by 4.
     """
     where = f"keypoints_{side}"
-    T_keypoints_wrist = calibrated_frame(calibration, side)
+    T_keypoints_wrist = calibrated_transform(calibration, calibration_name(side))
     keypoints = np.asarray(keypoints_m, dtype=np.float64)
     frame = wrist_frame(keypoints, side, where=where)
     if T_keypoints_wrist is not None:

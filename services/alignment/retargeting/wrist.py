@@ -1,5 +1,6 @@
 """Checks and comparisons of rigid transforms, such as those that a calibration holds."""
 
+from collections.abc import Mapping
 from typing import Final
 
 import numpy as np
@@ -8,6 +9,7 @@ from jaxtyping import Float64
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError
 from dextouch.geometry import invert
 from dextouch.geometry.rotations import rotation_angle
+from dextouch.schemas import Matrix
 
 # How far R Rᵀ of a stored transform may be from the identity.
 RIGID_TOLERANCE: Final = 1e-6
@@ -39,6 +41,19 @@ def rigid_transform(matrix: object, *, what: str) -> Float64[np.ndarray, "4 4"]:
             "again"
         )
     return T
+
+
+def calibrated_transform(
+    calibration: Mapping[str, Matrix], name: str
+) -> Float64[np.ndarray, "4 4"] | None:
+    """A rigid transform of a recording's calibration; None if it has none of this name.
+
+    Raises:
+        ShapeError, NonFiniteError, InvalidInputError: it is no rigid transform.
+    """
+    if name not in calibration:
+        return None
+    return rigid_transform(calibration[name], what=f"calibration {name!r}")
 
 
 def pose_difference(

@@ -22,8 +22,8 @@ from services.alignment.calibration.tactile_baseline import (
     TactileCalibration,
     TaxelSurvey,
 )
-from services.alignment.retargeting.keypoint_axes import calibrated_frame, to_wrist_axes
-from services.alignment.retargeting.wrist import rigid_transform
+from services.alignment.retargeting.keypoint_axes import calibration_name, to_wrist_axes
+from services.alignment.retargeting.wrist import calibrated_transform
 from services.alignment.synchronization.stream_clock import TimedStream, time_stream
 
 # Where the tracked body sits in what the tracker follows, by stream.
@@ -160,11 +160,13 @@ def date_stream(recording: Recording, name: str) -> DatedStream:
         return _pressures(raw, calibration)
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
-        convert = _keypoints_conversion(descriptor, calibration)
+        side, convert = descriptor.side, _as_float64
+        T = None if side is None else calibrated_transform(calibration, calibration_name(side))
+        if T is not None:
+            convert = partial(to_wrist_axes, T_keypoints_wrist=T)
     elif descriptor.kind == "pose":
-        T_tracker_body = T_world_base = None
-        if MOUNTS.get(name) in calibration:
-            T_tracker_body = _rigid(calibration, MOUNTS[name])
+        T_tracker_body = calibrated_transform(calibration, MOUNTS.get(name, ""))
+        T_world_base = None
         if descriptor.frame == BASE_FRAME:
             T_world_base = _base_of(calibration, name)
             descriptor = descriptor.model_copy(update={"frame": "world"})
@@ -184,18 +186,6 @@ def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
 
 def _as_it_is(values: np.ndarray) -> np.ndarray:
     return values
-
-
-def _keypoints_conversion(
-    descriptor: StreamDescriptor, calibration: dict[str, Matrix]
-) -> Conversion:
-    """Conversion to wrist axes if the calibration has them; otherwise unchanged."""
-    if descriptor.side is None:
-        return _as_float64
-    T_keypoints_wrist = calibrated_frame(calibration, descriptor.side)
-    if T_keypoints_wrist is None:
-        return _as_float64
-    return partial(to_wrist_axes, T_keypoints_wrist=T_keypoints_wrist)
 
 
 def _as_float64(values: np.ndarray) -> np.ndarray:
@@ -235,19 +225,16 @@ def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:
     )
 
 
-def _rigid(calibration: dict[str, Matrix], name: str) -> Float64[np.ndarray, "4 4"]:
-    return rigid_transform(calibration[name], what=f"calibration {name!r}")
-
-
 def _base_of(calibration: dict[str, Matrix], stream: str) -> Float64[np.ndarray, "4 4"]:
-    if BASE_NAME not in calibration:
+    T_world_base = calibrated_transform(calibration, BASE_NAME)
+    if T_world_base is None:
         raise InvalidInputError(
             f"stream {stream!r}: poses are in the robot's base, and calibration {BASE_NAME!r} "
             "(4 by 4) is missing; run dextouch station calibrate robot-base, or send poses "
             "in the world",
             missing=[BASE_NAME],
         )
-    return _rigid(calibration, BASE_NAME)
+    return T_world_base
 
 
 def _moved_poses(

@@ -200,7 +200,7 @@ def test_views_may_have_different_numbers_of_corners():
     for k in range(0, 20, 2):
         alone = views.only(np.array([k])).measurement(0.3)(B[k : k + 1])
         np.testing.assert_allclose(some.information[k], alone.information[0])
-        np.testing.assert_allclose(some.squares[k], alone.squares[0])
+        np.testing.assert_allclose(some.gradient[k], alone.gradient[0])
 
 
 def test_the_gate_lets_two_axes_pass():
