@@ -103,12 +103,7 @@ class JobQueue:
         return self._jobs[alignment_id].with_eta()
 
     def page(self, *, state: JobState | None, after: str | None, limit: int) -> AlignmentList:
-        """Some of the jobs, oldest first.
-
-        Args:
-            state: only jobs in this state; None for all.
-            after: id of the last job of the page before.
-            limit: number of jobs on the page.
+        """Some of the jobs, or of those in one state, oldest first, from the one `after` an id on.
 
         Raises:
             NotFoundError: there is no job `after`.

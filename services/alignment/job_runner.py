@@ -31,10 +31,6 @@ class JobRunner:
     """The alignments of one store; asking again for the same one gives the same job.
 
     Runs between `start` and `close`. All methods belong to one event loop. `queue` holds the jobs.
-
-    Args:
-        store: of recordings and episodes.
-        settings: workers, limits and default options.
     """
 
     def __init__(self, store: EpisodeStore, settings: AlignmentSettings) -> None:

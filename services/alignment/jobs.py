@@ -34,13 +34,8 @@ def align_recording(
     """Align one recording and write the episode.
 
     The episode's id follows from the recording's content and the options: doing it again, even
-    from two processes at once, gives the same episode and writes nothing.
-
-    Args:
-        store: store of the recording and the episode.
-        recording_id: of a finished recording.
-        options: of the alignment.
-        on_progress: called with the progress, in the caller's thread.
+    from two processes at once, gives the same episode and writes nothing. Progress is told in the
+    caller's thread.
 
     Raises:
         NotFoundError: no such recording.

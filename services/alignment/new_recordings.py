@@ -37,10 +37,6 @@ class NewRecordings:
     One that cannot be aligned becomes a failed job with the reason. One that cannot be read is
     logged and tried again after RETRY_S. One that comes back under the id of another that was
     deleted while this was watching counts as new unless an episode was made from its content.
-
-    Args:
-        store: of recordings and episodes.
-        jobs: where alignments are submitted.
     """
 
     def __init__(self, store: EpisodeStore, jobs: JobRunner) -> None:

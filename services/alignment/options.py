@@ -6,13 +6,7 @@ from dextouch.frozen_model import FrozenModel
 
 
 class AlignmentOptions(FrozenModel):
-    """Options of one alignment; they are part of the episode's identity.
-
-    Args:
-        model_rate_hz: of the action grid.
-        max_gap_ms: two samples further apart than this are not interpolated between.
-        min_num_steps: shorter stretches without a gap are no episode.
-    """
+    """Options of one alignment; they are part of the episode's identity."""
 
     model_rate_hz: float = Field(default=15.0, gt=0, le=1000, description="of the action grid")
     max_gap_ms: float = Field(

@@ -12,12 +12,7 @@ from services.alignment.synchronization.progress import OnProgress, Progress
 
 
 class AlignmentWorker:
-    """One process that aligns one recording after another.
-
-    Args:
-        store_url: of the store, as the process opens it.
-        log_level: of the process's log.
-    """
+    """One process that aligns one recording after another."""
 
     def __init__(self, store_url: str, log_level: str = "warning") -> None:
         self._store_url, self._log_level = store_url, log_level
@@ -55,12 +50,7 @@ class AlignmentWorker:
     def run(
         self, recording_id: str, options: AlignmentOptions, on_progress: OnProgress
     ) -> AlignmentReport:
-        """Align a recording.
-
-        Args:
-            recording_id: of a finished recording.
-            options: of the alignment.
-            on_progress: called with the progress, a few times a second.
+        """Align a finished recording; its progress is told a few times a second.
 
         Raises:
             UnavailableError: the process was killed; the store is as it was.

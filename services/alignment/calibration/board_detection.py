@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float32
@@ -156,23 +155,17 @@ def _charuco(board: CharucoBoard) -> dict[str, Detector]:
             (board.columns, board.rows), board.square_m, board.marker_m, dictionary
         )
         printed.setLegacyPattern(legacy)
-        return _charuco_detector(printed)
+        charuco = cv2.aruco.CharucoDetector(printed)
+        places = np.asarray(printed.getChessboardCorners(), dtype=np.float32)
+
+        def detect(photo: np.ndarray) -> View | None:
+            corners, ids, _, _ = charuco.detectBoard(photo)
+            if ids is None or len(ids) < MIN_CORNERS:
+                return None
+            return places[ids.ravel()], np.asarray(corners, dtype=np.float32).reshape(-1, 2)
+
+        return detect
 
     if board.rows % 2:
         return {EITHER_CHARUCO: detector(legacy=False)}
     return {CHARUCO: detector(legacy=False), LEGACY_CHARUCO: detector(legacy=True)}
-
-
-def _charuco_detector(printed: Any) -> Detector:  # noqa: ANN401 - OpenCV's board
-    import cv2
-
-    detector = cv2.aruco.CharucoDetector(printed)
-    places = np.asarray(printed.getChessboardCorners(), dtype=np.float32)
-
-    def detect(photo: np.ndarray) -> View | None:
-        corners, ids, _, _ = detector.detectBoard(photo)
-        if ids is None or len(ids) < MIN_CORNERS:
-            return None
-        return places[ids.ravel()], np.asarray(corners, dtype=np.float32).reshape(-1, 2)
-
-    return detect

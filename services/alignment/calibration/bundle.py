@@ -126,9 +126,7 @@ def predicted_jacobians(
 ) -> tuple[Float64[np.ndarray, "n 6 12"], Float64[np.ndarray, "n 6 6"]]:
     """Jacobians of the predicted poses B = X⁻¹ D⁻¹ W⁻¹ Z by X, Z and D.
 
-    Args:
-        Ts: [n, 4, 4] the predicted poses B.
-        X_B: [n, 4, 4] X · B.
+    `Ts` are the predicted poses B, `X_B` are X · B.
     """
     J = np.zeros((len(Ts), 6, 12))
     J[:, :, :6] = -adjoint(invert(Ts))

@@ -67,9 +67,10 @@ def calibrate_found(found: FoundBoards) -> CameraCalibration:
     )
     sigma = np.asarray(sigma, dtype=np.float64).ravel()
     K = np.asarray(K, dtype=np.float64)
-    spread_rad = _tilt_spread_rad(np.array(turns, dtype=np.float64).reshape(-1, 3))
-    relative = float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1]))
-    _check_views(spread_rad, relative)
+    _check_views(
+        rotation_from_vector(np.array(turns, dtype=np.float64).reshape(-1, 3)),
+        float(max(sigma[0] / K[0, 0], sigma[1] / K[1, 1])),
+    )
     return CameraCalibration(
         K=K,
         distortion=np.asarray(distortion, dtype=np.float64).ravel()[:5],
@@ -87,14 +88,11 @@ def _coverage(pixels_px: Sequence[np.ndarray], image_size_px: tuple[int, int]) -
     return len(np.unique(cells.astype(int).clip(0, 3), axis=0)) / 16
 
 
-def _tilt_spread_rad(turns_rad: np.ndarray) -> float:
-    """Largest angle between two directions of the board; `turns_rad` are its rotations."""
-    normals = rotation_from_vector(turns_rad)[:, :, 2]
-    return float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
-
-
-def _check_views(spread_rad: float, relative: float) -> None:
-    """Refuse views that do not determine the focal length."""
+def _check_views(Rs_camera_board: np.ndarray, relative: float) -> None:
+    """Refuse views that do not determine the focal length, known to a `relative` sigma."""
+    normals = Rs_camera_board[:, :, 2]
+    # Largest angle between two directions of the board.
+    spread_rad = float(np.arccos(np.clip(normals @ normals.T, -1, 1)).max())
     if spread_rad < MIN_TILT_SPREAD_RAD or not relative <= MAX_FOCAL_SIGMA:
         raise DegenerateMotionError(
             f"intrinsics: the board's directions differ by {np.rad2deg(spread_rad):.0f} degrees "

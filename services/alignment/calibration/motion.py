@@ -59,12 +59,7 @@ def view_pairs(num_views: int) -> np.ndarray:
 
 
 def check_turns(task: str, body: str, Ts_world_body: np.ndarray) -> None:
-    """Refuse rotation about a single axis, or hardly any.
-
-    Args:
-        task: for the message.
-        body: the moved object, for the error message.
-        Ts_world_body: [n, 4, 4] its poses.
+    """Refuse poses [n, 4, 4] of a body that turns about a single axis, or hardly at all.
 
     Raises:
         DegenerateMotionError: names the axes of the body about which it was not turned.

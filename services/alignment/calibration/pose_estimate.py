@@ -97,13 +97,8 @@ def weighted_bundle(
 ) -> tuple[Bundle, dict[str, float]]:
     """The bundle weighted with the noise estimated from the views, and that noise.
 
-    Args:
-        series: the views that agree.
-        agreed: where the bundle starts.
-        tracker: expected noise of the first series.
-        own: sources of noise of the second series.
-        corners: of a board, whose pixels are weighted instead of the second series.
-        is_mount_known: leave the mount as it is.
+    The second series has the sources of noise `own`. With the corners of a board their pixels are
+    weighted instead of its poses. A mount that is known stays as it is.
     """
     Ts = agreed.predicted(series)
     J, C = predicted_jacobians(Ts, agreed.X @ Ts)

@@ -19,6 +19,7 @@ from dextouch.tactile.layout import (
 )
 from services.alignment.calibration.tactile_tare import TaxelTare
 
+# The largest count that our gloves can send.
 FULL_SCALE_COUNTS = 65535.0
 SATURATED_RATIO = 0.995
 STATES = ("ok", "dead", "stuck", "saturated", "unproven", "nonlinear", "imprecise")
@@ -64,10 +65,7 @@ def classify_taxels(
 ) -> UInt8[np.ndarray, "320"]:
     """State of each taxel (index into `STATES`, anatomical order) from takes with contact.
 
-    Args:
-        takes: raw counts [T, 360] each; the rest take may be among them.
-        tare: of the same glove.
-        full_scale_counts: the largest count that the glove can send.
+    The takes are raw counts [T, 360] each; the rest take may be among them.
     """
     evidence, silent, moves = (np.zeros(NUM_TAXELS, dtype=np.int64) for _ in range(3))
     zero = select_taxels(tare.level.mean_counts, side=tare.side)

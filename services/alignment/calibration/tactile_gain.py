@@ -113,12 +113,8 @@ def fit_gain(
     """Weighted straight line of counts over pressure through each taxel's tare.
 
     A taxel is refused, with its state, where it does not answer, saturates in all presses, bends,
-    or was pressed too little for 10 % of gain; its gain is then 0 and must not be used.
-
-    Args:
-        tare: of the same glove.
-        presses: at least one; several pressures show a bent response.
-        full_scale_counts: the largest count that the glove can send.
+    or was pressed too little for 10 % of gain; its gain is then 0 and must not be used. Several
+    pressures show a bent response.
 
     Raises:
         InvalidInputError: no press, no taxel that answers, counts that fall under pressure, or

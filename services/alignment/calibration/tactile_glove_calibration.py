@@ -74,12 +74,7 @@ def calibrate_glove(
     *,
     full_scale_counts: float = FULL_SCALE_COUNTS,
 ) -> GloveCalibration:
-    """Gain and fault map of a glove, beside its tare.
-
-    Args:
-        tare: from a rest take (`measure_tare`).
-        presses: takes under known pressure; none for a tare alone.
-        full_scale_counts: the largest count that the glove can send.
+    """Gain and fault map of a glove, beside its tare; without presses the tare alone.
 
     Raises:
         InvalidInputError: as `fit_gain`, or more than a quarter of the taxels is faulty or

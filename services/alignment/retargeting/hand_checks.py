@@ -90,9 +90,7 @@ def _thinned(samples: np.ndarray, most: int) -> np.ndarray:
 def check_hand_shape(keypoints_m: np.ndarray, *, where: str = "keypoints") -> float:
     """Size of a hand (1: the mean adult); refuses what is none in metres, in our order of nodes.
 
-    Args:
-        keypoints_m: [T ≥ 1, 25, 3], any axes, of either hand; NaN where a node is not seen.
-        where: stream and recording, for the message.
+    Keypoints are in any axes, of either hand; a node that is not seen is NaN.
 
     Raises:
         InvalidInputError: another unit or order of nodes (named where it is known: `details`
@@ -145,11 +143,6 @@ def check_handedness(
     Fingers bend to the palm only, so bones turn about an axis that points to the thumb on a right
     hand and away from it on a left one. If they hardly bend, the base of the thumb is used, which
     is on the palm's side of the metacarpals.
-
-    Args:
-        keypoints_m: [T ≥ 1, 25, 3], any axes; NaN where a node is not seen.
-        side: which hand they should be of.
-        where: stream and recording, for the message.
 
     Raises:
         InvalidInputError: they are of the other hand.

@@ -131,10 +131,7 @@ def calibrate_wrist(
 
     Only samples with straight fingers count: in a grip, ring and little metacarpals give way.
 
-    Args:
-        keypoints_m: as for `wrist_frame`; one second of the flat hand is enough.
-        side: which hand.
-        where: the take, for the message.
+    One second of the flat hand is enough; keypoints as for `wrist_frame`.
 
     Raises:
         InvalidInputError: as `wrist_frame`, or fewer than 30 samples with straight fingers.

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.schemas import EpisodeAttributes, LineageEntry, StoredAnchor
 from dextouch.streams import StreamDescriptor
@@ -27,7 +28,6 @@ from services.alignment.synchronization.recorded_streams import (
     Block,
     DatedStream,
     LoadedStream,
-    Recording,
     date_stream,
 )
 from services.alignment.synchronization.refused_parts import (
@@ -68,7 +68,7 @@ class _Stretch:
 
 
 def build_episode(
-    recording: Recording,
+    recording: RecordingReader,
     *,
     episode_id: str,
     options: AlignmentOptions,
@@ -117,7 +117,7 @@ def build_episode(
 
 
 def _find_stretch(
-    recording: Recording,
+    recording: RecordingReader,
     streams: Mapping[str, DatedStream],
     options: AlignmentOptions,
     on_progress: OnProgress,
@@ -153,7 +153,7 @@ def _find_stretch(
 
 
 def _episode_attributes(
-    recording: Recording,
+    recording: RecordingReader,
     episode_id: str,
     actions: GridActions,
     streams: Mapping[str, DatedStream],
@@ -183,7 +183,7 @@ def _episode_attributes(
     )
 
 
-def check_complete(recording: Recording) -> None:
+def check_complete(recording: RecordingReader) -> None:
     """Refuse a recording from which no episode can be made.
 
     Raises:

@@ -32,10 +32,8 @@ class EpisodeStream:
 def cut_stream(stream: DatedStream, origin_ns: int, last_ns: int) -> EpisodeStream:
     """The samples of the episode's time, with the neighbours that its ends need.
 
-    Args:
-        stream: on the host's clock.
-        origin_ns: host time of the episode's time 0.
-        last_ns: of the last step, counted from there.
+    `origin_ns` is the host time of the episode's time 0; `last_ns`, of the last step, counts from
+    there.
     """
     margin_ns = round(EDGE_PERIODS * stream.descriptor.period_ns())
     edges_ns = [origin_ns - margin_ns, origin_ns + last_ns + margin_ns]

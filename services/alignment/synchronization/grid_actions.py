@@ -70,10 +70,7 @@ def make_actions(
 ) -> GridActions:
     """Measured and, where recorded, commanded actions, all relative to the measured first step.
 
-    Args:
-        gridded: valid at every step.
-        domain: "human" hands are retargeted, "robot" joints taken as they are.
-        calibration: of the recording.
+    Human hands are retargeted, a robot's joints taken as they are.
     """
     left, right, head = (_poses(gridded, name) for name in POSE_STREAMS)
     if domain == "human":

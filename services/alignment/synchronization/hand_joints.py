@@ -35,11 +35,8 @@ def retarget_hands(
     Every sample is retargeted once, at the rate at which the hand was tracked; the grid's steps
     take the line between their two neighbours, which `at` has found to be in no gap.
 
-    Args:
-        streams: `keypoints_left` and `keypoints_right`.
-        at: of both, valid at every step; at least one step.
-        calibration: of the recording; `hand_profile_SIDE` is the person's hand, which is measured
-            from the recording itself where it is absent.
+    `at` is valid at every step. `hand_profile_SIDE` of the calibration is the person's hand, which
+    is measured from the recording itself where it is absent.
 
     Raises:
         InvalidInputError: keypoints that are not a hand, of the other side or in other axes, see

@@ -7,15 +7,15 @@ pressures is never in memory at once.
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
+from dextouch.episodes import RecordingReader
 from dextouch.errors import InvalidInputError
 from dextouch.geometry import pose_from_transform, transform_from_pose
-from dextouch.schemas import Matrix, RecordingAttributes, matrix_rows
-from dextouch.streams import SampleBatch, StreamDescriptor
+from dextouch.schemas import Matrix, matrix_rows
+from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS
 from services.alignment.calibration.tactile_baseline import (
     REASONS,
@@ -43,32 +43,6 @@ LEAST_NORM = 1e-9
 Conversion = Callable[[np.ndarray], np.ndarray]
 
 
-@runtime_checkable
-class Recording(Protocol):
-    """The part of `dextouch.episodes.RecordingReader` that alignment uses."""
-
-    @property
-    def attributes(self) -> RecordingAttributes:
-        """Task, calibration, domain."""
-
-    @property
-    def streams(self) -> dict[str, StreamDescriptor]:
-        """Descriptors by name."""
-
-    @property
-    def content_sha256(self) -> str:
-        """Content hash."""
-
-    def stamps(self, name: str) -> SampleBatch:
-        """All stamps of a stream, without values."""
-
-    def values(self, name: str, start: int, stop: int) -> np.ndarray:
-        """Values of samples start … stop−1, images decoded."""
-
-    def encoded_images(self, name: str, start: int, stop: int) -> list[bytes]:
-        """Images start … stop−1 of a `jpeg` or `h264` stream as they are stored."""
-
-
 @dataclass(frozen=True)
 class Block:
     """Consecutive samples of one stream in the units of the episode; finite."""
@@ -94,7 +68,7 @@ class DatedStream:
     matrices that the episode carries beside those of the recording.
     """
 
-    recording: Recording
+    recording: RecordingReader
     descriptor: StreamDescriptor
     timing: TimedStream
     convert: Conversion
@@ -138,7 +112,7 @@ def piece_rows(descriptor: StreamDescriptor) -> int:
     return max(1, PIECE_BYTES // max(row_bytes, 1))
 
 
-def date_stream(recording: Recording, name: str) -> DatedStream:
+def date_stream(recording: RecordingReader, name: str) -> DatedStream:
     """Fit the clock of one stream and choose the conversion of its values.
 
     Raises:
@@ -154,13 +128,13 @@ def date_stream(recording: Recording, name: str) -> DatedStream:
         latency_ns=round(latency_ns or 0.0),
         latency_sigma_ns=_nanoseconds(calibration, f"{name}_latency_sigma_ns"),
     )
-    convert: Conversion = _as_it_is
+    convert: Conversion = np.asarray
     if descriptor.kind == "tactile" and descriptor.unit != "kPa":
-        raw = DatedStream(recording, descriptor, timing, _as_it_is)
+        raw = DatedStream(recording, descriptor, timing, np.asarray)
         return _pressures(raw, calibration)
     if descriptor.kind == "keypoints":
         descriptor = descriptor.model_copy(update={"dtype": "float64"})
-        side, convert = descriptor.side, _as_float64
+        side, convert = descriptor.side, partial(np.asarray, dtype=np.float64)
         T = None if side is None else calibrated_transform(calibration, calibration_name(side))
         if T is not None:
             convert = partial(to_wrist_axes, T_keypoints_wrist=T)
@@ -182,14 +156,6 @@ def _nanoseconds(calibration: dict[str, Matrix], name: str) -> float | None:
     if np.shape(matrix) != (1, 1):
         raise InvalidInputError(f"calibration {name!r}: got {np.shape(matrix)}, expected (1, 1)")
     return float(matrix[0][0])
-
-
-def _as_it_is(values: np.ndarray) -> np.ndarray:
-    return values
-
-
-def _as_float64(values: np.ndarray) -> np.ndarray:
-    return values.astype(np.float64)
 
 
 def _pressures(raw: DatedStream, calibration: dict[str, Matrix]) -> DatedStream:

@@ -38,12 +38,9 @@ class RefusedPart(FrozenModel):
 def refused_edges(
     first_ns: Mapping[str, int], last_ns: Mapping[str, int], start_ns: int
 ) -> list[RefusedPart]:
-    """Ends of the recording that not all streams cover.
+    """Ends of a recording, started at `start_ns`, that not all streams cover.
 
-    Args:
-        first_ns: of the first sample of each stream that actions are made of.
-        last_ns: of the last.
-        start_ns: of the recording; all on one clock.
+    `first_ns` and `last_ns` are of the samples of each stream that actions are made of.
     """
     latest = max(first_ns, key=lambda name: first_ns[name])
     earliest = min(last_ns, key=lambda name: last_ns[name])

@@ -68,11 +68,8 @@ def time_stream(
     the period and samples are numbered), else its sequence numbers times the nominal period, else
     the count of samples that a steady device must have sent, else the arrivals as they are.
 
-    Args:
-        batch: the whole take of one stream.
-        descriptor: widths and ticks of its counters.
-        latency_ns: calibrated constant path delay, taken away from all times.
-        latency_sigma_ns: how well it is known; None if it was not measured.
+    The calibrated constant path delay `latency_ns` is taken away from all times; its sigma is None
+    if it was not measured.
 
     Raises:
         ClockFitError: too few samples, or stamps that no clock gives; names the stream.
