@@ -158,10 +158,9 @@ class Output(NamedTuple):
     @staticmethod
     def of(num_samples: int, num_fingers: int) -> "Output":
         """Room for the results of so many samples."""
-        shape = num_samples, num_fingers
         return Output(
-            joints_rad=np.zeros((*shape, MAX_JOINTS)),
-            finger_status=np.zeros(shape, dtype=np.uint8),
-            status=np.zeros(num_samples, dtype=np.uint8),
-            tip_error_m=np.zeros(shape),
+            np.empty((num_samples, num_fingers, MAX_JOINTS)),
+            np.empty((num_samples, num_fingers), dtype=np.uint8),
+            np.empty(num_samples, dtype=np.uint8),
+            np.empty((num_samples, num_fingers)),
         )
