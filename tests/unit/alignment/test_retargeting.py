@@ -90,9 +90,8 @@ def test_missing_nodes_are_filled_and_told():
     keypoints = keypoints_of(joints)
     keypoints[3:5, NODE_INDEX["ring", "distal"]] = np.nan
     keypoints[1, [NODE_INDEX["index", "distal"], NODE_INDEX["index", "tip"]]] = np.nan
-    valid = np.ones((9, NUM_KEYPOINTS), dtype=bool)
-    valid[7] = False
-    result = HandRetargeter("right", options=EXACT).retarget(keypoints, valid)
+    keypoints[7] = np.nan
+    result = HandRetargeter("right", options=EXACT).retarget(keypoints)
     assert result.status.tolist() == [0, 1, 0, 1, 1, 0, 0, RetargetStatus.MISSING, 0]
     ring, index = CHAINS.index("ring"), CHAINS.index("index")
     assert result.finger_status[3, ring] == RetargetStatus.PARTIAL
