@@ -256,7 +256,7 @@ def test_wrong_shapes_are_refused():
     with pytest.raises(ShapeError):
         HandRetargeter("right").retarget(np.zeros((0, 25, 3)))
     with pytest.raises(ShapeError):
-        HandRetargeter("right").retarget(keypoints_of(bending(2)), np.ones(2, dtype=bool))
+        HandRetargeter("right").retarget(keypoints_of(bending(2)), t_s=np.ones(3))
 
 
 def test_limits_hold_exactly_for_hands_bent_too_far():
