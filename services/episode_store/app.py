@@ -45,7 +45,24 @@ def create_app(settings: EpisodeStoreSettings) -> FastAPI:
         max_window_steps=settings.max_window_steps,
         max_answer_bytes=settings.max_answer_bytes,
     )
-    intake, metrics = _intake(settings, store, ingest, catalog)
+    reserve = DiskReserve(store.root, min_free_bytes=settings.min_free_bytes)
+    quotas = StationQuotas(
+        ingest.folder,
+        recordings=catalog.bytes_by_station,
+        quota_bytes=settings.quota_bytes_per_station,
+    )
+    metrics = StoreMetrics(open_uploads=lambda: quotas.num_open, free_bytes=reserve.free_bytes)
+    admission = Admission(
+        max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
+    )
+    intake = Intake(
+        ingest,
+        admission=admission,
+        reserve=reserve,
+        quotas=quotas,
+        metrics=metrics,
+        num_threads=settings.max_batches_in_flight,
+    )
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -87,30 +104,6 @@ def _recover(store: EpisodeStore) -> None:
     removed = store.sweep()
     if removed:
         logger.info("unfinished_writes_removed", count=removed)
-
-
-def _intake(
-    settings: EpisodeStoreSettings, store: EpisodeStore, ingest: Ingest, catalog: Catalog
-) -> tuple[Intake, StoreMetrics]:
-    reserve = DiskReserve(store.root, min_free_bytes=settings.min_free_bytes)
-    quotas = StationQuotas(
-        ingest.folder,
-        recordings=catalog.bytes_by_station,
-        quota_bytes=settings.quota_bytes_per_station,
-    )
-    metrics = StoreMetrics(open_uploads=lambda: quotas.num_open, free_bytes=reserve.free_bytes)
-    admission = Admission(
-        max_requests=settings.max_batches_in_flight, max_bytes=settings.max_bytes_in_flight
-    )
-    intake = Intake(
-        ingest,
-        admission=admission,
-        reserve=reserve,
-        quotas=quotas,
-        metrics=metrics,
-        num_threads=settings.max_batches_in_flight,
-    )
-    return intake, metrics
 
 
 def _warm_up(catalog: Catalog) -> None:

@@ -1,8 +1,8 @@
 """Intake of uploads: applies admission, disk reserve and quotas before the ingest."""
 
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
-from contextlib import asynccontextmanager, contextmanager
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import ExitStack, contextmanager
 
 import anyio
 import anyio.to_thread
@@ -79,7 +79,13 @@ class Intake:
             StorageFullError: the disk or the station's quota is full; the body was not read.
             DexTouchError: as `Ingest.put_batch`.
         """
-        async with self._admitted(recording_id, announced):
+        # A body of unknown length may be as large as the largest batch.
+        num_bytes = int(announced) if announced and announced.isdecimal() else MAX_BATCH_BYTES
+        with ExitStack() as admission:
+            with self._counting_refusals():
+                admission.enter_context(self._admission.admitted(num_bytes))
+                self._reserve.check_upload(num_bytes)
+                self._quotas.check_upload(recording_id, num_bytes)
             started = time.perf_counter()
             data = await read()
             receipt = await anyio.to_thread.run_sync(
@@ -114,21 +120,6 @@ class Intake:
                 self._quotas.end(upload.recording_id)
                 gone.append(upload)
         return UploadList(uploads=tuple(gone))
-
-    @asynccontextmanager
-    async def _admitted(self, recording_id: str, announced: str | None) -> AsyncIterator[None]:
-        # A body of unknown length may be as large as the largest batch.
-        num_bytes = int(announced) if announced and announced.isdecimal() else MAX_BATCH_BYTES
-        with self._counting_refusals():
-            admission = self._admission.admitted(num_bytes)
-            admission.__enter__()
-        try:
-            with self._counting_refusals():
-                self._reserve.check_upload(num_bytes)
-                self._quotas.check_upload(recording_id, num_bytes)
-            yield
-        finally:
-            admission.__exit__(None, None, None)
 
     @contextmanager
     def _counting_refusals(self) -> Iterator[None]:

@@ -3,6 +3,7 @@
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from weakref import WeakValueDictionary
 
 from dextouch.errors import UnavailableError
 
@@ -15,8 +16,8 @@ class KeyedLocks:
     def __init__(self, *, patience_s: float) -> None:
         self._patience_s = patience_s
         self._guard = threading.Lock()
-        # Locks with their number of users, so that unknown ids cost no memory.
-        self._locks: dict[str, tuple[threading.Lock, int]] = {}
+        # Those who hold or wait for a lock keep it alive, so that unknown ids cost no memory.
+        self._locks: WeakValueDictionary[str, threading.Lock] = WeakValueDictionary()
 
     @contextmanager
     def holding(self, key: str) -> Iterator[None]:
@@ -26,27 +27,19 @@ class KeyedLocks:
             UnavailableError: the lock was not released in `patience_s`.
         """
         with self._guard:
-            lock, num_users = self._locks.get(key, (threading.Lock(), 0))
-            self._locks[key] = (lock, num_users + 1)
+            lock = self._locks.setdefault(key, threading.Lock())
+        if not lock.acquire(timeout=self._patience_s):
+            # The traceback would keep it alive.
+            del lock
+            raise UnavailableError(
+                f"{key}: still locked after {self._patience_s:g} s; try again later",
+                retry_after_s=RETRY_AFTER_S,
+            )
         try:
-            if not lock.acquire(timeout=self._patience_s):
-                raise UnavailableError(
-                    f"{key}: still locked after {self._patience_s:g} s; try again later",
-                    retry_after_s=RETRY_AFTER_S,
-                )
-            try:
-                yield
-            finally:
-                lock.release()
+            yield
         finally:
-            with self._guard:
-                lock, num_users = self._locks[key]
-                if num_users == 1:
-                    del self._locks[key]
-                else:
-                    self._locks[key] = (lock, num_users - 1)
+            lock.release()
 
     def is_wanted(self, key: str) -> bool:
         """Whether a key is locked or waited for."""
-        with self._guard:
-            return key in self._locks
+        return key in self._locks

@@ -74,11 +74,7 @@ class GroupReader(Generic[A]):
         if self._stream(name).kind != "image":
             raise InvalidInputError(f"{self._what}: {name!r} holds no images")
         stop = self.num_samples(name) if stop is None else stop
-        if not 0 <= start <= stop <= self.num_samples(name):
-            raise InvalidInputError(
-                f"{self._what}: got images {start} … {stop} of {name!r}, expected within "
-                f"0 … {self.num_samples(name)}"
-            )
+        self._check_span("images", name, start, stop)
         # A forged length must not be expanded to a list of numbers.
         self._contents.shard(name).check_index()
         return self._pick_images(self._stream(name), np.arange(start, stop), form, out)
@@ -127,6 +123,13 @@ class GroupReader(Generic[A]):
         if name not in self._contents.entries:
             raise UnknownNameError("array", name, list(self._contents.entries))
         return self._contents.entries[name].sha256
+
+    def _check_span(self, what: str, name: str, start: int, stop: int) -> None:
+        if not 0 <= start <= stop <= self.num_samples(name):
+            raise InvalidInputError(
+                f"{self._what}: got {what} {start} … {stop} of {name!r}, expected within "
+                f"0 … {self.num_samples(name)}"
+            )
 
     def _stream(self, name: str) -> StreamDescriptor:
         if name not in self.streams:

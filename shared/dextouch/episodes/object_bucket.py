@@ -2,8 +2,6 @@
 
 import os
 import re
-import threading
-from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +20,7 @@ from obstore.exceptions import (
 from obstore.store import S3Store
 
 from dextouch.episodes.object_address import ObjectAddress
+from dextouch.episodes.sources import LruCache
 from dextouch.errors import CorruptDataError, InvalidInputError, StorageError, UnavailableError
 
 _PASSED_ON = (
@@ -44,49 +43,19 @@ class ObjectFacts:
     modified: datetime
 
 
-class _Runtime:
-    """Guards against use after a fork, where the library's threads do not exist."""
-
-    owner: int | None = None
-
-    @classmethod
-    def check(cls, what: str) -> None:
-        if cls.owner is None:
-            cls.owner = os.getpid()
-        if cls.owner != os.getpid():
-            raise UnavailableError(
-                f"{what}: object storage was used before this process was forked, which the "
-                "connection does not survive; start workers with 'spawn' or 'forkserver' "
-                "(DataLoader: multiprocessing_context='spawn')"
-            )
+# The first process to use object storage; the library's threads do not exist in its forks.
+_OWNER: list[int] = []
 
 
-class BlockCache:
-    """LRU cache of object blocks, limited to `capacity` bytes; 0 disables it."""
-
-    def __init__(self, capacity: int) -> None:
-        self.capacity = capacity
-        self._guard = threading.Lock()
-        self._blocks: OrderedDict[tuple[str, str, int], bytes] = OrderedDict()
-        self._num_bytes = 0
-
-    def get(self, facts: ObjectFacts, number: int) -> bytes | None:
-        """A cached block of this version of an object."""
-        key = (facts.key, facts.etag, number)
-        with self._guard:
-            block = self._blocks.get(key)
-            if block is not None:
-                self._blocks.move_to_end(key)
-        return block
-
-    def put(self, facts: ObjectFacts, number: int, block: bytes) -> None:
-        """Add a block, evicting the least recently used ones."""
-        key = (facts.key, facts.etag, number)
-        with self._guard:
-            self._num_bytes += len(block) - len(self._blocks.pop(key, b""))
-            self._blocks[key] = block
-            while self._num_bytes > self.capacity:
-                self._num_bytes -= len(self._blocks.popitem(last=False)[1])
+def _refuse_forks(what: str) -> None:
+    if not _OWNER:
+        _OWNER.append(os.getpid())
+    if os.getpid() not in _OWNER:
+        raise UnavailableError(
+            f"{what}: object storage was used before this process was forked, which the "
+            "connection does not survive; start workers with 'spawn' or 'forkserver' "
+            "(DataLoader: multiprocessing_context='spawn')"
+        )
 
 
 class Bucket:
@@ -98,7 +67,8 @@ class Bucket:
     def __init__(self, address: ObjectAddress) -> None:
         self.address = address
         options = address.options
-        self.cache = BlockCache(options.cache_bytes)
+        # Blocks by key and version of their object, and number.
+        self.cache: LruCache[bytes] = LruCache(options.cache_bytes, len)
         config: Any = {
             name: value for name in _PASSED_ON if (value := getattr(options, name)) is not None
         }
@@ -214,7 +184,7 @@ class Bucket:
             StorageError: refused because of credentials, bucket or permissions.
             UnavailableError: no answer, or the service is overloaded.
         """
-        _Runtime.check(self.url(key))
+        _refuse_forks(self.url(key))
         try:
             yield
         except FileNotFoundError as error:

@@ -58,19 +58,19 @@ class ObjectFile:
             if found is None:
                 return None
             self._facts = found[0]
-            self._bucket.cache.put(self._facts, _TAIL, found[1])
+            self._keep(self._facts, _TAIL, found[1])
         return self._facts
 
     def _tail(self, facts: ObjectFacts, start: int) -> bytes:
-        data = self._bucket.cache.get(facts, _TAIL)
+        data = self._known(facts, _TAIL)
         if data is None:
             data = self._bucket.read(facts, start, facts.size)
-            self._bucket.cache.put(facts, _TAIL, data)
+            self._keep(facts, _TAIL, data)
         return data
 
     def _from_blocks(self, facts: ObjectFacts, offset: int, stop: int) -> bytes:
         first, last = offset // BLOCK_BYTES, (stop - 1) // BLOCK_BYTES
-        blocks = {n: self._bucket.cache.get(facts, n) for n in range(first, last + 1)}
+        blocks = {n: self._known(facts, n) for n in range(first, last + 1)}
         missing = [number for number, block in blocks.items() if block is None]
         if missing:
             blocks |= self._fetch(facts, missing[0], missing[-1] + 1)
@@ -90,8 +90,14 @@ class ObjectFile:
             for number in range(first, stop)
         }
         for number, block in blocks.items():
-            self._bucket.cache.put(facts, number, block)
+            self._keep(facts, number, block)
         return blocks
+
+    def _known(self, facts: ObjectFacts, number: int) -> bytes | None:
+        return self._bucket.cache.get((facts.key, facts.etag, number))
+
+    def _keep(self, facts: ObjectFacts, number: int, block: bytes) -> None:
+        self._bucket.cache.put((facts.key, facts.etag, number), block)
 
 
 class ObjectGroup:

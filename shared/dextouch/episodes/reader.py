@@ -90,11 +90,7 @@ class RecordingReader(GroupReader[RecordingAttributes]):
             InvalidInputError: samples outside the stream.
             CorruptDataError: damaged bytes.
         """
-        if not 0 <= start <= stop <= self.num_samples(name):
-            raise InvalidInputError(
-                f"{self._what}: got samples {start} … {stop} of {name!r}, expected within "
-                f"0 … {self.num_samples(name)}"
-            )
+        self._check_span("samples", name, start, stop)
         return self._values(name, start, stop)
 
 

@@ -4,11 +4,13 @@ import mmap
 import os
 import threading
 from collections import OrderedDict
+from collections.abc import Callable, Hashable
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from dextouch.episodes.files import disk_errors
 
+V = TypeVar("V")
 # Each mapping holds a file descriptor, and the usual limit is 1024 per process.
 MAX_MAPPED_FILES = 192
 
@@ -44,53 +46,58 @@ class GroupFiles(Protocol):
         ...
 
 
-class _MappedFiles:
-    """LRU cache of memory-mapped files."""
+class LruCache(Generic[V]):
+    """Thread-safe cache that evicts the least recently used values beyond a total weight."""
 
-    def __init__(self, capacity: int) -> None:
-        self._capacity = capacity
-        self._guard = threading.Lock()
-        self._maps: OrderedDict[tuple[str, int, int, int], mmap.mmap] = OrderedDict()
+    def __init__(self, capacity: int, weigh: Callable[[V], int]) -> None:
+        self.capacity, self._weigh = capacity, weigh
+        self.forget()
 
-    def get(self, path: Path) -> memoryview | None:
-        """The mapped bytes of a file; None if it is missing or empty."""
-        try:
-            status = path.stat()
-        except (FileNotFoundError, NotADirectoryError):
-            return None
-        # A file that was replaced under the same name has another identity.
-        key = (str(path), status.st_ino, status.st_size, status.st_mtime_ns)
+    def get(self, key: Hashable) -> V | None:
+        """The value of a key; None if it is not in the cache."""
         with self._guard:
-            known = self._maps.get(key)
-            if known is None:
-                if status.st_size == 0:
-                    return memoryview(b"")
-                known = self._map(path)
-                self._maps[key] = known
-                # Dropped, not closed: readers may still use the mapping, and the last one frees it.
-                while len(self._maps) > self._capacity:
-                    self._maps.popitem(last=False)
-            else:
-                self._maps.move_to_end(key)
-        return memoryview(known)
+            value = self._values.get(key)
+            if value is not None:
+                self._values.move_to_end(key)
+        return value
+
+    def put(self, key: Hashable, value: V) -> None:
+        """Add or replace a value."""
+        with self._guard:
+            before = self._values.pop(key, None)
+            self._weight += self._weigh(value) - (0 if before is None else self._weigh(before))
+            self._values[key] = value
+            while self._weight > self.capacity:
+                self._weight -= self._weigh(self._values.popitem(last=False)[1])
 
     def forget(self) -> None:
-        """Drop all mappings, as a forked process must."""
+        """Drop all values, and the lock that another thread may have held at a fork."""
         self._guard = threading.Lock()
-        self._maps.clear()
-
-    @staticmethod
-    def _map(path: Path) -> mmap.mmap:
-        descriptor = os.open(path, os.O_RDONLY)
-        try:
-            return mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ)
-        finally:
-            os.close(descriptor)
+        self._values: OrderedDict[Hashable, V] = OrderedDict()
+        self._weight = 0
 
 
-_MAPPED = _MappedFiles(MAX_MAPPED_FILES)
-# A lock that another thread held at the fork would stay locked in the child forever.
+# Evicted mappings are dropped, not closed: readers may still use them, and the last one frees them.
+_MAPPED: LruCache[mmap.mmap] = LruCache(MAX_MAPPED_FILES, lambda _: 1)
 os.register_at_fork(after_in_child=_MAPPED.forget)
+
+
+def _mapped(path: Path) -> memoryview | None:
+    """The memory-mapped bytes of a file; None if it is missing."""
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    # A file that was replaced under the same name has another identity.
+    key = (str(path), status.st_ino, status.st_size, status.st_mtime_ns)
+    known = _MAPPED.get(key)
+    if known is None:
+        if status.st_size == 0:
+            return memoryview(b"")
+        with path.open("rb") as file:
+            known = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        _MAPPED.put(key, known)
+    return memoryview(known)
 
 
 class LocalFile:
@@ -111,7 +118,7 @@ class LocalFile:
 
     def _bytes(self) -> memoryview | None:
         try:
-            return _MAPPED.get(self.path)
+            return _mapped(self.path)
         except OSError:
             # Entered only on a miss: on every read it would cost as much as the lookup.
             with disk_errors(f"read {self.path}"):

@@ -6,20 +6,21 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from dextouch.episodes.object_bucket import BlockCache, Bucket, ObjectFacts
+from dextouch.episodes.object_bucket import Bucket, ObjectFacts
 from dextouch.episodes.object_files import (
     BLOCK_BYTES,
     MAX_READ_AHEAD,
     TAIL_BYTES,
     ObjectFile,
 )
+from dextouch.episodes.sources import LruCache
 
 
 class CountedBucket(Bucket):
     """Objects in memory with the two requests that reading makes, counted."""
 
     def __init__(self, data, capacity):
-        self.data, self.requests, self.cache = data, [], BlockCache(capacity)
+        self.data, self.requests, self.cache = data, [], LruCache(capacity, len)
 
     def tail(self, key, length):
         self.requests.append(("tail", length))
@@ -47,7 +48,7 @@ def test_parts_of_an_object_are_slices_of_it(spans, capacity):
     for near, shift, length in spans:
         offset = max(0, near + shift)
         assert file.read(offset, length) == DATA[offset : offset + length]
-        assert sum(map(len, bucket.cache._blocks.values())) == bucket.cache._num_bytes <= capacity
+        assert sum(map(len, bucket.cache._values.values())) == bucket.cache._weight <= capacity
 
 
 def test_what_was_read_is_not_asked_for_again():
