@@ -200,7 +200,7 @@ def _line(
     by_seed: tuple[float | None, ...],
 ) -> Line:
     value, draws = figure
-    found = interval_of_draws(draws).interval if about.num and math.isfinite(value) else None
+    found = interval_of_draws(draws) if about.num and math.isfinite(value) else None
     interval = None if found is None else (found.low, found.high)
     return Line(
         task,

@@ -6,6 +6,10 @@ from typing import Any
 UNDEFINED = "undefined"
 # Smaller mean differences of success are not mentioned.
 NOTABLE_BIAS = 0.05
+# Changes of a correlation by one policy below this are not mentioned.
+NOTABLE_INFLUENCE = 0.1
+# A correlation that may be below this is not shown to be good.
+VAGUE_R = 0.5
 
 
 def task_comments(
@@ -30,7 +34,27 @@ def task_comments(
         _mean_error(agreement["bias"], world),
         *_widest_gaps(rows, world),
         *undefined,
+        *_correlation(agreement),
     ]
+
+
+def _correlation(agreement: Mapping[str, Any]) -> list[str]:
+    """What the correlation can tell: its interval, chance, and the policy that it hangs on."""
+    interval, chance = agreement.get("pearson_interval"), agreement.get("pearson_chance")
+    if not isinstance(interval, list) or not isinstance(chance, float):
+        return []
+    low, high = interval
+    vague = "; these data do not tell a faithful world from a poor one" if low < VAGUE_R else ""
+    sentences = [
+        f"Between the policies' true success rates Pearson's r is {low:.2f} to {high:.2f} (95 %)"
+        f"{vague}. Of all ways to pair the policies' rates, {chance:.2g} correlate as well."
+    ]
+    r, without = agreement["pearson"], agreement["pearson_without"]
+    moved = {name: value - r for name, value in without.items() if value != UNDEFINED}
+    name = max(moved, key=lambda one: abs(moved[one]), default=None)
+    if name is not None and abs(moved[name]) >= NOTABLE_INFLUENCE:
+        sentences.append(f"Without {name!r}, r would be {without[name]:.2f} instead of {r:.2f}.")
+    return sentences
 
 
 def _compared_starts(

@@ -6,8 +6,6 @@ table, so that all figures use the same draws. Figures of single rollouts are in
 `services.evaluation.statistics` and `dextouch.metrics.policy`.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float64
 
@@ -103,9 +101,3 @@ def mean_of_draws(
     weight = _weights(counts, start_index)
     with np.errstate(invalid="ignore"):
         return np.asarray((weight @ np.asarray(values, dtype=np.float64)) / weight.sum(axis=1))
-
-
-MEASURES: dict[str, Callable[[np.ndarray, np.ndarray], Float64[np.ndarray, " draws"]]] = {
-    "pearson": pearson_of_draws,
-    "mmrv": mmrv_of_draws,
-}

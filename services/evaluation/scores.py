@@ -1,30 +1,26 @@
 """Success rates of policies with confidence intervals, and their agreement between two worlds."""
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 
 from dextouch.errors import InvalidInputError
-from dextouch.metrics.policy import bias, kendall, mean_absolute_error, mmrv, pearson, spearman
+from services.evaluation.agreement import (
+    FIGURES,
+    Agreement,
+    paired_differences,
+    task_agreement,
+)
 from services.evaluation.comments import UNDEFINED, task_comments
-from services.evaluation.statistics import bootstrap_agreement, wilson_interval
+from services.evaluation.rate_draws import MatchedScores
+from services.evaluation.statistics import wilson_interval
 
 REAL = "real"
-_BOOTSTRAP_SEED = 0
-_AGREEMENT_FIGURES: dict[str, Callable[..., float]] = {
-    "pearson": pearson,
-    "mmrv": partial(mmrv, ties="simpler"),
-    "mmrv_paper": partial(mmrv, ties="paper"),
-    "spearman": spearman,
-    "kendall": kendall,
-    "bias": bias,
-    "mean_absolute_error": mean_absolute_error,
-}
+_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -147,7 +143,10 @@ class ClosedLoopReport:
 
         `mmrv` counts ties (`ties="simpler"`); `mmrv_paper` does not, so it is 0 for a world that
         gives every policy the same score. `rates` are the compared success rates, over the
-        `num_starts` starts that finished in both worlds for every policy.
+        `num_starts` starts that finished in both worlds for every policy. With two policies and
+        two starts or more, every figure has a 95 % interval of the true scores' figure and the
+        share of bootstrap draws in which it is undefined; `pearson_without` leaves one policy out,
+        `pearson_chance` is the permutation p value, and `differences` compares policies in pairs.
         """
         return {task: self._agreement(world, task) for task in self.tasks}
 
@@ -155,10 +154,21 @@ class ClosedLoopReport:
         outcomes = (self.outcomes(REAL, task), self.outcomes(world, task))
         compared, real, imagined = matched(self.policies, *outcomes)
         if real.size == 0:
-            undefined = dict.fromkeys(_AGREEMENT_FIGURES, UNDEFINED)
+            undefined = dict.fromkeys(FIGURES, UNDEFINED)
             return undefined | {"num_policies": 0, "num_starts": 0, "rates": {}}
         pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
-        found: dict[str, Any] = {n: defined(f(**pair)) for n, f in _AGREEMENT_FIGURES.items()}
+        found: dict[str, Any] = {n: defined(f(**pair)) for n, f in FIGURES.items()}
+        if min(real.shape) >= 2:
+            generator = np.random.default_rng(_SEED)
+            scores = MatchedScores(real[:, :, None], imagined[:, :, None])
+            found |= _entries(task_agreement(compared, scores, generator)[0])
+            found["differences"] = {
+                world: [
+                    asdict(one) | {"interval": [one.interval.low, one.interval.high]}
+                    for one in paired_differences(compared, outcomes, generator)
+                ]
+                for world, outcomes in ((REAL, real), ("imagined", imagined))
+            }
         found |= {
             "num_policies": len(real),
             "num_starts": real.shape[1],
@@ -167,16 +177,6 @@ class ClosedLoopReport:
                 for row, policy in enumerate(compared)
             },
         }
-        for measure in ("pearson", "mmrv"):
-            drawn = bootstrap_agreement(
-                real=real,
-                imagined=imagined,
-                measure=measure,
-                generator=np.random.default_rng(_BOOTSTRAP_SEED),
-            )
-            interval = drawn.interval
-            found[f"{measure}_interval"] = [interval.low, interval.high] if interval else UNDEFINED
-            found[f"{measure}_undefined_share"] = drawn.undefined_share
         return found
 
     def probe_accuracy(self) -> float | str:
@@ -221,6 +221,18 @@ def matched(
     columns = known[rows].all(axis=0)
     compared = [policy for policy, kept in zip(policies, rows, strict=True) if kept]
     return compared, real[rows][:, columns], imagined[rows][:, columns]
+
+
+def _entries(agreement: Agreement) -> dict[str, Any]:
+    """Report entries of intervals, of correlations without one policy, and of chance."""
+    found: dict[str, Any] = {}
+    for name, figure in agreement.figures.items():
+        interval = figure.interval
+        found[f"{name}_interval"] = [interval.low, interval.high] if interval else UNDEFINED
+        found[f"{name}_undefined_share"] = figure.undefined_share
+    found["pearson_without"] = {name: defined(r) for name, r in agreement.without.items()}
+    found["pearson_chance"] = defined(agreement.chance)
+    return found
 
 
 def defined(value: float) -> float | str:

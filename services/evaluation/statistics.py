@@ -1,4 +1,4 @@
-"""Success rates, classification metrics and agreement figures with confidence intervals."""
+"""Success rates and classification metrics, and confidence intervals."""
 
 import math
 from dataclasses import dataclass
@@ -7,7 +7,6 @@ from statistics import NormalDist
 import numpy as np
 
 from dextouch.errors import InvalidInputError, ShapeError
-from services.evaluation.resampling import MEASURES, rates_of_draws, start_counts
 
 
 @dataclass(frozen=True)
@@ -16,18 +15,6 @@ class Interval:
 
     low: float
     high: float
-
-
-@dataclass(frozen=True)
-class AgreementInterval:
-    """Confidence interval of an agreement figure.
-
-    `interval` is None if too few draws were defined; `undefined_share` is the share of draws
-    without a value (all scores of one side equal).
-    """
-
-    interval: Interval | None
-    undefined_share: float
 
 
 def _check_confidence(confidence: float) -> None:
@@ -109,47 +96,28 @@ def bootstrap_mean_interval(
     if checked.ndim != 1 or len(checked) == 0:
         raise ShapeError(f"bootstrap: got shape {checked.shape}, expected [n ≥ 1]")
     drawn = generator.integers(0, len(checked), (num_draws, len(checked)))
-    return _percentiles(checked[drawn].mean(axis=1), confidence)
+    return central_interval(checked[drawn].mean(axis=1), confidence=confidence)
 
 
-def bootstrap_agreement(
-    *,
-    real: np.ndarray,
-    imagined: np.ndarray,
-    measure: str,
-    generator: np.random.Generator,
-    num_draws: int = 1000,
-) -> AgreementInterval:
-    """95 % percentile interval of an agreement figure by resampling the matched starts.
-
-    Args:
-        real: scores [policies, starts]; column k of both arrays began from the same start.
-        imagined: scores [policies, starts].
-        measure: "pearson", or "mmrv" with ties counted, of the policies' means.
-        generator: source of the draws; every policy sees the same drawn starts.
-        num_draws: number of draws.
-
-    Raises:
-        ShapeError: different shapes or not two axes.
-        InvalidInputError: unknown measure.
-    """
-    real, imagined = np.asarray(real, dtype=np.float64), np.asarray(imagined, dtype=np.float64)
-    if real.shape != imagined.shape or real.ndim != 2 or real.size == 0:
-        raise ShapeError(
-            f"agreement: got shapes {real.shape} and {imagined.shape}, "
-            "expected the same [policies, starts]"
-        )
-    if measure not in MEASURES:
-        raise InvalidInputError(
-            f"agreement measure: got {measure!r}, expected one of {sorted(MEASURES)}"
-        )
-    counts = start_counts(real.shape[1], generator, num_draws=num_draws)
-    figures = MEASURES[measure](rates_of_draws(real, counts), rates_of_draws(imagined, counts))
-    return interval_of_draws(figures)
+def central_interval(draws: np.ndarray, *, confidence: float = 0.95) -> Interval:
+    """Interval between quantiles of draws [n ≥ 1] that leaves equal shares on both sides."""
+    low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
+    return Interval(float(low), float(high))
 
 
-def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> AgreementInterval:
+def shortest_interval(draws: np.ndarray, *, confidence: float = 0.95) -> Interval:
+    """The shortest interval that holds a share of draws [n ≥ 1], at least `confidence`."""
+    ordered = np.sort(draws)
+    held = math.ceil(confidence * len(ordered))
+    first = int(np.argmin(ordered[held - 1 :] - ordered[: len(ordered) - held + 1]))
+    return Interval(float(ordered[first]), float(ordered[first + held - 1]))
+
+
+def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> Interval | None:
     """Percentile interval of the figures [draws] of a bootstrap; undefined draws are NaN.
+
+    Returns:
+        The interval of the defined draws; None where more than half are undefined.
 
     Raises:
         ShapeError: not one axis with at least one draw.
@@ -157,13 +125,6 @@ def interval_of_draws(figures: np.ndarray, *, confidence: float = 0.95) -> Agree
     _check_confidence(confidence)
     if figures.ndim != 1 or len(figures) == 0:
         raise ShapeError(f"bootstrap: got shape {figures.shape}, expected [draws ≥ 1]")
-    num_draws = len(figures)
     defined = figures[np.isfinite(figures)]
-    undefined_share = 1 - len(defined) / num_draws
-    enough = undefined_share < 0.5
-    return AgreementInterval(_percentiles(defined, confidence) if enough else None, undefined_share)
-
-
-def _percentiles(draws: np.ndarray, confidence: float) -> Interval:
-    low, high = np.quantile(draws, [(1 - confidence) / 2, (1 + confidence) / 2])
-    return Interval(float(low), float(high))
+    enough = 2 * len(defined) > len(figures)
+    return central_interval(defined, confidence=confidence) if enough else None

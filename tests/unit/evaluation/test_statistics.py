@@ -8,8 +8,9 @@ from dextouch.errors import InvalidInputError, ShapeError
 from services.evaluation.statistics import (
     area_under_roc,
     balanced_accuracy,
-    bootstrap_agreement,
     bootstrap_mean_interval,
+    interval_of_draws,
+    shortest_interval,
     wilson_interval,
 )
 
@@ -88,37 +89,18 @@ def test_balanced_accuracy_by_hand():
             measure(np.ones(3), np.ones(3))
 
 
-def test_agreement_of_identical_worlds_is_sure():
-    rng = np.random.default_rng(2)
-    real = (rng.random((4, 20)) < np.array([[0.1], [0.4], [0.7], [0.95]])).astype(float)
-    drawn = bootstrap_agreement(
-        real=real, imagined=real, measure="pearson", generator=rng, num_draws=200
-    )
-    assert drawn.interval is not None
-    assert drawn.interval.low == pytest.approx(1.0)
-    assert drawn.undefined_share < 0.05
+def test_the_shortest_interval_reaches_the_bound_where_draws_crowd():
+    draws = 1 - np.random.default_rng(3).exponential(0.1, 10_000)
+    interval = shortest_interval(draws)
+    # 95 % of an exponential distribution lie below 3 times its mean.
+    assert (interval.low, interval.high) == pytest.approx((0.7, 1.0), abs=0.02)
 
 
-def test_agreement_without_spread_is_undefined():
-    flat = np.ones((3, 10))
-    drawn = bootstrap_agreement(
-        real=flat,
-        imagined=flat,
-        measure="pearson",
-        generator=np.random.default_rng(0),
-        num_draws=50,
-    )
-    assert drawn.interval is None
-    assert drawn.undefined_share == 1.0
-
-
-def test_agreement_checks_its_input():
-    rng = np.random.default_rng(0)
-    with pytest.raises(ShapeError, match="policies, starts"):
-        bootstrap_agreement(
-            real=np.ones((3, 4)), imagined=np.ones((3, 5)), measure="mmrv", generator=rng
-        )
-    with pytest.raises(InvalidInputError, match="mmrv"):
-        bootstrap_agreement(
-            real=np.ones((3, 4)), imagined=np.ones((3, 4)), measure="luck", generator=rng
-        )
+def test_an_interval_of_mostly_undefined_draws_is_none():
+    draws = np.full(10, np.nan)
+    draws[:5] = 0.5
+    assert interval_of_draws(draws) is None
+    draws[5] = 0.5
+    assert interval_of_draws(draws) is not None
+    with pytest.raises(ShapeError, match="draws"):
+        interval_of_draws(np.empty(0))

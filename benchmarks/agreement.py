@@ -1,0 +1,256 @@
+"""Entry point of the benchmark stage `agreement`: how often intervals hold the truth."""
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.special import ndtri
+
+from benchmarks.chart import Panel, Point
+from benchmarks.figures import Figure, Requirement
+from benchmarks.machine import describe_machine
+from benchmarks.report import ResultTable, StageReport
+from benchmarks.rounds import interleaved
+from benchmarks.stages import Bar
+from dextouch.errors import InvalidInputError
+from services.evaluation.agreement import CORRELATIONS, FIGURES, figures_of_draws
+from services.evaluation.rate_draws import (
+    MatchedScores,
+    ScoreDraws,
+    bootstrap_scores,
+    posterior_scores,
+)
+from services.evaluation.statistics import central_interval, shortest_interval
+
+Draw = Callable[..., ScoreDraws]
+OURS: Final = "posterior"
+METHODS: Final[Mapping[str, Draw]] = {OURS: posterior_scores, "bootstrap": bootstrap_scores}
+MEASURED: Final = ("pearson", "mmrv", "bias")
+# Standard deviations by which imagined success rates differ from real ones.
+DISAGREEMENTS: Final = (0.0, 0.05, 0.2, 0.5)
+NUM_POLICIES: Final = (3, 6, 10)
+NUM_STARTS: Final = 10
+# Correlation, on the scale of a normal variable, of the outcomes of different policies from the
+# same start: objects that lie badly are bad for all.
+SHARED: Final = 0.5
+# The paper's largest table: 4 tasks of 3 policies, 10 starts and 5 raters.
+PAPER: Final = (3, 10, 5)
+PAPER_TASKS: Final = 4
+USUAL: Final = {"studies": 200, "draws": 4000, "rounds": 7}
+QUICK: Final = {"studies": 6, "draws": 500, "rounds": 2}
+
+
+@dataclass(frozen=True)
+class Truth:
+    """True success rates of policies in both worlds."""
+
+    real: np.ndarray
+    imagined: np.ndarray
+
+    def figure(self, name: str) -> float:
+        """An agreement figure of the true rates."""
+        return FIGURES[name](real=self.real, imagined=self.imagined)
+
+
+@dataclass(frozen=True)
+class Tally:
+    """How often a method's intervals held the truth, and how wide they were."""
+
+    held: float
+    width: float
+    undefined: int
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of this stage."""
+    parser.add_argument("--studies", type=int, help="simulated studies of each kind (200; quick 6)")
+
+
+def measure(options: argparse.Namespace, folder: Path, bar: Bar) -> StageReport:
+    """Simulate studies of known truth, and time both methods on a study of the paper's size.
+
+    Raises:
+        InvalidInputError: no study.
+    """
+    del folder
+    plan: dict[str, Any] = dict(QUICK if options.quick else USUAL)
+    plan["studies"] = plan["studies"] if options.studies is None else options.studies
+    if plan["studies"] < 1:
+        raise InvalidInputError(f"--studies: got {plan['studies']}, expected at least 1")
+    kinds = [(p, d) for p in NUM_POLICIES for d in DISAGREEMENTS]
+    found: dict[tuple[int, float], dict[tuple[str, str], Tally]] = {}
+    with bar("studies", len(kinds)) as step:
+        for index, (num_policies, disagreement) in enumerate(kinds):
+            step(f"{num_policies} policies, {disagreement:g} apart")
+            generator = np.random.default_rng(index)
+            found[num_policies, disagreement] = coverage(
+                num_policies, disagreement, plan, generator
+            )
+    times_s = timed(plan["rounds"])
+    return StageReport(
+        stage="agreement",
+        machine=describe_machine(("numpy", "scipy")),
+        options=plan,
+        tables=[coverage_table(name, found) for name in MEASURED] + [time_table(times_s)],
+        panels=[panel(found, times_s)],
+        requirements=requirements(found, times_s),
+        data={
+            "coverage": [
+                {"policies": p, "disagreement": d, "method": method, "figure": name}
+                | {"held": tally.held, "width": tally.width, "undefined": tally.undefined}
+                for (p, d), tallies in found.items()
+                for (method, name), tally in tallies.items()
+            ],
+            "seconds": {name: list(figure.values) for name, figure in times_s.items()},
+        },
+        notes=[
+            f"{NUM_STARTS} starts of one success or failure each; times are processor time of a "
+            "study of the paper's size, 10,000 draws of every task"
+        ],
+    )
+
+
+def simulated_study(
+    num_policies: int, disagreement: float, generator: np.random.Generator
+) -> tuple[Truth, MatchedScores]:
+    """A study of policies of random skill from ten starts, with the rates behind it."""
+    real = generator.uniform(0.05, 0.95, num_policies)
+    imagined = np.clip(real + generator.normal(0, disagreement, num_policies), 0.02, 0.98)
+    luck = generator.standard_normal(NUM_STARTS)
+
+    def outcomes(rates: np.ndarray) -> np.ndarray:
+        own = generator.standard_normal((num_policies, NUM_STARTS))
+        skill = math.sqrt(SHARED) * luck + math.sqrt(1 - SHARED) * own
+        return (skill < ndtri(rates)[:, None]).astype(np.float64)[:, :, None]
+
+    return Truth(real, imagined), MatchedScores(outcomes(real), outcomes(imagined))
+
+
+def coverage(
+    num_policies: int,
+    disagreement: float,
+    plan: Mapping[str, int],
+    generator: np.random.Generator,
+) -> dict[tuple[str, str], Tally]:
+    """Tallies by method and figure over simulated studies of one kind."""
+    held: dict[tuple[str, str], list[tuple[bool, float]]] = {
+        (method, name): [] for method in METHODS for name in MEASURED
+    }
+    for _ in range(plan["studies"]):
+        truth, scores = simulated_study(num_policies, disagreement, generator)
+        for method, draw in METHODS.items():
+            draws = figures_of_draws(draw(scores, generator, num_draws=plan["draws"]))
+            for name in MEASURED:
+                defined = draws[name][np.isfinite(draws[name])]
+                if 2 * len(defined) < plan["draws"]:
+                    continue
+                # A bootstrap is read by its quantiles, as is usual.
+                shortest = method == OURS and name in CORRELATIONS
+                interval = (shortest_interval if shortest else central_interval)(defined)
+                # A truth at the edge of what is possible (r = 1) is met within a thousandth.
+                hit = interval.low - 1e-3 <= truth.figure(name) <= interval.high + 1e-3
+                held[method, name].append((hit, interval.high - interval.low))
+    return {
+        key: Tally(
+            float(np.mean([hit for hit, _ in rows])) if rows else math.nan,
+            float(np.median([width for _, width in rows])) if rows else math.nan,
+            plan["studies"] - len(rows),
+        )
+        for key, rows in held.items()
+    }
+
+
+def timed(num_rounds: int) -> dict[str, Figure]:
+    """Processor seconds of 10,000 draws of every task of the paper's largest study."""
+    generator = np.random.default_rng(0)
+    sides = [generator.integers(0, 5, PAPER) / 4 for _ in range(2)]
+    scores = MatchedScores(*sides)
+
+    def once(draw: Draw, round_index: int) -> float:
+        started = time.process_time()
+        for _ in range(PAPER_TASKS):
+            figures_of_draws(draw(scores, np.random.default_rng(round_index)))
+        return time.process_time() - started
+
+    subjects = {name: partial(once, draw) for name, draw in METHODS.items()}
+    return {name: Figure.of(values) for name, values in interleaved(subjects, num_rounds).items()}
+
+
+def coverage_table(
+    name: str, found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]]
+) -> ResultTable:
+    """How often the 95 % interval of a figure holds the truth, and its median width."""
+    rows = []
+    for (num_policies, disagreement), tallies in found.items():
+        row = [f"{num_policies} policies, {disagreement:g} apart"]
+        for method in METHODS:
+            tally = tallies[method, name]
+            row += [f"{tally.held:.2f}", f"{tally.width:.2f}", str(tally.undefined)]
+        rows.append(tuple(row))
+    columns = [f"{method}: {c}" for method in METHODS for c in ("holds", "width", "undefined")]
+    return ResultTable(f"95 % intervals of {name}", ("studies", *columns), rows)
+
+
+def time_table(times_s: Mapping[str, Figure]) -> ResultTable:
+    """Seconds of both methods."""
+    rows = [(name, figure.text()) for name, figure in times_s.items()]
+    return ResultTable("4 tasks of 3 policies, 10 starts, 5 raters", ("method", "s"), rows)
+
+
+def mean_held(
+    found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]], method: str, name: str
+) -> float:
+    """Share of all simulated studies whose interval holds the truth."""
+    held = [tallies[method, name].held for tallies in found.values()]
+    return float(np.nanmean(held))
+
+
+def panel(
+    found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]],
+    times_s: Mapping[str, Figure],
+) -> Panel:
+    """Time of a study against how far the intervals of Pearson's r are from holding 95 %."""
+    points = [
+        Point(
+            label=name,
+            time=figure.median,
+            time_low=figure.low,
+            time_high=figure.high,
+            error=abs(mean_held(found, name, "pearson") - 0.95),
+            is_ours=name == OURS,
+        )
+        for name, figure in times_s.items()
+    ]
+    label = "distance from 0.95 of the share that holds the truth"
+    return Panel("95 % intervals of Pearson's r", "processor s a study", label, points)
+
+
+def requirements(
+    found: Mapping[tuple[int, float], Mapping[tuple[str, str], Tally]],
+    times_s: Mapping[str, Figure],
+) -> list[Requirement]:
+    """What the evaluation promises of its intervals."""
+    return [
+        *(
+            Requirement(
+                f"{name}: studies whose 95 % interval holds the truth",
+                mean_held(found, OURS, name),
+                "at least",
+                0.92,
+            )
+            for name in MEASURED
+        ),
+        Requirement(
+            "hierarchical bootstrap of the paper's largest study, 10,000 draws",
+            times_s["bootstrap"].median,
+            "at most",
+            1.0,
+            "s",
+        ),
+    ]

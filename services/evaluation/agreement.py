@@ -1,0 +1,297 @@
+"""Agreement of policies' scores between two worlds: figures, intervals and significance.
+
+`task_agreement` and `pooled_agreement` are what a study reports: correlations, mean maximum rank
+violation, bias and error with 95 % intervals, the influence of each policy, and how likely chance
+alone would order the policies as well. `paired_differences` compares policies inside one world.
+"""
+
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from statistics import NormalDist
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float64
+
+from dextouch.errors import InvalidInputError, ShapeError
+from dextouch.metrics import policy
+from services.evaluation.rate_draws import (
+    MatchedScores,
+    ScoreDraws,
+    bootstrap_scores,
+    posterior_scores,
+)
+from services.evaluation.resampling import mmrv_of_draws, pearson_of_draws
+from services.evaluation.statistics import Interval, central_interval, shortest_interval
+
+FIGURES: Final[Mapping[str, Callable[..., float]]] = {
+    "pearson": policy.pearson,
+    "spearman": policy.spearman,
+    "kendall": policy.kendall,
+    "mmrv": partial(policy.mmrv, ties="simpler"),
+    "mmrv_paper": partial(policy.mmrv, ties="paper"),
+    "bias": policy.bias,
+    "mean_absolute_error": policy.mean_absolute_error,
+}
+CORRELATIONS: Final = ("pearson", "spearman", "kendall")
+# Assignments of policies that are all tried; of more, this many are drawn.
+MAX_PERMUTATIONS: Final = 50_000
+
+
+@dataclass(frozen=True)
+class Figure:
+    """An agreement figure with its 95 % interval.
+
+    `value` is NaN and `interval` None where it is undefined, as a correlation where all scores of a
+    world are equal; `undefined_share` is the share of hierarchical bootstrap draws in which it is.
+    The interval is that of the true scores: noise pulls an observed correlation towards zero, so
+    the interval may lie above it.
+    """
+
+    value: float
+    interval: Interval | None
+    undefined_share: float
+
+
+@dataclass(frozen=True)
+class Draws:
+    """Draws of one task's scores: from the posterior, for intervals, and of the bootstrap."""
+
+    posterior: ScoreDraws
+    bootstrap: ScoreDraws
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Agreement of the policies of one task, or of all tasks together.
+
+    `figures` has those of `FIGURES`; `without` is Pearson's r when one policy is left out, by
+    policy; `chance` is the share of all assignments of imagined to real scores that correlate at
+    least as well as the true one (1/6 at best with three policies), NaN where r is undefined.
+    """
+
+    figures: Mapping[str, Figure]
+    without: Mapping[str, float]
+    chance: float
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Mean score of one policy less that of another over the same starts of one world.
+
+    `p` is the exact or sampled p value of the sign-flip test, two-sided.
+    """
+
+    first: str
+    second: str
+    difference: float
+    interval: Interval
+    p: float
+
+
+def task_agreement(
+    policies: Sequence[str], scores: MatchedScores, generator: np.random.Generator
+) -> tuple[Agreement, Draws]:
+    """Agreement of one task, and the draws it rests on.
+
+    Args:
+        policies: names, in the order of the scores.
+        scores: of at least two policies from at least two starts.
+        generator: source of draws and permutations.
+
+    Raises:
+        ShapeError: names and scores differ in number.
+        InvalidInputError: too few policies or starts.
+    """
+    _check_names(policies, scores)
+    real, imagined = (rollouts.mean(axis=1) for rollouts in scores.by_rollout())
+    draws = Draws(posterior_scores(scores, generator), bootstrap_scores(scores, generator))
+    without = {
+        name: policy.pearson(real=np.delete(real, row), imagined=np.delete(imagined, row))
+        for row, name in enumerate(policies)
+    }
+    chance = chance_of_correlation([real], [imagined], generator)
+    return Agreement(_figures(real, imagined, draws), without, chance), draws
+
+
+def pooled_agreement(
+    policies: Sequence[str],
+    tasks: Sequence[MatchedScores],
+    draws: Sequence[Draws],
+    generator: np.random.Generator,
+) -> Agreement:
+    """Agreement over all policies of all tasks at once, each pair one point.
+
+    A pooled correlation also rewards telling easy tasks from hard ones; read it beside those of the
+    tasks. Permutations assign policies within each task only, and `without` leaves a policy out of
+    every task.
+
+    Args:
+        policies: names, the same in every task.
+        tasks: scores of each task.
+        draws: those of `task_agreement`.
+        generator: source of permutations.
+    """
+    for scores in tasks:
+        _check_names(policies, scores)
+    means = [[rollouts.mean(axis=1) for rollouts in scores.by_rollout()] for scores in tasks]
+    real, imagined = (np.array([pair[side] for pair in means]) for side in (0, 1))
+    joined = Draws(
+        _joined([one.posterior for one in draws]), _joined([one.bootstrap for one in draws])
+    )
+    without = {
+        name: policy.pearson(
+            real=np.delete(real, row, axis=1).ravel(),
+            imagined=np.delete(imagined, row, axis=1).ravel(),
+        )
+        for row, name in enumerate(policies)
+    }
+    chance = chance_of_correlation(list(real), list(imagined), generator)
+    return Agreement(_figures(real.ravel(), imagined.ravel(), joined), without, chance)
+
+
+def _check_names(policies: Sequence[str], scores: MatchedScores) -> None:
+    if len(policies) != scores.num_policies:
+        raise ShapeError(
+            f"agreement: got {len(policies)} names and scores of {scores.num_policies} policies"
+        )
+
+
+def _joined(draws: Sequence[ScoreDraws]) -> ScoreDraws:
+    return ScoreDraws(
+        np.concatenate([one.real for one in draws], axis=1),
+        np.concatenate([one.imagined for one in draws], axis=1),
+    )
+
+
+def _figures(real: np.ndarray, imagined: np.ndarray, draws: Draws) -> dict[str, Figure]:
+    posterior, bootstrap = figures_of_draws(draws.posterior), figures_of_draws(draws.bootstrap)
+    found = {}
+    for name, figure in FIGURES.items():
+        value = float(figure(real=real, imagined=imagined))
+        # Correlations crowd at their bound: the shortest interval contains it, quantiles do not.
+        interval = shortest_interval if name in CORRELATIONS else central_interval
+        drawn = posterior[name][np.isfinite(posterior[name])]
+        found[name] = Figure(
+            value,
+            None if math.isnan(value) else interval(drawn),
+            float(np.mean(~np.isfinite(bootstrap[name]))),
+        )
+    return found
+
+
+def figures_of_draws(draws: ScoreDraws) -> dict[str, Float64[np.ndarray, " draws"]]:
+    """Every figure of `FIGURES` in every draw; NaN where undefined."""
+    real, imagined = draws.real, draws.imagined
+    ranks = [_mean_ranks(side) for side in (real, imagined)]
+    orders = [np.sign(side[:, :, None] - side[:, None, :]) for side in (real, imagined)]
+    gap = np.abs(real[:, :, None] - real[:, None, :])
+    opposite = orders[0] * orders[1] < 0
+    return {
+        "pearson": pearson_of_draws(real, imagined),
+        "spearman": pearson_of_draws(*ranks),
+        "kendall": pearson_of_draws(*(order.reshape(len(order), -1) for order in orders)),
+        "mmrv": mmrv_of_draws(real, imagined),
+        "mmrv_paper": np.asarray((gap * opposite).max(axis=2).mean(axis=1)),
+        "bias": np.asarray((imagined - real).mean(axis=1)),
+        "mean_absolute_error": np.asarray(np.abs(imagined - real).mean(axis=1)),
+    }
+
+
+def _mean_ranks(scores: np.ndarray) -> Float64[np.ndarray, "draws policies"]:
+    order = np.sign(scores[:, :, None] - scores[:, None, :])
+    return np.asarray((order > 0).sum(axis=2) + (order == 0).sum(axis=2) / 2)
+
+
+def chance_of_correlation(
+    real: Sequence[np.ndarray], imagined: Sequence[np.ndarray], generator: np.random.Generator
+) -> float:
+    """One-sided p value of Pearson's r over all assignments of policies, within each task.
+
+    Exact up to `MAX_PERMUTATIONS` assignments; beyond, that many are drawn and the true one is
+    counted among them.
+
+    Args:
+        real: mean scores [policies] of each task.
+        imagined: mean scores of the same policies.
+        generator: source of drawn assignments.
+
+    Returns:
+        The p value; NaN where the correlation is undefined.
+    """
+    flat = np.concatenate(real)
+    observed = policy.pearson(real=flat, imagined=np.concatenate(imagined))
+    if math.isnan(observed):
+        return math.nan
+    sizes = [len(task) for task in real]
+    if math.prod(math.factorial(size) for size in sizes) <= MAX_PERMUTATIONS:
+        orders = [list(itertools.permutations(task)) for task in imagined]
+        shuffled = np.array([np.concatenate(one) for one in itertools.product(*orders)])
+        counted = 0
+    else:
+        shuffled = np.concatenate(
+            [generator.permuted(np.tile(task, (MAX_PERMUTATIONS, 1)), axis=1) for task in imagined],
+            axis=1,
+        )
+        counted = 1
+    found = pearson_of_draws(np.broadcast_to(flat, shuffled.shape), shuffled)
+    # Assignments equal to the true one differ from it in the last bits.
+    as_good = int(np.count_nonzero(found >= observed - 1e-9))
+    return (as_good + counted) / (len(shuffled) + counted)
+
+
+def paired_differences(
+    policies: Sequence[str],
+    rollouts: Float64[np.ndarray, "policies starts"],
+    generator: np.random.Generator,
+) -> list[Difference]:
+    """Differences of mean scores of all pairs of policies over matched starts.
+
+    The interval is that of Bonett and Price (2012) for paired rates, which adds one difference of
+    +1 and one of −1; for graded scores in 0 … 1 the same two are added.
+
+    Raises:
+        InvalidInputError: no starts.
+    """
+    if rollouts.shape[1] < 1:
+        raise InvalidInputError("paired differences: got no starts, expected at least one")
+    z, rows = NormalDist().inv_cdf(0.975), range(len(policies))
+    found = []
+    for first, second in itertools.combinations(rows, 2):
+        paired = rollouts[first] - rollouts[second]
+        widened = np.concatenate([paired, [1.0, -1.0]])
+        centre, half = widened.mean(), z * widened.std() / math.sqrt(len(widened))
+        interval = Interval(max(-1.0, float(centre - half)), min(1.0, float(centre + half)))
+        found.append(
+            Difference(
+                policies[first],
+                policies[second],
+                float(paired.mean()),
+                interval,
+                sign_flip_p(paired, generator),
+            )
+        )
+    return found
+
+
+def sign_flip_p(differences: np.ndarray, generator: np.random.Generator) -> float:
+    """Two-sided p value of a mean of paired differences [n] under random signs.
+
+    Exact where at most `MAX_PERMUTATIONS` sign patterns of the nonzero differences exist; 1 where
+    all are zero.
+    """
+    nonzero = differences[differences != 0]
+    if len(nonzero) == 0:
+        return 1.0
+    if 2 ** len(nonzero) <= MAX_PERMUTATIONS:
+        signs = np.array(list(itertools.product((1.0, -1.0), repeat=len(nonzero))))
+        counted = 0
+    else:
+        signs = generator.choice([1.0, -1.0], (MAX_PERMUTATIONS, len(nonzero)))
+        counted = 1
+    sums = np.abs(signs @ nonzero)
+    as_large = int(np.count_nonzero(sums >= abs(nonzero.sum()) - 1e-9))
+    return (as_large + counted) / (len(signs) + counted)

@@ -1,0 +1,230 @@
+"""Agreement figures against scipy, hand calculations, brute force and simulated studies."""
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from dextouch.errors import InvalidInputError, ShapeError
+from services.evaluation.agreement import (
+    FIGURES,
+    chance_of_correlation,
+    figures_of_draws,
+    paired_differences,
+    pooled_agreement,
+    sign_flip_p,
+    task_agreement,
+)
+from services.evaluation.rate_draws import (
+    MatchedScores,
+    ScoreDraws,
+    bootstrap_scores,
+    noise_covariance,
+    posterior_scores,
+)
+
+
+def rng(seed=0):
+    return np.random.default_rng(seed)
+
+
+def binary(rates, num_starts, generator):
+    return (generator.random((len(rates), num_starts, 1)) < np.array(rates)[:, None, None]) * 1.0
+
+
+def test_figures_of_draws_are_those_of_scipy():
+    real, imagined = rng(1).integers(0, 6, (2, 40, 5)) / 5
+    found = figures_of_draws(ScoreDraws(real, imagined))
+    for row in range(len(real)):
+        expected = {
+            "pearson": stats.pearsonr(real[row], imagined[row])[0],
+            "spearman": stats.spearmanr(real[row], imagined[row])[0],
+            "kendall": stats.kendalltau(real[row], imagined[row])[0],
+        }
+        for name, value in expected.items():
+            assert found[name][row] == pytest.approx(value, abs=1e-9)
+        for name, figure in FIGURES.items():
+            single = figure(real=real[row], imagined=imagined[row])
+            assert found[name][row] == pytest.approx(single, abs=1e-9)
+
+
+def test_three_policies_in_order_are_chance_once_in_six():
+    scores = [np.array([0.1, 0.5, 0.9])]
+    assert chance_of_correlation(scores, [np.array([0.2, 0.5, 1.0])], rng()) == pytest.approx(1 / 6)
+    # Two tasks: one in 36.
+    twice = [*scores, *scores]
+    assert chance_of_correlation(twice, twice, rng()) == pytest.approx(1 / 36)
+    assert math.isnan(chance_of_correlation(scores, [np.ones(3)], rng()))
+
+
+@pytest.mark.parametrize("num_policies", [6, 10])
+def test_chance_is_that_of_scipy(num_policies):
+    real = rng(2).random(num_policies)
+    imagined = 0.5 * real + 0.5 * rng(3).random(num_policies)
+    oracle = stats.permutation_test(
+        (imagined,),
+        lambda x: stats.pearsonr(real, x)[0],
+        permutation_type="pairings",
+        alternative="greater",
+        n_resamples=2000,
+        rng=rng(4),
+    )
+    found = chance_of_correlation([real], [imagined], rng(5))
+    assert found == pytest.approx(oracle.pvalue, abs=0.015)
+
+
+@pytest.mark.parametrize("num_starts", [8, 30])
+def test_sign_flips_are_those_of_scipy(num_starts):
+    paired = rng(6).normal(0.3, 1, num_starts)
+    oracle = stats.permutation_test(
+        (paired,), np.mean, permutation_type="samples", n_resamples=20_000, rng=rng(7)
+    )
+    assert sign_flip_p(paired, rng(8)) == pytest.approx(oracle.pvalue, abs=0.01)
+    assert sign_flip_p(np.zeros(5), rng()) == 1.0
+
+
+def test_paired_difference_by_hand():
+    # Three starts of ten that only the first policy solves: p12 = 4/12, p21 = 1/12, so the centre
+    # is 0.25 and the variance (5/12 - 0.0625) / 12.
+    outcomes = np.array([[1, 1, 1, 1, 1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 1, 0, 0, 0, 0, 0]]) * 1.0
+    (found,) = paired_differences(["a", "b"], outcomes, rng())
+    half = 1.959964 * math.sqrt((5 / 12 - 0.0625) / 12)
+    assert found.difference == pytest.approx(0.3)
+    assert (found.interval.low, found.interval.high) == pytest.approx((0.25 - half, 0.25 + half))
+    # All three differences have one sign: twice one in eight.
+    assert found.p == pytest.approx(0.25)
+
+
+def test_always_against_never_is_not_certain():
+    outcomes = np.stack([np.ones(10), np.zeros(10)])
+    (found,) = paired_differences(["a", "b"], outcomes, rng())
+    assert found.interval.low < 0.9 < found.interval.high == 1.0
+
+
+def test_noise_of_ten_successes_by_hand():
+    found = noise_covariance(np.array([np.ones(10), [1, 0] * 5]))
+    assert found[0, 0] == pytest.approx((11 / 12) * (1 / 12) / 10, rel=1e-5)
+    assert found[1, 1] == pytest.approx(0.25 / 10, rel=1e-5)
+    assert found[0, 1] == 0
+
+
+def test_noise_shared_by_series_is_seen():
+    generator = rng(9)
+    luck = generator.random(5000)
+    found = noise_covariance(np.stack([luck, luck, generator.random(5000)]))
+    # Variance of a uniform number is 1/12.
+    assert found[0, 0] == pytest.approx(1 / 12 / 5000, rel=0.05)
+    assert found[0, 1] == pytest.approx(found[0, 0], rel=0.01)
+    assert abs(found[0, 2]) < 0.05 * found[0, 0]
+
+
+def test_posterior_is_that_of_importance_sampling():
+    scores = MatchedScores(binary([0.2, 0.8], 10, rng(10)), binary([0.3, 0.7], 10, rng(11)))
+    draws = posterior_scores(scores, rng(12), num_draws=20_000)
+    generator, num = rng(13), 400_000
+    grid = np.array([0.02, 0.04, 0.08, 0.12, 0.17, 0.23, 0.30, 0.40, 0.55])
+    width = np.gradient(grid)
+    spread = generator.choice(grid, (num, 2), p=width / width.sum())
+    r = np.tanh(generator.choice(np.linspace(-3, 3, 25), num))
+    mean = generator.uniform(-2, 3, (num, 2))
+    normal = generator.standard_normal((2, num, 2))
+    normal[1] = r[:, None] * normal[0] + np.sqrt(1 - r**2)[:, None] * normal[1]
+    true = np.concatenate([mean[:, [k]] + spread[:, [k]] * normal[k] for k in (0, 1)], axis=1)
+    rollouts = np.concatenate(scores.by_rollout())
+    weight = stats.multivariate_normal(rollouts.mean(axis=1), noise_covariance(rollouts)).pdf(true)
+    weight /= weight.sum()
+    true = np.clip(true, 0, 1)
+    expected = weight @ true
+    sigma = np.sqrt(weight @ (true - expected) ** 2)
+    drawn = np.concatenate([draws.real, draws.imagined], axis=1)
+    assert drawn.mean(axis=0) == pytest.approx(expected, abs=0.02)
+    assert drawn.std(axis=0) == pytest.approx(sigma, rel=0.1)
+
+
+def test_intervals_hold_the_truth_where_a_bootstrap_does_not():
+    generator, held = rng(14), {"posterior": 0, "bootstrap": 0}
+    for _ in range(30):
+        real = generator.uniform(0.05, 0.95, 6)
+        imagined = np.clip(real + generator.normal(0, 0.05, 6), 0.02, 0.98)
+        truth = np.corrcoef(real, imagined)[0, 1]
+        scores = MatchedScores(binary(real, 10, generator), binary(imagined, 10, generator))
+        agreement, draws = task_agreement("abcdef", scores, generator)
+        interval = agreement.figures["pearson"].interval
+        held["posterior"] += interval.low <= truth <= interval.high
+        drawn = figures_of_draws(draws.bootstrap)["pearson"]
+        low, high = np.nanquantile(drawn, [0.025, 0.975])
+        held["bootstrap"] += low <= truth <= high
+    assert held["posterior"] >= 26
+    assert held["bootstrap"] <= 15
+
+
+def test_many_starts_leave_little_doubt():
+    rates = [0.2, 0.5, 0.8]
+    scores = MatchedScores(binary(rates, 3000, rng(15)), binary(rates, 3000, rng(16)))
+    agreement, _ = task_agreement("abc", scores, rng(17))
+    interval = agreement.figures["pearson"].interval
+    assert interval.low > 0.98
+    assert agreement.figures["pearson"].undefined_share == 0
+
+
+def test_bootstrap_spreads_as_starts_and_raters_do():
+    # Rollouts vary by 0.5 and raters by 0.5 around each: the variance of a mean over 50 rollouts of
+    # 4 raters is (0.25 + 0.25 / 4) / 50, and drawing raters adds their part a second time.
+    generator = rng(18)
+    rollout = generator.uniform(0.25, 0.75, (1, 50, 1))
+    scores = np.clip(rollout + generator.uniform(-0.25, 0.25, (1, 50, 4)), 0, 1)
+    drawn = bootstrap_scores(MatchedScores(scores, scores), rng(19), num_draws=4000).real
+    between = scores.mean(axis=2).var()
+    within = scores.var(axis=2).mean()
+    assert drawn.var() == pytest.approx((between + within / 4) / 50, rel=0.1)
+    assert drawn.mean() == pytest.approx(scores.mean(), abs=0.005)
+
+
+def test_absent_raters_are_left_out():
+    full = rng(20).random((2, 6, 3))
+    gaps = np.concatenate([np.full((2, 6, 1), np.nan), full[:, :, :1]], axis=2)
+    one, both = (
+        bootstrap_scores(MatchedScores(side, side), rng(21), num_draws=500)
+        for side in (full[:, :, :1], gaps)
+    )
+    assert both.real.mean() == pytest.approx(one.real.mean(), abs=0.02)
+    assert np.isfinite(both.real).all()
+
+
+def test_pooled_agreement_joins_tasks():
+    tasks = [
+        MatchedScores(binary(rates, 20, rng(22)), binary(rates, 20, rng(23)))
+        for rates in ([0.1, 0.5, 0.9], [0.2, 0.4, 0.6])
+    ]
+    found = [task_agreement("abc", scores, rng(24)) for scores in tasks]
+    pooled = pooled_agreement("abc", tasks, [draws for _, draws in found], rng(25))
+    means = [[side.mean(axis=1) for side in scores.by_rollout()] for scores in tasks]
+    real, imagined = (np.concatenate([pair[k] for pair in means]) for k in (0, 1))
+    assert pooled.figures["pearson"].value == pytest.approx(np.corrcoef(real, imagined)[0, 1])
+    assert set(pooled.without) == set("abc")
+    assert pooled.chance <= 4 / 36
+
+
+@pytest.mark.parametrize(
+    ("real", "imagined", "error", "message"),
+    [
+        (np.zeros((2, 3, 1)), np.zeros((2, 4, 1)), ShapeError, "same policies and starts"),
+        (np.zeros((0, 3, 1)), np.zeros((0, 3, 1)), ShapeError, "at least one"),
+        (np.full((2, 3, 1), np.nan), np.zeros((2, 3, 1)), InvalidInputError, "has no score"),
+        (np.full((2, 3, 1), 4.0), np.zeros((2, 3, 1)), InvalidInputError, "rubric's maximum"),
+    ],
+)
+def test_scores_that_cannot_be_compared_are_refused(real, imagined, error, message):
+    with pytest.raises(error, match=message):
+        MatchedScores(real, imagined)
+
+
+def test_a_single_policy_has_no_posterior():
+    one = MatchedScores(np.ones((1, 5, 1)), np.ones((1, 5, 1)))
+    with pytest.raises(InvalidInputError, match="at least two"):
+        posterior_scores(one, rng())
+    with pytest.raises(ShapeError, match="2 names"):
+        task_agreement("ab", one, rng())
+    with pytest.raises(InvalidInputError, match="no starts"):
+        paired_differences("ab", np.zeros((2, 0)), rng())
