@@ -181,6 +181,20 @@ def test_bootstrap_spreads_as_starts_and_raters_do():
     assert drawn.mean() == pytest.approx(scores.mean(), abs=0.005)
 
 
+def test_a_start_is_drawn_for_both_worlds():
+    scores = binary([0.3, 0.6], 10, rng(26))
+    draws = bootstrap_scores(MatchedScores(scores, scores), rng(27), num_draws=50)
+    np.testing.assert_array_equal(draws.real, draws.imagined)
+
+
+def test_a_world_without_spread_has_no_correlation():
+    scores = MatchedScores(binary([0.2, 0.5, 0.8], 10, rng(28)), np.ones((3, 10, 1)))
+    agreement, _ = task_agreement("abc", scores, rng(29))
+    pearson = agreement.figures["pearson"]
+    assert math.isnan(pearson.value)
+    assert (pearson.interval, pearson.undefined_share) == (None, 1.0)
+
+
 def test_absent_raters_are_left_out():
     full = rng(20).random((2, 6, 3))
     gaps = np.concatenate([np.full((2, 6, 1), np.nan), full[:, :, :1]], axis=2)

@@ -1,0 +1,1 @@
+"""Rating of rollouts by people: rubrics, marks, and agreement between raters."""
