@@ -88,6 +88,14 @@ COMMANDS = {
         "score policies in real and imagined worlds",
         "services.evaluation.command_line:run_evaluation",
     ),
+    "rate": Command("score rollouts by people: a page for raters, and their agreement"),
+    "rate serve": Command(
+        "serve the page on which raters mark rollouts", "services.evaluation.rating.app:main"
+    ),
+    "rate report": Command(
+        "print scores and how far raters agree",
+        "services.evaluation.rating.command_line:report_main",
+    ),
     "dashboard": Command("serve the operators' page", "services.dashboard.app:main"),
 }
 

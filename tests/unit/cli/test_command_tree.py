@@ -14,7 +14,7 @@ from services.cli import main
 
 COMMANDS = """
 align report, align retarget, align run, align serve,
-checkpoint, dashboard, demo, doctor, evaluate, export, import, serve,
+checkpoint, dashboard, demo, doctor, evaluate, export, import, rate report, rate serve, serve,
 station calibrate camera, station calibrate glove, station calibrate hand-eye,
 station calibrate latency, station calibrate profile, station calibrate robot-base,
 station calibrate show, station calibrate wrist, station serve,
@@ -26,11 +26,14 @@ twin record, twin serve, up
 """
 NAMES = [" ".join(name.split()) for name in COMMANDS.split(",")]
 # Services run until they are stopped and answer over HTTP: they have no result to write.
-WITHOUT_JSON = {"align serve", "dashboard", "serve", "station serve", "store serve", "twin serve"}
+WITHOUT_JSON = {
+    "align serve", "dashboard", "rate serve", "serve", "station serve", "store serve", "twin serve",
+}  # fmt: skip
 GROUPS = {
     "": tuple(name for name in main.COMMANDS if " " not in name),
     "train": tuple(main.commands_of("train")),
     "station": tuple(main.commands_of("station")),
+    "rate": tuple(main.commands_of("rate")),
 }
 EXAMPLE = re.compile(r"^examples?:\n((?:  .*(?:\n|$))+)", re.MULTILINE | re.IGNORECASE)
 DOCUMENT = Path(__file__).parents[3] / "docs" / "command_line.md"

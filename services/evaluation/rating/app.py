@@ -1,0 +1,180 @@
+"""Application and routes of the rating page."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path as FilePath
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Depends, FastAPI, Path, Request, Response
+from fastapi.responses import FileResponse
+from pydantic import Field
+
+from dextouch.episodes import EpisodeStore
+from dextouch.errors import ConflictError
+from dextouch.frozen_model import FrozenModel
+from dextouch.serving import RequireScope, create_service_app, serve
+from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
+from services.evaluation.rating.rated_rollouts import RolloutPictures, rated_rollouts
+from services.evaluation.rating.rating_queue import RatingQueue
+from services.evaluation.rating.rubrics import Rubric, bundled_rubrics, read_rubrics, rubric_of
+from services.evaluation.rating.settings import RatingSettings
+
+STATIC: Final = FilePath(__file__).parent / "static"
+FILES: Final = {"/": "rate.html"} | {
+    f"/rate.{kind}": f"rate.{kind}" for kind in ("js", "css", "svg")
+}
+PAGE_HEADERS: Final = {
+    "content-security-policy": (
+        "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' blob:; "
+        "connect-src 'self'; form-action 'none'; frame-ancestors 'none'; base-uri 'none'"
+    ),
+    "x-content-type-options": "nosniff",
+    "cache-control": "no-store",
+}
+Token = Annotated[str, Path(pattern=r"^[0-9a-f]{20}$")]
+
+
+class ShownCriterion(FrozenModel):
+    """A criterion as the page asks for it."""
+
+    name: str
+    description: str
+    latched: bool
+
+
+class ShownRollout(FrozenModel):
+    """The next rollout of a rater; nothing names its policy or world."""
+
+    rollout: str
+    presentation: int
+    task: str
+    instruction: str
+    criteria: tuple[ShownCriterion, ...]
+    penalty: float
+    num_steps: int
+    rate_hz: float
+    num_done: int
+    num_open: int
+
+
+class GivenMark(Judgement):
+    """Body of a mark."""
+
+    rollout: str = Field(pattern=r"^[0-9a-f]{20}$")
+
+
+class GivenNumber(FrozenModel):
+    """Number of a stored mark."""
+
+    number: int
+
+
+def create_rating_app(settings: RatingSettings) -> FastAPI:
+    """Create the application.
+
+    Raises:
+        InvalidInputError: unreadable rubrics, or a store without anything to rate.
+        UnknownNameError: a task without a rubric.
+        StorageError: the marks cannot be opened.
+    """
+    rubrics = rubrics_of(settings.rubrics)
+    tasks = settings.tasks or tuple(rubrics)
+    for task in tasks:
+        rubric_of(task, rubrics)
+    store = EpisodeStore(settings.store_url)
+    marks = MarkLog(settings.marks)
+    queue = RatingQueue(
+        rated_rollouts(store, tasks),
+        marks,
+        raters_per_rollout=settings.raters_per_rollout,
+        repeat_share=settings.repeat_share,
+    )
+    routers = [page_router(), rating_router(queue, marks, rubrics, RolloutPictures(store))]
+    return create_service_app(name="rating", settings=settings, routers=routers)
+
+
+def rubrics_of(path: FilePath | None) -> Mapping[str, Rubric]:
+    """Rubrics of a file, or the package's."""
+    return bundled_rubrics() if path is None else read_rubrics(path)
+
+
+def page_router() -> APIRouter:
+    """Router of the page and its files."""
+    router = APIRouter(include_in_schema=False)
+    for address, name in FILES.items():
+
+        async def file(name: str = name) -> FileResponse:
+            return FileResponse(STATIC / name, headers=PAGE_HEADERS)
+
+        router.add_api_route(address, file)
+    return router
+
+
+def rating_router(
+    queue: RatingQueue, marks: MarkLog, rubrics: Mapping[str, Rubric], pictures: RolloutPictures
+) -> APIRouter:
+    """Router of assignments, pictures and marks."""
+    needs_rater = RequireScope("rate")
+    router = APIRouter(prefix="/v1/rating", tags=["rating"], dependencies=[Depends(needs_rater)])
+
+    @router.get("/next", response_model=None, responses={200: {"model": ShownRollout}, 204: {}})
+    def next_rollout(
+        request: Request, rater: RaterName, key: Annotated[str, Depends(needs_rater)]
+    ) -> ShownRollout | Response:
+        """The rollout that a rater should rate next; 204 when nothing is left."""
+        assigned = queue.next(_rater(request, rater, key))
+        if assigned is None:
+            return Response(status_code=204)
+        rollout, rubric = assigned.rollout, rubric_of(assigned.rollout.task, rubrics)
+        return ShownRollout(
+            rollout=rollout.token,
+            presentation=assigned.presentation,
+            task=rollout.task,
+            instruction=rollout.instruction,
+            criteria=tuple(
+                ShownCriterion(name=one.name, description=one.description, latched=one.latched)
+                for one in rubric.criteria
+            ),
+            penalty=rubric.penalty,
+            num_steps=rollout.num_steps,
+            rate_hz=rollout.rate_hz,
+            num_done=assigned.num_done,
+            num_open=assigned.num_open,
+        )
+
+    @router.get("/rollouts/{token}/steps/{step}.jpg", response_class=Response)
+    def picture(token: Token, step: Annotated[int, Path(ge=0, le=100_000)]) -> Response:
+        """Head image and taxel maps of one step."""
+        jpeg = pictures.step(queue.rollout(token).episode_id, step)
+        return Response(jpeg, media_type="image/jpeg", headers={"cache-control": "no-store"})
+
+    @router.post("/marks", status_code=201)
+    def give(
+        request: Request, given: GivenMark, key: Annotated[str, Depends(needs_rater)]
+    ) -> GivenNumber:
+        """Add a mark; a second one for the same presentation corrects the first."""
+        rollout = queue.rollout(given.rollout)
+        fields = given.model_dump(exclude={"rollout", "rater"})
+        mark = Mark.model_validate(
+            fields | {"rater": _rater(request, given.rater, key), "episode_id": rollout.episode_id}
+        )
+        if not mark.cannot_judge:
+            rubric_of(rollout.task, rubrics).score(mark.holds)
+        return GivenNumber(number=marks.add(mark))
+
+    return router
+
+
+def _rater(request: Request, name: str, key: str) -> str:
+    """The rater: with keys the name of the key, so that nobody marks for another.
+
+    Raises:
+        ConflictError: another rater than the key's.
+    """
+    if request.app.state.access.has_keys and name != key:
+        raise ConflictError(f"rater: got {name!r}, expected {key!r}, the name of this key")
+    return name
+
+
+def main(argv: Sequence[str]) -> int:
+    """Serve the rating page until SIGINT or SIGTERM."""
+    return serve("rating", RatingSettings, create_rating_app, argv)

@@ -1,0 +1,41 @@
+"""The command `dextouch rate report`."""
+
+from collections.abc import Sequence
+
+from dextouch.command_line import write_result
+from dextouch.episodes import EpisodeStore
+from dextouch.serving import load_settings
+from services.evaluation.rating.app import rubrics_of
+from services.evaluation.rating.marks import MarkLog
+from services.evaluation.rating.rated_rollouts import rated_rollouts
+from services.evaluation.rating.rating_report import UNDEFINED, rating_report
+from services.evaluation.rating.settings import RatingReportSettings
+
+
+def report_main(argv: Sequence[str]) -> int:
+    """Print scores and agreement by task, and write the report on request."""
+    settings = load_settings(RatingReportSettings, list(argv))
+    rubrics = rubrics_of(settings.rubrics)
+    rollouts = rated_rollouts(EpisodeStore(settings.store_url), tuple(rubrics))
+    marks = MarkLog(settings.marks).latest().values()
+    tasks = {one.episode_id: one.task for one in rollouts.values()}
+    report = rating_report(marks, tasks, rubrics)
+    write_result(settings.json_path, report, allow_nan=False)
+    print(f"{report['num_marks']} marks of {len(report['rollouts'])} rollouts")
+    for task, found in report["tasks"].items():
+        alpha, icc = (
+            value if value == UNDEFINED else f"{value:.2f}"
+            for value in (found["alpha"], found["icc_2k"])
+        )
+        score = found["score"] if found["score"] == UNDEFINED else f"{found['score']:.2f}"
+        print(
+            f"{task}: score {score} over {found['num_rollouts']} rollouts, "
+            f"{found['num_raters']} raters, alpha {alpha}, ICC(2,k) {icc}"
+        )
+        print(f"  {found['comment']}")
+        for row in found["raters"]:
+            low, high = row["bias_interval"]
+            print(
+                f"  {row['rater']}: {row['bias']:+.2f} ({low:+.2f} … {high:+.2f}) from the others"
+            )
+    return 0

@@ -1,0 +1,59 @@
+"""Settings of the rating commands."""
+
+from pathlib import Path
+
+from pydantic import Field
+from pydantic_settings import BaseSettings
+
+from dextouch.command_line import JSON_HELP
+from dextouch.data_folder import default_store
+from dextouch.serving import ServiceSettings, service_config
+
+DEFAULT_MARKS = Path("runs/ratings.sqlite")
+_MARKS = "SQLite file of the marks, which only grows"
+_RUBRICS = "TOML file of rubrics by task; default: the package's"
+
+
+class RatingSettings(ServiceSettings):
+    """Serve a page on which people rate the rollouts of a store, without knowing their origin.
+
+    Every rater sees the rollouts in an order of their own, without policy, world or the marks of
+    others; some they see twice. With API keys, a rater is the name of a key with the scope `rate`.
+
+    Example:
+      dextouch rate serve --store-url runs/rollouts --marks runs/ratings.sqlite --port 8087
+    """
+
+    model_config = service_config("rating", "dextouch rate serve")
+
+    store_url: str = Field(
+        default_factory=default_store, min_length=1, description="folder or file:// URL"
+    )
+    marks: Path = Field(default=DEFAULT_MARKS, description=_MARKS)
+    rubrics: Path | None = Field(default=None, description=_RUBRICS)
+    tasks: tuple[str, ...] = Field(
+        default=(), description="tasks to rate; default: all that have a rubric"
+    )
+    raters_per_rollout: int = Field(
+        default=5, ge=1, le=100, description="people who rate each rollout"
+    )
+    repeat_share: float = Field(
+        default=0.08, ge=0, le=0.5, description="share of rollouts that a rater sees twice"
+    )
+
+
+class RatingReportSettings(BaseSettings):
+    """Print scores of the rated rollouts of a store, and how far raters agree.
+
+    Example:
+      dextouch rate report --store-url runs/rollouts --marks runs/ratings.sqlite --json ratings.json
+    """
+
+    model_config = service_config("rating_report", "dextouch rate report")
+
+    store_url: str = Field(
+        default_factory=default_store, min_length=1, description="folder or file:// URL"
+    )
+    marks: Path = Field(default=DEFAULT_MARKS, description=_MARKS)
+    rubrics: Path | None = Field(default=None, description=_RUBRICS)
+    json_path: Path | None = Field(default=None, alias="json", description=JSON_HELP)

@@ -1,0 +1,75 @@
+"""A person rates rollouts on the page, by mouse and by keyboard, in a real browser."""
+
+import re
+
+import pytest
+from playwright.sync_api import expect
+
+from dextouch.episodes import EpisodeStore
+from services.evaluation.rating.app import create_rating_app
+from services.evaluation.rating.marks import MarkLog
+from services.evaluation.rating.settings import RatingSettings
+from tests.unit.evaluation import toy
+from tests.unit.evaluation.test_rating_app import RUBRICS
+from tests.unit.evaluation.toy_store import write
+
+
+@pytest.fixture
+def settings(tmp_path):
+    store = EpisodeStore(str(tmp_path / "store"))
+    for seed in (1, 2, 3):
+        write(store, toy.demonstration("reach", seed))
+    (tmp_path / "rubrics.toml").write_text(RUBRICS)
+    return RatingSettings(
+        store_url=str(tmp_path / "store"),
+        marks=tmp_path / "ratings.sqlite",
+        rubrics=tmp_path / "rubrics.toml",
+    )
+
+
+def test_a_person_rates_all_rollouts(serve, page, settings):
+    problems = []
+    page.on("pageerror", lambda error: problems.append(str(error)))
+    page.on("console", lambda line: problems.append(line.text) if line.type == "error" else None)
+    page.goto(serve(create_rating_app(settings)))
+    page.get_by_label("Your name").fill("ada")
+    page.get_by_role("button", name="Start").click()
+    expect(page.get_by_role("heading", name="Touch the red spot.")).to_be_visible()
+    expect(page.locator("#progress")).to_have_text("ada: 0 rated, 3 to go")
+    # The picture is really drawn: its canvas has the size of a picture of the server.
+    expect(page.locator("canvas")).to_have_attribute("height", "384")
+    expect(page.locator("#time")).to_have_text(re.compile(r"^(0\.[3-9]|[1-9])"))
+
+    save = page.get_by_role("button", name="Save and next")
+    expect(save).to_be_disabled()
+    rows = page.locator(".criterion")
+    rows.nth(0).get_by_role("button", name="Yes").click()
+    rows.nth(1).get_by_role("button", name="No").click()
+    page.get_by_label("Comment").fill("slipped at the end")
+    save.click()
+
+    expect(page.locator("#progress")).to_have_text("ada: 1 rated, 2 to go")
+    for pressed in ("1", "2", "i", "Enter"):
+        page.locator("body").press(pressed)
+    expect(page.locator("#progress")).to_have_text("ada: 2 rated, 1 to go")
+    page.locator("body").press("c")
+    expect(page.locator("#progress")).to_have_text("Everything is rated. Thank you.")
+
+    first, second, third = (stored.mark for stored in MarkLog(settings.marks).history())
+    assert first.holds == {"touched": True, "stayed": False}
+    assert first.comment == "slipped at the end"
+    assert second.holds == {"touched": True, "stayed": True}
+    assert second.is_inconsistent
+    assert third.cannot_judge
+    assert problems == []
+
+
+def test_an_error_is_said_in_words(serve, page, settings):
+    keyed = settings.model_copy(update={"api_keys": ()})
+    address = serve(create_rating_app(keyed))
+    page.goto(address)
+    page.get_by_label("Your name").fill("ada")
+    page.route("**/v1/rating/next*", lambda route: route.abort())
+    page.get_by_role("button", name="Start").click()
+    expect(page.get_by_role("alert")).not_to_be_empty()
+    expect(page.get_by_label("Your name")).to_be_visible()

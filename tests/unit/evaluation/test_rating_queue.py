@@ -1,0 +1,147 @@
+"""Marks that are never lost, and the order in which raters see rollouts."""
+
+import sqlite3
+from collections import Counter
+
+import pytest
+from pydantic import ValidationError
+
+from dextouch.errors import NotFoundError, StorageError
+from services.evaluation.rating.marks import FIRST, REPEAT, Mark, MarkLog
+from services.evaluation.rating.rating_queue import RatedRollout, RatingQueue, token_of
+from services.evaluation.rating.rating_report import rating_report
+from services.evaluation.rating.rubrics import bundled_rubrics
+
+IDS = [f"rollout-{number}" for number in range(12)]
+
+
+def rollouts(ids=IDS):
+    return {
+        one: RatedRollout(token_of(one), one, "stand_bottle", "Stand it up.", 40, 15.0)
+        for one in ids
+    }
+
+
+def mark(rater, episode_id, *, standing=True, **changes):
+    fields = {"rater": rater, "episode_id": episode_id, "holds": {"standing": standing}}
+    return Mark.model_validate(fields | changes)
+
+
+@pytest.fixture
+def log(tmp_path):
+    return MarkLog(tmp_path / "deep" / "ratings.sqlite")
+
+
+def rate_all(queue, log, rater, *, standing=lambda _: True):
+    order = []
+    while (assigned := queue.next(rater)) is not None:
+        name = assigned.rollout.episode_id
+        order.append((name, assigned.presentation))
+        log.add(mark(rater, name, standing=standing(name), presentation=assigned.presentation))
+    return order
+
+
+def test_a_correction_counts_and_the_first_mark_stays(log):
+    log.add(mark("ada", "rollout-1"))
+    number = log.add(mark("ada", "rollout-1", standing=False))
+    assert [one.mark.holds["standing"] for one in log.history()] == [True, False]
+    (latest,) = MarkLog(log.path).latest().values()
+    assert (latest.number, latest.mark.holds) == (number, {"standing": False})
+
+
+@pytest.mark.parametrize("change", ["UPDATE marks SET rater = 'eve'", "DELETE FROM marks"])
+def test_marks_cannot_be_changed(log, change):
+    log.add(mark("ada", "rollout-1"))
+    connection = sqlite3.connect(log.path)
+    with pytest.raises(sqlite3.IntegrityError, match="never"):
+        connection.execute(change)
+    connection.close()
+    assert len(log.history()) == 1
+
+
+def test_a_file_that_is_no_database_is_refused(tmp_path):
+    path = tmp_path / "notes.txt"
+    path.write_text("not a database, but long enough to be looked at as one")
+    with pytest.raises(StorageError, match=r"notes\.txt: cannot be opened"):
+        MarkLog(path)
+
+
+def test_a_mark_judges_or_does_not():
+    assert mark("ada", "rollout-1", holds={}, cannot_judge=True).cannot_judge
+    for fields in ({"holds": {}}, {"cannot_judge": True}):
+        with pytest.raises(ValidationError, match="every criterion, or cannot_judge"):
+            mark("ada", "rollout-1", **fields)
+    with pytest.raises(ValidationError, match="rater"):
+        mark("../ada", "rollout-1")
+
+
+def test_every_rollout_gets_its_raters_and_each_rater_an_order_of_their_own(log):
+    queue = RatingQueue(rollouts(), log, raters_per_rollout=2, repeat_share=0.0)
+    orders = {rater: rate_all(queue, log, rater) for rater in ("ada", "bob", "cy")}
+    assert Counter(one.mark.episode_id for one in log.history()) == dict.fromkeys(IDS, 2)
+    assert [len(order) for order in orders.values()] == [12, 12, 0]
+    first, second = ([name for name, _ in orders[rater]] for rater in ("ada", "bob"))
+    assert sorted(first) == sorted(second) == sorted(IDS)
+    assert first != second != IDS
+
+
+def test_raters_in_turns_keep_rollouts_balanced(log):
+    queue = RatingQueue(rollouts(), log, raters_per_rollout=2, repeat_share=0.0)
+    for _ in range(4):
+        for rater in ("ada", "bob", "cy"):
+            log.add(mark(rater, queue.next(rater).rollout.episode_id))
+    counts = Counter(one.mark.episode_id for one in log.history())
+    assert set(counts.values()) == {1}
+    assert len(counts) == 12
+
+
+def test_asking_twice_gives_the_same_rollout(log):
+    queue = RatingQueue(rollouts(), log)
+    assert queue.next("ada") == queue.next("ada")
+    with pytest.raises(NotFoundError, match="rollout"):
+        queue.rollout("0" * 20)
+
+
+def test_some_rollouts_come_back_after_a_while(log):
+    many = [f"rollout-{number}" for number in range(40)]
+    queue = RatingQueue(rollouts(many), log, raters_per_rollout=1, repeat_share=0.1)
+    order = rate_all(queue, log, "ada")
+    names = [name for name, _ in order]
+    repeats = [(index, name) for index, (name, shown) in enumerate(order) if shown == REPEAT]
+    assert len(repeats) == 4
+    assert len(order) == 44
+    for index, name in repeats:
+        assert index - names.index(name) > 10
+        assert order[names.index(name)] == (name, FIRST)
+
+
+def test_automatic_marks_do_not_take_a_person_s_place(log):
+    for name in IDS:
+        log.add(mark("probe", name, kind="auto"))
+    queue = RatingQueue(rollouts(), log, raters_per_rollout=1, repeat_share=0.0)
+    assert len(rate_all(queue, log, "ada")) == 12
+
+
+def test_the_report_by_hand(log):
+    for rater in ("ada", "bob"):
+        for name in IDS[:4]:
+            stands = name in IDS[:2] and not (rater == "bob" and name == IDS[1])
+            log.add(mark(rater, name, standing=stands))
+    log.add(mark("ada", IDS[0], standing=False, presentation=REPEAT))
+    log.add(mark("ada", IDS[5], holds={}, cannot_judge=True))
+    log.add(mark("probe", IDS[1], kind="auto"))
+    log.add(mark("ada", "of-another-store"))
+    tasks = dict.fromkeys(IDS, "stand_bottle")
+    found = rating_report(log.latest().values(), tasks, bundled_rubrics())
+    scores = {row["episode_id"]: row["score"] for row in found["rollouts"]}
+    assert scores == {IDS[0]: 1.0, IDS[1]: 0.5, IDS[2]: 0.0, IDS[3]: 0.0}
+    assert found["rollouts"][1]["auto_scores"] == [1.0]
+    assert found["cannot_judge"] == 1
+    task = found["tasks"]["stand_bottle"]
+    assert (task["score"], task["num_raters"], task["num_rollouts"]) == (0.375, 2, 4)
+    # 8 ratings, 3 of them 1. Observed: one of four pairs differs, 2 ordered pairs of 8; expected:
+    # 2 · 3 · 5 of 8 · 7 ordered pairs. Alpha = 1 - (2 / 8) / (30 / 56).
+    assert task["alpha_by_criterion"]["standing"] == pytest.approx(1 - (2 / 8) / (30 / 56))
+    assert task["repeats"] == {"num": 1, "same_score": 0.0}
+    assert {row["rater"]: row["bias"] for row in task["raters"]} == {"ada": 0.25, "bob": -0.25}
+    assert "agree too little" in task["comment"]
