@@ -11,6 +11,7 @@ from dextouch.episodes import disk_errors
 from dextouch.serving import create_service_app, serve
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers, load_calibration
+from services.acquisition.health import HealthCollector
 from services.acquisition.memory import keep_for_life
 from services.acquisition.routes import recorder_router, station_router
 from services.acquisition.settings import AcquisitionSettings
@@ -102,7 +103,10 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
     uploads = uploader or _make_uploader(settings)
 
     @asynccontextmanager
-    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
+        # /metrics shows the station's health for as long as the application runs.
+        metrics = HealthCollector(station.health.report, station.health.raised)
+        app.state.registry.register(metrics)
         await run_in_threadpool((mock or station).start)
         if mock is not None:
             mock.play_forever()
@@ -112,6 +116,7 @@ def create_app(settings: AcquisitionSettings, uploader: Uploader | None = None) 
         finally:
             await run_in_threadpool(uploads.stop)
             await run_in_threadpool((mock or station).stop)
+            app.state.registry.unregister(metrics)
 
     async def missing() -> Sequence[str]:
         return [s.driver.name for s in station.supervisors if not s.connected.is_set()]

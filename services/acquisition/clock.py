@@ -5,8 +5,6 @@ import time
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
-from dextouch.errors import InvalidInputError
-
 # Far more than the fraction of a millisecond that reading two clocks or slewing one takes.
 MIN_NOTICED_NS = 100_000_000
 
@@ -40,11 +38,6 @@ class StationClock(Protocol):
         """A new waiter. `drives_time` only matters to a virtual clock."""
         ...
 
-
-@runtime_checkable
-class HostTimes(Protocol):
-    """Suspend time and wall clock offset of a clock's host."""
-
     def suspended_ns(self) -> int:
         """How long the host has slept since the clock was made."""
         ...
@@ -55,30 +48,22 @@ class HostTimes(Protocol):
 
 
 class RealClock:
-    """The host's monotonic clock, optionally `speed` times as fast (for faster replays).
+    """The host's monotonic clock.
 
-    It continues while the host is suspended, unlike `time.monotonic_ns`, and cannot be set. A
-    faster clock also magnifies the jitter of the operating system.
+    It continues while the host is suspended, unlike `time.monotonic_ns`, and cannot be set.
     """
 
-    def __init__(self, speed: float = 1.0) -> None:
-        if not 0.01 <= speed <= 100:
-            raise InvalidInputError(f"clock speed: got {speed}, expected 0.01 … 100")
-        self._speed = speed
+    def __init__(self) -> None:
         self._suspended_before_ns = _suspended_ns()
-        self._origin_ns = self._host_ns()
 
     def now_ns(self) -> int:
         """Nanoseconds since the origin of `time.monotonic_ns`, including time in suspend."""
-        t_ns = self._host_ns()
-        if self._speed == 1.0:
-            return t_ns
-        return self._origin_ns + int((t_ns - self._origin_ns) * self._speed)
+        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._suspended_before_ns
 
     def waiter(self, *, drives_time: bool = False) -> Waiter:
         """A waiter that sleeps."""
         del drives_time
-        return _RealWaiter(self, self._speed)
+        return _RealWaiter(self)
 
     def suspended_ns(self) -> int:
         """How long the host has slept since the clock was made."""
@@ -88,9 +73,6 @@ class RealClock:
         """Wall clock minus the time since boot."""
         return time.time_ns() - time.clock_gettime_ns(time.CLOCK_BOOTTIME)
 
-    def _host_ns(self) -> int:
-        return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - self._suspended_before_ns
-
 
 def _suspended_ns() -> int:
     """How long this host has slept since it was booted; less than a millisecond is noise."""
@@ -99,14 +81,13 @@ def _suspended_ns() -> int:
 
 
 class _RealWaiter:
-    def __init__(self, clock: RealClock, speed: float) -> None:
+    def __init__(self, clock: RealClock) -> None:
         self._clock = clock
-        self._speed = speed
         self._cancelled = threading.Event()
 
     def wait_until(self, t_ns: int) -> bool:
         while (remaining_ns := t_ns - self._clock.now_ns()) > 0:
-            if self._cancelled.wait(remaining_ns / 1e9 / self._speed):
+            if self._cancelled.wait(remaining_ns / 1e9):
                 return False
         return not self._cancelled.is_set()
 
@@ -128,9 +109,8 @@ class VirtualClock:
     def __init__(self, start_ns: int = 1_000_000_000) -> None:
         self._now_ns = start_ns
         self._suspended_ns = 0
-        self._wall_offset_ns = 0
-        self._lock = threading.Lock()
-        self._open: set[_VirtualWaiter] = set()
+        self.lock = threading.Lock()
+        self.open_waiters: set[_VirtualWaiter] = set()
 
     def now_ns(self) -> int:
         """The virtual time."""
@@ -138,78 +118,68 @@ class VirtualClock:
 
     def waiter(self, *, drives_time: bool = False) -> Waiter:
         """A waiter; from now on time advances only while this waiter waits."""
-        waiter = _VirtualWaiter(self, self._lock, drives_time=drives_time)
-        with self._lock:
-            self._open.add(waiter)
+        waiter = _VirtualWaiter(self, drives_time=drives_time)
+        with self.lock:
+            self.open_waiters.add(waiter)
         return waiter
 
     def suspend(self, duration_ns: int) -> None:
         """Suspend the host: time passes without any thread running."""
-        with self._lock:
+        with self.lock:
             self._now_ns += duration_ns
             self._suspended_ns += duration_ns
-            self._advance()
-
-    def set_wall(self, step_ns: int) -> None:
-        """Step the wall clock, which the time of this clock does not follow."""
-        self._wall_offset_ns += step_ns
+            self.advance()
 
     def suspended_ns(self) -> int:
         """How long the simulated host has slept."""
         return self._suspended_ns
 
     def wall_offset_ns(self) -> int:
-        """How far the simulated wall clock was set."""
-        return self._wall_offset_ns
+        """Nobody sets the wall clock of a simulated host."""
+        return 0
 
-    def _wait(self, waiter: "_VirtualWaiter", t_ns: int) -> bool:
-        with self._lock:
-            waiter.target_ns = t_ns
-            self._advance()
-            while waiter.target_ns is not None and not waiter.cancelled:
-                waiter.woken.wait()
-            waiter.target_ns = None
-            return not waiter.cancelled
-
-    def _cancel(self, waiter: "_VirtualWaiter") -> None:
-        with self._lock:
-            waiter.cancelled = True
-            waiter.woken.notify()
-
-    def _leave(self, waiter: "_VirtualWaiter") -> None:
-        with self._lock:
-            self._open.discard(waiter)
-            self._advance()
-
-    def _advance(self) -> None:
-        targets = [w.target_ns for w in self._open if w.target_ns is not None]
-        if len(targets) < len(self._open) or not any(w.drives_time for w in self._open):
+    def advance(self) -> None:
+        """Move the time and wake who is due; the caller holds the lock."""
+        targets = [w.target_ns for w in self.open_waiters if w.target_ns is not None]
+        if len(targets) < len(self.open_waiters) or not any(
+            w.drives_time for w in self.open_waiters
+        ):
             due_ns = self._now_ns
         else:
             due_ns = max(self._now_ns, min(targets))
         self._now_ns = due_ns
-        for waiter in self._open:
+        for waiter in self.open_waiters:
             if waiter.target_ns is not None and waiter.target_ns <= due_ns:
                 waiter.target_ns = None
                 waiter.woken.notify()
 
 
 class _VirtualWaiter:
-    def __init__(self, clock: VirtualClock, lock: threading.Lock, *, drives_time: bool) -> None:
+    def __init__(self, clock: VirtualClock, *, drives_time: bool) -> None:
         self._clock = clock
         self.drives_time = drives_time
-        self.woken = threading.Condition(lock)
+        self.woken = threading.Condition(clock.lock)
         self.target_ns: int | None = None
-        self.cancelled = False
+        self._is_cancelled = False
 
     def wait_until(self, t_ns: int) -> bool:
-        return self._clock._wait(self, t_ns)  # noqa: SLF001 - the two classes are one mechanism
+        with self._clock.lock:
+            self.target_ns = t_ns
+            self._clock.advance()
+            while self.target_ns is not None and not self._is_cancelled:
+                self.woken.wait()
+            self.target_ns = None
+            return not self._is_cancelled
 
     def cancel(self) -> None:
-        self._clock._cancel(self)  # noqa: SLF001
+        with self._clock.lock:
+            self._is_cancelled = True
+            self.woken.notify()
 
     def close(self) -> None:
-        self._clock._leave(self)  # noqa: SLF001
+        with self._clock.lock:
+            self._clock.open_waiters.discard(self)
+            self._clock.advance()
 
 
 @dataclass
@@ -237,16 +207,13 @@ class HostWatch:
 
     def __init__(self, clock: StationClock) -> None:
         self._clock = clock
-        self._times = clock if isinstance(clock, HostTimes) else None
         self.events = {"host_suspended": HostEvent(), "wall_clock_set": HostEvent()}
-        self._suspended_ns = self._times.suspended_ns() if self._times else 0
-        self._wall_offset_ns = self._times.wall_offset_ns() if self._times else 0
+        self._suspended_ns, self._wall_offset_ns = clock.suspended_ns(), clock.wall_offset_ns()
 
     def look(self) -> None:
         """Compare with the last look."""
-        if self._times is None:
-            return
-        suspended_ns, wall_offset_ns = self._times.suspended_ns(), self._times.wall_offset_ns()
+        suspended_ns = self._clock.suspended_ns()
+        wall_offset_ns = self._clock.wall_offset_ns()
         asleep_ns = suspended_ns - self._suspended_ns
         if asleep_ns > MIN_NOTICED_NS:
             self.events["host_suspended"].add(self._clock.now_ns(), asleep_ns)

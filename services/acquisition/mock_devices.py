@@ -59,7 +59,7 @@ class MockFactory:
         self._seed = seed
         self._clock = clock
         self._links = links or MockLinks()
-        self._make_glove = mock_of(self._links.glove_kind)
+        self._make_glove = mock_of(self._links.gloves)
 
     def build(self) -> list[MockPair]:
         """One pair a device.

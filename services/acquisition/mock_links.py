@@ -51,9 +51,4 @@ class MockLinks(FrozenModel):
         known = sorted({*GLOVE_PROTOCOLS, *kind_names()})
         if gloves not in known:
             raise ValueError(f"got {gloves!r}, expected a kind of glove: {', '.join(known)}")
-        return gloves
-
-    @property
-    def glove_kind(self) -> str:
-        """The name of the kind of both gloves."""
-        return GLOVE_PROTOCOLS.get(self.gloves, self.gloves)
+        return GLOVE_PROTOCOLS.get(gloves, gloves)

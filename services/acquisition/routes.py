@@ -1,16 +1,14 @@
 """HTTP routes of a station: the recorder, its health, live views and uploads."""
 
-from collections.abc import AsyncIterator, Callable
-from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Annotated
 
-from fastapi import APIRouter, Body, Depends, FastAPI, Query, Response
+from fastapi import APIRouter, Body, Depends, Query, Response
 from starlette.concurrency import run_in_threadpool
 
 from dextouch.schemas import StoreId
 from dextouch.serving import RequireScope
 from dextouch.streams import pack
-from services.acquisition.health import DiskJudge, HealthCollector, HealthEvents, StationHealth
+from services.acquisition.health import DiskJudge, HealthEvents, StationHealth
 from services.acquisition.schemas import (
     CameraList,
     RecorderStatus,
@@ -80,7 +78,6 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         prefix="/v1",
         tags=["station"],
         dependencies=[Depends(RequireScope(SCOPE))],
-        lifespan=_health_metrics(station),
     )
 
     @router.get("/health")
@@ -121,20 +118,3 @@ def station_router(station: Station, uploader: Uploader) -> APIRouter:
         return await run_in_threadpool(uploader.retry, recording_id)
 
     return router
-
-
-def _health_metrics(
-    station: Station,
-) -> Callable[[FastAPI], AbstractAsyncContextManager[None]]:
-    """Show the station's health at /metrics for as long as the application runs."""
-
-    @asynccontextmanager
-    async def lifespan(app: FastAPI) -> AsyncIterator[None]:
-        collector = HealthCollector(station.health.report, station.health.raised)
-        app.state.registry.register(collector)
-        try:
-            yield
-        finally:
-            app.state.registry.unregister(collector)
-
-    return lifespan

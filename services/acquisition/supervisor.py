@@ -2,7 +2,6 @@
 
 import os
 import threading
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -215,9 +214,8 @@ class DeviceSupervisor:
     def _release_waiter(self) -> None:
         with self._waiter_lock:
             if self._waiter is not None:
-                waiter, self._waiter = self._waiter, None
-                with closing(waiter):
-                    pass
+                self._waiter.close()
+                self._waiter = None
 
 
 class SequenceGuard:
@@ -331,8 +329,6 @@ class SpoolFlusher:
         on_tick: Callable[[], None],
         on_failure: Callable[[StorageError], None],
     ) -> None:
-        self.num_flushes = 0
-        self.longest_flush_s = 0.0
         self._path = path
         self._safety = safety
         self._clock = clock
@@ -373,8 +369,5 @@ class SpoolFlusher:
 
     def _flush(self) -> None:
         check_free_space(self._path, self._safety)
-        start_s = time.perf_counter()
         with disk_errors(f"flush spool {self._path.name!r}"):
             os.fdatasync(self._log)
-        self.longest_flush_s = max(self.longest_flush_s, time.perf_counter() - start_s)
-        self.num_flushes += 1

@@ -41,6 +41,12 @@ class SetClock:
     def waiter(self, *, drives_time=False):
         raise AssertionError("nobody waits on this clock")
 
+    def suspended_ns(self):
+        return 0
+
+    def wall_offset_ns(self):
+        return 0
+
 
 class Played:
     """One device's packets with ordinary skew, delay and jitter, decoded as they arrive."""

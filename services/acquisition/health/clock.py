@@ -82,11 +82,8 @@ class ClockJudge:
         text = f"its clock is skewed by {skew_ppm:+.0f} ppm"
         findings = find("clock_skew", abs(skew_ppm), text)
         if len(kept_s) >= MIN_RESIDUALS:
-            scatter_s = _scatter_s(kept_s)
-            figures["clock_residual_p95_seconds"] = scatter_s
-            figures["clock_sigma_seconds"] = _sigma_s(kept_s)
-            text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about its clock"
-            findings += find("clock_residual", scatter_s, text)
+            scatter = _judge_scatter(kept_s, "its clock")
+            findings, figures = findings + scatter.findings, {**figures, **scatter.figures}
         return Verdict((*findings, *self._judge_steps(now_ns)), figures)
 
     def _figures(self) -> dict[str, float]:
@@ -226,16 +223,12 @@ class CountingJudge:
         kept_s = self._residuals.add(arrivals_ns, residuals_ns * 1e-9, now_ns)
         if not len(block) or len(kept_s) < MIN_RESIDUALS or not self._clock.is_steady:
             return Verdict()
-        scatter_s = _scatter_s(kept_s)
+        scatter = _judge_scatter(kept_s, "the count of its samples", at_least=self._limits_s)
         figures = {
             "clock_resets": float(self._num_resets + self._clock.num_steps),
             "clock_skew_ratio": self._clock.skew_ppm * 1e-6,
-            "clock_residual_p95_seconds": scatter_s,
-            "clock_sigma_seconds": _sigma_s(kept_s),
         }
-        text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about the count of its samples"
-        findings = find("clock_residual", scatter_s, text, at_least=self._limits_s)
-        return Verdict(findings, figures)
+        return Verdict(scatter.findings, {**figures, **scatter.figures})
 
     def _follow(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
         """Arrivals of the samples that got their final time now, and how long they waited, ns."""
@@ -249,15 +242,20 @@ class CountingJudge:
         return np.array(arrivals_ns, dtype=np.int64), np.array(residuals_ns, dtype=np.int64)
 
 
-def _scatter_s(residuals_s: np.ndarray) -> float:
-    """How far 95 % lie from the median, which is path delay and cannot be told from offset."""
-    return float(np.percentile(np.abs(residuals_s - np.median(residuals_s)), 95))
+def _judge_scatter(
+    residuals_s: np.ndarray, about: str, *, at_least: tuple[float, float] = (0.0, 0.0)
+) -> Verdict:
+    """How far 95 % lie from the median, which is path delay and cannot be told from offset.
 
-
-def _sigma_s(residuals_s: np.ndarray) -> float:
-    """How far the lower edge of the residuals moves from second to second."""
-    edges = [part.min() for part in np.array_split(residuals_s, BINS)]
-    return float(1.4826 * np.median(np.abs(edges - np.median(edges))))
+    The figure of the offset's scatter is how far the lower edge of the residuals moves from second
+    to second.
+    """
+    scatter_s = float(np.percentile(np.abs(residuals_s - np.median(residuals_s)), 95))
+    edges_s = [part.min() for part in np.array_split(residuals_s, BINS)]
+    sigma_s = float(1.4826 * np.median(np.abs(edges_s - np.median(edges_s))))
+    figures = {"clock_residual_p95_seconds": scatter_s, "clock_sigma_seconds": sigma_s}
+    text = f"arrivals scatter by {scatter_s * 1e3:.1f} ms about {about}"
+    return Verdict(find("clock_residual", scatter_s, text, at_least=at_least), figures)
 
 
 def _signed(steps: np.ndarray, bits: int, unit: int) -> np.ndarray:

@@ -3,9 +3,6 @@
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field
-
-import numpy as np
 
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
@@ -14,14 +11,13 @@ from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
-from services.acquisition.health.codes import StaleCode
-from services.acquisition.health.levels import Board, EventLog, Judge, Verdict, worst
+from services.acquisition.health.levels import EventLog, Judge, Verdict, worst
 from services.acquisition.health.link import LinkJudge, TrackingJudge
-from services.acquisition.health.report import device_health, stale_code, stream_health
-from services.acquisition.health.samples import Block, SampleQueue
+from services.acquisition.health.samples import Block
 from services.acquisition.health.schemas import HealthEvents, StationHealth
 from services.acquisition.health.station import CalibrationJudge, PathJudge, judge_uploads
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
+from services.acquisition.health.watched import Watched, WatchedStream, device_health
 from services.acquisition.path_latency import PathWatch
 from services.acquisition.supervisor import DeviceSupervisor
 
@@ -31,31 +27,6 @@ CONFIRM_NS = 200_000_000
 # A device may take this long after the start before its silence is an event.
 START_NS = 1_000_000_000
 STATION = "station"
-_NO_NUMBERS = np.empty(0, dtype=np.int64)
-_NO_SAMPLES = Block(_NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS, _NO_NUMBERS)
-
-
-@dataclass
-class _Watched:
-    """The station or one of its streams, with its checks and their latest results."""
-
-    name: str
-    judges: list[Judge]
-    board: Board = field(default_factory=Board)
-    figures: dict[str, float] = field(default_factory=dict)
-    evaluated_ns: int = 0
-    is_suspicious: bool = False
-    queue: SampleQueue | None = None
-
-
-@dataclass
-class _WatchedStream(_Watched):
-    """One stream, its device, and the samples that wait for the next evaluation."""
-
-    supervisor: DeviceSupervisor = field(kw_only=True)
-    descriptor: StreamDescriptor = field(kw_only=True)
-    queue: SampleQueue = field(kw_only=True)
-    stale: StaleCode | None = None
 
 
 class HealthMonitor:
@@ -89,7 +60,7 @@ class HealthMonitor:
         self._streams = {watched.name: watched for watched in streams}
         descriptors = [watched.descriptor for watched in streams]
         calibrated = CalibrationJudge(descriptors, calibration)
-        self._itself = _Watched(STATION, [calibrated.judge, self._judge_itself])
+        self._itself = Watched(STATION, [calibrated.judge, self._judge_itself])
         self._started_ns = clock.now_ns()
         self._due_ns = self._started_ns + PERIOD_NS
         # One evaluates at a time; the other lock guards what a report reads.
@@ -151,16 +122,7 @@ class HealthMonitor:
         """Current health of every stream and device."""
         now_ns = self._clock.now_ns()
         with self._lock:
-            streams = tuple(
-                stream_health(
-                    watched.supervisor,
-                    watched.descriptor,
-                    now_ns,
-                    findings=watched.board.active(now_ns),
-                    figures=watched.figures,
-                )
-                for watched in self._streams.values()
-            )
+            streams = tuple(watched.health(now_ns) for watched in self._streams.values())
             findings, figures = self._itself.board.active(now_ns), self._itself.figures
         levels = [stream.level for stream in streams] + [finding.level for finding in findings]
         return StationHealth(
@@ -196,9 +158,8 @@ class HealthMonitor:
             while waiter.wait_until(self._clock.now_ns() + TICK_NS):
                 self.tick()
 
-    def _evaluate(self, watched: _Watched, now_ns: int, *, confirming: bool) -> None:
-        block = watched.queue.take() if watched.queue else _NO_SAMPLES
-        verdicts = [judge(block, now_ns) for judge in watched.judges]
+    def _evaluate(self, watched: Watched, now_ns: int, *, confirming: bool) -> None:
+        verdicts = watched.verdicts(now_ns)
         findings = [finding for verdict in verdicts for finding in verdict.findings]
         with self._lock:
             changes = watched.board.update(findings, now_ns, confirming=confirming)
@@ -210,8 +171,8 @@ class HealthMonitor:
 
     def _notice_silence(self, now_ns: int) -> None:
         for name, watched in self._streams.items():
-            stale, code = watched.stale, stale_code(watched.supervisor, watched.descriptor, now_ns)
-            never = watched.supervisor.streams[name].last_t_host_ns is None
+            stale, code = watched.stale, watched.stale_code(now_ns)
+            never = watched.counters.last_t_host_ns is None
             if code == stale or (never and now_ns < self._started_ns + START_NS):
                 continue
             if stale is not None:
@@ -223,7 +184,7 @@ class HealthMonitor:
 
 def _watch(
     supervisor: DeviceSupervisor, calibration: Mapping[str, Matrix], paths: PathWatch | None
-) -> list[_WatchedStream]:
+) -> list[WatchedStream]:
     """The streams of one device, each with the checks for its kind."""
     watched = []
     clock: ClockJudge | None = None
@@ -243,15 +204,7 @@ def _watch(
             judges.append(TrackingJudge(supervisor.events).judge)
         if paths is not None and paths.num_failures(descriptor.name) is not None:
             judges.append(PathJudge(descriptor.name, paths, calibration).judge)
-        watched.append(
-            _WatchedStream(
-                descriptor.name,
-                judges,
-                supervisor=supervisor,
-                descriptor=descriptor,
-                queue=SampleQueue(descriptor),
-            )
-        )
+        watched.append(WatchedStream(supervisor, descriptor, judges))
     return watched
 
 

@@ -27,6 +27,12 @@ class Waits:
             self.supervisor._stopping.set()
         return True
 
+    def suspended_ns(self):
+        return 0
+
+    def wall_offset_ns(self):
+        return 0
+
     def cancel(self):
         pass
 
