@@ -3,17 +3,18 @@
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
+from functools import partial
 
 from dextouch.schemas import Matrix
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
-from services.acquisition.drivers.base import Driver, Readings
+from services.acquisition.drivers.base import Driver
 from services.acquisition.glove_record import glove_record, is_ours
 from services.acquisition.health.cells import TaxelJudge, cell_judge
 from services.acquisition.health.clock import ClockJudge, CountingJudge
 from services.acquisition.health.levels import EventLog, Judge, Verdict, worst
 from services.acquisition.health.link import LinkJudge, TrackingJudge
-from services.acquisition.health.samples import Block
+from services.acquisition.health.samples import Block, deliver
 from services.acquisition.health.schemas import HealthEvents, StationHealth
 from services.acquisition.health.station import CalibrationJudge, PathJudge, judge_uploads
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
@@ -58,6 +59,8 @@ class HealthMonitor:
         self._log = EventLog()
         streams = [watched for s in supervisors for watched in _watch(s, calibration, paths)]
         self._streams = {watched.name: watched for watched in streams}
+        # Called by the reader threads with what they have spooled.
+        self.accept = partial(deliver, {watched.name: watched.queue for watched in streams}, clock)
         descriptors = [watched.descriptor for watched in streams]
         calibrated = CalibrationJudge(descriptors, calibration)
         self._itself = Watched(STATION, [calibrated.judge, self._judge_itself])
@@ -76,12 +79,6 @@ class HealthMonitor:
     def watch_uploads(self, refused: Callable[[], Mapping[str, str]]) -> None:
         """Start monitoring which takes the store refused, and why."""
         self.watch(lambda _block, _now_ns: judge_uploads(refused()))
-
-    def accept(self, readings: Readings) -> None:
-        """Keep samples for the next evaluation (called by the reader threads, once spooled)."""
-        now_ns = self._clock.now_ns()
-        for name, samples in readings.items():
-            self._streams[name].queue.add(samples, now_ns)
 
     def start(self) -> None:
         """Start evaluating."""

@@ -9,6 +9,8 @@ import numpy as np
 from jaxtyping import Float64, Int64, Shaped
 
 from dextouch.streams import Sample, StreamDescriptor
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Readings
 
 WINDOW_NS = 10_000_000_000
 # What is kept between two evaluations, which are a second apart.
@@ -84,6 +86,13 @@ class SampleQueue:
                 values = self._values[places]
             self._num_taken, self._num_latencies_taken = self._num_added, self._num_latencies
         return Block(stamps[0], stamps[1], stamps[2], latencies_ns, values)
+
+
+def deliver(queues: Mapping[str, SampleQueue], clock: StationClock, readings: Readings) -> None:
+    """Keep samples for the next evaluation (called by the reader threads, once spooled)."""
+    now_ns = clock.now_ns()
+    for name, samples in readings.items():
+        queues[name].add(samples, now_ns)
 
 
 class CountWindow:

@@ -294,8 +294,7 @@ def test_what_is_no_pressure_is_refused(words):
 def test_a_station_starts_before_its_gloves_are_calibrated(bench):
     """Else nobody could record the takes that a calibration needs."""
     drivers = list(bench.recorder._drivers.values())
-    live = LiveView(drivers, {})
-    assert live.glove("tactile_left") is None
+    assert LiveView(drivers, {})._gloves == {}
     tare = {"tactile_left_tare_counts": ((1.0,) * 360,)}
     assert LiveView(drivers, tare)._gloves == {}
     with pytest.raises(NotFoundError, match=r"tactile_left_gain.*got 3 numbers"):
