@@ -11,7 +11,7 @@ import uvicorn
 from fastapi import FastAPI
 
 from dextouch.errors import ConflictError, UnavailableError
-from dextouch.serving import MAX_WEBSOCKET_BYTES
+from dextouch.serving import server_options
 
 BACKLOG = 128
 
@@ -90,7 +90,10 @@ async def serve_all(
     Raises:
         UnavailableError: a service terminated unexpectedly; the others were shut down.
     """
-    servers = {place.name: _server(app, grace_s) for place, app in placed}
+    servers = {
+        place.name: Server(uvicorn.Config(app, backlog=BACKLOG, **server_options(grace_s)))
+        for place, app in placed
+    }
     tasks = {
         place.name: asyncio.create_task(servers[place.name].serve(sockets=[place.socket]))
         for place, _ in placed
@@ -130,17 +133,3 @@ async def _announce(servers: Sequence[Server], on_ready: Callable[[], None]) -> 
     for server in servers:
         await server.answers.wait()
     on_ready()
-
-
-def _server(app: FastAPI, grace_s: int) -> Server:
-    config = uvicorn.Config(
-        app,
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        backlog=BACKLOG,
-        timeout_graceful_shutdown=grace_s,
-        ws_max_size=MAX_WEBSOCKET_BYTES,
-        proxy_headers=False,
-    )
-    return Server(config)

@@ -228,18 +228,25 @@ def run(app: FastAPI, settings: ServiceSettings) -> None:
     """Serve until SIGINT or SIGTERM; requests in flight get `shutdown_grace_s` to end."""
     import uvicorn
 
-    uvicorn.run(
-        app,
-        host=settings.host,
-        port=settings.port,
-        log_config=None,
-        access_log=False,
-        server_header=False,
-        proxy_headers=False,
-        timeout_keep_alive=KEEP_ALIVE_S,
-        ws_max_size=MAX_WEBSOCKET_BYTES,
-        timeout_graceful_shutdown=settings.shutdown_grace_s,
-    )
+    grace_s = settings.shutdown_grace_s
+    uvicorn.run(app, host=settings.host, port=settings.port, **server_options(grace_s))
+
+
+def server_options(grace_s: int) -> dict[str, Any]:
+    """Options of uvicorn for every service, alone or beside others.
+
+    Args:
+        grace_s: time that requests in flight get to end.
+    """
+    return {
+        "log_config": None,
+        "access_log": False,
+        "server_header": False,
+        "proxy_headers": False,
+        "timeout_keep_alive": KEEP_ALIVE_S,
+        "ws_max_size": MAX_WEBSOCKET_BYTES,
+        "timeout_graceful_shutdown": grace_s,
+    }
 
 
 def serve(
