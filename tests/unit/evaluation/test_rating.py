@@ -41,6 +41,12 @@ def test_alpha_of_equal_ratings_is_undefined():
     assert krippendorff_alpha(np.array([[1.0, 1.0], [0.0, 0.0]]), level="nominal") == 1.0
 
 
+def test_alpha_with_absent_raters_by_hand():
+    # Three zeros and four ones: 7² - 3² - 4² = 24 unequal pairs of 42; one rollout disagrees.
+    ratings = np.array([[0, 1, nan], [0, 0, nan], [1, 1, 1]])
+    assert krippendorff_alpha(ratings, level="nominal") == pytest.approx(1 - 2 / (24 / 6))
+
+
 def test_alpha_of_chance_is_zero():
     ratings = np.random.default_rng(0).integers(0, 2, (4000, 3)) * 1.0
     assert krippendorff_alpha(ratings, level="nominal") == pytest.approx(0, abs=0.02)
