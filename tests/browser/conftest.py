@@ -94,17 +94,8 @@ def _served(make_app):
     stop, ready, failures = asyncio.Event(), threading.Event(), []
     loop = asyncio.new_event_loop()
 
-    async def tell(answering):
-        await answering.wait()
-        ready.set()
-
     async def serve():
-        answering = asyncio.Event()
-        telling = asyncio.create_task(tell(answering))
-        try:
-            await serve_all([(place, make_app(place.url))], stop=stop, ready=answering, grace_s=1)
-        finally:
-            telling.cancel()
+        await serve_all([(place, make_app(place.url))], stop=stop, on_ready=ready.set, grace_s=1)
 
     def run():
         try:

@@ -41,7 +41,7 @@ class Service:
 
     def start(self):
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "services.alignment", *self._arguments],
+            [sys.executable, "-m", "services.cli.main", "align", *self._arguments],
             stdout=self._log,
             stderr=self._log,
         )

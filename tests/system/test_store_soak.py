@@ -43,7 +43,16 @@ class Soak:
             "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)
         }
         flags = ["--store_url", str(self.store_folder), "--port", self.url.rsplit(":", 1)[1]]
-        command = [sys.executable, "-m", "services.episode_store", *flags, "--log_level", "warning"]
+        command = [
+            sys.executable,
+            "-m",
+            "services.cli.main",
+            "store",
+            "serve",
+            *flags,
+            "--log-level",
+            "warning",
+        ]
         with (self.folder / "store.log").open("wb") as log:
             server = subprocess.Popen(command, env=environment, cwd=ROOT, stdout=log, stderr=log)
             try:

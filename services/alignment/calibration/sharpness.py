@@ -7,7 +7,6 @@ squares do show it, those across the motion more than those along it.
 
 import numpy as np
 from jaxtyping import Float64, UInt8
-from scipy.ndimage import map_coordinates
 
 # Wider edges are blurred. Measured on rendered ChArUco boards: sharp 2.0 to 2.2 px, out of focus by
 # 1.5 px (one sigma) 3.1 to 3.7, moved by 3 px 2.4 to 3.3, moved by 6 px 4.1 to 5.1; on photos of a
@@ -74,5 +73,8 @@ def _widths_px(
 
 def _sampled(photo: np.ndarray, places: np.ndarray) -> Float64[np.ndarray, "edges steps"]:
     """Bilinear grey levels at pixels [..., 2]; outside the photo those of its rim."""
+    # Here, since commands that measure nothing import this module on stations without scipy.
+    from scipy.ndimage import map_coordinates
+
     at = np.moveaxis(places, -1, 0)[::-1]
     return map_coordinates(photo.astype(np.float64), at, order=1, mode="nearest")

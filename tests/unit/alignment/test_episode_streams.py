@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from dextouch import images
 from dextouch.episodes import GOP_IMAGES, EpisodeStore
 from dextouch.episodes.image_codecs import ImageChunks
-from dextouch.images import jpeg
 from dextouch.streams import StreamDescriptor
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
@@ -67,7 +67,7 @@ def no_decoding(monkeypatch):
         raise AssertionError("an image was decoded or encoded")
 
     monkeypatch.setattr(ImageChunks, "decode", refuse)
-    monkeypatch.setattr(jpeg, "encode_jpeg", refuse)
+    monkeypatch.setattr(images, "encode_jpeg", refuse)
     monkeypatch.setattr("dextouch.episodes.stream_writer.encode_jpeg", refuse)
     monkeypatch.setattr("dextouch.episodes.stream_writer.GopEncoder", refuse)
 
