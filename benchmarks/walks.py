@@ -25,14 +25,13 @@ from dextouch.clients import EpisodeStoreClient, PolicyStart, Rollout, RolloutCl
 from dextouch.clocks import OnlineClock
 from dextouch.command_line import add_json, write_result
 from dextouch.hands.actions import IDENTITY_POSE_9D, POSE_SLICES, AnchorPoses
-from dextouch.schemas import Observation
+from dextouch.schemas import Observation, SaveTake, TakePrompt
 from dextouch.worlds import CopyFirstWorld, World, WorldServiceSettings, create_world_app
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.uploader import Uploader
 from services.cli.demo.background import served
 from services.episode_store.app import create_app

@@ -3,11 +3,10 @@
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
-from dextouch.schemas import LedgerEntry
+from dextouch.schemas import LedgerEntry, StreamTake, TakeCheck, TakeProblem
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS
 from services.acquisition.health import CODES, count_taxels
-from services.acquisition.schemas import StreamTake, TakeCheck, TakeProblem
 from services.acquisition.supervisor import StreamCounters
 
 # A take may lose more than a running station before it is not worth keeping.

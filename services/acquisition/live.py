@@ -6,12 +6,11 @@ import numpy as np
 from jaxtyping import Float32
 
 from dextouch.errors import NotFoundError, StaleDataError
-from dextouch.schemas import Matrix
+from dextouch.schemas import CameraLive, Matrix
 from dextouch.streams import H264_UNIT, Sample
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import GroupPreview
 from services.acquisition.glove_record import NO_CELL, glove_record
-from services.acquisition.schemas import CameraLive
 
 MAX_AGE_NS = 500_000_000
 

@@ -10,7 +10,7 @@ from types import TracebackType
 import structlog
 
 from dextouch.errors import DeviceError, InvalidInputError
-from dextouch.schemas import Matrix
+from dextouch.schemas import Matrix, SaveTake, TakeCheck, TakePrompt
 from services.acquisition.clock import StationClock, VirtualClock, Waiter
 from services.acquisition.mock_devices import MockFactory, duration_ns
 from services.acquisition.mock_links import MockLinks
@@ -18,7 +18,6 @@ from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Ledger
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import SaveTake, TakeCheck, TakePrompt
 from services.acquisition.station import Station
 from services.acquisition.supervisor import SpoolSafety
 

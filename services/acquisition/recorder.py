@@ -13,27 +13,28 @@ from dextouch.clocks import PathLatency
 from dextouch.episodes import disk_errors
 from dextouch.episodes.spool import SpoolWriter
 from dextouch.errors import ConflictError
-from dextouch.schemas import Matrix, RecordingAttributes
+from dextouch.schemas import (
+    Matrix,
+    RecorderAction,
+    RecorderState,
+    RecorderStatus,
+    RecordingAttributes,
+    SaveTake,
+    TakeCheck,
+    TakePrompt,
+)
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import begin_take
 from services.acquisition.memory import give_back_free_memory
 from services.acquisition.path_latency import add_latencies
-from services.acquisition.schemas import (
-    Action,
-    RecorderStatus,
-    SaveTake,
-    State,
-    TakeCheck,
-    TakePrompt,
-)
 from services.acquisition.supervisor import check_free_space
 from services.acquisition.take import Take, TakeOptions
 
 logger = structlog.get_logger(__name__)
 
-ACTIONS: Mapping[State, tuple[Action, ...]] = {
+ACTIONS: Mapping[RecorderState, tuple[RecorderAction, ...]] = {
     "idle": ("arm",),
     "armed": ("arm", "record", "discard"),
     "recording": ("stop", "discard", "rerecord"),
@@ -80,7 +81,7 @@ class Recorder:
         self._stated: frozenset[str] = frozenset()
         # Held for a whole action, disk included; readers never take it.
         self._lock = threading.RLock()
-        self._state: State = "idle"
+        self._state: RecorderState = "idle"
         self._discarded_id: str | None = None
         self._forget()
 
@@ -88,7 +89,7 @@ class Recorder:
         self._prompt: TakePrompt | None = None
         self._take: Take | None = None
         self._check: TakeCheck | None = None
-        self._done: dict[Action, SaveTake | None] = {}
+        self._done: dict[RecorderAction, SaveTake | None] = {}
 
     def measure_latencies(self, latencies: Callable[[], Mapping[str, PathLatency]]) -> None:
         """Give takes measured path delays of streams whose delay the calibration does not name."""
@@ -278,7 +279,7 @@ class Recorder:
     def _recording_id(self) -> str | None:
         return self._take.spool.attributes.recording_id if self._take else None
 
-    def _is_done(self, action: Action, recording_id: str | None) -> bool:
+    def _is_done(self, action: RecorderAction, recording_id: str | None) -> bool:
         """Whether the action was done to the named take; an unnamed one is never a repetition."""
         present = self._recording_id()
         if recording_id is None or (action == "record" and present is None):
@@ -291,7 +292,7 @@ class Recorder:
             )
         return action in self._done
 
-    def _expect(self, action: Action) -> None:
+    def _expect(self, action: RecorderAction) -> None:
         if action not in ACTIONS[self._state]:
             allowed = ", ".join(ACTIONS[self._state])
             raise ConflictError(

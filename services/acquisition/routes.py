@@ -5,18 +5,20 @@ from typing import Annotated
 from fastapi import APIRouter, Body, Depends, Query, Response
 from starlette.concurrency import run_in_threadpool
 
-from dextouch.schemas import StoreId
-from dextouch.serving import RequireScope
-from dextouch.streams import pack
-from services.acquisition.health import DiskJudge, HealthEvents, StationHealth
-from services.acquisition.schemas import (
+from dextouch.schemas import (
     CameraList,
+    HealthEvents,
     RecorderStatus,
     SaveTake,
+    StationHealth,
+    StoreId,
     TakeName,
     TakePrompt,
     UploadStatus,
 )
+from dextouch.serving import RequireScope
+from dextouch.streams import pack
+from services.acquisition.health import DiskJudge
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 

@@ -9,7 +9,7 @@ import structlog
 
 from dextouch.episodes.spool import SpoolWriter, StreamRecord
 from dextouch.errors import StorageError
-from dextouch.schemas import LedgerEntry
+from dextouch.schemas import LedgerEntry, TakeCheck
 from dextouch.streams import Sample, SampleBatch
 from services.acquisition.clock import HostWatch, StationClock
 from services.acquisition.completeness import (
@@ -21,7 +21,6 @@ from services.acquisition.completeness import (
 )
 from services.acquisition.drivers.base import Driver, Readings
 from services.acquisition.drivers.image_encoding import take_gates
-from services.acquisition.schemas import TakeCheck
 from services.acquisition.supervisor import SpoolFlusher, SpoolSafety, StreamCounters
 from services.acquisition.take_findings import HealthSource, TakeFindings
 

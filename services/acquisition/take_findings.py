@@ -7,9 +7,8 @@ warnings of its check, and figures of its quality.
 from collections.abc import Collection
 from typing import Protocol, runtime_checkable
 
-from dextouch.schemas import LedgerEntry
-from services.acquisition.health import CODES, HealthEvents, StationHealth
-from services.acquisition.schemas import TakeProblem
+from dextouch.schemas import HealthEvents, LedgerEntry, StationHealth, TakeProblem
+from services.acquisition.health import CODES
 
 # What stands in the take's quality in a form of its own (`_rate_hz`), or counts from the
 # station's start.

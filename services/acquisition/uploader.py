@@ -26,10 +26,10 @@ from dextouch.schemas import (
     LedgerEntry,
     RecordingAttributes,
     RecordingStatus,
+    UploadStatus,
 )
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.memory import give_back_free_memory
-from services.acquisition.schemas import UploadStatus
 
 logger = structlog.get_logger(__name__)
 

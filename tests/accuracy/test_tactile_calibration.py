@@ -7,6 +7,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, NonFiniteError, ShapeError, UnknownNameError
+from dextouch.schemas import TakePrompt
 from dextouch.streams import StreamDescriptor
 from dextouch.tactile.layout import NUM_TAXELS, expand_taxels, raw_indices, select_taxels
 from services.acquisition.clock import VirtualClock
@@ -15,7 +16,6 @@ from services.acquisition.devices.tactile_glove.mock import GloveCalibration as 
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import TakePrompt
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.alignment.calibration.tactile_faults import STATES, classify_taxels
 from services.alignment.calibration.tactile_gain import TaxelPress, fit_gain

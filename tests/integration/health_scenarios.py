@@ -7,9 +7,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from dextouch.errors import DeviceError
+from dextouch.schemas import HealthEvent, TakePrompt
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.health import STATION, DiskJudge, HealthEvent
+from services.acquisition.health import STATION, DiskJudge
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
@@ -17,7 +18,6 @@ from services.acquisition.mocks.ledger import Fate, Ledger
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import TakePrompt
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")
 # The device with the fault stands beside a head tracker that is never disturbed.

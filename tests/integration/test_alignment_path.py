@@ -6,11 +6,11 @@ import pytest
 
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader
+from dextouch.schemas import TakePrompt
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import TakePrompt
 from services.alignment.jobs import align_recording
 from services.alignment.options import AlignmentOptions
 from services.alignment.recording_error import compare_with_truth

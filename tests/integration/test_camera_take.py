@@ -12,7 +12,7 @@ from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes import EpisodeStore
 from dextouch.episodes.spool import SpoolReader, SpoolWriter
 from dextouch.images import decode_jpeg
-from dextouch.schemas import RecordingAttributes
+from dextouch.schemas import RecordingAttributes, SaveTake, TakePrompt
 from dextouch.streams import SampleBatch, StreamDescriptor
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.station_camera.mock import video_camera
@@ -21,7 +21,6 @@ from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.station import Station
 from services.acquisition.uploader import Uploader
 from services.alignment.synchronization.stream_clock import time_stream

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
+from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import StreamDescriptor
 from services.acquisition import path_latency
 from services.acquisition.clock import RealClock
@@ -14,7 +15,6 @@ from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mo
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.station import Station
 
 SECONDS = 20

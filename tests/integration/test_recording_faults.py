@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from dextouch.episodes.spool import SpoolReader
+from dextouch.schemas import TakePrompt
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.schemas import TakePrompt
 from tests.integration.recording_streams import human_streams, robot_streams, stream
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dextouch.schemas import TakePrompt
 from services.acquisition.clock import RealClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.schemas import TakePrompt
 from tests.integration.recording_streams import human_streams
 
 ROOT = Path(__file__).parents[2]

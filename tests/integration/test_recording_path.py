@@ -5,13 +5,13 @@ import pytest
 
 from dextouch.clocks import fit_clock
 from dextouch.episodes.spool import SpoolReader
+from dextouch.schemas import TakePrompt
 from dextouch.tactile.layout import select_taxels
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.mock_station import LEDGER_FILE, MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.ledger import Fate, Ledger
-from services.acquisition.schemas import TakePrompt
 from tests.integration.recording_streams import human_streams, robot_streams
 
 PROMPT = TakePrompt(task="stack_bowls", instruction="stack the bowls")

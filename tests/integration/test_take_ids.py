@@ -10,12 +10,12 @@ import pytest
 from dextouch.clients import EpisodeStoreClient
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError
+from dextouch.schemas import TakePrompt
 from services.acquisition.app import create_app as create_station
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks import pattern
 from services.acquisition.mocks.faults import FaultScript
-from services.acquisition.schemas import TakePrompt
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.uploader import Uploader
 from services.episode_store.app import create_app as create_store

@@ -3,11 +3,11 @@
 import sys
 from pathlib import Path
 
+from dextouch.schemas import TakePrompt
 from services.acquisition.clock import RealClock
 from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
-from services.acquisition.schemas import TakePrompt
 
 
 def main(spool: str, seed: str) -> None:

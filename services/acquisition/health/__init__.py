@@ -8,7 +8,6 @@ from services.acquisition.health.cells import count_taxels
 from services.acquisition.health.codes import CODES
 from services.acquisition.health.metrics import STATION_FIGURES, HealthCollector
 from services.acquisition.health.monitor import STATION, TICK_NS, HealthMonitor
-from services.acquisition.health.schemas import HealthEvent, HealthEvents, StationHealth
 from services.acquisition.health.station import DiskJudge
 
 __all__ = [
@@ -18,9 +17,6 @@ __all__ = [
     "TICK_NS",
     "DiskJudge",
     "HealthCollector",
-    "HealthEvent",
-    "HealthEvents",
     "HealthMonitor",
-    "StationHealth",
     "count_taxels",
 ]

@@ -6,13 +6,11 @@ docs/health.md holds it as `table` shows it.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, Final, Literal
+from typing import Final
 
-from pydantic import AfterValidator, Field
+from dextouch.schemas import HealthLevel
 
-Level = Literal["OK", "WARN", "ERROR", "STALE"]
-SEVERITY: tuple[Level, ...] = ("OK", "WARN", "ERROR", "STALE")
-StaleCode = Literal["unplugged", "silent"]
+SEVERITY: tuple[HealthLevel, ...] = ("OK", "WARN", "ERROR", "STALE")
 NEVER = math.inf
 # How a limit is shown: the factor that makes a number of this unit.
 _SHOWN_AS: Final = {
@@ -129,16 +127,6 @@ CODES: Final[Mapping[str, Rule]] = {
         "Resolve the reason that the store gives, then send the take again."),
 }
 # fmt: on
-
-
-def _known(code: str) -> str:
-    if code not in CODES:
-        raise ValueError(f"got code {code!r}, expected one of {', '.join(CODES)}")
-    return code
-
-
-# What can be wrong with a stream or the station; a code never changes its meaning.
-Code = Annotated[str, AfterValidator(_known), Field(json_schema_extra={"enum": [*CODES]})]
 
 
 def table() -> str:

@@ -6,9 +6,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
-from services.acquisition.health.codes import CODES, NEVER, SEVERITY, Code, Level
+from dextouch.schemas import HealthEvent, HealthLevel, RaisedFinding
+from services.acquisition.health.codes import CODES, NEVER, SEVERITY
 from services.acquisition.health.samples import Block
-from services.acquisition.health.schemas import HealthEvent, RaisedFinding
 
 RAISE_AFTER = 2
 CLEAR_AFTER = 5
@@ -18,7 +18,7 @@ MAX_EVENTS = 2000
 class Finding(NamedTuple):
     """What one evaluation found wrong."""
 
-    code: Code
+    code: str
     level: Literal["WARN", "ERROR"]
     message: str
 
@@ -42,7 +42,7 @@ Judge = Callable[[Block, int], Verdict]
 
 
 def find(
-    code: Code,
+    code: str,
     value: float | int,
     message: str,
     *,
@@ -63,7 +63,26 @@ def find(
     return (Finding(code, "ERROR" if is_error else "WARN", message),)
 
 
-def worst(levels: Sequence[Level], default: Level = "OK") -> Level:
+def raised_finding(
+    code: str, level: HealthLevel, message: str, *, lasted_ns: int | None
+) -> RaisedFinding:
+    """A finding for the report, with the advice of its code.
+
+    Raises:
+        KeyError: a code that is not in `CODES`.
+    """
+    return RaisedFinding.model_validate(
+        {
+            "code": code,
+            "level": level,
+            "message": message,
+            "advice": CODES[code].advice,
+            "lasted_s": None if lasted_ns is None else max(0, lasted_ns) / 1e9,
+        }
+    )
+
+
+def worst(levels: Sequence[HealthLevel], default: HealthLevel = "OK") -> HealthLevel:
     """The most severe level; STALE ranks above ERROR."""
     return max(levels, key=_rank, default=default)
 
@@ -78,17 +97,17 @@ class Hysteresis:
     __slots__ = ("_recent", "level", "message", "since_ns")
 
     def __init__(self) -> None:
-        self.level: Level = "OK"
+        self.level: HealthLevel = "OK"
         self.message = ""
         self.since_ns = 0
-        self._recent: tuple[Level, ...] = ()
+        self._recent: tuple[HealthLevel, ...] = ()
 
     @property
     def is_rising(self) -> bool:
         """Whether one more judgement like the last one would raise the level."""
         return bool(self._recent) and _rank(self._recent[-1]) > _rank(self.level)
 
-    def update(self, judgement: Level) -> Level:
+    def update(self, judgement: HealthLevel) -> HealthLevel:
         """One evaluation."""
         recent = self._recent = (*self._recent, judgement)[-CLEAR_AFTER:]
         if len(recent) >= RAISE_AFTER:
@@ -102,7 +121,7 @@ class Board:
     """Findings of one stream (or of the station), with separate hysteresis for each code."""
 
     def __init__(self) -> None:
-        self._codes: dict[Code, Hysteresis] = {}
+        self._codes: dict[str, Hysteresis] = {}
 
     @property
     def is_rising(self) -> bool:
@@ -111,7 +130,7 @@ class Board:
 
     def update(
         self, findings: Sequence[Finding], now_ns: int, *, confirming: bool = False
-    ) -> list[tuple[Code, Level]]:
+    ) -> list[tuple[str, HealthLevel]]:
         """One evaluation; codes whose level changed, with the new level.
 
         Args:
@@ -119,11 +138,11 @@ class Board:
             now_ns: of the evaluation.
             confirming: an evaluation between the regular ones. It may raise, never clear.
         """
-        judged: dict[Code, Level] = {}
+        judged: dict[str, HealthLevel] = {}
         for finding in sorted(findings, key=lambda item: _rank(item.level)):
             judged[finding.code] = finding.level
             self._codes.setdefault(finding.code, Hysteresis()).message = finding.message
-        changes: list[tuple[Code, Level]] = []
+        changes: list[tuple[str, HealthLevel]] = []
         for code, hysteresis in self._codes.items():
             judgement, before = judged.get(code, "OK"), hysteresis.level
             if confirming and _rank(judgement) <= _rank(before):
@@ -137,7 +156,7 @@ class Board:
     def active(self, now_ns: int) -> tuple[RaisedFinding, ...]:
         """What is raised now, gravest first."""
         raised = [
-            RaisedFinding.since(code, h.level, h.message, lasted_ns=now_ns - h.since_ns)
+            raised_finding(code, h.level, h.message, lasted_ns=now_ns - h.since_ns)
             for code, h in self._codes.items()
             if h.level != "OK"
         ]
@@ -151,11 +170,11 @@ class EventLog:
     """
 
     def __init__(self) -> None:
-        self._events: deque[tuple[int, str, Code, Level]] = deque(maxlen=MAX_EVENTS)
+        self._events: deque[tuple[int, str, str, HealthLevel]] = deque(maxlen=MAX_EVENTS)
         self._raised: Counter[tuple[str, str]] = Counter()
         self._lock = threading.Lock()
 
-    def add(self, t_host_ns: int, stream: str, code: Code, level: Level) -> None:
+    def add(self, t_host_ns: int, stream: str, code: str, level: HealthLevel) -> None:
         """A code of a stream has reached a level; OK is its end."""
         with self._lock:
             self._events.append((t_host_ns, stream, code, level))
@@ -177,5 +196,5 @@ class EventLog:
             return dict(self._raised)
 
 
-def _rank(level: Level) -> int:
+def _rank(level: HealthLevel) -> int:
     return SEVERITY.index(level)

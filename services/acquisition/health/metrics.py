@@ -7,8 +7,8 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily
 from prometheus_client.metrics_core import Metric
 from prometheus_client.registry import Collector
 
+from dextouch.schemas import StationHealth
 from services.acquisition.health.codes import SEVERITY
-from services.acquisition.health.schemas import StationHealth
 
 STREAM_LABELS = ("stream", "hand", "device")
 DEVICE_LABELS = ("hand", "device")

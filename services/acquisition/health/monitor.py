@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 
-from dextouch.schemas import Matrix
+from dextouch.schemas import HealthEvents, Matrix, StationHealth
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.drivers.base import Driver
@@ -15,7 +15,6 @@ from services.acquisition.health.clock import ClockJudge, CountingJudge
 from services.acquisition.health.levels import EventLog, Judge, Verdict, worst
 from services.acquisition.health.link import LinkJudge, TrackingJudge
 from services.acquisition.health.samples import Block, deliver
-from services.acquisition.health.schemas import HealthEvents, StationHealth
 from services.acquisition.health.station import CalibrationJudge, PathJudge, judge_uploads
 from services.acquisition.health.values import CameraJudge, FiniteJudge, PoseJudge
 from services.acquisition.health.watched import Watched, WatchedStream, device_health

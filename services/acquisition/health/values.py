@@ -4,7 +4,6 @@ import numpy as np
 
 from dextouch.streams import StreamDescriptor
 from services.acquisition.drivers.base import Driver
-from services.acquisition.health.codes import Code
 from services.acquisition.health.levels import Finding, Verdict, find
 from services.acquisition.health.samples import WINDOW_NS, Block, Rolling
 
@@ -83,7 +82,7 @@ class FiniteJudge:
     What never held a number is no part of the device (a glove model's empty cells).
     """
 
-    def __init__(self, code: Code, word: str) -> None:
+    def __init__(self, code: str, word: str) -> None:
         self._code, self._word = code, word
         self._shares = Rolling(WINDOW_NS)
         self._ever: np.ndarray | None = None
@@ -106,7 +105,7 @@ class CameraJudge:
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
-        self._since_ns: dict[Code, int] = {}
+        self._since_ns: dict[str, int] = {}
 
     def judge(self, block: Block, now_ns: int) -> Verdict:
         """One evaluation."""

@@ -2,11 +2,11 @@
 
 import numpy as np
 
+from dextouch.schemas import DeviceHealth, StaleCode, StreamHealth
 from dextouch.streams import StreamDescriptor
-from services.acquisition.health.codes import CODES, StaleCode
-from services.acquisition.health.levels import Board, Judge, Verdict, worst
+from services.acquisition.health.codes import CODES
+from services.acquisition.health.levels import Board, Judge, Verdict, raised_finding, worst
 from services.acquisition.health.samples import Block, SampleQueue
-from services.acquisition.health.schemas import DeviceHealth, RaisedFinding, StreamHealth
 from services.acquisition.supervisor import DeviceSupervisor
 
 STALE_AFTER_NS = {"image": 500_000_000}
@@ -81,10 +81,10 @@ class WatchedStream(Watched):
         stale = self.stale_code(now_ns)
         if stale is not None:
             text = self._stale_words(stale, age_ns)
-            is_stale = RaisedFinding.since(stale, "STALE", text, lasted_ns=age_ns)
+            is_stale = raised_finding(stale, "STALE", text, lasted_ns=age_ns)
             findings, figures = (is_stale, *findings), {}
         elif not findings and age_ns is not None and age_ns > LATE_PERIODS * descriptor.period_ns():
-            findings = (RaisedFinding.since("late", "WARN", "late", lasted_ns=age_ns),)
+            findings = (raised_finding("late", "WARN", "late", lasted_ns=age_ns),)
         skew = figures.get("clock_skew_ratio")
         residual_s = figures.get("clock_residual_p95_seconds")
         return StreamHealth(

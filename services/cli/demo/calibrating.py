@@ -11,13 +11,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from dextouch.episodes.spool import SpoolReader
-from dextouch.schemas import Matrix, matrix_rows
+from dextouch.schemas import Matrix, TakePrompt, matrix_rows
 from dextouch.tactile.layout import NUM_TAXELS, SIDES, Side
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.replay import ReplayStream
-from services.acquisition.schemas import TakePrompt
 from services.alignment.calibration.tactile_gain import TaxelPress
 from services.alignment.calibration.tactile_glove_calibration import calibrate_glove
 from services.alignment.calibration.tactile_tare import measure_tare

@@ -18,13 +18,12 @@ from dextouch.episodes import EpisodeReader, EpisodeStore
 from dextouch.episodes.care import UPLOADS
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError, InvalidInputError, UnavailableError
-from dextouch.schemas import Problem, RecordingAttributes, error_from_problem
+from dextouch.schemas import Problem, RecordingAttributes, SaveTake, TakePrompt, error_from_problem
 from services.acquisition.clock import VirtualClock
 from services.acquisition.mock_station import MockStation, MockTake
 from services.acquisition.mocks.episode import replay_calibration, replay_streams
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.ledger import Fate
-from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.uploader import Uploader
 from services.alignment.recording_error import NEAR_NS, compare_with_truth, match_samples
 from services.alignment.schemas import AlignmentJob

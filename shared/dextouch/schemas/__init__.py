@@ -67,5 +67,25 @@ if TYPE_CHECKING:
     from dextouch.schemas.rollouts import WorldKind as WorldKind
     from dextouch.schemas.rollouts import WorldList as WorldList
     from dextouch.schemas.rollouts import check_observation as check_observation
+    from dextouch.schemas.station import CameraList as CameraList
+    from dextouch.schemas.station import CameraLive as CameraLive
+    from dextouch.schemas.station import DeviceHealth as DeviceHealth
+    from dextouch.schemas.station import HealthEvent as HealthEvent
+    from dextouch.schemas.station import HealthEvents as HealthEvents
+    from dextouch.schemas.station import HealthLevel as HealthLevel
+    from dextouch.schemas.station import RaisedFinding as RaisedFinding
+    from dextouch.schemas.station import RecorderAction as RecorderAction
+    from dextouch.schemas.station import RecorderState as RecorderState
+    from dextouch.schemas.station import RecorderStatus as RecorderStatus
+    from dextouch.schemas.station import SaveTake as SaveTake
+    from dextouch.schemas.station import StaleCode as StaleCode
+    from dextouch.schemas.station import StationHealth as StationHealth
+    from dextouch.schemas.station import StreamHealth as StreamHealth
+    from dextouch.schemas.station import StreamTake as StreamTake
+    from dextouch.schemas.station import TakeCheck as TakeCheck
+    from dextouch.schemas.station import TakeName as TakeName
+    from dextouch.schemas.station import TakeProblem as TakeProblem
+    from dextouch.schemas.station import TakePrompt as TakePrompt
+    from dextouch.schemas.station import UploadStatus as UploadStatus
 else:
     __getattr__, __dir__, __all__ = lazy_exports(__name__)

@@ -5,6 +5,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
+from dextouch.schemas import TakePrompt
 from services.acquisition.app import create_app
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.camera.driver import CameraDriver
@@ -17,7 +18,6 @@ from services.acquisition.mock_station import MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import at_rate
-from services.acquisition.schemas import TakePrompt
 from services.acquisition.settings import AcquisitionSettings
 from services.acquisition.transports.usb import UsbTransport
 from tests.integration.recording_streams import human_streams, robot_streams

@@ -8,6 +8,7 @@ from structlog.testing import capture_logs
 from dextouch.clocks import PathLatency, RoundTrip
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import DeviceError
+from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
@@ -17,7 +18,6 @@ from services.acquisition.health.station import PathJudge
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.path_latency import MAX_BACK_OFF, PathWatch, add_latencies
 from services.acquisition.recorder import Recorder
-from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.supervisor import DeviceSupervisor
 from tests.unit.acquisition.health_blocks_made import block
 

@@ -8,6 +8,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import ConflictError
+from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
@@ -15,7 +16,6 @@ from services.acquisition.devices.tactile_glove.packets import TactileGloveDecod
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort, PtyPort
 from services.acquisition.recorder import Recorder
-from services.acquisition.schemas import SaveTake, TakePrompt
 
 PROMPT = TakePrompt(task="stand_bottle", instruction="stand the bottle up", consent=True)
 ANYWAY = SaveTake(accept_incomplete=True)

@@ -11,6 +11,7 @@ import pytest
 
 from dextouch.episodes.spool import SpoolReader
 from dextouch.errors import InvalidInputError, StorageFullError
+from dextouch.schemas import SaveTake, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition import supervisor
 from services.acquisition.clock import RealClock, VirtualClock
@@ -18,7 +19,6 @@ from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.recorder import Recorder
-from services.acquisition.schemas import SaveTake, TakePrompt
 from services.acquisition.supervisor import SpoolSafety
 from services.acquisition.take import TakeOptions
 

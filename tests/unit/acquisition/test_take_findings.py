@@ -2,9 +2,14 @@
 
 import pytest
 
-from services.acquisition.health import HealthEvent, HealthEvents, StationHealth
-from services.acquisition.health.schemas import RaisedFinding, StreamHealth
-from services.acquisition.schemas import TakeProblem
+from dextouch.schemas import (
+    HealthEvent,
+    HealthEvents,
+    RaisedFinding,
+    StationHealth,
+    StreamHealth,
+    TakeProblem,
+)
 from services.acquisition.take_findings import TakeFindings
 
 START_NS = 10**10

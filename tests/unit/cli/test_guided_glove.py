@@ -9,6 +9,7 @@ import pytest
 
 from dextouch.clients import Reply
 from dextouch.errors import ConflictError, InvalidInputError, NotFoundError, UnknownNameError
+from dextouch.schemas import SaveTake, TakeName, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
@@ -18,7 +19,6 @@ from services.acquisition.drivers.base import Driver
 from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.recorder import Recorder
-from services.acquisition.schemas import SaveTake, TakeName, TakePrompt
 from services.alignment.calibration.tactile_baseline import TactileCalibration
 from services.cli.calibrate import glove, guided
 from services.cli.calibrate.command import main

@@ -10,8 +10,9 @@ import httpx
 import pytest
 import yaml
 
+from dextouch.schemas import StationHealth
 from dextouch.serving import ServiceSettings, create_service_app
-from services.acquisition.health import STATION_FIGURES, HealthCollector, StationHealth
+from services.acquisition.health import STATION_FIGURES, HealthCollector
 from services.cli.main import COMMANDS, find_command
 
 ROOT = Path(__file__).parents[3]

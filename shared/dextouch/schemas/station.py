@@ -1,0 +1,204 @@
+"""Bodies of a station's routes: recorder, live views, uploads and health."""
+
+from typing import Literal
+
+from pydantic import Field, FiniteFloat
+
+from dextouch.frozen_model import FrozenModel
+from dextouch.schemas.episodes import Domain, StoreId
+
+RecorderState = Literal["idle", "armed", "recording", "checking", "saved", "discarded"]
+RecorderAction = Literal["arm", "record", "stop", "save", "discard", "rerecord"]
+HealthLevel = Literal["OK", "WARN", "ERROR", "STALE"]
+StaleCode = Literal["unplugged", "silent"]
+
+
+class TakePrompt(FrozenModel):
+    """What is going to be recorded; given before the start."""
+
+    task: str = Field(min_length=1, max_length=128)
+    instruction: str = Field(min_length=1, max_length=2000)
+    domain: Domain = "human"
+    operator: str | None = Field(default=None, max_length=128)
+    consent: bool = False
+
+
+class TakeName(FrozenModel):
+    """Which take an action is meant for; without an id, the present one.
+
+    A request that names its take may be sent again: what was done is not done twice. `record` gives
+    its take this id.
+    """
+
+    recording_id: StoreId | None = None
+
+
+class SaveTake(TakeName):
+    """How a take ended; an incomplete one is only saved when `accept_incomplete` says so."""
+
+    success: bool | None = None
+    accept_incomplete: bool = False
+
+
+class TakeProblem(FrozenModel):
+    """Something that the check after a take found in one stream."""
+
+    stream: str
+    code: str
+    level: Literal["WARN", "ERROR"]
+    message: str
+
+
+class StreamTake(FrozenModel):
+    """Summary of one stream in a take."""
+
+    stream: str
+    num_samples: int
+    rate_hz: float | None
+    largest_gap_s: float
+    lost: int
+    crc_errors: int
+
+
+class TakeCheck(FrozenModel):
+    """Whether a take is complete, found right after its end."""
+
+    complete: bool
+    duration_s: float
+    streams: tuple[StreamTake, ...]
+    problems: tuple[TakeProblem, ...]
+
+
+class RecorderStatus(FrozenModel):
+    """Current state of the recorder, and the actions that are possible."""
+
+    state: RecorderState
+    actions: tuple[RecorderAction, ...]
+    recording_id: str | None = None
+    prompt: TakePrompt | None = None
+    duration_s: float | None = None
+    num_samples: dict[str, int] = Field(default_factory=dict)
+    problems: tuple[str, ...] = ()
+    check: TakeCheck | None = None
+
+
+class CameraLive(FrozenModel):
+    """A camera whose newest image can be had."""
+
+    name: str
+    image_index: int
+    age_s: float
+    height_px: int
+    width_px: int
+
+
+class CameraList(FrozenModel):
+    """Cameras that have sent an image."""
+
+    cameras: tuple[CameraLive, ...]
+
+
+class UploadStatus(FrozenModel):
+    """One saved take and whether the store has it.
+
+    `stored_as` is its id in the store, which differs where another recording had that id already. A
+    `refused` take stays in the spool and is not sent again until a retry is requested.
+    """
+
+    recording_id: str
+    uploaded: bool
+    stored_as: str | None = None
+    refused: bool = False
+    error: str | None = None
+
+
+class RaisedFinding(FrozenModel):
+    """Something that is wrong now, since when, and what to do about it.
+
+    `code` is one of the table in docs/health.md. `lasted_s` is None where nothing was ever heard of
+    a stream.
+    """
+
+    code: str
+    level: Literal["WARN", "ERROR", "STALE"]
+    message: str
+    advice: str
+    lasted_s: float | None
+
+
+class StreamHealth(FrozenModel):
+    """One stream at this moment; `lost` and `received` count its device's packets since start.
+
+    `stale` says why nothing is known; it is the first of the findings then. `reasons` are their
+    messages. `figures` are the numbers behind them by their Prometheus names, none while the
+    stream is stale.
+    """
+
+    stream: str
+    device: str
+    hand: Literal["left", "right"] | None = None
+    level: HealthLevel
+    stale: StaleCode | None = None
+    reasons: tuple[str, ...]
+    findings: tuple[RaisedFinding, ...] = ()
+    figures: dict[str, FiniteFloat] = Field(default_factory=dict)
+    rate_hz: float | None
+    nominal_rate_hz: float
+    age_s: float | None
+    num_samples: int = 0
+    received: int
+    lost: int
+    skew_ppm: float | None = None
+    clock_residual_ms: float | None = None
+
+
+class DeviceHealth(FrozenModel):
+    """One device and its counters since the station's start."""
+
+    device: str
+    hand: Literal["left", "right"] | None = None
+    connected: bool
+    address: str
+    packets: int
+    lost: int
+    crc_errors: int
+    length_errors: int
+    resync_bytes: int
+    refused: int
+    suspects: int = 0
+    repeated: int = 0
+    restarts: int = 0
+    queue_dropped: int = 0
+    reconnects: int
+    failures: int = 0
+    last_error: str | None
+
+
+class StationHealth(FrozenModel):
+    """All streams and devices; `level` is the worst of the streams and of `findings`.
+
+    `findings` and `figures` are those of the station itself: disk, calibration and uploads.
+    """
+
+    station: str
+    level: HealthLevel
+    findings: tuple[RaisedFinding, ...] = ()
+    figures: dict[str, FiniteFloat] = Field(default_factory=dict)
+    streams: tuple[StreamHealth, ...]
+    devices: tuple[DeviceHealth, ...]
+
+
+class HealthEvent(FrozenModel):
+    """A code of a stream (or of the `station`) reached a level; OK is its end."""
+
+    t_host_ns: int
+    stream: str
+    code: str
+    level: HealthLevel
+
+
+class HealthEvents(FrozenModel):
+    """Changes of levels, oldest first, and the station's clock now."""
+
+    now_ns: int
+    events: tuple[HealthEvent, ...]
