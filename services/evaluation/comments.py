@@ -47,7 +47,7 @@ def _correlation(agreement: Mapping[str, Any]) -> list[str]:
     vague = "; these data do not tell a faithful world from a poor one" if low < VAGUE_R else ""
     sentences = [
         f"Between the policies' true success rates Pearson's r is {low:.2f} to {high:.2f} (95 %)"
-        f"{vague}. Of all ways to pair the policies' rates, {chance:.2g} correlate as well."
+        f"{vague}. {_chance(chance)}"
     ]
     r, without = agreement["pearson"], agreement["pearson_without"]
     moved = {name: value - r for name, value in without.items() if value != UNDEFINED}
@@ -55,6 +55,11 @@ def _correlation(agreement: Mapping[str, Any]) -> list[str]:
     if name is not None and abs(moved[name]) >= NOTABLE_INFLUENCE:
         sentences.append(f"Without {name!r}, r would be {without[name]:.2f} instead of {r:.2f}.")
     return sentences
+
+
+def _chance(chance: float) -> str:
+    share = f"{chance:.2g}" if chance >= 0.001 else "fewer than one in a thousand"
+    return f"Of all ways to pair the policies' rates, {share} correlate as well."
 
 
 def _compared_starts(

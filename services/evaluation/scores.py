@@ -12,7 +12,9 @@ from dextouch.errors import InvalidInputError
 from services.evaluation.agreement import (
     FIGURES,
     Agreement,
+    Draws,
     paired_differences,
+    pooled_agreement,
     task_agreement,
 )
 from services.evaluation.comments import UNDEFINED, task_comments
@@ -21,6 +23,15 @@ from services.evaluation.statistics import wilson_interval
 
 REAL = "real"
 _SEED = 0
+
+
+@dataclass(frozen=True)
+class _Compared:
+    """What the agreement over all tasks needs of one of them."""
+
+    policies: tuple[str, ...]
+    scores: MatchedScores
+    draws: Draws
 
 
 @dataclass(frozen=True)
@@ -148,20 +159,38 @@ class ClosedLoopReport:
         share of bootstrap draws in which it is undefined; `pearson_without` leaves one policy out,
         `pearson_chance` is the permutation p value, and `differences` compares policies in pairs.
         """
-        return {task: self._agreement(world, task) for task in self.tasks}
+        return {task: self._agreement(world, task)[0] for task in self.tasks}
 
-    def _agreement(self, world: str, task: str) -> dict[str, Any]:
+    def _agreements(self, world: str) -> tuple[dict[str, dict[str, Any]], dict[str, Any]]:
+        """Report entries by task, and over all tasks at once if they compare the same policies."""
+        found = {task: self._agreement(world, task) for task in self.tasks}
+        by_task = {task: entries for task, (entries, _) in found.items()}
+        compared = [one for _, one in found.values() if one is not None]
+        if len(compared) < max(2, len(found)) or len({one.policies for one in compared}) > 1:
+            return by_task, {}
+        pooled = pooled_agreement(
+            compared[0].policies,
+            [one.scores for one in compared],
+            [one.draws for one in compared],
+            np.random.default_rng(_SEED),
+        )
+        return by_task, _entries(pooled)
+
+    def _agreement(self, world: str, task: str) -> tuple[dict[str, Any], "_Compared | None"]:
         outcomes = (self.outcomes(REAL, task), self.outcomes(world, task))
         compared, real, imagined = matched(self.policies, *outcomes)
         if real.size == 0:
             undefined = dict.fromkeys(FIGURES, UNDEFINED)
-            return undefined | {"num_policies": 0, "num_starts": 0, "rates": {}}
+            return undefined | {"num_policies": 0, "num_starts": 0, "rates": {}}, None
         pair = {"real": real.mean(axis=1), "imagined": imagined.mean(axis=1)}
         found: dict[str, Any] = {n: defined(f(**pair)) for n, f in FIGURES.items()}
+        joined = None
         if min(real.shape) >= 2:
             generator = np.random.default_rng(_SEED)
             scores = MatchedScores(real[:, :, None], imagined[:, :, None])
-            found |= _entries(task_agreement(compared, scores, generator)[0])
+            agreement, draws = task_agreement(compared, scores, generator)
+            joined = _Compared(tuple(compared), scores, draws)
+            found |= _entries(agreement)
             found["differences"] = {
                 world: [
                     asdict(one) | {"interval": [one.interval.low, one.interval.high]}
@@ -177,7 +206,7 @@ class ClosedLoopReport:
                 for row, policy in enumerate(compared)
             },
         }
-        return found
+        return found, joined
 
     def probe_accuracy(self) -> float | str:
         """Share of real rollouts whose outcome the probe classifies correctly."""
@@ -189,10 +218,12 @@ class ClosedLoopReport:
     def to_report(self) -> dict[str, Any]:
         """Report entries as plain JSON: `policies`, `agreement` and the rest."""
         first, *others = self.imagined_worlds or (None,)
-        rows, agreement = self.policy_rows(), {} if first is None else self.agreement(first)
+        rows = self.policy_rows()
+        agreement, pooled = ({}, {}) if first is None else self._agreements(first)
         return {
             "policies": rows,
             "agreement": agreement,
+            "agreement_of_all_tasks": pooled,
             "comments": {
                 task: task_comments([r for r in rows if r["task"] == task], found, str(first))
                 for task, found in agreement.items()
@@ -224,10 +255,11 @@ def matched(
 
 
 def _entries(agreement: Agreement) -> dict[str, Any]:
-    """Report entries of intervals, of correlations without one policy, and of chance."""
+    """Report entries of figures and intervals, correlations without one policy, and chance."""
     found: dict[str, Any] = {}
     for name, figure in agreement.figures.items():
         interval = figure.interval
+        found[name] = defined(figure.value)
         found[f"{name}_interval"] = [interval.low, interval.high] if interval else UNDEFINED
         found[f"{name}_undefined_share"] = figure.undefined_share
     found["pearson_without"] = {name: defined(r) for name, r in agreement.without.items()}

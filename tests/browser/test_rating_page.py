@@ -64,12 +64,20 @@ def test_a_person_rates_all_rollouts(serve, page, settings):
     assert problems == []
 
 
-def test_an_error_is_said_in_words(serve, page, settings):
-    keyed = settings.model_copy(update={"api_keys": ()})
-    address = serve(create_rating_app(keyed))
-    page.goto(address)
+def test_a_wrong_key_is_said_and_the_right_one_opens_the_page(serve, page, settings):
+    key = {"name": "ada", "key": "a-key-of-some-length", "scopes": ("rate",)}
+    app = create_rating_app(RatingSettings(**settings.model_dump() | {"api_keys": (key,)}))
+    page.goto(serve(app))
     page.get_by_label("Your name").fill("ada")
-    page.route("**/v1/rating/next*", lambda route: route.abort())
+    for typed, says in (("", "no key"), ("a-key-that-nobody-has", "unknown key")):
+        page.get_by_label("Key").fill(typed)
+        page.get_by_role("button", name="Start").click()
+        expect(page.get_by_role("alert")).to_contain_text(says)
+    page.get_by_label("Key").fill(key["key"])
     page.get_by_role("button", name="Start").click()
-    expect(page.get_by_role("alert")).not_to_be_empty()
-    expect(page.get_by_label("Your name")).to_be_visible()
+    expect(page.get_by_role("heading", name="Touch the red spot.")).to_be_visible()
+    # Pictures and marks carry the key, too.
+    expect(page.locator("#time")).to_have_text(re.compile(r"^(0\.[3-9]|[1-9])"))
+    page.locator("body").press("c")
+    expect(page.locator("#progress")).to_have_text("ada: 1 rated, 2 to go")
+    assert MarkLog(settings.marks).history()[0].mark.cannot_judge

@@ -15,7 +15,7 @@ from dextouch.serving import RequireScope, create_service_app, serve
 from services.evaluation.rating.marks import Judgement, Mark, MarkLog, RaterName
 from services.evaluation.rating.rated_rollouts import RolloutPictures, rated_rollouts
 from services.evaluation.rating.rating_queue import RatingQueue
-from services.evaluation.rating.rubrics import Rubric, bundled_rubrics, read_rubrics, rubric_of
+from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
 from services.evaluation.rating.settings import RatingSettings
 
 STATIC: Final = FilePath(__file__).parent / "static"
@@ -76,7 +76,7 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
         UnknownNameError: a task without a rubric.
         StorageError: the marks cannot be opened.
     """
-    rubrics = rubrics_of(settings.rubrics)
+    rubrics = read_rubrics(settings.rubrics)
     tasks = settings.tasks or tuple(rubrics)
     for task in tasks:
         rubric_of(task, rubrics)
@@ -90,11 +90,6 @@ def create_rating_app(settings: RatingSettings) -> FastAPI:
     )
     routers = [page_router(), rating_router(queue, marks, rubrics, RolloutPictures(store))]
     return create_service_app(name="rating", settings=settings, routers=routers)
-
-
-def rubrics_of(path: FilePath | None) -> Mapping[str, Rubric]:
-    """Rubrics of a file, or the package's."""
-    return bundled_rubrics() if path is None else read_rubrics(path)
 
 
 def page_router() -> APIRouter:

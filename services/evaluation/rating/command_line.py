@@ -5,21 +5,21 @@ from collections.abc import Sequence
 from dextouch.command_line import write_result
 from dextouch.episodes import EpisodeStore
 from dextouch.serving import load_settings
-from services.evaluation.rating.app import rubrics_of
 from services.evaluation.rating.marks import MarkLog
-from services.evaluation.rating.rated_rollouts import rated_rollouts
+from services.evaluation.rating.rated_rollouts import rated_rollouts, state_scores
 from services.evaluation.rating.rating_report import UNDEFINED, rating_report
+from services.evaluation.rating.rubrics import read_rubrics
 from services.evaluation.rating.settings import RatingReportSettings
 
 
 def report_main(argv: Sequence[str]) -> int:
     """Print scores and agreement by task, and write the report on request."""
     settings = load_settings(RatingReportSettings, list(argv))
-    rubrics = rubrics_of(settings.rubrics)
-    rollouts = rated_rollouts(EpisodeStore(settings.store_url), tuple(rubrics))
+    rubrics, store = read_rubrics(settings.rubrics), EpisodeStore(settings.store_url)
+    rollouts = rated_rollouts(store, tuple(rubrics))
     marks = MarkLog(settings.marks).latest().values()
-    tasks = {one.episode_id: one.task for one in rollouts.values()}
-    report = rating_report(marks, tasks, rubrics)
+    tasks = {one.episode_id: one.task for one in rollouts}
+    report = rating_report(marks, tasks, rubrics, state_scores(store, rollouts, rubrics))
     write_result(settings.json_path, report, allow_nan=False)
     print(f"{report['num_marks']} marks of {len(report['rollouts'])} rollouts")
     for task, found in report["tasks"].items():
@@ -33,6 +33,8 @@ def report_main(argv: Sequence[str]) -> int:
             f"{found['num_raters']} raters, alpha {alpha}, ICC(2,k) {icc}"
         )
         print(f"  {found['comment']}")
+        if found["less_state_score"] != UNDEFINED:
+            print(f"  people's scores less the twin's own: {found['less_state_score']:+.2f}")
         for row in found["raters"]:
             low, high = row["bias_interval"]
             print(

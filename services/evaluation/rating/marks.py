@@ -36,7 +36,8 @@ class Judgement(FrozenModel):
 
     `holds` has every criterion of the task's rubric, and nothing if the rater `cannot_judge`.
     `is_inconsistent` says that something physically impossible is seen. `presentation` is 2 when
-    the rater is shown the rollout again, to measure how consistent they are.
+    the rater is shown the rollout again, to measure how consistent they are. Programs that judge
+    rollouts are raters of the kind "auto".
     """
 
     rater: RaterName
@@ -45,6 +46,7 @@ class Judgement(FrozenModel):
     cannot_judge: bool = False
     comment: str = Field(default="", max_length=2000)
     presentation: Literal[1, 2] = 1
+    kind: Literal["human", "auto"] = "human"
 
     @model_validator(mode="after")
     def _judges_or_not(self) -> "Judgement":
@@ -56,10 +58,9 @@ class Judgement(FrozenModel):
 
 
 class Mark(Judgement):
-    """The judgement of one rollout, by a person or an automatic judge."""
+    """The judgement of one rollout."""
 
     episode_id: str = Field(min_length=1, max_length=200)
-    kind: Literal["human", "auto"] = "human"
 
 
 @dataclass(frozen=True)

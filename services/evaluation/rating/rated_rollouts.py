@@ -1,6 +1,6 @@
 """Rollouts of an episode store as raters see them: prompts, and pictures of image and touch."""
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Mapping
 from functools import lru_cache
 from typing import Final
 
@@ -8,10 +8,11 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from PIL import Image
 
-from dextouch.episodes import EpisodeReader, EpisodeStore
+from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, NotFoundError
 from dextouch.images import encode_jpeg
 from services.evaluation.rating.rating_queue import RatedRollout, token_of
+from services.evaluation.rating.rubrics import Rubric
 from services.evaluation.reporting.pictures import touch_image
 
 CAMERA: Final = "camera_head"
@@ -19,8 +20,8 @@ IMAGE_HEIGHT_PX: Final = 384
 _BACKGROUND: Final = 24
 
 
-def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> dict[str, RatedRollout]:
-    """Rollouts of a store that have head images, by episode id.
+def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> list[RatedRollout]:
+    """Rollouts of a store that have head images.
 
     Args:
         store: of episodes.
@@ -29,18 +30,20 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> dict[str, Rat
     Raises:
         InvalidInputError: nothing to rate.
     """
-    found = {}
+    found = []
     for episode_id in store.list():
         episode = store.open(episode_id)
         about = episode.attributes
         if about.task in tasks and CAMERA in episode.streams:
-            found[episode_id] = RatedRollout(
-                token_of(episode_id),
-                episode_id,
-                about.task,
-                about.instruction,
-                episode.num_steps,
-                about.model_rate_hz,
+            found.append(
+                RatedRollout(
+                    token_of(episode_id),
+                    episode_id,
+                    about.task,
+                    about.instruction,
+                    episode.num_steps,
+                    about.model_rate_hz,
+                )
             )
     if not found:
         raise InvalidInputError(
@@ -50,13 +53,31 @@ def rated_rollouts(store: EpisodeStore, tasks: Collection[str]) -> dict[str, Rat
     return found
 
 
+def state_scores(
+    store: EpisodeStore, rollouts: Iterable[RatedRollout], rubrics: Mapping[str, Rubric]
+) -> dict[str, float]:
+    """Scores of the twin's rollouts by its milestones, by episode id: the truth for raters.
+
+    Rollouts of other worlds, rubrics that the twin cannot judge, and takes whose milestones were
+    not noted have none.
+    """
+    found = {}
+    for rollout in rollouts:
+        about, rubric = store.open(rollout.episode_id).attributes, rubrics[rollout.task]
+        was_noted = about.event_times_s or about.success is False
+        if about.origin == "twin" and was_noted and rubric.is_seen_by_twin:
+            holds = rubric.holds_in_twin(about.event_times_s)
+            found[rollout.episode_id] = rubric.score(holds)
+    return found
+
+
 class RolloutPictures:
     """JPEG pictures of single steps: the head image beside taxel maps of both hands."""
 
     def __init__(self, store: EpisodeStore) -> None:
-        self._store = store
-        # A rater's page asks for the steps of one rollout after the other.
-        self._opened = lru_cache(maxsize=16)(self._read)
+        # A rater's page asks for the steps of one rollout after the other. Only readers are kept:
+        # decoded images of a long rollout would take hundreds of megabytes.
+        self._opened = lru_cache(maxsize=16)(store.open)
 
     def step(self, episode_id: str, step: int) -> bytes:
         """JPEG of one step; where it has no image, of the nearest one.
@@ -64,17 +85,13 @@ class RolloutPictures:
         Raises:
             NotFoundError: no such step.
         """
-        images, tactile_kpa = self._opened(episode_id)
-        if not 0 <= step < len(images):
-            raise NotFoundError(f"step {step}: the rollout has the steps 0 … {len(images) - 1}")
-        return encode_jpeg(side_by_side(images[step], tactile_kpa[step]))
-
-    def _read(
-        self, episode_id: str
-    ) -> tuple[UInt8[np.ndarray, "steps h w 3"], Float32[np.ndarray, "steps 2 320"]]:
-        episode: EpisodeReader = self._store.open(episode_id)
-        window = episode.window(0, episode.num_steps, cameras=(CAMERA,))
-        return window.images[CAMERA], window.tactile_kpa
+        episode = self._opened(episode_id)
+        if not 0 <= step < episode.num_steps:
+            raise NotFoundError(
+                f"step {step}: the rollout has the steps 0 … {episode.num_steps - 1}"
+            )
+        window = episode.window(step, 1, cameras=(CAMERA,))
+        return encode_jpeg(side_by_side(window.images[CAMERA][0], window.tactile_kpa[0]))
 
 
 def side_by_side(

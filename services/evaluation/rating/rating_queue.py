@@ -2,7 +2,7 @@
 
 import hashlib
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 from dextouch.errors import NotFoundError
@@ -56,14 +56,14 @@ class RatingQueue:
 
     def __init__(
         self,
-        rollouts: Mapping[str, RatedRollout],
+        rollouts: Iterable[RatedRollout],
         marks: MarkLog,
         *,
         raters_per_rollout: int = 5,
         repeat_share: float = 0.08,
         repeat_gap: int = 10,
     ) -> None:
-        self._rollouts = {one.token: one for one in rollouts.values()}
+        self._rollouts = {one.token: one for one in rollouts}
         self._marks = marks
         self._raters_per_rollout = raters_per_rollout
         self._repeat_share = repeat_share

@@ -21,7 +21,10 @@ UNDEFINED = "undefined"
 
 
 def rating_report(
-    marks: Iterable[StoredMark], task_of: Mapping[str, str], rubrics: Mapping[str, Rubric]
+    marks: Iterable[StoredMark],
+    task_of: Mapping[str, str],
+    rubrics: Mapping[str, Rubric],
+    state_scores: Mapping[str, float],
 ) -> dict[str, Any]:
     """Report entries: scores by rollout, and by task alpha, ICC(2,k), biases and consistency.
 
@@ -31,16 +34,22 @@ def rating_report(
         marks: those that count (`MarkLog.latest`).
         task_of: task of each episode id; marks of others are left out and counted.
         rubrics: by task.
+        state_scores: true scores by episode id, where they are known.
     """
     known = [one.mark for one in marks if one.mark.episode_id in task_of]
     tasks = sorted({task_of[mark.episode_id] for mark in known})
+    rollouts = [
+        row | {"state_score": state_scores.get(row["episode_id"], UNDEFINED)}
+        for row in _rollouts(known, task_of, rubrics)
+    ]
     return {
-        "rollouts": _rollouts(known, task_of, rubrics),
+        "rollouts": rollouts,
         "tasks": {
             task: _task(
                 [mark for mark in known if task_of[mark.episode_id] == task],
                 rubric_of(task, rubrics),
             )
+            | {"less_state_score": _less_state([r for r in rollouts if r["task"] == task])}
             for task in tasks
         },
         "cannot_judge": sum(mark.cannot_judge for mark in known),
@@ -62,6 +71,14 @@ def _rollouts(
         | {"score": float(np.mean(kinds["human"])) if kinds["human"] else UNDEFINED}
         for episode_id, kinds in sorted(found.items())
     ]
+
+
+def _less_state(rollouts: list[dict[str, Any]]) -> float | str:
+    """Mean of people's scores less true ones, over the rollouts that have both."""
+    both = [row for row in rollouts if UNDEFINED not in {row["score"], row["state_score"]}]
+    if not both:
+        return UNDEFINED
+    return float(np.mean([row["score"] - row["state_score"] for row in both]))
 
 
 def _score(mark: Mark, rubric: Rubric) -> float:

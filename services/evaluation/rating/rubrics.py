@@ -2,7 +2,6 @@
 
 import tomllib
 from collections.abc import Mapping
-from functools import cache
 from pathlib import Path
 from typing import Final
 
@@ -59,6 +58,11 @@ class Rubric(FrozenModel):
         """Points of a rollout that meets every criterion."""
         return sum(criterion.points for criterion in self.criteria)
 
+    @property
+    def is_seen_by_twin(self) -> bool:
+        """Whether every criterion has a milestone of the twin."""
+        return all(criterion.milestone is not None for criterion in self.criteria)
+
     def score(self, holds: Mapping[str, bool], *, is_inconsistent: bool = False) -> float:
         """Score of a rollout in 0 … 1: its points as a share of the maximum.
 
@@ -102,12 +106,13 @@ class Rubric(FrozenModel):
         return {one.name: one.milestone in event_times_s for one in self.criteria}
 
 
-def read_rubrics(path: Path) -> dict[str, Rubric]:
-    """Rubrics of a TOML file by task.
+def read_rubrics(path: Path | None = None) -> dict[str, Rubric]:
+    """Rubrics of a TOML file by task; by default the package's: the paper's and the twin's tasks.
 
     Raises:
         InvalidInputError: unreadable, or no valid rubric in a table.
     """
+    path = BUNDLED if path is None else path
     try:
         tables = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
@@ -123,19 +128,12 @@ def read_rubrics(path: Path) -> dict[str, Rubric]:
     return rubrics
 
 
-@cache
-def bundled_rubrics() -> Mapping[str, Rubric]:
-    """The package's rubrics by task: those of the paper and of the twin's tasks."""
-    return read_rubrics(BUNDLED)
-
-
-def rubric_of(task: str, rubrics: Mapping[str, Rubric] | None = None) -> Rubric:
+def rubric_of(task: str, rubrics: Mapping[str, Rubric]) -> Rubric:
     """Rubric of a task.
 
     Raises:
         UnknownNameError: no rubric for it.
     """
-    known = bundled_rubrics() if rubrics is None else rubrics
-    if task not in known:
-        raise UnknownNameError("rubric of task", task, list(known))
-    return known[task]
+    if task not in rubrics:
+        raise UnknownNameError("rubric of task", task, list(rubrics))
+    return rubrics[task]

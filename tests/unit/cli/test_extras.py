@@ -62,6 +62,8 @@ COMMANDS = (
     "train probe --help",
     "serve --help",
     "evaluate --help",
+    "rate serve --help",
+    "rate report --help",
 )
 HELP = "\n".join(("--help", "train --help", *COMMANDS))
 
@@ -105,6 +107,8 @@ def run_without(folder, packages, lines):
                 "train probe --help",
                 "serve --help",
                 "evaluate --help",
+                "rate serve --help",
+                "rate report --help",
             },
         ),
         (
@@ -118,6 +122,8 @@ def run_without(folder, packages, lines):
                 "train probe --help",
                 "serve --help",
                 "evaluate --help",
+                "rate serve --help",
+                "rate report --help",
             },
         ),
     ],

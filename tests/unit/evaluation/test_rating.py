@@ -12,10 +12,11 @@ from services.evaluation.rating.rater_agreement import (
     krippendorff_alpha,
     rater_biases,
 )
-from services.evaluation.rating.rubrics import Rubric, bundled_rubrics, read_rubrics, rubric_of
+from services.evaluation.rating.rubrics import Rubric, read_rubrics, rubric_of
 from services.twin.tasks import TASK_NAMES, get_task
 
 nan = np.nan
+RUBRICS = read_rubrics()
 # Krippendorff, "Computing Krippendorff's Alpha-Reliability" (2011), example C: 4 observers of 12
 # units.
 KRIPPENDORFF = np.array([
@@ -78,8 +79,8 @@ def test_ratings_that_are_no_numbers_are_refused():
 def test_points_are_those_of_the_paper():
     # "World Models as Policy Evaluators": shoes 4, bowls 2, phone 2, bottle 1; penalty 0.5.
     expected = {"place_shoes": 4, "stack_three_bowls": 2, "place_phone": 2, "stand_bottle": 1}
-    assert {task: rubric_of(task).max_points for task in expected} == expected
-    assert {rubric.penalty for rubric in bundled_rubrics().values()} == {0.5}
+    assert {task: rubric_of(task, RUBRICS).max_points for task in expected} == expected
+    assert {rubric.penalty for rubric in RUBRICS.values()} == {0.5}
 
 
 def test_points_agree_with_the_table_of_the_paper():
@@ -89,21 +90,25 @@ def test_points_agree_with_the_table_of_the_paper():
     table = json.loads(path.read_text())
     names = {"Stack Bowls": "stack_three_bowls"}
     for title, points in table["rubric_max_points"].items():
-        assert rubric_of(names.get(title, title.lower().replace(" ", "_"))).max_points == points
+        assert (
+            rubric_of(names.get(title, title.lower().replace(" ", "_")), RUBRICS).max_points
+            == points
+        )
     assert table["imagined_penalty_points"] == 0.5
 
 
 @pytest.mark.parametrize("task", TASK_NAMES)
 def test_the_twin_scores_all_its_tasks(task):
-    rubric, milestones = rubric_of(task), get_task(task).milestones
+    rubric, milestones = rubric_of(task, RUBRICS), get_task(task).milestones
     assert {one.milestone for one in rubric.criteria} <= set(milestones)
+    assert rubric.is_seen_by_twin
     nothing, everything = ({}, dict.fromkeys(milestones, 1.0))
     assert rubric.score(rubric.holds_in_twin(nothing)) == 0
     assert rubric.score(rubric.holds_in_twin(everything)) == 1
 
 
 def test_scores_by_hand():
-    rubric = rubric_of("place_shoes")
+    rubric = rubric_of("place_shoes", RUBRICS)
     names = [one.name for one in rubric.criteria]
     holds = dict(zip(names, [True, False, True, False], strict=True))
     assert rubric.score(holds) == 0.5
@@ -114,15 +119,15 @@ def test_scores_by_hand():
 
 
 def test_marks_that_do_not_fit_are_refused():
-    rubric = rubric_of("place_phone")
+    rubric = rubric_of("place_phone", RUBRICS)
     with pytest.raises(UnknownNameError, match="'flew'"):
         rubric.score({"picked_up": True, "placed": True, "flew": True})
     with pytest.raises(InvalidInputError, match="no mark for placed"):
         rubric.score({"picked_up": True})
     with pytest.raises(UnknownNameError, match="place_phone"):
-        rubric_of("juggle")
+        rubric_of("juggle", RUBRICS)
     with pytest.raises(InvalidInputError, match="first_stacked, second_stacked has no milestone"):
-        rubric_of("stack_three_bowls").holds_in_twin({})
+        rubric_of("stack_three_bowls", RUBRICS).holds_in_twin({})
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,7 @@ from dextouch.episodes import EpisodeStore
 from dextouch.errors import InvalidInputError, UnknownNameError
 from services.cli.main import main
 from services.evaluation.rating.app import create_rating_app
+from services.evaluation.rating.marks import MarkLog
 from services.evaluation.rating.rated_rollouts import side_by_side
 from services.evaluation.rating.settings import RatingSettings
 from tests.unit.evaluation import toy
@@ -22,12 +23,14 @@ RUBRICS = """
 [[reach.criteria]]
 name = "touched"
 points = 2
+milestone = "touched"
 description = "The hand touched the spot."
 [[reach.criteria]]
 name = "stayed"
 points = 1
 description = "The hand stayed there."
 latched = false
+milestone = "stayed"
 requires = ["touched"]
 """
 KEY = {"name": "ada", "key": "a-key-of-some-length", "scopes": ("rate",)}
@@ -82,6 +85,41 @@ async def test_a_rater_rates_everything_without_learning_what_it_is(settings, tm
     report = json.loads(path.read_text())
     assert [row["score"] for row in report["rollouts"]] == [pytest.approx(2 / 3)] * 2
     assert "reach: score 0.67 over 2 rollouts, 1 raters" in capsys.readouterr().out
+
+
+async def test_the_report_compares_people_with_the_twin(settings, tmp_path):
+    store = EpisodeStore(settings["store_url"])
+    noted = toy.demonstration("reach", 3, name="noted")
+    write(store, noted, origin="twin", event_times_s={"touched": 1.0, "stayed": 3.0})
+    write(store, toy.demonstration("reach", 4, name="missed"), origin="twin", success=False)
+    write(store, toy.demonstration("reach", 5, name="unknown"), origin="twin", success=True)
+    async with client(settings) as http:
+        while (shown := await http.get("/v1/rating/next", params={"rater": "ada"})).is_success:
+            if shown.status_code == 204:
+                break
+            await http.post("/v1/rating/marks", json=given(shown.json(), kind="human"))
+    flags = [f"--{name.replace('_', '-')}={value}" for name, value in settings.items()]
+    path = tmp_path / "report.json"
+    assert main(["rate", "report", *flags, "--json", str(path)]) == 0
+    report = json.loads(path.read_text())
+    true = {row["episode_id"]: row["state_score"] for row in report["rollouts"]}
+    assert {name: true[name] for name in ("noted", "missed", "unknown")} == {
+        "noted": 1.0,
+        "missed": 0.0,
+        "unknown": "undefined",
+    }
+    # Ada gave two points of three to both: one third too few, two thirds too many.
+    assert report["tasks"]["reach"]["less_state_score"] == pytest.approx((2 / 3 - 1 + 2 / 3) / 2)
+
+
+async def test_a_program_is_a_rater_of_its_own_kind(settings):
+    async with client(settings) as http:
+        shown = (await http.get("/v1/rating/next", params={"rater": "probe"})).json()
+        answer = await http.post("/v1/rating/marks", json=given(shown, rater="probe", kind="auto"))
+        assert answer.status_code == 201
+        (stored,) = MarkLog(settings["marks"]).history()
+        assert (stored.mark.rater, stored.mark.kind) == ("probe", "auto")
+        assert (await http.get("/v1/rating/next", params={"rater": "ada"})).json()["num_open"] == 2
 
 
 async def test_pictures_show_image_and_touch(settings):

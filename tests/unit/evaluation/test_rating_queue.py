@@ -10,16 +10,15 @@ from dextouch.errors import NotFoundError, StorageError
 from services.evaluation.rating.marks import FIRST, REPEAT, Mark, MarkLog
 from services.evaluation.rating.rating_queue import RatedRollout, RatingQueue, token_of
 from services.evaluation.rating.rating_report import rating_report
-from services.evaluation.rating.rubrics import bundled_rubrics
+from services.evaluation.rating.rubrics import read_rubrics
 
 IDS = [f"rollout-{number}" for number in range(12)]
 
 
 def rollouts(ids=IDS):
-    return {
-        one: RatedRollout(token_of(one), one, "stand_bottle", "Stand it up.", 40, 15.0)
-        for one in ids
-    }
+    return [
+        RatedRollout(token_of(one), one, "stand_bottle", "Stand it up.", 40, 15.0) for one in ids
+    ]
 
 
 def mark(rater, episode_id, *, standing=True, **changes):
@@ -132,16 +131,19 @@ def test_the_report_by_hand(log):
     log.add(mark("probe", IDS[1], kind="auto"))
     log.add(mark("ada", "of-another-store"))
     tasks = dict.fromkeys(IDS, "stand_bottle")
-    found = rating_report(log.latest().values(), tasks, bundled_rubrics())
+    found = rating_report(log.latest().values(), tasks, read_rubrics(), {IDS[1]: 1.0, IDS[2]: 0.0})
     scores = {row["episode_id"]: row["score"] for row in found["rollouts"]}
     assert scores == {IDS[0]: 1.0, IDS[1]: 0.5, IDS[2]: 0.0, IDS[3]: 0.0}
     assert found["rollouts"][1]["auto_scores"] == [1.0]
+    assert [row["state_score"] for row in found["rollouts"]] == ["undefined", 1.0, 0.0, "undefined"]
     assert found["cannot_judge"] == 1
     task = found["tasks"]["stand_bottle"]
     assert (task["score"], task["num_raters"], task["num_rollouts"]) == (0.375, 2, 4)
     # 8 ratings, 3 of them 1. Observed: one of four pairs differs, 2 ordered pairs of 8; expected:
     # 2 · 3 · 5 of 8 · 7 ordered pairs. Alpha = 1 - (2 / 8) / (30 / 56).
     assert task["alpha_by_criterion"]["standing"] == pytest.approx(1 - (2 / 8) / (30 / 56))
+    # The second rollout lacks 0.5, the third nothing.
+    assert task["less_state_score"] == -0.25
     assert task["repeats"] == {"num": 1, "same_score": 0.0}
     assert {row["rater"]: row["bias"] for row in task["raters"]} == {"ada": 0.25, "bob": -0.25}
     assert "agree too little" in task["comment"]

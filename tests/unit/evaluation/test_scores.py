@@ -117,6 +117,43 @@ def test_a_correlation_that_hangs_on_one_policy_is_named():
     assert alone["comments"]["stand"][-1].endswith("at least two policies.")
 
 
+def test_chance_below_its_resolution_is_said_in_words():
+    # Eight policies in the same order: 1 of 8! = 40,320 pairings correlates as well.
+    marks = {name: "1" * k + "0" * (8 - k) for k, name in enumerate("abcdefgh")}
+    sentences = report({"real": marks, "dream": marks}).to_report()["comments"]["stand"]
+    assert any("policies' rates, fewer than one in a thousand correlate" in s for s in sentences)
+
+
+def test_agreement_of_all_tasks_correlates_all_policies_of_all_tasks():
+    """Two tasks of different difficulty: their rates correlate at once, by hand."""
+    easy, hard = report(GOOD).scores, []
+    for world, policies in (
+        ("real", {"a": "1000", "b": "0000", "c": "0000"}),
+        ("model", {"a": "1100", "b": "0000", "c": "1000"}),
+    ):
+        for policy, marks in policies.items():
+            hard += [
+                RolloutScore(world, policy, "pour", k, f"pour {k}", mark == "1", float(mark))
+                for k, mark in enumerate(marks)
+            ]
+    worlds = tuple(s for s in easy if s.world != "copy") + tuple(hard)
+    whole = ClosedLoopReport(worlds, ("model",), ("a", "b", "c")).to_report()
+    real, imagined = [1, 0.5, 0, 0.25, 0, 0], [0.75, 0.75, 0.25, 0.5, 0, 0.25]
+    found = whole["agreement_of_all_tasks"]
+    assert found["pearson"] == pytest.approx(np.corrcoef(real, imagined)[0, 1])
+    low, high = found["pearson_interval"]
+    assert low < found["pearson"] < high
+    json.dumps(whole, allow_nan=False)
+    # One task has none, nor have tasks that compare different policies: all of c's pouring failed.
+    assert report(GOOD).to_report()["agreement_of_all_tasks"] == {}
+    ended = tuple(s for s in worlds if (s.world, s.task, s.policy) != ("model", "pour", "c"))
+    failures = tuple(
+        RolloutFailure("model", "c", "pour", k, "Unavailable", "lost") for k in range(4)
+    )
+    other = ClosedLoopReport(ended, ("model",), ("a", "b", "c"), failures).to_report()
+    assert other["agreement_of_all_tasks"] == {}
+
+
 def test_probe_is_judged_on_real_rollouts():
     assert report(GOOD).to_report()["probe_accuracy_on_real"] == 1.0
 
