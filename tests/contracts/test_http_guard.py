@@ -11,7 +11,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from dextouch.serving.settings import ApiKey
+from dextouch.serving.guard import ApiKey
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from services.acquisition.settings import AcquisitionSettings
 from services.alignment.settings import AlignmentSettings

@@ -26,6 +26,21 @@ if TYPE_CHECKING:
     from dextouch.schemas.episodes import matrix_rows as matrix_rows
     from dextouch.schemas.health import Health as Health
     from dextouch.schemas.health import Readiness as Readiness
+    from dextouch.schemas.observations import EVERYTHING as EVERYTHING
+    from dextouch.schemas.observations import Doubt as Doubt
+    from dextouch.schemas.observations import Observation as Observation
+    from dextouch.schemas.observations import ReturnSelector as ReturnSelector
+    from dextouch.schemas.observations import RolloutAnswer as RolloutAnswer
+    from dextouch.schemas.observations import RolloutOrigin as RolloutOrigin
+    from dextouch.schemas.observations import RolloutStart as RolloutStart
+    from dextouch.schemas.observations import check_observation as check_observation
+    from dextouch.schemas.observations import decode_answer as decode_answer
+    from dextouch.schemas.observations import decode_observation as decode_observation
+    from dextouch.schemas.observations import decode_start as decode_start
+    from dextouch.schemas.observations import encode_answer as encode_answer
+    from dextouch.schemas.observations import encode_observation as encode_observation
+    from dextouch.schemas.observations import encode_start as encode_start
+    from dextouch.schemas.observations import start_from as start_from
     from dextouch.schemas.problems import CLASS_OF_STATUS as CLASS_OF_STATUS
     from dextouch.schemas.problems import PROBLEM_MEDIA_TYPE as PROBLEM_MEDIA_TYPE
     from dextouch.schemas.problems import Problem as Problem
@@ -44,29 +59,14 @@ if TYPE_CHECKING:
     from dextouch.schemas.recordings import RecordingSummary as RecordingSummary
     from dextouch.schemas.recordings import UploadList as UploadList
     from dextouch.schemas.recordings import UploadSummary as UploadSummary
-    from dextouch.schemas.rollout_codec import RolloutAnswer as RolloutAnswer
-    from dextouch.schemas.rollout_codec import RolloutOrigin as RolloutOrigin
-    from dextouch.schemas.rollout_codec import decode_answer as decode_answer
-    from dextouch.schemas.rollout_codec import decode_observation as decode_observation
-    from dextouch.schemas.rollout_codec import decode_start as decode_start
-    from dextouch.schemas.rollout_codec import encode_answer as encode_answer
-    from dextouch.schemas.rollout_codec import encode_observation as encode_observation
-    from dextouch.schemas.rollout_codec import encode_start as encode_start
-    from dextouch.schemas.rollout_codec import start_from as start_from
-    from dextouch.schemas.rollouts import EVERYTHING as EVERYTHING
     from dextouch.schemas.rollouts import MAX_SEED as MAX_SEED
     from dextouch.schemas.rollouts import ActionKind as ActionKind
-    from dextouch.schemas.rollouts import Doubt as Doubt
     from dextouch.schemas.rollouts import ForkRequest as ForkRequest
-    from dextouch.schemas.rollouts import Observation as Observation
-    from dextouch.schemas.rollouts import ReturnSelector as ReturnSelector
     from dextouch.schemas.rollouts import RolloutInfo as RolloutInfo
-    from dextouch.schemas.rollouts import RolloutStart as RolloutStart
     from dextouch.schemas.rollouts import StartRequest as StartRequest
     from dextouch.schemas.rollouts import WorldDescription as WorldDescription
     from dextouch.schemas.rollouts import WorldKind as WorldKind
     from dextouch.schemas.rollouts import WorldList as WorldList
-    from dextouch.schemas.rollouts import check_observation as check_observation
     from dextouch.schemas.station import CameraList as CameraList
     from dextouch.schemas.station import CameraLive as CameraLive
     from dextouch.schemas.station import DeviceHealth as DeviceHealth

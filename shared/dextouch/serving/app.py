@@ -1,15 +1,34 @@
-"""Factory of service applications: problem+json errors, health, metrics, access and body limits."""
+"""Factory of service applications: problem+json errors, health, metrics, request ids and timings.
 
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
-from contextlib import AbstractAsyncContextManager, asynccontextmanager, nullcontext
+Every response has a request id and a Server-Timing header; `timed` adds parts to the latter.
+"""
+
+import re
+import time
+import uuid
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Sequence
+from contextlib import (
+    AbstractAsyncContextManager,
+    asynccontextmanager,
+    contextmanager,
+    nullcontext,
+)
 from http import HTTPStatus
 
 import structlog
 from fastapi import APIRouter, FastAPI, Request, Response
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse
-from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, generate_latest
+from prometheus_client import (
+    CONTENT_TYPE_LATEST,
+    CollectorRegistry,
+    Counter,
+    Histogram,
+    generate_latest,
+)
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.exceptions import HTTPException
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from dextouch import __version__
 from dextouch.errors import DexTouchError, InvalidInputError, UnavailableError
@@ -21,13 +40,14 @@ from dextouch.schemas import (
     Readiness,
     problem_from_error,
 )
-from dextouch.serving.access import AccessControl
-from dextouch.serving.bodies import BodyRules
-from dextouch.serving.guard import Admits, Guard, GuardMiddleware, SitePolicy
-from dextouch.serving.middleware import RequestMetrics, RequestMiddleware
+from dextouch.serving.guard import AccessControl, Admits, BodyRules, GuardMiddleware, SitePolicy
 from dextouch.serving.settings import ServiceSettings
 
 logger = structlog.get_logger(__name__)
+
+REQUEST_ID = re.compile(r"[A-Za-z0-9._-]{1,64}")
+KNOWN_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+SECONDS = (0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 30.0)
 
 Lifespan = Callable[[FastAPI], AbstractAsyncContextManager[None]]
 # Names of what is missing before requests are accepted; empty when ready.
@@ -63,17 +83,17 @@ def create_service_app(
     app.state.access = AccessControl(settings.api_keys)
     app.state.registry = CollectorRegistry()
     app.state.running = False
-    guard = Guard(
+    # The last one added is outermost, so that refusals of the guard have request ids and are
+    # counted.
+    app.add_middleware(
+        GuardMiddleware,
         access=app.state.access,
-        site=SitePolicy(settings),
+        site=SitePolicy(settings.allowed_hosts, settings.allowed_origins),
         bodies=BodyRules(routers, max_body_bytes=settings.max_body_bytes),
         refuse=_refusal,
         admits=admits,
     )
-    # The last one added is outermost, so that refusals of the guard have request ids and are
-    # counted.
-    app.add_middleware(GuardMiddleware, guard=guard)
-    app.add_middleware(RequestMiddleware, metrics=RequestMetrics(app.state.registry))
+    app.add_middleware(RequestMiddleware, registry=app.state.registry)
     _add_error_handlers(app)
     app.include_router(_health_router(name, readiness))
     for router in routers:
@@ -185,3 +205,77 @@ def _problem_response(
     return JSONResponse(
         problem.model_dump(), problem.status, headers=headers, media_type=PROBLEM_MEDIA_TYPE
     )
+
+
+class RequestMiddleware:
+    """Sets `request.state.request_id` and `.timings_s`, the headers for them, and counts requests.
+
+    The counters belong to the given Prometheus registry.
+    """
+
+    def __init__(self, app: ASGIApp, *, registry: CollectorRegistry) -> None:
+        self._app = app
+        self._requests = Counter(
+            "dextouch_http_requests",
+            "Answered requests.",
+            ("method", "route", "status"),
+            registry=registry,
+        )
+        self._seconds = Histogram(
+            "dextouch_http_request_seconds",
+            "Time from the first byte to the answer's head.",
+            ("method", "route"),
+            buckets=SECONDS,
+            registry=registry,
+        )
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request; other scopes (lifespan, websocket) pass through."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        started = time.perf_counter()
+        headers = Headers(scope=scope)
+        state = scope.setdefault("state", {})
+        state["request_id"] = _request_id(headers)
+        state["timings_s"] = {}
+
+        async def send_with_headers(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                duration_s = time.perf_counter() - started
+                answer = MutableHeaders(scope=message)
+                answer["x-request-id"] = state["request_id"]
+                answer["server-timing"] = _server_timing(state["timings_s"], duration_s)
+                self._count(scope, message["status"], duration_s)
+            await send(message)
+
+        with structlog.contextvars.bound_contextvars(request_id=state["request_id"]):
+            await self._app(scope, receive, send_with_headers)
+
+    def _count(self, scope: Scope, status: int, duration_s: float) -> None:
+        # The route template, not the path, to keep the number of labels bounded.
+        route = getattr(scope.get("route"), "path", "unmatched")
+        method = scope["method"] if scope["method"] in KNOWN_METHODS else "OTHER"
+        self._requests.labels(method, route, str(status)).inc()
+        self._seconds.labels(method, route).observe(duration_s)
+
+
+@contextmanager
+def timed(request: Request, part: str) -> Iterator[None]:
+    """Time a part of a request (`queue`, `device`, `encode`, …) for its Server-Timing header."""
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        timings_s: dict[str, float] = request.state.timings_s
+        timings_s[part] = timings_s.get(part, 0.0) + time.perf_counter() - started
+
+
+def _request_id(headers: Headers) -> str:
+    given = headers.get("x-request-id", "")
+    return given if REQUEST_ID.fullmatch(given) else uuid.uuid4().hex
+
+
+def _server_timing(timings_s: dict[str, float], total_s: float) -> str:
+    parts = [*timings_s.items(), ("total", total_s)]
+    return ", ".join(f"{name};dur={seconds * 1e3:.2f}" for name, seconds in parts)

@@ -1,59 +1,111 @@
-"""Admission of requests and WebSockets: host name, origin, key and body limit.
+"""What a service lets in: host name and origin, key and scope, media type and size of the body.
 
 Browsers let any page send requests to any address (CSRF), and with DNS rebinding a page can even
 read the responses. So a request without a key must come from a page of this service, or not from a
 page at all.
 """
 
+import hashlib
+import hmac
+import ipaddress
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from email.message import Message
+from typing import TypeVar
 
 import structlog
+from fastapi import APIRouter
+from fastapi.routing import APIRoute
+from pydantic import Field, SecretStr
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection, Request
 from starlette.responses import Response
 from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.types import Message as AsgiMessage
 
 from dextouch.errors import AccessDeniedError, DexTouchError
-from dextouch.serving.access import AccessControl, not_signed_in
-from dextouch.serving.bodies import BodyLimit, BodyRules
-from dextouch.serving.settings import (
-    ServiceSettings,
-    canonical_host,
-    canonical_origin,
-    is_loopback,
-)
+from dextouch.frozen_model import FrozenModel
 
 logger = structlog.get_logger(__name__)
 
+HOST_NAME = re.compile(r"[a-z0-9_.-]+")
+HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
+ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
 # Health checks and Prometheus have no key, and use container names as host.
 PROBES = frozenset({"/healthz", "/readyz", "/metrics"})
-HTTP_SCHEMES = {"ws": "http", "wss": "https"}
-HOST = re.compile(r"(?:\[([0-9a-f:.]+)\]|([a-z0-9_.-]+))(?::\d{1,5})?")
 POLICY_VIOLATION = 1008
 MAX_REASON_BYTES = 123
+
+JSON = "application/json"
+MSGPACK = "application/msgpack"
+OCTETS = "application/octet-stream"
+FORM = "application/x-www-form-urlencoded"
+KIB = 2**10
+# For bodies of variable size: the limit is the setting max_body_bytes.
+AS_SET = 2**63
+RULE_ATTRIBUTE = "__dextouch_body_rule__"
+EndpointT = TypeVar("EndpointT", bound=Callable[..., object])
 
 # Whether a request without a key comes from a signed-in browser.
 Admits = Callable[[HTTPConnection], bool]
 Refuse = Callable[[Request, DexTouchError | HTTPException], Response]
 
 
-class SitePolicy:
-    """The service's own host names and origins."""
+def canonical_host(text: str) -> str:
+    """A host name as browsers write it: in lower case, an IPv6 address short and without brackets.
 
-    def __init__(self, settings: ServiceSettings) -> None:
-        self._hosts = frozenset(settings.allowed_hosts)
-        self._origins = frozenset(settings.allowed_origins)
+    Raises:
+        ValueError: not a host name, or one with a port.
+    """
+    name = text.lower()
+    if HOST_NAME.fullmatch(name):
+        return name
+    try:
+        return str(ipaddress.IPv6Address(name))
+    except ValueError:
+        raise ValueError(
+            f"got {text!r}, expected a name or an address without its port (every port is "
+            "answered), IPv6 without brackets"
+        ) from None
+
+
+def canonical_origin(text: str) -> str:
+    """An origin as browsers write it: in lower case, without the default port of its scheme.
+
+    Raises:
+        ValueError: not an origin.
+    """
+    parts = ORIGIN.fullmatch(text.lower())
+    if parts is None or int(parts[4] or 0) > 65535:
+        raise ValueError(
+            f"got {text!r}, expected http(s)://HOST or http(s)://HOST:PORT without a path"
+        )
+    scheme, name, address, port = parts.groups()
+    host = f"[{canonical_host(address)}]" if address else name
+    is_default = port is None or (scheme, int(port)) in {("http", 80), ("https", 443)}
+    return f"{scheme}://{host}" if is_default else f"{scheme}://{host}:{int(port)}"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this machine can reach a socket bound to `host`."""
+    with suppress(ValueError):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+@dataclass(frozen=True)
+class SitePolicy:
+    """The service's own host names and origins, besides loopback names and the request's own."""
+
+    hosts: Sequence[str]
+    origins: Sequence[str]
 
     def check(self, connection: HTTPConnection, *, is_unsafe: bool) -> None:
-        """Refuse requests from pages of other sites.
-
-        Args:
-            connection: the request.
-            is_unsafe: whether it may change state or opens a WebSocket.
+        """Refuse pages of other sites; unsafe is what may change state, or opens a WebSocket.
 
         Raises:
             AccessDeniedError: a foreign host name or origin (see `reason`).
@@ -62,12 +114,11 @@ class SitePolicy:
         self._check_host(host)
         if not is_unsafe:
             return
-        scheme = str(connection.scope["scheme"])
-        scheme = HTTP_SCHEMES.get(scheme, scheme)
-        own = _canonical(f"{scheme}://{host}")
+        # Of a WebSocket the scheme is ws or wss, of its page http or https.
+        own = _canonical(f"{connection.scope['scheme'].replace('ws', 'http')}://{host}")
         if "origin" in connection.headers:
             origin = ", ".join(connection.headers.getlist("origin")).lower()
-            if _canonical(origin) not in {own, *self._origins}:
+            if _canonical(origin) not in {own, *self.origins}:
                 raise _foreign_origin(f"origin {origin!r}", own)
             return
         site = connection.headers.get("sec-fetch-site", "none").lower()
@@ -75,100 +126,23 @@ class SitePolicy:
             raise _foreign_origin(f"a page of another origin (Sec-Fetch-Site: {site})", own)
 
     def _check_host(self, host: str) -> None:
-        parts = HOST.fullmatch(host)
         name = ""
-        if parts is not None:
+        if parts := HOST.fullmatch(host):
             with suppress(ValueError):
                 name = canonical_host(parts[1] or parts[2])
-        if name not in self._hosts and not is_loopback(name):
+        if name not in self.hosts and not is_loopback(name):
             raise AccessDeniedError(
                 f"host: got {host!r}, expected a loopback name or one of the setting "
-                f"allowed_hosts ({', '.join(sorted(self._hosts)) or 'none'}); "
+                f"allowed_hosts ({', '.join(sorted(self.hosts)) or 'none'}); "
                 "add the name there if browsers or tools are to use it",
                 reason="foreign_host",
             )
 
 
-@dataclass(frozen=True)
-class Guard:
-    """Admission checks of a service, and the response to a refused request.
-
-    `admits` is None if every request needs a key.
-    """
-
-    access: AccessControl
-    site: SitePolicy
-    bodies: BodyRules
-    refuse: Refuse
-    admits: Admits | None = None
-
-    def check_sender(self, connection: HTTPConnection, *, needs_key: bool, is_unsafe: bool) -> None:
-        """Refuse foreign pages, and unsafe requests without a key.
-
-        Raises:
-            AccessDeniedError: with the reason.
-        """
-        if self.access.has_keys:
-            authorization = connection.headers.get("authorization")
-            # A foreign page cannot know a key, so host and origin do not matter with one.
-            if connection.scope["path"] in PROBES or self.access.knows(authorization):
-                return
-            signed_in = self.admits is not None and self.admits(connection)
-            if is_unsafe and needs_key and not signed_in:
-                if self.admits is not None:
-                    raise not_signed_in()
-                self.access.identify(authorization)
-            if self.admits is None:
-                return
-        self.site.check(connection, is_unsafe=is_unsafe)
-
-
-class GuardMiddleware:
-    """ASGI middleware that applies a guard before the body is read."""
-
-    def __init__(self, app: ASGIApp, *, guard: Guard) -> None:
-        self._app = app
-        self._guard = guard
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Handle one request or WebSocket."""
-        if scope["type"] == "http":
-            await self._http(scope, receive, send)
-        elif scope["type"] == "websocket":
-            await self._websocket(scope, receive, send)
-        else:
-            await self._app(scope, receive, send)
-
-    async def _http(self, scope: Scope, receive: Receive, send: Send) -> None:
-        request = Request(scope)
-        rule = self._guard.bodies.rule_of(scope)
-        is_unsafe = scope["method"] not in SAFE_METHODS
-        try:
-            self._guard.check_sender(request, needs_key=rule.needs_key, is_unsafe=is_unsafe)
-            max_bytes = self._guard.bodies.limit(request.headers, rule)
-            limited = BodyLimit(receive, request.headers, max_bytes)
-        except (DexTouchError, HTTPException) as error:
-            response = self._guard.refuse(request, error)
-            await response(scope, receive, send)
-            return
-        await self._app(scope, limited, send)
-
-    async def _websocket(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            self._guard.check_sender(HTTPConnection(scope), needs_key=True, is_unsafe=True)
-        except AccessDeniedError as error:
-            logger.warning("websocket_refused", path=scope["path"], error=error.message)
-            reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
-            await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
-            return
-        await self._app(scope, receive, send)
-
-
 def _canonical(origin: str) -> str:
-    try:
+    with suppress(ValueError):
         return canonical_origin(origin)
-    except ValueError:
-        return origin
+    return origin
 
 
 def _foreign_origin(got: str, own: str) -> AccessDeniedError:
@@ -176,3 +150,248 @@ def _foreign_origin(got: str, own: str) -> AccessDeniedError:
         f"got a request of {got}, expected one of {own} or of the setting allowed_origins",
         reason="foreign_origin",
     )
+
+
+class ApiKey(FrozenModel):
+    """A key and its scopes; `name` appears in logs, the key never."""
+
+    name: str = Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")
+    key: SecretStr = Field(min_length=16)
+    scopes: tuple[str, ...] = Field(min_length=1)
+
+
+def not_signed_in() -> AccessDeniedError:
+    """Error for a browser without a session."""
+    return AccessDeniedError("not signed in: open / and sign in", reason="missing_key")
+
+
+def _no_key(authorization: str | None) -> AccessDeniedError:
+    if _token(authorization) is not None:
+        return AccessDeniedError("unknown key", reason="unknown_key")
+    return AccessDeniedError(
+        "no key: expected the header 'Authorization: Bearer KEY'", reason="missing_key"
+    )
+
+
+class AccessControl:
+    """The keys of one service; without keys (loopback only, see settings) access is open."""
+
+    def __init__(self, api_keys: Sequence[ApiKey]) -> None:
+        self._keys = [(_digest(key.key.get_secret_value()), key) for key in api_keys]
+
+    @property
+    def has_keys(self) -> bool:
+        """Whether the service requires a key."""
+        return bool(self._keys)
+
+    def find(self, authorization: str | None) -> ApiKey | None:
+        """The key in the header, if it is a valid one."""
+        token = _token(authorization)
+        if token is None:
+            return None
+        presented = _digest(token)
+        # Every key is compared, to avoid a timing side channel.
+        matches = [key for digest, key in self._keys if hmac.compare_digest(digest, presented)]
+        return matches[0] if matches else None
+
+    def check(self, authorization: str | None, scope: str) -> str:
+        """Check a key and its scope, and return the key's name.
+
+        Raises:
+            AccessDeniedError: no key, an unknown one (see `reason`), or one without the scope.
+        """
+        if not self._keys:
+            return "loopback"
+        key = self.find(authorization)
+        if key is None:
+            raise _no_key(authorization)
+        if scope not in key.scopes:
+            raise AccessDeniedError(
+                f"key {key.name!r} lacks the scope {scope!r}; it has: {', '.join(key.scopes)}",
+                reason="missing_scope",
+                scope=scope,
+            )
+        return key.name
+
+
+@dataclass(frozen=True)
+class RequireScope:
+    """Route dependency that requires a scope: `dependencies=[Depends(RequireScope("rollout"))]`."""
+
+    scope: str
+
+    async def __call__(self, request: Request) -> str:
+        """The name of the caller's key; raises AccessDeniedError."""
+        access: AccessControl = request.app.state.access
+        return access.check(request.headers.get("authorization"), self.scope)
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode()).digest()
+
+
+def _token(authorization: str | None) -> str | None:
+    kind, _, token = (authorization or "").partition(" ")
+    return token.strip() or None if kind.lower() == "bearer" else None
+
+
+@dataclass(frozen=True)
+class BodyRule:
+    """Maximum body size in bytes by media type; `needs_key` is False only for signing in."""
+
+    max_bytes: Mapping[str, int]
+    needs_key: bool = True
+
+
+# Default limit: room for names and options, not for data.
+DEFAULT_RULE = BodyRule({JSON: 64 * KIB})
+# The router responds with 404 or 405 without reading the body.
+NO_ROUTE = BodyRule({})
+
+
+def takes(
+    max_bytes: Mapping[str, int], *, needs_key: bool = True
+) -> Callable[[EndpointT], EndpointT]:
+    """Decorator that declares the bodies a route accepts, placed directly above the function.
+
+    Routes without it accept JSON of at most 64 KiB. Other media types are refused with 415, larger
+    bodies with 413, both before the body is read.
+
+    Args:
+        max_bytes: maximum size by media type, such as `{JSON: 4 * KIB, MSGPACK: AS_SET}`.
+        needs_key: False if the route can be called without a key.
+    """
+
+    def mark(endpoint: EndpointT) -> EndpointT:
+        setattr(endpoint, RULE_ATTRIBUTE, BodyRule(max_bytes, needs_key))
+        return endpoint
+
+    return mark
+
+
+def media_type(content_type: str | None) -> tuple[str, dict[str, str]]:
+    """A Content-Type's media type and parameters in lower case; "none" where there is none.
+
+    Extended parameters (`name*=charset'language'value`) are ignored.
+    """
+    header = Message()
+    header["content-type"] = content_type or "none/none"
+    parameters = {
+        name.lower(): value.lower()
+        for name, value in header.get_params() or []
+        if isinstance(value, str)
+    }
+    return (header.get_content_type() if content_type else "none"), parameters
+
+
+class BodyRules:
+    """The rules of all routes of a service."""
+
+    def __init__(self, routers: Sequence[APIRouter], *, max_body_bytes: int) -> None:
+        self._rules = [
+            (
+                route.path_regex,
+                frozenset(route.methods or ()),
+                getattr(route.endpoint, RULE_ATTRIBUTE, DEFAULT_RULE),
+            )
+            for router in routers
+            for route in router.routes
+            if isinstance(route, APIRoute)
+        ]
+        self._max_body_bytes = max_body_bytes
+
+    def rule_of(self, scope: Scope) -> BodyRule:
+        """The rule of the route that matches a request."""
+        for path_regex, methods, rule in self._rules:
+            if scope["method"] in methods and path_regex.match(scope["path"]):
+                return rule
+        return NO_ROUTE
+
+    def limited(self, receive: Receive, headers: Headers, rule: BodyRule) -> Receive:
+        """Wrap `receive` to enforce the limit, with or without Content-Length.
+
+        Raises:
+            HTTPException: 415, a media type that the route does not accept; 413, a larger body.
+        """
+        limit = self._limit(headers, rule)
+        received = 0
+
+        def check(num_bytes: int) -> None:
+            if num_bytes > limit:
+                # Starlette's own class, since FastAPI turns any other into a 400.
+                raise HTTPException(413, f"body: got {num_bytes} bytes, expected at most {limit}")
+
+        async def limited() -> AsgiMessage:
+            nonlocal received
+            message = await receive()
+            received += len(message.get("body", b""))
+            check(received)
+            return message
+
+        announced = headers.get("content-length", "0")
+        check(int(announced) if announced.isdecimal() else 0)
+        return limited
+
+    def _limit(self, headers: Headers, rule: BodyRule) -> int:
+        if not rule.max_bytes:
+            return self._max_body_bytes
+        largest = min(max(rule.max_bytes.values()), self._max_body_bytes)
+        if headers.get("content-length", "0") == "0" and "transfer-encoding" not in headers:
+            return largest
+        got, _ = media_type(headers.get("content-type"))
+        if got not in rule.max_bytes:
+            raise HTTPException(
+                415, f"body: got Content-Type {got!r}, expected {' or '.join(rule.max_bytes)}"
+            )
+        return min(rule.max_bytes[got], self._max_body_bytes)
+
+
+@dataclass(frozen=True)
+class GuardMiddleware:
+    """ASGI middleware that refuses requests and WebSockets before a body is read.
+
+    `refuse` makes the response to a refused request; `admits` is None if every request needs a key.
+    """
+
+    app: ASGIApp
+    access: AccessControl
+    site: SitePolicy
+    bodies: BodyRules
+    refuse: Refuse
+    admits: Admits | None = None
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Handle one request or WebSocket."""
+        if scope["type"] == "http":
+            request, rule = Request(scope), self.bodies.rule_of(scope)
+            is_unsafe = scope["method"] not in SAFE_METHODS
+            try:
+                self._check_sender(request, needs_key=rule.needs_key, is_unsafe=is_unsafe)
+                receive = self.bodies.limited(receive, request.headers, rule)
+            except (DexTouchError, HTTPException) as error:
+                await self.refuse(request, error)(scope, receive, send)
+                return
+        elif scope["type"] == "websocket":
+            try:
+                self._check_sender(HTTPConnection(scope), needs_key=True, is_unsafe=True)
+            except AccessDeniedError as error:
+                logger.warning("websocket_refused", path=scope["path"], error=error.message)
+                reason = error.message.encode()[:MAX_REASON_BYTES].decode(errors="ignore")
+                await send({"type": "websocket.close", "code": POLICY_VIOLATION, "reason": reason})
+                return
+        await self.app(scope, receive, send)
+
+    def _check_sender(
+        self, connection: HTTPConnection, *, needs_key: bool, is_unsafe: bool
+    ) -> None:
+        if self.access.has_keys:
+            authorization = connection.headers.get("authorization")
+            # A foreign page cannot know a key, so host and origin do not matter with one.
+            if connection.scope["path"] in PROBES or self.access.find(authorization) is not None:
+                return
+            signed_in = self.admits is not None and self.admits(connection)
+            if is_unsafe and needs_key and not signed_in:
+                raise _no_key(authorization) if self.admits is None else not_signed_in()
+            if self.admits is None:
+                return
+        self.site.check(connection, is_unsafe=is_unsafe)

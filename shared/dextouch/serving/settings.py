@@ -2,7 +2,6 @@
 
 import argparse
 import inspect
-import ipaddress
 import re
 from collections.abc import Callable, Sequence
 from typing import Annotated, Any, Literal, TypeVar
@@ -11,7 +10,6 @@ from fastapi import FastAPI
 from pydantic import (
     AfterValidator,
     Field,
-    SecretStr,
     ValidationError,
     model_validator,
 )
@@ -19,71 +17,23 @@ from pydantic_settings import BaseSettings, CliApp, CliSettingsSource, SettingsC
 
 from dextouch.command_line import CommandParser
 from dextouch.errors import InvalidInputError
-from dextouch.frozen_model import FrozenModel
 from dextouch.schemas import first_problems
+from dextouch.serving.guard import ApiKey, canonical_host, canonical_origin, is_loopback
 from dextouch.serving.logs import configure_logging
 
-MIN_KEY_CHARACTERS = 16
 # Keep-alive, so that a policy may take this long between two chunks.
 KEEP_ALIVE_S = 75
 # Maximum size of a WebSocket message; the server closes the connection on larger ones.
 MAX_WEBSOCKET_BYTES = 2**16
-HOST_NAME = re.compile(r"[a-z0-9_.-]+")
-ORIGIN = re.compile(r"(https?)://(?:([a-z0-9_.-]+)|\[([0-9a-f:.]+)\])(?::([0-9]{1,5}))?")
-DEFAULT_PORTS = {"http": 80, "https": 443}
-MAX_PORT = 65535
 # Defaults that say nothing to a user of the command line.
 _NO_DEFAULT = re.compile(r"\s*\((default: (null|\(\)|\{\})|default factory: [^)]*)\)$")
 _PLACEHOLDERS = {"int": "N", "float": "X", "Path": "PATH"}
 _LIST = re.compile(r"tuple\[(.+),\.\.\.\]")
 
 
-def canonical_host(text: str) -> str:
-    """A host name as browsers write it: in lower case, an IPv6 address short and without brackets.
-
-    Raises:
-        ValueError: not a host name, or one with a port.
-    """
-    name = text.lower()
-    if HOST_NAME.fullmatch(name):
-        return name
-    try:
-        return str(ipaddress.IPv6Address(name))
-    except ValueError:
-        raise ValueError(
-            f"got {text!r}, expected a name or an address without its port (every port is "
-            "answered), IPv6 without brackets"
-        ) from None
-
-
-def canonical_origin(text: str) -> str:
-    """An origin as browsers write it: in lower case, without the default port of its scheme.
-
-    Raises:
-        ValueError: not an origin.
-    """
-    parts = ORIGIN.fullmatch(text.lower())
-    if parts is None or int(parts[4] or 0) > MAX_PORT:
-        raise ValueError(
-            f"got {text!r}, expected http(s)://HOST or http(s)://HOST:PORT without a path"
-        )
-    scheme, name, address, port = parts.groups()
-    host = f"[{canonical_host(address)}]" if address else name
-    is_default = port is None or int(port) == DEFAULT_PORTS[scheme]
-    return f"{scheme}://{host}" if is_default else f"{scheme}://{host}:{int(port)}"
-
-
 HostName = Annotated[str, AfterValidator(canonical_host)]
 Origin = Annotated[str, AfterValidator(canonical_origin)]
 SettingsT = TypeVar("SettingsT", bound=BaseSettings)
-
-
-class ApiKey(FrozenModel):
-    """A key and its scopes; `name` appears in logs, the key never."""
-
-    name: str = Field(pattern=r"^[a-z][a-z0-9_-]{0,31}$")
-    key: SecretStr = Field(min_length=MIN_KEY_CHARACTERS)
-    scopes: tuple[str, ...] = Field(min_length=1)
 
 
 class ServiceSettings(BaseSettings):
@@ -212,16 +162,6 @@ def _placeholder(kind: str, flag: str) -> str:
         return "JSON"
     word = re.split(r"[-.]", flag)[-1].upper()
     return word if kind in {"str", "SecretStr"} else _PLACEHOLDERS.get(kind, kind)
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this machine can reach a socket bound to `host`."""
-    if host == "localhost":
-        return True
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return False
 
 
 def run(app: FastAPI, settings: ServiceSettings) -> None:

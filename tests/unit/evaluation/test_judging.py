@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from dextouch.errors import InvalidInputError
-from dextouch.schemas.rollouts import Doubt, Observation
+from dextouch.schemas import Doubt, Observation
 from services.evaluation.calibration import Calibration
 from services.evaluation.endings import Ending, EndingEpisode, milestones_of
 from services.evaluation.judge_network import ProbeShape, probe_batch

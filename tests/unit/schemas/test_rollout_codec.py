@@ -25,7 +25,7 @@ from dextouch.schemas import (
     encode_observation,
     encode_start,
 )
-from dextouch.schemas.rollouts import check_observation_arrays
+from dextouch.schemas.observations import check_observation_arrays
 from dextouch.streams import pack, unpack
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, anchor, observation
 

@@ -23,7 +23,7 @@ from dextouch.serving import (
     takes,
     timed,
 )
-from dextouch.serving.settings import ApiKey
+from dextouch.serving.guard import ApiKey
 
 CASES = [
     (errors.PacketError("bad"), 400),

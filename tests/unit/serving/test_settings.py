@@ -8,7 +8,7 @@ from pydantic import BaseModel, ValidationError
 
 from dextouch.errors import InvalidInputError
 from dextouch.serving import ServiceSettings, load_settings, service_config
-from dextouch.serving.settings import is_loopback
+from dextouch.serving.guard import is_loopback
 
 EVERYWHERE = "0.0.0.0"  # noqa: S104 - that keys are demanded there is what is tested
 

@@ -20,7 +20,7 @@ from dextouch.schemas import (
     decode_answer,
     encode_start,
 )
-from dextouch.serving.settings import ApiKey
+from dextouch.serving.guard import ApiKey
 from dextouch.worlds import CopyFirstWorld, WorldServiceSettings, create_world_app
 from tests.unit.worlds.fakes import CAMERAS, K_HEAD, SumWorld, actions, anchor, observation
 

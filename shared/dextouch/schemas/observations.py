@@ -1,0 +1,398 @@
+"""Observations of rollouts, and the binary codec that server, client and store share."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Final, Literal, TypeVar
+
+import numpy as np
+from jaxtyping import Float32, Float64, UInt8
+from pydantic import BaseModel, Field, ValidationError, field_validator, model_validator
+
+from dextouch.errors import DegenerateRotationError, InvalidInputError, NonFiniteError, ShapeError
+from dextouch.frozen_model import FrozenModel
+from dextouch.hands.actions import ACTION_DIM, AnchorPoses
+from dextouch.schemas.problems import first_problems
+from dextouch.schemas.rollouts import ActionKind, RolloutInfo, StartRequest
+from dextouch.streams import pack, unpack
+
+# Tolerance of the norm of a unit quaternion in float32.
+QUATERNION_TOLERANCE: Final = 1e-3
+ARRAYS = ("images", "tactile_kpa", "action_reached", "object_poses")
+IMAGE_PREFIX = "image/"
+ANCHOR_NAMES = ("T_world_wrist_left", "T_world_wrist_right", "T_world_camera_head")
+RIGID_TOLERANCE = 1e-6
+ModelT = TypeVar("ModelT", bound=BaseModel)
+
+
+class ReturnSelector(FrozenModel):
+    """Requested part of an observation.
+
+    `cameras` None means all cameras of the world, an empty list none; in a query, where an empty
+    list cannot be written, none is `cameras=`.
+    """
+
+    cameras: tuple[str, ...] | None = None
+    steps: Literal["last", "all"] = "all"
+    tactile: bool = True
+
+    @field_validator("cameras")
+    @classmethod
+    def _one_empty_name_means_none(cls, cameras: tuple[str, ...] | None) -> tuple[str, ...] | None:
+        return () if cameras == ("",) else cameras
+
+    def wants(self, camera: str) -> bool:
+        """Whether images of this camera are requested."""
+        return self.cameras is None or camera in self.cameras
+
+
+EVERYTHING: Final = ReturnSelector()
+
+
+class Doubt(FrozenModel):
+    """Uncertainty of an imagining world about its prediction.
+
+    Both numbers are non-negative, and comparable within one world digest only.
+
+    Attributes:
+        disagreement: between several predictions of the same steps.
+        distance: of the rollout from the training distribution.
+        outside: whether the world's own bound is exceeded, so that the prediction is unreliable.
+        reason: why it is outside; None otherwise.
+    """
+
+    disagreement: float = Field(ge=0, allow_inf_nan=False)
+    distance: float = Field(ge=0, allow_inf_nan=False)
+    outside: bool = False
+    reason: str | None = Field(default=None, min_length=1, max_length=500)
+
+    @model_validator(mode="after")
+    def _a_reason_if_outside(self) -> "Doubt":
+        if self.outside != (self.reason is not None):
+            raise ValueError(
+                f"got outside {self.outside} with reason {self.reason!r}, expected a reason where "
+                "outside is true and none where it is not"
+            )
+        return self
+
+
+@dataclass(frozen=True)
+class Observation:
+    """Images, touch and measurements over n consecutive steps of the model grid.
+
+    `action_reached` is the pose and joint reading as an action, relative to the rollout's step 0:
+    measured by a twin or a robot; in an imagined world, which does not sense joints, the commanded
+    actions (`reached_is_measured` says which). `object_poses` are T_world_object (x y z in m, qw qx
+    qy qz) as estimated by an imagined world, in the order of the description's `object_names`; None
+    in worlds without object poses, such as a robot. `doubt` is about the whole chunk.
+    """
+
+    first_step: int
+    images: dict[str, UInt8[np.ndarray, "n h w 3"]]
+    tactile_kpa: Float32[np.ndarray, "n 2 320"]
+    action_reached: Float64[np.ndarray, "n 67"]
+    reached_is_measured: bool
+    success: bool | None = None
+    object_poses: Float32[np.ndarray, "n objects 7"] | None = None
+    doubt: Doubt | None = None
+
+    def __len__(self) -> int:
+        return len(self.tactile_kpa)
+
+    def last(self) -> "Observation":
+        """The last step only."""
+        return replace(
+            self,
+            first_step=self.first_step + len(self) - 1,
+            images={camera: images[-1:] for camera, images in self.images.items()},
+            tactile_kpa=self.tactile_kpa[-1:],
+            action_reached=self.action_reached[-1:],
+            object_poses=None if self.object_poses is None else self.object_poses[-1:],
+        )
+
+    def selected(self, selector: ReturnSelector) -> "Observation":
+        """Apply a selector: the requested cameras, and all steps or the last one.
+
+        The last step is an observation of one step that begins where the chunk ends. Touch is
+        always kept; whether it is sent is decided by the sender.
+        """
+        shown = self.last() if selector.steps == "last" else self
+        wanted = {camera: rows for camera, rows in shown.images.items() if selector.wants(camera)}
+        return replace(shown, images=wanted)
+
+
+@dataclass(frozen=True)
+class RolloutStart:
+    """Start of a rollout: a task and seed, or an observation made elsewhere.
+
+    `anchor` are the absolute poses of step 0, `K_head` the head camera's matrix in pixels; both
+    come with `observation` (one step), and with every first observation that a world gives.
+    """
+
+    task: str
+    seed: int
+    instruction: str
+    action_kind: ActionKind = "commanded"
+    observation: Observation | None = None
+    anchor: AnchorPoses | None = None
+    K_head: Float64[np.ndarray, "3 3"] | None = None
+
+
+def check_observation(observation: Observation, *, where: str) -> None:
+    """Validate an observation with `check_observation_arrays`."""
+    arrays = {name: getattr(observation, name) for name in ARRAYS}
+    check_observation_arrays(**arrays, where=where)
+
+
+def check_observation_arrays(
+    *,
+    images: Mapping[str, np.ndarray],
+    tactile_kpa: np.ndarray,
+    action_reached: np.ndarray,
+    object_poses: np.ndarray | None = None,
+    where: str,
+) -> None:
+    """Check that the arrays of an observation are consistent and finite.
+
+    Raises:
+        ShapeError: inconsistent dtypes, lengths or shapes.
+        NonFiniteError: in touch, actions or object poses.
+        DegenerateRotationError: an object's quaternion is not of length 1.
+    """
+    num_steps = len(tactile_kpa) if tactile_kpa.ndim else 0
+    if num_steps == 0:
+        raise ShapeError(f"{where}: got 0 steps, expected at least 1")
+    _check_array("tactile_kpa", tactile_kpa, ("float32", (num_steps, 2, 320)), where)
+    _check_array("action_reached", action_reached, ("float64", (num_steps, ACTION_DIM)), where)
+    size_px = next((array.shape[1:3] for array in images.values() if array.ndim == 4), (0, 0))
+    for camera, array in images.items():
+        _check_array(f"images of {camera}", array, ("uint8", (num_steps, *size_px, 3)), where)
+    if object_poses is not None:
+        _check_object_poses(object_poses, num_steps, where)
+
+
+def _check_object_poses(poses: np.ndarray, num_steps: int, where: str) -> None:
+    num_objects = poses.shape[1] if poses.ndim == 3 else 1
+    if num_objects == 0:
+        raise ShapeError(f"{where}: object_poses got 0 objects, expected at least 1 or no poses")
+    _check_array("object_poses", poses, ("float32", (num_steps, num_objects, 7)), where)
+    off = np.abs(np.linalg.norm(poses[:, :, 3:], axis=2) - 1.0)
+    if off.max() > QUATERNION_TOLERANCE:
+        step, index = np.unravel_index(off.argmax(), off.shape)
+        raise DegenerateRotationError(
+            f"{where}: object_poses hold a quaternion (qw qx qy qz) of step {step}, object {index} "
+            f"whose length is off 1 by {off.max():.1e}, expected at most {QUATERNION_TOLERANCE:.0e}"
+        )
+
+
+def _check_array(
+    name: str, array: np.ndarray, expected: tuple[str, tuple[int, ...]], where: str
+) -> None:
+    if (array.dtype.name, array.shape) != expected:
+        raise ShapeError(
+            f"{where}: {name} got {array.dtype.name} {list(array.shape)}, "
+            f"expected {expected[0]} {list(expected[1])}"
+        )
+    if array.dtype.kind == "f" and not np.isfinite(array).all():
+        raise NonFiniteError(f"{where}: {name} holds NaN or infinity, expected finite numbers")
+
+
+class ObservationFields(FrozenModel):
+    """The non-array fields of an observation."""
+
+    first_step: int
+    reached_is_measured: bool
+    success: bool | None = None
+    doubt: Doubt | None = Field(default=None, exclude_if=lambda doubt: doubt is None)
+
+
+class AnswerFields(FrozenModel):
+    """The fields of a response with an observation."""
+
+    rollout: RolloutInfo
+    observation: ObservationFields
+    info: dict[str, float] = Field(default={})
+
+
+class StartFields(FrozenModel):
+    """The fields of a start request with an observation."""
+
+    start: StartRequest
+    observation: ObservationFields | None = None
+
+
+@dataclass(frozen=True)
+class RolloutOrigin:
+    """Anchor poses and camera matrix of a rollout, given with its first observation."""
+
+    anchor: AnchorPoses
+    K_head: Float64[np.ndarray, "3 3"]
+
+
+@dataclass(frozen=True)
+class RolloutAnswer:
+    """A decoded response; `origin` only with the first observation of a rollout."""
+
+    rollout: RolloutInfo
+    observation: Observation
+    info: dict[str, float]
+    origin: RolloutOrigin | None
+
+
+def encode_answer(
+    rollout: RolloutInfo,
+    observation: Observation,
+    *,
+    tactile: bool = True,
+    info: dict[str, float] | None = None,
+    origin: RolloutOrigin | None = None,
+) -> bytes:
+    """Encode an observation with the rollout's progress; without touch unless `tactile`."""
+    arrays = _observation_arrays(observation)
+    if not tactile:
+        del arrays["tactile_kpa"]
+    if origin is not None:
+        arrays |= _origin_arrays(origin)
+    fields = AnswerFields(rollout=rollout, observation=_fields_of(observation), info=info or {})
+    return pack(fields.model_dump(mode="json"), arrays)
+
+
+def decode_answer(data: bytes, *, max_bytes: int) -> RolloutAnswer:
+    """Decode the result of `encode_answer` with tactile.
+
+    Raises:
+        InvalidInputError: not a valid response.
+    """
+    raw, arrays = unpack(data, max_bytes=max_bytes)
+    fields = _validated(AnswerFields, raw, where="answer")
+    origin = _origin_from(arrays, where="answer") if "K_head" in arrays else None
+    observation = _observation_from(fields.observation, arrays, where="answer")
+    return RolloutAnswer(fields.rollout, observation, fields.info, origin)
+
+
+def encode_observation(observation: Observation) -> bytes:
+    """Encode an observation alone, for a world's snapshot."""
+    return pack(_fields_of(observation).model_dump(mode="json"), _observation_arrays(observation))
+
+
+def decode_observation(data: bytes, *, max_bytes: int) -> Observation:
+    """Inverse of `encode_observation`.
+
+    Raises:
+        InvalidInputError: not a valid observation.
+    """
+    raw, arrays = unpack(data, max_bytes=max_bytes)
+    fields = _validated(ObservationFields, raw, where="observation")
+    return _observation_from(fields, arrays, where="observation")
+
+
+def encode_start(request: StartRequest, start: RolloutStart) -> bytes:
+    """The body of POST /v1/rollouts, with the observation to start from if there is one."""
+    arrays: dict[str, np.ndarray] = {}
+    observation = None
+    if start.observation is not None:
+        if start.anchor is None or start.K_head is None:
+            raise InvalidInputError("start: an observation needs anchor and K_head beside it")
+        arrays = _observation_arrays(start.observation)
+        arrays |= _origin_arrays(RolloutOrigin(start.anchor, start.K_head))
+        observation = _fields_of(start.observation)
+    fields = StartFields(start=request, observation=observation)
+    return pack(fields.model_dump(mode="json"), arrays)
+
+
+def decode_start(data: bytes, *, max_bytes: int) -> tuple[StartRequest, RolloutStart]:
+    """Decode and validate a start request from an untrusted source.
+
+    Raises:
+        InvalidInputError: not a valid start request.
+    """
+    raw, arrays = unpack(data, max_bytes=max_bytes)
+    fields = _validated(StartFields, raw, where="start")
+    if fields.observation is None:
+        return fields.start, start_from(fields.start)
+    observation = _observation_from(fields.observation, arrays, where="start")
+    origin = _origin_from(arrays, where="start")
+    return fields.start, start_from(fields.start, observation=observation, origin=origin)
+
+
+def start_from(
+    request: StartRequest,
+    *,
+    observation: Observation | None = None,
+    origin: RolloutOrigin | None = None,
+) -> RolloutStart:
+    """Build the start from a request and an optional observation."""
+    known = {} if origin is None else vars(origin)
+    return RolloutStart(**request.model_dump(exclude={"world"}), observation=observation, **known)
+
+
+def _fields_of(observation: Observation) -> ObservationFields:
+    return ObservationFields.model_validate(observation, from_attributes=True)
+
+
+def _observation_arrays(observation: Observation) -> dict[str, np.ndarray]:
+    arrays = {
+        "tactile_kpa": observation.tactile_kpa,
+        "action_reached": observation.action_reached,
+        **{IMAGE_PREFIX + camera: images for camera, images in observation.images.items()},
+    }
+    if observation.object_poses is not None:
+        arrays["object_poses"] = observation.object_poses
+    return arrays
+
+
+def _origin_arrays(origin: RolloutOrigin) -> dict[str, np.ndarray]:
+    return {
+        **dict(zip(ANCHOR_NAMES, origin.anchor.as_tuple(), strict=True)),
+        "K_head": origin.K_head,
+    }
+
+
+def _observation_from(
+    fields: ObservationFields, arrays: Mapping[str, np.ndarray], *, where: str
+) -> Observation:
+    images = {
+        name.removeprefix(IMAGE_PREFIX): array
+        for name, array in arrays.items()
+        if name.startswith(IMAGE_PREFIX)
+    }
+    tactile_kpa, action_reached = (_array(arrays, name, where) for name in ARRAYS[1:3])
+    found = (images, tactile_kpa, action_reached, arrays.get("object_poses"))
+    known: dict[str, Any] = dict(zip(ARRAYS, found, strict=True))
+    check_observation_arrays(**known, where=where)
+    return Observation(**dict(fields), **known)
+
+
+def _origin_from(arrays: Mapping[str, np.ndarray], *, where: str) -> RolloutOrigin:
+    poses = [_matrix(arrays, name, 4, where) for name in ANCHOR_NAMES]
+    for name, T in zip(ANCHOR_NAMES, poses, strict=True):
+        R = T[:3, :3]
+        off = max(np.abs(R.T @ R - np.eye(3)).max(), np.abs(T[3] - [0.0, 0.0, 0.0, 1.0]).max())
+        if off > RIGID_TOLERANCE or np.linalg.det(R) < 0:
+            raise DegenerateRotationError(
+                f"{where}: {name} is not a rigid transform (off by {off:.1e}, expected at most "
+                f"{RIGID_TOLERANCE:.0e})"
+            )
+    return RolloutOrigin(AnchorPoses(*poses), _matrix(arrays, "K_head", 3, where))
+
+
+def _matrix(arrays: Mapping[str, np.ndarray], name: str, size: int, where: str) -> np.ndarray:
+    matrix = _array(arrays, name, where)
+    if matrix.shape != (size, size) or matrix.dtype != np.float64 or not np.isfinite(matrix).all():
+        raise ShapeError(
+            f"{where}: {name} got {matrix.dtype} {matrix.shape}, expected finite [{size}, {size}]"
+        )
+    return matrix
+
+
+def _array(arrays: Mapping[str, np.ndarray], name: str, where: str) -> np.ndarray:
+    if name not in arrays:
+        listed = ", ".join(sorted(arrays)) or "none"
+        raise InvalidInputError(f"{where}: array {name!r} is missing; got: {listed}")
+    return arrays[name]
+
+
+def _validated(model: type[ModelT], fields: object, *, where: str) -> ModelT:
+    try:
+        return model.model_validate(fields)
+    except ValidationError as error:
+        raise InvalidInputError(f"{where}: {first_problems(error)}") from error
