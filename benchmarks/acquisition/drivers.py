@@ -18,8 +18,8 @@ from services.acquisition.devices.camera.driver import (
     camera_descriptor,
 )
 from services.acquisition.devices.camera.mock import CameraSource
-from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.driver import (
+    BridgeFingerTrackerDecoder,
     FingerTrackerDecoder,
     keypoints_descriptor,
 )
@@ -27,21 +27,23 @@ from services.acquisition.devices.finger_tracker.mock import (
     BridgeFingerTrackerSource,
     FingerTrackerSource,
 )
-from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import (
+    BridgePoseTrackerDecoder,
+    PoseTrackerDecoder,
+)
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
-from services.acquisition.devices.robot_state.mock import RobotStateSource
-from services.acquisition.devices.robot_state.packets import (
+from services.acquisition.devices.pose_tracker.poses import pose_descriptor
+from services.acquisition.devices.robot_state.driver import (
     STREAM_SIZES,
     RobotStateDecoder,
     robot_descriptor,
 )
+from services.acquisition.devices.robot_state.mock import RobotStateSource
 from services.acquisition.drivers.base import Decoder
 from services.acquisition.drivers.reports import DESCRIPTOR_REPORT
-from services.acquisition.drivers.tracking import pose_descriptor
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import PacketSource, ReplayStream
-from services.acquisition.transports.socket import READ_BYTES
+from services.acquisition.transports.ports import READ_BYTES
 
 NUM_PACKETS = 300
 NUM_IMAGES = 24

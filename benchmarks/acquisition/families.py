@@ -8,15 +8,14 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 
 from dextouch.streams import Sample
+from services.acquisition.devices.justfloat_glove.driver import TAIL, JustFloatGloveDecoder
 from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
-from services.acquisition.devices.justfloat_glove.packets import TAIL, JustFloatGloveDecoder
-from services.acquisition.devices.tactile_glove.packets import (
+from services.acquisition.devices.tactile_glove.driver import (
     MAGIC,
     PAYLOAD_BYTES,
     TactileGloveDecoder,
 )
-from services.acquisition.devices.wuji_glove.mock import encode_wuji
-from services.acquisition.devices.wuji_glove.packets import (
+from services.acquisition.devices.wuji_glove.driver import (
     CRC_OFFSET,
     HEAD,
     MARK,
@@ -26,6 +25,7 @@ from services.acquisition.devices.wuji_glove.packets import (
     WujiGloveDecoder,
     WujiPacket,
 )
+from services.acquisition.devices.wuji_glove.mock import encode_wuji
 from services.acquisition.drivers.base import StreamDecoder
 from services.acquisition.drivers.packets import HEADER, OVERHEAD, SOURCES, VERSION, Packet
 from services.acquisition.drivers.packets import encode_packet as encode_ours

@@ -7,7 +7,7 @@ from pydantic import Field, SecretStr, model_validator
 
 from dextouch.data_folder import default_spool
 from dextouch.serving import ServiceSettings, service_config
-from services.acquisition.devices.chosen import ChosenDevice
+from services.acquisition.devices.registry import ChosenDevice
 from services.acquisition.mock_links import MockLinks
 from services.acquisition.supervisor import SpoolSafety
 

@@ -15,15 +15,15 @@ import pytest
 from dextouch.errors import DeviceError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
-from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import BridgePoseTrackerDecoder
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource
-from services.acquisition.devices.robot_state.packets import STREAM_SIZES
+from services.acquisition.devices.robot_state.driver import STREAM_SIZES
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.sdk_link_driver import BridgeDriver
-from services.acquisition.mock_devices import MockFactory
+from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockFactory
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import PacketSource, ReplayStream

@@ -5,16 +5,17 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
 from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
-from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
-from services.acquisition.devices.tactile_glove.commands import (
+from services.acquisition.devices.tactile_glove.driver import (
     COMMAND_MAGIC,
+    MAGIC,
     REQUEST,
+    TactileGloveDecoder,
     encode_request,
 )
-from services.acquisition.devices.tactile_glove.packets import MAGIC, TactileGloveDecoder
+from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
 from services.acquisition.devices.wuji_glove.mock import encode_wuji
-from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
 from services.acquisition.drivers.packets import Packet, PacketDecoder, encode_packet
 
 NUM_VALUES = 401

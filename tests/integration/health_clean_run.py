@@ -8,10 +8,10 @@ import numpy as np
 
 from services.acquisition.devices.finger_tracker.driver import DESCRIPTOR_REPORT
 from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
-from services.acquisition.devices.robot_state.packets import STREAM_SIZES
+from services.acquisition.devices.robot_state.driver import STREAM_SIZES
 from services.acquisition.health import TICK_NS, HealthMonitor
-from services.acquisition.mock_devices import MockFactory
 from services.acquisition.mock_links import MockLinks
+from services.acquisition.mock_station import MockFactory
 from services.acquisition.mocks.faults import FaultScript
 from services.acquisition.mocks.pattern import pattern_calibration, pattern_streams
 from services.acquisition.supervisor import DeviceSupervisor

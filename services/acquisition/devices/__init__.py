@@ -6,14 +6,20 @@ docs/tutorials/add_a_device.md builds one.
 
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.kind import DeviceKind, DeviceSettings
-from services.acquisition.devices.registry import ENTRY_POINT_GROUP, device_kind, kind_names
-from services.acquisition.devices.serial_line import (
+from services.acquisition.devices.kind import (
+    DeviceKind,
+    DeviceSettings,
     GloveSettings,
     SerialLineSettings,
     serial_transport,
 )
-from services.acquisition.devices.station_drivers import build_drivers, load_calibration
+from services.acquisition.devices.registry import (
+    ENTRY_POINT_GROUP,
+    build_drivers,
+    device_kind,
+    kind_names,
+    load_calibration,
+)
 from services.acquisition.drivers.base import (
     CellLayout,
     Decoder,
@@ -22,12 +28,12 @@ from services.acquisition.drivers.base import (
     StreamDecoder,
     hand_name,
 )
-from services.acquisition.drivers.packet_search import (
+from services.acquisition.drivers.packets import (
     DecoderStatistics,
     FrameSearch,
     SequenceCounter,
 )
-from services.acquisition.transports.base import Transport, TransportInfo
+from services.acquisition.transports.ports import Transport, TransportInfo
 
 __all__ = [
     "ENTRY_POINT_GROUP",

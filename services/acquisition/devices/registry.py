@@ -1,19 +1,27 @@
-"""Finds kinds of devices by name: those of this package, and those that other packages bring.
+"""Finds kinds of devices by name, and builds the drivers that a station's settings name.
 
-Both are entry points of one group and are loaded by the same code, when a station names them. Every
-folder beside this file is one of ours, with or without an installation: its `kind` holds `KIND`.
+Kinds of this package and of others are entry points of one group and are loaded by the same code,
+when a station names them. Every folder beside this file is one of ours, with or without an
+installation: its `driver` holds `KIND`.
 """
 
+import json
 import pkgutil
 import re
 import sys
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
-from typing import Any, get_args
+from typing import Annotated, Any, get_args
+
+from pydantic import BeforeValidator, SerializeAsAny, TypeAdapter, ValidationError
 
 from dextouch.errors import DexTouchError, InvalidInputError, UnknownNameError
+from dextouch.schemas import Matrix
+from services.acquisition.clock import StationClock
 from services.acquisition.devices.kind import DeviceKind, DeviceSettings
+from services.acquisition.drivers.base import Driver
 
 ENTRY_POINT_GROUP = "dextouch.devices"
 OWN_PACKAGE = "dextouch-wm"
@@ -33,6 +41,9 @@ IMPORT_FAILURES = (
     RuntimeError,
     DexTouchError,
 )
+# Until now these gloves were `tactile_glove` with a `protocol`; such settings are still read.
+OLD_PROTOCOLS = {"wuji": "wuji_glove", "justfloat": "justfloat_glove"}
+_MATRICES = TypeAdapter(dict[str, Matrix])
 
 
 def kind_names() -> list[str]:
@@ -70,7 +81,7 @@ def _points(path: tuple[str, ...]) -> tuple[EntryPoint, ...]:
     """Ours, then those of installed packages; looking through the folders of `path` takes 0.1 s."""
     del path
     ours = [
-        EntryPoint(folder.name, f"{__package__}.{folder.name}.kind:KIND", ENTRY_POINT_GROUP)
+        EntryPoint(folder.name, f"{__package__}.{folder.name}.driver:KIND", ENTRY_POINT_GROUP)
         for folder in pkgutil.iter_modules([str(Path(__file__).parent)])
         if folder.ispkg
     ]
@@ -119,3 +130,78 @@ def _wrong(point: EntryPoint, got: str, expected: str) -> InvalidInputError:
     return InvalidInputError(
         f"{_where(point)}: got {got}, expected {expected}; fix package {package_of(point)}"
     )
+
+
+def _validated(value: object) -> DeviceSettings:
+    if isinstance(value, DeviceSettings):
+        return value
+    if not isinstance(value, Mapping) or not isinstance(value.get("kind"), str):
+        raise ValueError(  # noqa: TRY004 - pydantic gathers ValueErrors of all devices
+            f"got {value!r}, expected a map that names its kind: {', '.join(kind_names())}"
+        )
+    told: dict[str, Any] = dict(value)
+    if told["kind"] == "tactile_glove" and told.get("protocol") in OLD_PROTOCOLS:
+        told["kind"] = OLD_PROTOCOLS[told.pop("protocol")]
+    try:
+        settings = device_kind(told["kind"]).settings
+    except InvalidInputError as error:
+        raise ValueError(error.message) from error
+    return settings.model_validate(told)
+
+
+ChosenDevice = Annotated[SerializeAsAny[DeviceSettings], BeforeValidator(_validated)]
+
+
+def build_drivers(devices: Sequence[DeviceSettings], clock: StationClock) -> list[Driver]:
+    """One driver a device.
+
+    Raises:
+        InvalidInputError: two devices of the same name or with the same stream, or none at all.
+    """
+    drivers = [_build(device, clock) for device in devices]
+    names = [driver.name for driver in drivers]
+    if not names or len(set(names)) < len(names):
+        raise InvalidInputError(
+            f"station: got devices {names}, expected at least one and no two alike; "
+            "set DEXTOUCH_ACQUISITION_DEVICES or DEXTOUCH_ACQUISITION_MOCK"
+        )
+    _refuse_shared_streams(drivers)
+    return drivers
+
+
+def _build(device: DeviceSettings, clock: StationClock) -> Driver:
+    kind = device_kind(device.kind)
+    driver: object = kind.build(device, clock)
+    if not isinstance(driver, Driver):
+        raise InvalidInputError(
+            f"kind of device {kind.name!r}: build gave {type(driver).__name__}, expected a "
+            "services.acquisition.devices.Driver; fix the package that provides this kind"
+        )
+    return driver
+
+
+def _refuse_shared_streams(drivers: Sequence[Driver]) -> None:
+    owners: dict[str, str] = {}
+    for driver in drivers:
+        for descriptor in driver.descriptors:
+            owner = owners.setdefault(descriptor.name, driver.name)
+            if owner != driver.name:
+                raise InvalidInputError(
+                    f"station: stream {descriptor.name!r} is given by {owner!r} and by "
+                    f"{driver.name!r}, expected one device a stream; leave one of them out, or "
+                    "name the streams that robot_state shall give (`streams`)"
+                )
+
+
+def load_calibration(path: Path | None) -> dict[str, Matrix]:
+    """Named matrices of a JSON file; none without a file.
+
+    Raises:
+        InvalidInputError: the file cannot be read or holds something else.
+    """
+    if path is None:
+        return {}
+    try:
+        return _MATRICES.validate_python(json.loads(path.read_text(encoding="utf-8")))
+    except (OSError, ValueError, ValidationError) as error:
+        raise InvalidInputError(f"calibration {path}: no JSON of matrices ({error})") from error

@@ -10,9 +10,15 @@ from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
 from services.acquisition.drivers.image_quality import ImageQuality
-from services.acquisition.drivers.packet_search import DecoderStatistics, Found, PacketFinder
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet
-from services.acquisition.transports.base import Transport, TransportInfo
+from services.acquisition.drivers.packets import (
+    SOURCES,
+    VERSION,
+    DecoderStatistics,
+    Found,
+    Packet,
+    PacketFinder,
+)
+from services.acquisition.transports.ports import Transport, TransportInfo
 
 Readings = dict[str, list[Sample]]
 

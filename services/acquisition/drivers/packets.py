@@ -1,13 +1,18 @@
-"""The one packet frame of our documented devices: bytes in any portions ↔ checked packets."""
+"""Search for frames in a byte stream split into arbitrary reads, and its counters."""
 
 import struct
 import zlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar, runtime_checkable
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.packet_search import FrameSearch, SequenceCounter
 
+Found = TypeVar("Found")
+
+# Packets that overtake each other do so within a few; a restarted device jumps further.
+LATE_PACKETS = 64
 # magic, version, source, payload length, sequence, device time in ns (docs/device_packets.md)
 HEADER = struct.Struct("<4sBBIIQ")
 CRC = struct.Struct("<I")
@@ -17,6 +22,183 @@ MAGIC_SIZE = 4
 SEQUENCE_BITS = 32
 SEQUENCE_MODULUS = 1 << SEQUENCE_BITS
 SOURCES = {"none": 0, "left": 1, "right": 2, "head": 3}
+
+
+@dataclass
+class DecoderStatistics:
+    """What a decoder has seen; `lost` counts by sequence numbers, between first and last.
+
+    A packet that was overtaken is `lost` until it comes, from then on `late`: `lost` may shrink.
+    `suspects` are packets that were held back although all that their family checks held: their
+    numbers cannot be readings.
+    """
+
+    packets: int = 0
+    crc_errors: int = 0
+    length_errors: int = 0
+    resync_bytes: int = 0
+    lost: int = 0
+    late: int = 0
+    repeated: int = 0
+    restarts: int = 0
+    refused: int = 0
+    suspects: int = 0
+
+
+class SequenceCounter:
+    """Counts lost, late and repeated packets and restarts by a sequence number of so many bits.
+
+    A decreasing number is a late packet if it is missing among the last 64, otherwise a restart of
+    the device.
+    """
+
+    def __init__(self, statistics: DecoderStatistics, *, bits: int) -> None:
+        self._statistics = statistics
+        self._modulus = 1 << bits
+        self._last: int | None = None
+        # Numbers behind the last one that have not come, and whether they are counted as lost.
+        self._missing: dict[int, bool] = {}
+
+    def count(self, sequence: int, *, is_restarted: bool = False) -> None:
+        """One packet came.
+
+        Args:
+            sequence: its number.
+            is_restarted: the device's clock says that it started anew, so the number may be any.
+        """
+        statistics = self._statistics
+        statistics.packets += 1
+        if self._last is None:
+            self._begin(sequence)
+            return
+        step = (sequence - self._last) % self._modulus
+        if sequence in self._missing:
+            # Its clock steps back, too, which alone would look like a restart.
+            statistics.late += 1
+            statistics.lost -= self._missing.pop(sequence)
+        elif step == 0 and not is_restarted:
+            statistics.repeated += 1
+        elif step < self._modulus // 2 and not is_restarted:
+            statistics.lost += step - 1
+            self._go_on(sequence, step)
+        else:
+            statistics.restarts += 1
+            self._begin(sequence)
+
+    def _begin(self, sequence: int) -> None:
+        """The first packet of a run; those that it overtook nobody missed."""
+        self._last = sequence
+        before = range(sequence - LATE_PACKETS, sequence)
+        self._missing = {number % self._modulus: False for number in before}
+
+    def _go_on(self, sequence: int, step: int) -> None:
+        self._last = sequence
+        if step > 1:
+            skipped = range(sequence - min(step - 1, LATE_PACKETS), sequence)
+            self._missing |= {number % self._modulus: True for number in skipped}
+        # In the order of their numbers: what can only come too late for anybody goes first.
+        while self._missing:
+            oldest = next(iter(self._missing))
+            if (sequence - oldest) % self._modulus <= LATE_PACKETS:
+                break
+            del self._missing[oldest]
+
+
+@runtime_checkable
+class PacketFinder(Protocol[Found]):
+    """Finds the packets of one device in its bytes."""
+
+    statistics: DecoderStatistics
+
+    def reset(self) -> None:
+        """Forget half a packet, since the link was lost."""
+        ...
+
+    def feed(self, data: bytes, /) -> list[Found]:
+        """Packets completed by `data`."""
+        ...
+
+
+class PortionedSearch(ABC, Generic[Found]):
+    """Collects reads until a search can continue; the result does not depend on the portions.
+
+    What was read at once is searched as it came, without a copy. `_needed` is the length that the
+    bytes must have before looking again can find more.
+    """
+
+    def __init__(self) -> None:
+        self.statistics = DecoderStatistics()
+        self._portions: list[bytes] = []
+        self._num_waiting = 0
+        self._needed = 0
+
+    def reset(self) -> None:
+        """Forget half a frame (the link was lost); counters and sequence stay."""
+        self.statistics.resync_bytes += self._num_waiting
+        self._keep(b"")
+        self._needed = 0
+
+    def feed(self, data: bytes) -> list[Found]:
+        """Frames completed by `data`."""
+        self._portions.append(data)
+        self._num_waiting += len(data)
+        if self._num_waiting < self._needed:
+            return []
+        self._needed = 0
+        data = b"".join(self._portions)
+        found, position = self._search(data)
+        self._keep(data[position:])
+        self._needed = max(0, self._needed - position)
+        return found
+
+    def _keep(self, rest: bytes) -> None:
+        self._portions = [rest] if rest else []
+        self._num_waiting = len(rest)
+
+    @abstractmethod
+    def _search(self, data: bytes) -> tuple[list[Found], int]:
+        """What was found in all bytes that wait, and how many of them are done with."""
+
+
+class FrameSearch(PortionedSearch[Found]):
+    """Looks for frames that begin with a mark.
+
+    After an invalid frame the search continues one byte further, not after its claimed end, so that
+    only the damaged frame is lost.
+
+    Args:
+        mark: the bytes that every frame begins with.
+    """
+
+    def __init__(self, mark: bytes) -> None:
+        super().__init__()
+        self._mark = mark
+
+    def _search(self, data: bytes) -> tuple[list[Found], int]:
+        found: list[Found] = []
+        position = 0
+        while (start := data.find(self._mark, position)) >= 0:
+            self.statistics.resync_bytes += start - position
+            taken = self._take(data, start)
+            if taken is not None:
+                found.append(taken[0])
+                position = start + taken[1]
+            elif self._needed:
+                return found, start
+            else:
+                position = start + 1
+                self.statistics.resync_bytes += 1
+        # The last bytes may be the first ones of a mark.
+        rest = max(position, len(data) - len(self._mark) + 1)
+        self.statistics.resync_bytes += rest - position
+        return found, rest
+
+    @abstractmethod
+    def _take(self, data: bytes, position: int) -> tuple[Found, int] | None:
+        """The frame at `position` and its size; None when there is none, or not yet.
+
+        In the latter case `_needed` is set to the length that `data` must have first.
+        """
 
 
 @dataclass(slots=True)

@@ -1,10 +1,12 @@
-"""Numbered 64-byte reports ↔ a packet's bytes, and which packets of a tracker are new."""
+"""Trackers whose packets come in numbered 64-byte reports, and which of their packets are new."""
 
 import struct
 from dataclasses import dataclass
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.drivers.packets import SEQUENCE_MODULUS
+from dextouch.streams import StreamDescriptor
+from services.acquisition.drivers.base import Readings, StreamDecoder
+from services.acquisition.drivers.packets import SEQUENCE_MODULUS, Packet, PacketDecoder
 
 REPORT_BYTES = 64
 DATA_REPORT = 0x01
@@ -115,4 +117,44 @@ class OrderFilter:
                 self.late += 1
                 return False
         self._last = sequence
+        return True
+
+
+class ReportDecoder(StreamDecoder[Packet]):
+    """Base of the decoders of trackers by HID or USB, whose packets come in reports.
+
+    Args:
+        descriptor: of the stream.
+        packets: finds the packets in joined reports.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor, packets: PacketDecoder) -> None:
+        super().__init__(descriptor, packets)
+        self.reports = ReportReassembler()
+        self.order = OrderFilter()
+
+    def events(self) -> dict[str, int]:
+        """Packets dropped so far, by the reason."""
+        return self.order.counts()
+
+    def reset(self) -> None:
+        """Forget half a message; another device may answer now."""
+        super().reset()
+        self.reports.reset()
+        self.order.reset()
+
+    def decode(self, data: bytes, t_host_ns: int) -> Readings:
+        """Samples completed by one report.
+
+        Raises:
+            DeviceError: another version of the device, or another device than expected.
+        """
+        message = self.reports.feed(data)
+        if message is None or not self._is_data(*message):
+            return {}
+        return super().decode(message[1], t_host_ns)
+
+    def _is_data(self, report_id: int, body: bytes) -> bool:
+        """Whether a message is a data packet; what else it is was taken in."""
+        del report_id, body
         return True

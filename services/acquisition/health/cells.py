@@ -18,7 +18,7 @@ from dextouch.errors import InvalidInputError
 from dextouch.schemas import Matrix
 from dextouch.tactile import CONTACT_THRESHOLD_KPA
 from dextouch.tactile.layout import NUM_TAXELS, Side, join_pads, raw_indices, split_pads
-from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS
+from services.acquisition.devices.tactile_glove.driver import FULL_SCALE_COUNTS
 from services.acquisition.drivers.base import CellLayout, Decoder, TellsCells
 from services.acquisition.glove_record import NO_CELL, GloveRecord, mapped_cells
 from services.acquisition.health.codes import CODES

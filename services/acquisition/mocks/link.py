@@ -4,7 +4,7 @@ import threading
 from collections.abc import Callable
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.base import Transport, TransportInfo
+from services.acquisition.transports.ports import Transport, TransportInfo
 
 KEEP_UP_TIMEOUT_S = 20.0
 

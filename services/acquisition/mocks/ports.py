@@ -14,10 +14,13 @@ from typing import ClassVar, Protocol, runtime_checkable
 
 from dextouch.errors import DeviceError
 from services.acquisition.mocks.link import KEEP_UP_TIMEOUT_S, Link, WatchedTransport
-from services.acquisition.transports.base import Transport
-from services.acquisition.transports.hid import HidDevice, HidTransport
-from services.acquisition.transports.serial import SerialTransport
-from services.acquisition.transports.socket import SocketTransport
+from services.acquisition.transports.ports import (
+    HidDevice,
+    HidTransport,
+    SerialTransport,
+    SocketTransport,
+    Transport,
+)
 
 # A host that is merely busy loses nothing, as behind a real device with buffers of its own.
 SEND_TIMEOUT_S = KEEP_UP_TIMEOUT_S

@@ -3,7 +3,7 @@
 from typing import Protocol, runtime_checkable
 
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
-from services.acquisition.drivers.sdk_link_protocol import (
+from services.acquisition.drivers.sdk_link import (
     BridgeHello,
     FrameConvention,
 )

@@ -6,7 +6,7 @@ from typing import Literal
 
 from services.acquisition.clock import StationClock, VirtualClock
 from services.acquisition.drivers.packets import SEQUENCE_MODULUS
-from services.acquisition.drivers.sdk_link_driver import BridgeDecoder, BridgeDriver
+from services.acquisition.drivers.sdk_link import BridgeDecoder, BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults, Schedule
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.ports import HidPort

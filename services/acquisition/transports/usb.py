@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports.base import HandleTransport, TransportInfo
+from services.acquisition.transports.ports import HandleTransport, TransportInfo
 
 if TYPE_CHECKING:
     from usb.backend import IBackend

@@ -68,7 +68,7 @@ def server(kind):
 
 def test_a_bridge_without_samples_still_lives(kind, server, monkeypatch):
     # Longer than the real limit of 200 ms, so that a busy machine is not taken for a dead bridge.
-    monkeypatch.setattr("services.acquisition.drivers.sdk_link_driver.SILENCE_NS", 10**9)
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link.SILENCE_NS", 10**9)
     driver = driver_of(kind, server.port)
     driver.open()
     end_s = time.monotonic() + 1.2

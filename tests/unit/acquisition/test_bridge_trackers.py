@@ -10,12 +10,16 @@ from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, PacketError, StaleDataError
 from dextouch.geometry import pose_from_transform
-from dextouch.geometry.rotations import quaternion_from_rotation, rotation_from_vector
+from dextouch.geometry.rotations import (
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    rotation_from_vector,
+)
 from dextouch.hands import NODES
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.mock import BridgeFingerTrackerSource
-from services.acquisition.devices.pose_tracker.bridge import (
+from services.acquisition.devices.pose_tracker.driver import (
     POSE_PAYLOAD,
     BridgePoseTrackerDecoder,
     TrackingResult,
@@ -26,14 +30,12 @@ from services.acquisition.devices.pose_tracker.mock import (
     Jump,
     Occlusion,
 )
-from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
-from services.acquisition.drivers.sdk_link_driver import BridgeDriver
-from services.acquisition.drivers.sdk_link_protocol import FrameConvention
-from services.acquisition.drivers.sender_frame import (
+from services.acquisition.devices.pose_tracker.poses import (
     SenderFrame,
-    pose_in_our_frame,
     quaternion_of_one,
 )
+from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
+from services.acquisition.drivers.sdk_link import BridgeDriver, FrameConvention
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.sdk_link_server import BridgePort
@@ -81,12 +83,20 @@ def about(axis, angle_rad):
     return q_wxyz
 
 
+OURS = FrameConvention(handedness="right", axes=("+x", "+y", "+z"))
+
+
+def converted(convention, matrix, *, scale_m=1.0):
+    """A sender's matrix [R | t] as our pose."""
+    return np.array(SenderFrame(convention, scale_m).pose(matrix.ravel().tolist()))
+
+
 @pytest.mark.parametrize("axis", range(3))
 @pytest.mark.parametrize("angle_rad", [0.3, -1.1, 2.9])
 def test_left_handed_rotations(axis, angle_rad):
     # Turning z round mirrors turns about x and y, and leaves those about z.
     R = rotation_from_vector(angle_rad * np.eye(3)[axis])
-    pose = pose_in_our_frame(matrix_of(R, (10.0, 20.0, 30.0)), LEFT_HANDED.ours_from_theirs(), 0.01)
+    pose = converted(LEFT_HANDED, matrix_of(R, (10.0, 20.0, 30.0)), scale_m=0.01)
     np.testing.assert_allclose(pose[:3], [0.1, 0.2, -0.3], atol=1e-15)
     sign = 1.0 if axis == 2 else -1.0
     np.testing.assert_allclose(pose[3:], about(axis, sign * angle_rad), atol=1e-12)
@@ -98,7 +108,7 @@ def test_left_handed_rotations(axis, angle_rad):
 def test_y_up_rotations(axis, ours, sign):
     # Their y is our z, their z our −y: a turn about one is a turn about the other.
     R = rotation_from_vector(0.7 * np.eye(3)[axis])
-    pose = pose_in_our_frame(matrix_of(R, (1.0, 2.0, 3.0)), Y_UP.ours_from_theirs(), 1.0)
+    pose = converted(Y_UP, matrix_of(R, (1.0, 2.0, 3.0)))
     np.testing.assert_allclose(pose[:3], [1.0, -3.0, 2.0], atol=1e-15)
     np.testing.assert_allclose(pose[3:], about(ours, sign * 0.7), atol=1e-12)
 
@@ -107,12 +117,12 @@ def test_a_chain_of_frames_is_kept(rng):
     # Conversion and composition commute, whatever the handedness.
     M = LEFT_HANDED.ours_from_theirs()
     R_a, R_b = (rotation_from_vector(rng.normal(size=3)) for _ in range(2))
-    converted = [pose_in_our_frame(matrix_of(R), M, 1.0)[3:] for R in (R_a, R_b, R_a @ R_b)]
+    q_ab_wxyz = converted(LEFT_HANDED, matrix_of(R_a @ R_b))[3:]
     T = [np.eye(4) for _ in range(2)]
     for transform, R in zip(T, (M @ R_a @ M.T, M @ R_b @ M.T), strict=True):
         transform[:3, :3] = R
     product = pose_from_transform(T[0] @ T[1])[3:]
-    assert abs(abs(product @ converted[2]) - 1.0) < 1e-12
+    assert abs(abs(product @ q_ab_wxyz) - 1.0) < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -127,7 +137,7 @@ def test_a_chain_of_frames_is_kept(rng):
 )
 def test_matrices_that_are_no_rotation_are_refused(R):
     with pytest.raises(PacketError, match="pose matrix"):
-        pose_in_our_frame(matrix_of(R), np.eye(3), 1.0)
+        converted(OURS, matrix_of(R))
 
 
 @given(
@@ -156,25 +166,18 @@ def all_conventions():
             yield FrameConvention(handedness=handedness, axes=axes)
 
 
-def outcome(convert):
-    """The bytes of a pose, or the words it is refused with."""
-    try:
-        return np.array(convert()).tobytes()
-    except PacketError as error:
-        return error.message
-
-
 @pytest.mark.parametrize("convention", list(all_conventions()), ids=lambda c: "".join(c.axes))
 def test_the_frame_of_a_sender_is_the_product_of_matrices(convention):
     rng = np.random.default_rng(4)
     vectors_rad = [*rng.normal(0, 2, (20, 3)), *math.pi * np.eye(3), *np.eye(3), np.zeros(3)]
     for vector_rad in vectors_rad:
         matrix = matrix_of(rotation_from_vector(vector_rad), rng.normal(0, 3, 3))
-        sent = matrix.astype(np.float32).astype(np.float64)
-        for numbers in (sent, np.round(sent)):
-            frame, M = SenderFrame(convention, 0.01), convention.ours_from_theirs()
-            got = outcome(lambda f=frame, n=numbers: f.pose(n.ravel().tolist()))
-            assert got == outcome(lambda m=M, n=numbers: pose_in_our_frame(n, m, 0.01))
+        pose, M = converted(convention, matrix, scale_m=0.01), convention.ours_from_theirs()
+        np.testing.assert_allclose(pose[:3], 0.01 * M @ matrix[:, 3], atol=1e-15)
+        R_ours = rotation_from_quaternion(pose[3:])
+        np.testing.assert_allclose(R_ours, M @ matrix[:, :3] @ M.T, atol=1e-14)
+        # No −0, on which signs would hang.
+        assert not np.any((pose == 0) & np.signbit(pose))
 
 
 @pytest.mark.parametrize("place", range(12))
@@ -194,7 +197,7 @@ def test_poses_arrive_as_they_are(frame):
     np.testing.assert_allclose(got, sent, atol=2e-7)
     # The stamps are the SDK's seconds, to the nanosecond.
     assert [s.t_device_ns for s in samples] == (BOOT_NS + source.t_ns).tolist()
-    assert not any(decoder.tracking.packets.values())
+    assert not any(decoder.tracking.values())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -215,7 +218,7 @@ def test_only_the_running_result_counts():
     samples = play(source, decoder)
     # The flag was set all the time.
     assert [s.sequence for s in samples] == np.flatnonzero(source.labels == "").tolist()
-    assert decoder.tracking.packets == {"occluded": 30, "jumped": 0, "stale": 0}
+    assert decoder.tracking == {"occluded": 30, "jumped": 0, "stale": 0}
 
 
 @pytest.mark.parametrize("result", [r for r in TrackingResult if r != 200] + [0, 199, 201])
@@ -224,7 +227,7 @@ def test_no_flag_makes_a_sample(result, flag):
     decoder = BridgePoseTrackerDecoder("wrist_left")
     decoder.decode(poses().hello(), 0)
     assert decoder.decode(pose_packet(result=result, flag=flag), 1) == {}
-    assert decoder.tracking.packets["occluded"] == 1
+    assert decoder.tracking["occluded"] == 1
 
 
 def pose_packet(result=200, flag=1, seconds=1.0, R=None, index=POSE_INDEX, source="left"):
@@ -260,7 +263,7 @@ def test_other_devices_of_the_bridge_are_not_ours():
     decoder = BridgePoseTrackerDecoder("wrist_left")
     decoder.decode(poses().hello(), 0)
     assert decoder.decode(pose_packet(index=POSE_INDEX + 1), 1) == {}
-    assert not any(decoder.tracking.packets.values())
+    assert not any(decoder.tracking.values())
 
 
 def test_jumps_are_marked():
@@ -268,7 +271,7 @@ def test_jumps_are_marked():
     decoder = BridgePoseTrackerDecoder("wrist_left")
     samples = play(source, decoder)
     assert [s.sequence for s in samples] == np.flatnonzero(source.labels == "").tolist()
-    assert decoder.tracking.packets == {"occluded": 0, "jumped": 2, "stale": 0}
+    assert decoder.tracking == {"occluded": 0, "jumped": 2, "stale": 0}
 
 
 @pytest.mark.parametrize("kind", ["fingers", "poses"])
@@ -281,8 +284,7 @@ def test_old_data_is_left_out_and_marked(kind):
     )
     samples = play(source, decoder, lambda index: (350 if 50 <= index < 60 else 2) * MS)
     assert [s.sequence for s in samples] == [*range(50), *range(60, len(source.t_ns))]
-    assert decoder.tracking.packets == {"occluded": 0, "jumped": 0, "stale": 10}
-    assert decoder.freshness.num_old == 10
+    assert decoder.tracking == {"occluded": 0, "jumped": 0, "stale": 10}
 
 
 def test_two_hands_of_one_bridge_are_told_apart():
@@ -376,7 +378,7 @@ def test_samples_that_come_with_the_hello_are_not_lost(stage):
 
 
 def test_a_bridge_without_a_hello_is_refused(stage, monkeypatch):
-    monkeypatch.setattr("services.acquisition.drivers.sdk_link_driver.HELLO_READS", 2)
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link.HELLO_READS", 2)
     stage.port._hello = lambda: b"{"
     with pytest.raises(DeviceError, match="no hello"):
         stage.driver.open()

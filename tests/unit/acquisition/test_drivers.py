@@ -15,19 +15,19 @@ from services.acquisition.devices.finger_tracker.driver import (
     parse_node_order,
 )
 from services.acquisition.devices.finger_tracker.driver import MAGIC as FINGER_MAGIC
-from services.acquisition.devices.pose_tracker.packets import MAGIC as POSE_MAGIC
-from services.acquisition.devices.pose_tracker.packets import PAYLOAD as POSE_PAYLOAD
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
-from services.acquisition.devices.robot_state.packets import MAGIC as ROBOT_MAGIC
-from services.acquisition.devices.robot_state.packets import PAYLOAD as ROBOT_PAYLOAD
-from services.acquisition.devices.robot_state.packets import RobotStateDecoder
+from services.acquisition.devices.pose_tracker.driver import MAGIC as POSE_MAGIC
+from services.acquisition.devices.pose_tracker.driver import PAYLOAD as POSE_PAYLOAD
+from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.poses import TrackingState
+from services.acquisition.devices.robot_state.driver import MAGIC as ROBOT_MAGIC
+from services.acquisition.devices.robot_state.driver import PAYLOAD as ROBOT_PAYLOAD
+from services.acquisition.devices.robot_state.driver import RobotStateDecoder
 from services.acquisition.drivers.packets import SOURCES, Packet, encode_packet
 from services.acquisition.drivers.reports import (
     DATA_REPORT,
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.drivers.tracking import TrackingState
 
 POSE = (1.0, 2.0, 3.0, 0.0, 0.0, 1.0, 0.0)
 
@@ -116,7 +116,7 @@ def test_pose_of_a_running_tracker():
 def test_pose_of_another_state_is_a_gap(state):
     decoder = PoseTrackerDecoder("wrist_left")
     assert decoder.decode(pose_report(state), 3) == {}
-    assert decoder.tracking.packets["occluded"] == 1
+    assert decoder.tracking["occluded"] == 1
     assert decoder.statistics.packets == 1
 
 

@@ -9,13 +9,12 @@ from dextouch.errors import DeviceError, InvalidInputError, PacketError
 from dextouch.streams import StreamDescriptor
 from services.acquisition.clock import RealClock
 from services.acquisition.devices.justfloat_glove.mock import mock_justfloat_glove
-from services.acquisition.devices.tactile_glove.commands import (
+from services.acquisition.devices.tactile_glove.driver import (
+    TactileGlove,
     encode_identity,
     parse_identity,
     parse_reply,
-    parse_tare,
 )
-from services.acquisition.devices.tactile_glove.driver import TactileGlove
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, mock_glove
 from services.acquisition.devices.wuji_glove.mock import mock_wuji_glove
 from services.acquisition.drivers.packets import Packet
@@ -78,20 +77,11 @@ def test_opening_asks_who_it_is(glove):
 def test_samples_that_come_during_a_request_are_kept(glove):
     glove.driver.open()
     play(glove, range(5))
-    glove.driver.diagnostics()
+    glove.driver.identify()
     play(glove, range(5, 8))
     assert [s.sequence for s in read_samples(glove.driver, 8)] == list(range(8))
     assert glove.driver.statistics.packets == 8
     assert glove.driver.statistics.lost == 0
-
-
-def test_diagnostics_count(glove):
-    glove.driver.open()
-    play(glove, range(3))
-    first = glove.driver.diagnostics()
-    second = glove.driver.diagnostics()
-    assert (first.packets, first.crc_errors, first.resets) == (3, 0, 0)
-    assert second.uptime_ns > first.uptime_ns > 0
 
 
 def test_time_round_trip_is_on_the_devices_clock(glove):
@@ -111,31 +101,21 @@ def test_requests_that_fail_leave_nothing_behind(glove, monkeypatch):
     monkeypatch.setattr(glove.driver.transport, "write", fail)
     for _ in range(3):
         with pytest.raises(DeviceError, match="lost while writing"):
-            glove.driver.diagnostics()
+            glove.driver.identify()
     monkeypatch.undo()
     # Nobody answers this one in time; its answer comes later.
     monkeypatch.setattr(glove.driver, "_await", lambda *_: None)
     with pytest.raises(DeviceError, match="no answer"):
-        glove.driver.diagnostics()
+        glove.driver.identify()
     monkeypatch.undo()
     play(glove, range(1))
     read_samples(glove.driver, 1)
     assert (glove.driver._asked, glove.driver._replies) == (set(), {})
 
 
-def test_tare_is_the_mean_of_the_next_packets(glove, monkeypatch):
-    """Asked by one thread while another one reads, as in a station."""
+def test_one_thread_asks_while_another_one_reads(glove):
+    """As in a station."""
     glove.driver.open()
-    port = glove.device.port
-    heard = threading.Event()
-    hear = port._answer
-
-    def answer(data):
-        replies = hear(data)
-        heard.set()
-        return replies
-
-    monkeypatch.setattr(port, "_answer", answer)
     opened = threading.Event()
     done = threading.Event()
 
@@ -148,23 +128,11 @@ def test_tare_is_the_mean_of_the_next_packets(glove, monkeypatch):
     reader = threading.Thread(target=read)
     reader.start()
     assert opened.wait(10)
-    found = []
-    asking = threading.Thread(target=lambda: found.append(glove.driver.tare(6)))
-    asking.start()
-    assert heard.wait(10)
     play(glove, range(7))
-    asking.join()
+    assert [glove.driver.identify().serial_number for _ in range(3)] == ["glove_left"] * 3
     done.set()
     reader.join()
-    counts = glove.device.source._counts[:6].astype(float)
-    np.testing.assert_array_equal(found[0], np.rint(counts.mean(axis=0)))
-
-
-@pytest.mark.parametrize("num_packets", [0, 601])
-def test_impossible_tares_are_refused(glove, num_packets):
-    glove.driver.open()
-    with pytest.raises(InvalidInputError, match="1 … 600"):
-        glove.driver.tare(num_packets)
+    assert glove.driver.statistics.packets == 7
 
 
 def test_swapped_gloves_are_named():
@@ -197,7 +165,7 @@ def test_a_silent_device_is_an_error():
 
 
 def test_commands_with_bit_errors_are_asked_again(glove, monkeypatch):
-    """The first request is spoilt on its way; the glove counts it and the second is answered."""
+    """The first request is spoilt on its way; the second is answered."""
     transport = glove.driver.transport
     write = transport.write
     sent = []
@@ -209,7 +177,6 @@ def test_commands_with_bit_errors_are_asked_again(glove, monkeypatch):
     monkeypatch.setattr(transport, "write", spoil)
     glove.driver.open()
     assert len(sent) == 2
-    assert glove.driver.diagnostics().crc_errors == 1
 
 
 @pytest.mark.parametrize("make_glove", [mock_wuji_glove, mock_justfloat_glove])
@@ -238,8 +205,6 @@ def test_replies_that_are_none_are_refused():
         parse_reply(Packet(1, 1, 0, 0, bytes([1, 9, 0, 0])))
     with pytest.raises(PacketError, match="20"):
         parse_identity(b"", 1)
-    with pytest.raises(PacketError, match="720"):
-        parse_tare(b"123")
     with pytest.raises(PacketError, match="ASCII"):
         parse_identity(b"\xff" * 20, 1)
     with pytest.raises(InvalidInputError, match="16 letters"):

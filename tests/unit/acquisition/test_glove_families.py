@@ -5,15 +5,15 @@ import numpy as np
 import pytest
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
-from services.acquisition.devices.justfloat_glove.packets import (
+from services.acquisition.devices.justfloat_glove.driver import (
     TAIL,
     JustFloatGloveDecoder,
     are_readings,
     bits_of,
 )
+from services.acquisition.devices.justfloat_glove.mock import encode_justfloat
+from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder, are_pressures, crc16
 from services.acquisition.devices.wuji_glove.mock import encode_wuji
-from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder, are_pressures, crc16
 
 
 def cells(rng):

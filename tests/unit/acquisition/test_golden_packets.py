@@ -9,8 +9,8 @@ from dextouch.streams import StreamDescriptor
 from services.acquisition.devices.camera.mock import CameraSource
 from services.acquisition.devices.finger_tracker.mock import FingerTrackerSource
 from services.acquisition.devices.pose_tracker.mock import PoseTrackerSource
+from services.acquisition.devices.robot_state.driver import STREAM_SIZES
 from services.acquisition.devices.robot_state.mock import RobotStateSource
-from services.acquisition.devices.robot_state.packets import STREAM_SIZES
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration, TactileGloveSource
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.replay import ReplayStream

@@ -7,8 +7,8 @@ from prometheus_client import CollectorRegistry, generate_latest
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices.camera.driver import camera_descriptor
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
-from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
+from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
+from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.health import CODES, DiskJudge, HealthCollector, HealthMonitor
 from services.acquisition.health.codes import table

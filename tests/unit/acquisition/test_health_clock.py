@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dextouch.streams import StreamDescriptor
-from services.acquisition.devices.tactile_glove.packets import glove_descriptor
+from services.acquisition.devices.tactile_glove.driver import glove_descriptor
 from services.acquisition.health.clock import ClockJudge, CountingJudge
 from services.acquisition.health.samples import Block
 from tests.unit.acquisition.health_blocks_made import NONE, SECOND_NS, block, codes

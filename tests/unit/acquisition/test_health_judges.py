@@ -6,10 +6,10 @@ import pytest
 from dextouch.streams import Sample, StreamDescriptor
 from dextouch.tactile.layout import expand_taxels, raw_indices
 from services.acquisition.clock import VirtualClock
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.poses import pose_descriptor
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.image_quality import ImageQuality
-from services.acquisition.drivers.tracking import pose_descriptor
 from services.acquisition.glove_record import GloveRecord
 from services.acquisition.health.cells import TaxelJudge, count_taxels, neighbour_share
 from services.acquisition.health.link import TrackingJudge
@@ -206,7 +206,7 @@ def test_what_a_trackers_decoder_leaves_out_is_judged(kind, count, expected):
     judge = TrackingJudge(driver_of(decoder).events)
     decoder.statistics.packets += 1000
     for _ in range(count):
-        decoder.tracking.leave_out(kind)
+        decoder.tracking[kind] += 1
     assert codes(judge.judge(block([]), SECOND_NS)) == expected
 
 

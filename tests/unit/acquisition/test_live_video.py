@@ -9,7 +9,7 @@ from dextouch.images import decode_jpeg
 from dextouch.streams import Sample, encoded_values
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.camera.kind import CameraSettings
+from services.acquisition.devices.camera.driver import CameraSettings
 from services.acquisition.live import LiveView
 
 CAMERA = CameraSettings(stream="camera_head", port=1, height_px=48, width_px=64, encoding="h264")

@@ -11,10 +11,9 @@ from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices.camera.driver import CameraDriver
 from services.acquisition.devices.finger_tracker.driver import FingerTracker
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.drivers.sdk_link_driver import BridgeDriver
-from services.acquisition.mock_devices import MockFactory
+from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mock_links import MockLinks
-from services.acquisition.mock_station import MockStation
+from services.acquisition.mock_station import MockFactory, MockStation
 from services.acquisition.mocks.faults import DeviceFaults, FaultScript
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.replay import at_rate

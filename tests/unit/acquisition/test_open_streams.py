@@ -8,7 +8,7 @@ from dextouch.errors import DeviceError, InvalidInputError, NotFoundError
 from dextouch.streams import Sample, StreamDescriptor
 from services.acquisition.clock import RealClock
 from services.acquisition.devices import CellLayout, DecoderStatistics, Driver, build_drivers
-from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import MAGIC, PAYLOAD, PoseTrackerDecoder
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
 from services.acquisition.glove_record import is_ours

@@ -14,20 +14,24 @@ import numpy as np
 import pytest
 
 from services.acquisition.devices.camera.driver import CameraDecoder
-from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
-from services.acquisition.devices.finger_tracker.driver import FingerTrackerDecoder
-from services.acquisition.devices.justfloat_glove.packets import JustFloatGloveDecoder
-from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
-from services.acquisition.devices.robot_state.packets import RobotStateDecoder
-from services.acquisition.devices.tactile_glove.commands import (
+from services.acquisition.devices.finger_tracker.driver import (
+    BridgeFingerTrackerDecoder,
+    FingerTrackerDecoder,
+)
+from services.acquisition.devices.justfloat_glove.driver import JustFloatGloveDecoder
+from services.acquisition.devices.pose_tracker.driver import (
+    BridgePoseTrackerDecoder,
+    PoseTrackerDecoder,
+)
+from services.acquisition.devices.robot_state.driver import RobotStateDecoder
+from services.acquisition.devices.tactile_glove.driver import (
+    TactileGloveDecoder,
     encode_request,
-    parse_diagnostics,
     parse_identity,
     parse_reply,
+    parse_time,
 )
-from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
-from services.acquisition.devices.wuji_glove.packets import WujiGloveDecoder
+from services.acquisition.devices.wuji_glove.driver import WujiGloveDecoder
 
 ARRIVED_NS = 5_000_000_000
 SEQUENCE = 0x0A0B0C0D
@@ -100,16 +104,14 @@ def test_replies_of_the_tactile_glove():
     assert (command, status) == (1, 0)
     found = parse_identity(body, identity.source)
     assert (found.serial_number, found.firmware, found.side) == ("DXT-0042", "2.11.5", "right")
-    told = "02 00 0000 0000000001000000 05000000 06000000 07000000"
-    counters = parse_diagnostics(parse_reply(heard(replied(told)))[2])
-    assert counters.uptime_ns == 2**32
-    assert (counters.packets, counters.crc_errors, counters.resets) == (5, 6, 7)
+    told = "03 00 0000 0000000001000000"
+    assert parse_time(parse_reply(heard(replied(told)))[2]) == 2**32
 
 
 def test_requests_to_the_tactile_glove():
-    # Tare of 600 packets: command 4, argument 0x0258.
-    wanted = captured(f"44585443 01 {NO_SOURCE} 04000000 09000000 0000000000000000 04 00 5802")
-    assert encode_request(4, argument=600, request=9) == wanted
+    # Time sync: command 3, without an argument.
+    wanted = captured(f"44585443 01 {NO_SOURCE} 04000000 09000000 0000000000000000 03 00 0000")
+    assert encode_request(3, request=9) == wanted
 
 
 # The tracker's own order: the little finger first, from tip to metacarpal, the wrist last.

@@ -6,13 +6,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError, InvalidInputError
-from services.acquisition.devices.tactile_glove.packets import (
+from services.acquisition.devices.tactile_glove.driver import (
     MAGIC,
     PAYLOAD_BYTES,
     TactileGloveDecoder,
 )
-from services.acquisition.drivers.packet_search import DecoderStatistics, SequenceCounter
-from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder, encode_packet
+from services.acquisition.drivers.packets import (
+    SOURCES,
+    DecoderStatistics,
+    Packet,
+    PacketDecoder,
+    SequenceCounter,
+    encode_packet,
+)
 
 
 def glove_packet(sequence, rng, *, version=1, source=SOURCES["left"]):

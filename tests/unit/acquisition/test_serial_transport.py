@@ -9,8 +9,8 @@ import serial
 from structlog.testing import capture_logs
 
 from dextouch.errors import DeviceError
-from services.acquisition.transports import serial as serial_transport
-from services.acquisition.transports.serial import SerialTransport
+from services.acquisition.transports import ports as serial_transport
+from services.acquisition.transports.ports import SerialTransport
 
 
 @pytest.fixture

@@ -8,9 +8,12 @@ from dextouch.episodes import is_keyframe
 from dextouch.errors import DeviceError, InvalidInputError
 from services.acquisition.clock import RealClock, VirtualClock
 from services.acquisition.devices import build_drivers
-from services.acquisition.devices.station_camera.capture import CapturedImage, CaptureLink
+from services.acquisition.devices.station_camera.capture import (
+    CapturedImage,
+    CaptureLink,
+    StationCameraSettings,
+)
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.devices.station_camera.settings import StationCameraSettings
 from services.acquisition.drivers import image_encoding
 from services.acquisition.drivers.image_encoding import TakeAware
 from services.acquisition.settings import AcquisitionSettings

@@ -3,7 +3,7 @@
 from structlog.testing import capture_logs
 
 from dextouch.errors import DeviceError
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.mocks.ports import HidPort
 from services.acquisition.supervisor import DeviceSupervisor

@@ -8,15 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dextouch.errors import DeviceError
-from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
-from services.acquisition.devices.finger_tracker.driver import FingerTrackerDecoder
+from services.acquisition.devices.finger_tracker.driver import (
+    BridgeFingerTrackerDecoder,
+    FingerTrackerDecoder,
+)
 from services.acquisition.devices.finger_tracker.mock import (
     BridgeFingerTrackerSource,
     FingerTrackerSource,
 )
-from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import (
+    BridgePoseTrackerDecoder,
+    PoseTrackerDecoder,
+)
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 

@@ -7,11 +7,13 @@ import numpy as np
 import pytest
 
 from services.acquisition.clock import RealClock
-from services.acquisition.devices.pose_tracker.bridge import BridgePoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.driver import (
+    BridgePoseTrackerDecoder,
+    PoseTrackerDecoder,
+)
 from services.acquisition.devices.pose_tracker.mock import BridgePoseSource, PoseTrackerSource
-from services.acquisition.devices.pose_tracker.packets import PoseTrackerDecoder
 from services.acquisition.drivers.base import Driver
-from services.acquisition.drivers.sdk_link_driver import BridgeDriver
+from services.acquisition.drivers.sdk_link import BridgeDriver
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.pattern import pattern_streams
 from services.acquisition.mocks.ports import HidPort
@@ -67,7 +69,7 @@ class Rig:
 @pytest.fixture(params=["hid", "usb", "bridge"])
 def rig(request, monkeypatch):
     # A busy machine may be slower with the next sample than a bridge may be silent.
-    monkeypatch.setattr("services.acquisition.drivers.sdk_link_driver.SILENCE_NS", 10**10)
+    monkeypatch.setattr("services.acquisition.drivers.sdk_link.SILENCE_NS", 10**10)
     built = Rig(request.param)
     built.port.plug()
     built.supervisor.start()

@@ -11,10 +11,10 @@ from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     CaptureLink,
     OpenCvCapture,
+    StationCameraSettings,
     find_camera,
 )
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.devices.station_camera.settings import StationCameraSettings
 
 
 def wanted(**settings):

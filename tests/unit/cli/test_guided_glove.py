@@ -13,8 +13,8 @@ from dextouch.schemas import SaveTake, TakeName, TakePrompt
 from dextouch.streams import Sample
 from services.acquisition.clock import VirtualClock
 from services.acquisition.devices import load_calibration
+from services.acquisition.devices.tactile_glove.driver import TactileGloveDecoder
 from services.acquisition.devices.tactile_glove.mock import GloveCalibration
-from services.acquisition.devices.tactile_glove.packets import TactileGloveDecoder
 from services.acquisition.drivers.base import Driver
 from services.acquisition.live import LiveView
 from services.acquisition.mocks.ports import PtyPort

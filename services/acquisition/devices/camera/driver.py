@@ -1,8 +1,10 @@
 """Driver of a camera bridge, whose packets hold raw, JPEG or H.264 images."""
 
 import struct
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 
 from dextouch.episodes import GOP_IMAGES
 from dextouch.errors import CorruptDataError, DeviceError, InvalidInputError
@@ -15,11 +17,12 @@ from dextouch.streams import (
     encoded_values,
 )
 from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import CameraStream, DeviceKind, TcpSettings
 from services.acquisition.drivers.base import Driver, StreamDecoder, check_packet
 from services.acquisition.drivers.image_encoding import ImageEncoding, WholeGroups
 from services.acquisition.drivers.image_quality import ImageChecker, ImageQuality
 from services.acquisition.drivers.packets import Packet, PacketDecoder
-from services.acquisition.transports.base import Transport
+from services.acquisition.transports.ports import Transport, tcp_transport
 
 __all__ = ["CameraDecoder", "CameraDriver", "ImageEncoding", "camera_descriptor"]
 
@@ -181,3 +184,32 @@ class CameraDriver(Driver):
     def quality(self) -> ImageQuality:
         """What the images are like."""
         return self._images.quality
+
+
+class CameraSettings(TcpSettings):
+    """A camera bridge at a TCP address."""
+
+    kind: Literal["camera"] = "camera"
+    stream: CameraStream
+    height_px: int = Field(default=480, gt=0)
+    width_px: int = Field(default=640, gt=0)
+    encoding: Literal["rgb8", "jpeg", "h264"] = "jpeg"
+
+
+def build(settings: CameraSettings, clock: StationClock) -> CameraDriver:
+    """The driver of one bridge."""
+    decoder = CameraDecoder(
+        settings.stream,
+        height_px=settings.height_px,
+        width_px=settings.width_px,
+        encoding=settings.encoding,
+    )
+    return CameraDriver(
+        settings.stream,
+        transport=tcp_transport(settings.host, settings.port),
+        decoder=decoder,
+        clock=clock,
+    )
+
+
+KIND = DeviceKind(name="camera", settings=CameraSettings, build=build)

@@ -1,8 +1,8 @@
-"""Driver of a finger tracker by HID or USB: 25 keypoints of one hand in its wrist frame, in m."""
+"""Driver of a finger tracker by HID, USB or its SDK's bridge: 25 keypoints of one hand, in m."""
 
 import struct
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Literal
 
 import numpy as np
 from jaxtyping import Float32, Int64
@@ -12,15 +12,25 @@ from dextouch.hands import CHAINS, FINGER_JOINTS, NO_KEYPOINT, NUM_KEYPOINTS, WR
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
 from services.acquisition.clock import StationClock
-from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
-from services.acquisition.drivers.packets import Packet, PacketDecoder
+from services.acquisition.devices.kind import (
+    DeviceKind,
+    TrackerSettings,
+    tracker_transport,
+)
+from services.acquisition.drivers.base import Driver, check_packet
+from services.acquisition.drivers.packets import SOURCES, Packet, PacketDecoder
 from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     REPORT_BYTES,
-    OrderFilter,
-    ReportReassembler,
+    ReportDecoder,
 )
-from services.acquisition.transports.base import Transport
+from services.acquisition.drivers.sdk_link import (
+    BridgeConnection,
+    BridgeDecoder,
+    BridgeDriver,
+    BridgeHello,
+)
+from services.acquisition.transports.ports import Transport
 
 MAGIC = b"DXFT"
 DESCRIPTOR_MAGIC = b"DXFD"
@@ -107,7 +117,7 @@ def unpack_keypoints(
     return keypoints, int(unseen.sum())
 
 
-class FingerTrackerDecoder(StreamDecoder[Packet]):
+class FingerTrackerDecoder(ReportDecoder):
     """Joins reports, resolves nodes by the descriptor's ids, marks unseen nodes with NaN.
 
     Its `statistics` are those of the data packets.
@@ -118,12 +128,10 @@ class FingerTrackerDecoder(StreamDecoder[Packet]):
         super().__init__(keypoints_descriptor(side), packets)
         self._side = side
         self._device = f"finger_tracker_{side}"
-        self.reports = ReportReassembler()
         self._descriptor = PacketDecoder(
             DESCRIPTOR_MAGIC, min_payload=DESCRIPTOR_BYTES, max_payload=DESCRIPTOR_BYTES
         )
         self._order: Int64[np.ndarray, 25] | None = None
-        self.order = OrderFilter()
         self.undescribed = 0
         self.unseen_nodes = 0
 
@@ -134,30 +142,18 @@ class FingerTrackerDecoder(StreamDecoder[Packet]):
 
     def events(self) -> dict[str, int]:
         """Packets dropped so far, and nodes that were not seen."""
-        return {**self.order.counts(), "unseen_nodes": self.unseen_nodes}
+        return {**super().events(), "unseen_nodes": self.unseen_nodes}
 
     def reset(self) -> None:
         """Forget half a message and the node order (another device may answer now)."""
         super().reset()
-        self.reports.reset()
         self._descriptor.reset()
-        self.order.reset()
         self._order = None
 
-    def decode(self, data: bytes, t_host_ns: int) -> Readings:
-        """Keypoints (float32 [25, 3], m) completed by one report.
-
-        Raises:
-            DeviceError: another version, the other hand, or nodes we do not know.
-        """
-        message = self.reports.feed(data)
-        if message is None:
-            return {}
-        report_id, body = message
+    def _is_data(self, report_id: int, body: bytes) -> bool:
         if report_id == DESCRIPTOR_REPORT:
             self._describe(body)
-            return {}
-        return super().decode(body, t_host_ns)
+        return report_id != DESCRIPTOR_REPORT
 
     def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
         check_packet(packet, device=self._device, source=self._side)
@@ -199,3 +195,88 @@ class FingerTracker(Driver):
             if self._nodes.described:
                 return
         raise DeviceError(f"{self.name}: {self.info} sends no node descriptor; wrong firmware?")
+
+
+class BridgeFingerTrackerDecoder(BridgeDecoder):
+    """Keypoints (float32 [25, 3], m, wrist frame) of one hand behind a finger tracker's SDK.
+
+    Args:
+        side: which hand.
+        serial_number: of the glove; the bridge's only one of this side if None.
+    """
+
+    def __init__(self, side: Side, *, serial_number: str | None = None) -> None:
+        self._side = side
+        self._device = f"finger_tracker_{side}"
+        connection = BridgeConnection(
+            "finger_tracker",
+            device=self._device,
+            source=side,
+            serial_number=serial_number,
+            packets=PacketDecoder(MAGIC, min_payload=0, max_payload=PAYLOAD_BYTES),
+            payload_bytes=PAYLOAD_BYTES,
+        )
+        super().__init__(keypoints_descriptor(side), connection)
+        self._order: Int64[np.ndarray, 25] | None = None
+        self._ours_m = np.eye(3)
+        self.unseen_nodes = 0
+
+    def events(self) -> dict[str, int]:
+        """Packets left out so far, by the reason, and nodes that were not seen."""
+        return {**super().events(), "unseen_nodes": self.unseen_nodes}
+
+    def reset(self) -> None:
+        """The connection was lost."""
+        super().reset()
+        self._order = None
+
+    def _learn(self, hello: BridgeHello) -> None:
+        """The order of the nodes and the frame.
+
+        Raises:
+            DeviceError: nodes we do not know.
+        """
+        try:
+            self._order = np.array(resolve_nodes(hello.nodes or ()))
+        except PacketError as error:
+            raise DeviceError(
+                f"{self._device}: {error.message}", device=self._device, event="wrong_nodes"
+            ) from error
+        self._ours_m = hello.scale_m() * hello.frame.ours_from_theirs()
+
+    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        hello, order = self.connection.hello, self._order
+        if hello is None or order is None:
+            return None
+        if packet.source != SOURCES[self._side]:
+            # The other hand of the same bridge is none of ours; one it did not announce is a fault.
+            announced = [SOURCES[device.source] for device in hello.devices]
+            if packet.source not in announced:
+                check_packet(packet, device=self._device, source=self._side)
+            return None
+        if not self.is_fresh(packet.t_device_ns, t_host_ns):
+            return None
+        theirs, num_unseen = unpack_keypoints(packet.payload, order)
+        self.unseen_nodes += num_unseen
+        keypoints = (theirs.astype(np.float64) @ self._ours_m.T).astype(np.float32)
+        return Sample(t_host_ns, keypoints, packet.t_device_ns, packet.sequence)
+
+
+class FingerTrackerSettings(TrackerSettings):
+    """A finger tracker of one hand."""
+
+    kind: Literal["finger_tracker"] = "finger_tracker"
+    side: Side
+
+
+def build(settings: FingerTrackerSettings, clock: StationClock) -> Driver:
+    """The driver of one tracker, by its link."""
+    name = f"finger_tracker_{settings.side}"
+    transport = tracker_transport(settings)
+    if settings.link == "bridge":
+        decoder = BridgeFingerTrackerDecoder(settings.side, serial_number=settings.serial_number)
+        return BridgeDriver(name, transport=transport, decoder=decoder, clock=clock)
+    return FingerTracker(name, settings.side, transport=transport, clock=clock)
+
+
+KIND = DeviceKind(name="finger_tracker", settings=FingerTrackerSettings, build=build)

@@ -5,7 +5,6 @@ from jaxtyping import Float64, Int64
 
 from dextouch.hands import NODES, NUM_KEYPOINTS, chain_indices
 from dextouch.tactile.layout import Side
-from services.acquisition.devices.finger_tracker.bridge import BridgeFingerTrackerDecoder
 from services.acquisition.devices.finger_tracker.driver import (
     ALL_SEEN,
     CHAIN_IDS,
@@ -13,6 +12,7 @@ from services.acquisition.devices.finger_tracker.driver import (
     JOINT_IDS,
     MAGIC,
     VALIDITY,
+    BridgeFingerTrackerDecoder,
     FingerTracker,
 )
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
@@ -21,7 +21,7 @@ from services.acquisition.drivers.reports import (
     DESCRIPTOR_REPORT,
     split_into_reports,
 )
-from services.acquisition.drivers.sdk_link_protocol import (
+from services.acquisition.drivers.sdk_link import (
     PROTOCOL,
     PROTOCOL_VERSION,
     BridgedDevice,

@@ -11,24 +11,26 @@ from dextouch.geometry.rotations import (
     rotation_from_quaternion,
     rotation_from_vector,
 )
-from services.acquisition.devices.pose_tracker.bridge import (
+from services.acquisition.devices.pose_tracker.driver import (
+    MAGIC,
+    PAYLOAD,
     POSE_MAGIC,
     POSE_PAYLOAD,
     BridgePoseTrackerDecoder,
+    PoseTrackerDecoder,
     TrackingResult,
 )
-from services.acquisition.devices.pose_tracker.packets import MAGIC, PAYLOAD, PoseTrackerDecoder
+from services.acquisition.devices.pose_tracker.poses import TrackingState, source_of
 from services.acquisition.drivers.base import Driver
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.drivers.reports import DATA_REPORT, split_into_reports
-from services.acquisition.drivers.sdk_link_protocol import (
+from services.acquisition.drivers.sdk_link import (
     PROTOCOL,
     PROTOCOL_VERSION,
     BridgedDevice,
     BridgeHello,
     FrameConvention,
 )
-from services.acquisition.drivers.tracking import TrackingState, source_of
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.ledger import Fate
 from services.acquisition.mocks.pair import MockPair

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from dextouch.errors import InvalidInputError
-from services.acquisition.devices.robot_state.packets import MAGIC, STREAM_SIZES
+from services.acquisition.devices.robot_state.driver import MAGIC, STREAM_SIZES
 from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
 from services.acquisition.mocks.replay import ReplayStream
 

@@ -15,9 +15,9 @@ from services.acquisition.clock import StationClock, Waiter
 from services.acquisition.devices.station_camera.capture import (
     CapturedImage,
     CaptureLink,
+    StationCameraSettings,
 )
 from services.acquisition.devices.station_camera.driver import StationCamera
-from services.acquisition.devices.station_camera.settings import StationCameraSettings
 from services.acquisition.mocks.faults import DeviceFaults
 from services.acquisition.mocks.link import Link
 from services.acquisition.mocks.pair import MockPair

@@ -1,38 +1,206 @@
-"""Driver of our tactile glove, which also asks it for its identity, its time and a tare."""
+"""Driver of our tactile glove: its packets, and the requests for its identity and its time."""
 
 import itertools
+import struct
 import threading
-from typing import NamedTuple
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import UInt16
 
 from dextouch.clocks import RoundTrip
-from dextouch.errors import DeviceError, InvalidInputError
-from dextouch.tactile.layout import Side
+from dextouch.errors import DeviceError, InvalidInputError, PacketError
+from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
+from dextouch.tactile.layout import NUM_RAW_TAXELS, Side
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.tactile_glove.commands import (
-    MAX_TARE_PACKETS,
-    Command,
-    GloveDiagnostics,
-    GloveIdentity,
-    Status,
-    encode_request,
-    parse_diagnostics,
-    parse_identity,
-    parse_reply,
-    parse_tare,
-    parse_time,
+from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
+from services.acquisition.drivers.base import (
+    Driver,
+    Readings,
+    StreamDecoder,
+    check_packet,
+    hand_name,
 )
-from services.acquisition.devices.tactile_glove.packets import NOMINAL_RATE_HZ, TactileGloveDecoder
-from services.acquisition.drivers.base import Driver, Readings, hand_name
-from services.acquisition.drivers.packets import SEQUENCE_MODULUS, Packet
-from services.acquisition.transports.base import Transport
+from services.acquisition.drivers.packets import (
+    SEQUENCE_MODULUS,
+    SOURCES,
+    VERSION,
+    Packet,
+    PacketDecoder,
+    encode_packet,
+)
+from services.acquisition.transports.ports import Transport
 
+COMMAND_MAGIC = b"DXTC"
+REPLY_MAGIC = b"DXTR"
+# command, argument
+REQUEST = struct.Struct("<BxH")
+# command, status
+REPLY_HEAD = struct.Struct("<BBxx")
+# serial number, firmware
+IDENTITY = struct.Struct("<16s3Bx")
+TIME_SYNC = struct.Struct("<Q")
+MIN_REPLY, MAX_REPLY = REPLY_HEAD.size, REPLY_HEAD.size + IDENTITY.size
+MAGIC = b"DXTG"
+PAYLOAD_BYTES = 2 * NUM_RAW_TAXELS
+NOMINAL_RATE_HZ = 60.0
+FULL_SCALE_COUNTS = 65_535
+_COUNT = np.dtype("<u2")
 ANSWER_TIMEOUT_NS = 300_000_000
 NUM_ATTEMPTS = 3
 # A virtual clock does not advance while a device is opened; count empty reads instead.
 MAX_SILENT_READS = 5
+
+
+class Command(IntEnum):
+    """Commands of the host."""
+
+    IDENTIFY = 1
+    TIME_SYNC = 3
+
+
+class Status(IntEnum):
+    """How the device took it."""
+
+    OK = 0
+    UNKNOWN_COMMAND = 1
+    BAD_ARGUMENT = 2
+
+
+@dataclass(frozen=True)
+class GloveIdentity:
+    """Who a glove is."""
+
+    serial_number: str
+    firmware: str
+    side: str
+
+
+def encode_request(command: int, *, request: int, argument: int = 0) -> bytes:
+    """Bytes of one request; `request` comes back in the reply's sequence field."""
+    packet = Packet(VERSION, SOURCES["none"], request, 0, REQUEST.pack(command, argument))
+    return encode_packet(COMMAND_MAGIC, packet)
+
+
+def encode_reply(request: Packet, status: Status, body: bytes, *, made: Packet) -> bytes:
+    """Bytes of the answer to `request`; `made` gives the device's source and time."""
+    payload = REPLY_HEAD.pack(request.payload[0], status) + body
+    packet = Packet(VERSION, made.source, request.sequence, made.t_device_ns, payload)
+    return encode_packet(REPLY_MAGIC, packet)
+
+
+def parse_reply(packet: Packet) -> tuple[int, Status, bytes]:
+    """Command, status and body of a reply.
+
+    Raises:
+        PacketError: a status that there is not.
+    """
+    command, status = REPLY_HEAD.unpack_from(packet.payload)
+    if status not in list(Status):
+        raise PacketError(f"glove reply: got status {status}, expected {[*map(int, Status)]}")
+    return command, Status(status), packet.payload[REPLY_HEAD.size :]
+
+
+def parse_identity(body: bytes, source: int) -> GloveIdentity:
+    """Who the glove says it is.
+
+    Raises:
+        PacketError: another size, or a serial number that is no ASCII text.
+    """
+    _check_size("identity", body, IDENTITY.size)
+    serial_bytes, *firmware = IDENTITY.unpack(body)
+    try:
+        serial_number = serial_bytes.rstrip(b"\0").decode("ascii")
+    except UnicodeDecodeError as error:
+        raise PacketError(f"glove identity: got {serial_bytes!r}, expected ASCII") from error
+    sides = {number: name for name, number in SOURCES.items()}
+    return GloveIdentity(
+        serial_number, ".".join(map(str, firmware)), sides.get(source, str(source))
+    )
+
+
+def encode_identity(serial_number: str, firmware: tuple[int, int, int]) -> bytes:
+    """Body of an identity.
+
+    Raises:
+        InvalidInputError: a serial number that does not fit.
+    """
+    data = serial_number.encode("ascii", errors="replace")
+    if not 0 < len(data) <= 16:
+        raise InvalidInputError(f"serial number: got {serial_number!r}, expected 1 … 16 letters")
+    return IDENTITY.pack(data, *firmware)
+
+
+def parse_time(body: bytes) -> int:
+    """When the glove got the request, on its clock in ns.
+
+    Raises:
+        PacketError: another size.
+    """
+    _check_size("time sync", body, TIME_SYNC.size)
+    (t_received_ns,) = TIME_SYNC.unpack(body)
+    return int(t_received_ns)
+
+
+def _check_size(what: str, body: bytes, size: int) -> None:
+    if len(body) != size:
+        raise PacketError(f"glove {what}: got {len(body)} bytes, expected {size}")
+
+
+def glove_descriptor(side: Side, label: str | None = None) -> StreamDescriptor:
+    """The raw stream of one glove."""
+    return StreamDescriptor(
+        name=f"tactile_{hand_name(side, label)}",
+        kind="tactile",
+        shape=(NUM_RAW_TAXELS,),
+        dtype="uint16",
+        unit="counts",
+        nominal_rate_hz=NOMINAL_RATE_HZ,
+        side=side,
+        device=f"glove_{hand_name(side, label)}",
+        capabilities=ClockCapabilities(crc=True, sequence=True, device_time=True),
+    )
+
+
+class TactileGloveDecoder(StreamDecoder[Packet]):
+    """Decodes one glove's byte stream to uint16 counts [360] in raw scan order.
+
+    Args:
+        side: which glove it must be; None takes any.
+        on_reply: takes each reply to a command with its arrival; without it replies are passed
+            over.
+        label: of a further glove of this hand.
+    """
+
+    def __init__(
+        self,
+        side: Side | None = None,
+        *,
+        on_reply: Callable[[Packet, int], None] | None = None,
+        label: str | None = None,
+    ) -> None:
+        packets = PacketDecoder(
+            MAGIC,
+            min_payload=PAYLOAD_BYTES,
+            max_payload=PAYLOAD_BYTES,
+            others={REPLY_MAGIC: (MIN_REPLY, MAX_REPLY)},
+        )
+        # Where the side is open, the stream is named for the left hand.
+        super().__init__(glove_descriptor(side or "left", label), packets)
+        self._side: Side | None = side
+        self._device = f"glove_{'any' if side is None else hand_name(side, label)}"
+        self._on_reply = on_reply
+
+    def _sample(self, packet: Packet, t_host_ns: int) -> Sample | None:
+        if packet.magic == REPLY_MAGIC:
+            if self._on_reply is not None:
+                self._on_reply(packet, t_host_ns)
+            return None
+        check_packet(packet, device=self._device, source=self._side)
+        counts = np.frombuffer(packet.payload, _COUNT)
+        return Sample(t_host_ns, counts, packet.t_device_ns, packet.sequence)
 
 
 class Answer(NamedTuple):
@@ -108,30 +276,10 @@ class TactileGlove(Driver):
         answer = self._ask(Command.IDENTIFY)
         return parse_identity(answer.body, answer.packet.source)
 
-    def diagnostics(self) -> GloveDiagnostics:
-        """The glove's own counters."""
-        return parse_diagnostics(self._ask(Command.DIAGNOSTICS).body)
-
     def time_round_trip(self) -> RoundTrip:
         """One request for the glove's time; `dextouch.clocks.RoundTripClock` takes many of them."""
         body, packet, t_asked_ns, t_answered_ns = self._ask(Command.TIME_SYNC)
         return RoundTrip(t_asked_ns, parse_time(body), packet.t_device_ns, t_answered_ns)
-
-    def tare(self, num_packets: int) -> UInt16[np.ndarray, "360"]:
-        """Mean counts of the next packets, in raw scan order; the glove must be without load.
-
-        Args:
-            num_packets: 1 … 600.
-
-        Raises:
-            InvalidInputError: another number.
-            DeviceError: no answer in twice the time that the packets take.
-        """
-        if not 1 <= num_packets <= MAX_TARE_PACKETS:
-            raise InvalidInputError(f"tare: got {num_packets}, expected 1 … {MAX_TARE_PACKETS}")
-        timeout_ns = ANSWER_TIMEOUT_NS + round(2e9 * num_packets / NOMINAL_RATE_HZ)
-        answer = self._ask(Command.TARE, argument=num_packets, timeout_ns=timeout_ns)
-        return parse_tare(answer.body)
 
     def _check(self, identity: GloveIdentity) -> None:
         where = f"{self.name}: the glove {identity.serial_number!r} at {self.info.address}"
@@ -150,13 +298,10 @@ class TactileGlove(Driver):
                 event="wrong_side",
             )
 
-    def _ask(
-        self, command: Command, *, argument: int = 0, timeout_ns: int = ANSWER_TIMEOUT_NS
-    ) -> Answer:
+    def _ask(self, command: Command) -> Answer:
         for _ in range(NUM_ATTEMPTS):
             number = next(self._numbers) % SEQUENCE_MODULUS
-            data = encode_request(command, argument=argument, request=number)
-            t_asked_ns, reply = self._ask_once(number, data, timeout_ns)
+            t_asked_ns, reply = self._ask_once(number, encode_request(command, request=number))
             if reply is not None:
                 packet, t_answered_ns = reply
                 return Answer(self._body(command, packet), packet, t_asked_ns, t_answered_ns)
@@ -166,31 +311,29 @@ class TactileGlove(Driver):
             device=self.name,
         )
 
-    def _ask_once(
-        self, number: int, data: bytes, timeout_ns: int
-    ) -> tuple[int, tuple[Packet, int] | None]:
+    def _ask_once(self, number: int, data: bytes) -> tuple[int, tuple[Packet, int] | None]:
         try:
             with self._writing:
                 self._asked.add(number)
                 t_asked_ns = self._clock.now_ns()
                 self.transport.write(data)
-            return t_asked_ns, self._await(number, timeout_ns)
+            return t_asked_ns, self._await(number)
         finally:
             # Also replies that arrived too late: a station sends requests for months.
             with self._answered:
                 self._asked.discard(number)
                 self._replies.pop(number, None)
 
-    def _await(self, number: int, timeout_ns: int) -> tuple[Packet, int] | None:
+    def _await(self, number: int) -> tuple[Packet, int] | None:
         """The reply; read here if this is the reading thread, else that one brings it."""
         if self._reader in (None, threading.get_ident()):
-            return self._read_until(number, timeout_ns)
+            return self._read_until(number)
         with self._answered:
-            self._answered.wait_for(lambda: number in self._replies, timeout_ns * 1e-9)
+            self._answered.wait_for(lambda: number in self._replies, ANSWER_TIMEOUT_NS * 1e-9)
             return self._replies.pop(number, None)
 
-    def _read_until(self, number: int, timeout_ns: int) -> tuple[Packet, int] | None:
-        end_ns = self._clock.now_ns() + timeout_ns
+    def _read_until(self, number: int) -> tuple[Packet, int] | None:
+        end_ns = self._clock.now_ns() + ANSWER_TIMEOUT_NS
         num_silent = 0
         while number not in self._replies:
             if num_silent >= MAX_SILENT_READS or self._clock.now_ns() > end_ns:
@@ -223,3 +366,33 @@ class TactileGlove(Driver):
                 device=self.name,
             )
         return body
+
+
+class TactileGloveSettings(GloveSettings):
+    """Our glove on a serial line.
+
+    With serial number and port, the port is opened and the glove there must say that it has the
+    number. `protocol` has this one value; older settings named other gloves by it.
+    """
+
+    kind: Literal["tactile_glove"] = "tactile_glove"
+    protocol: Literal["dextouch"] = "dextouch"
+
+
+def build(settings: TactileGloveSettings, clock: StationClock) -> TactileGlove:
+    """The driver of one glove."""
+    return TactileGlove(
+        settings.side,
+        transport=serial_transport(settings, device=settings.device),
+        clock=clock,
+        serial_number=settings.serial_number,
+        label=settings.label,
+    )
+
+
+KIND = DeviceKind(
+    name="tactile_glove",
+    settings=TactileGloveSettings,
+    build=build,
+    mock="services.acquisition.devices.tactile_glove.mock:mock_glove",
+)

@@ -1,6 +1,6 @@
-"""Simulated glove of our own protocol, with its own offsets and gains, that answers commands."""
+"""Simulated glove of our own protocol, with its own offsets and gains, that answers requests."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,22 +10,73 @@ from dextouch.errors import ShapeError
 from dextouch.schemas import Matrix, matrix_rows
 from dextouch.tactile.layout import NUM_RAW_TAXELS, NUM_TAXELS, Side, expand_taxels
 from services.acquisition.clock import StationClock
-from services.acquisition.devices.tactile_glove.driver import TactileGlove
-from services.acquisition.devices.tactile_glove.mock_answers import GloveAnswers
-from services.acquisition.devices.tactile_glove.packets import FULL_SCALE_COUNTS, MAGIC
-from services.acquisition.drivers.packets import SOURCES, VERSION, Packet, encode_packet
+from services.acquisition.devices.tactile_glove.driver import (
+    COMMAND_MAGIC,
+    FULL_SCALE_COUNTS,
+    MAGIC,
+    REQUEST,
+    TIME_SYNC,
+    Command,
+    Status,
+    TactileGlove,
+    encode_identity,
+    encode_reply,
+)
+from services.acquisition.drivers.packets import (
+    SOURCES,
+    VERSION,
+    Packet,
+    PacketDecoder,
+    encode_packet,
+)
 from services.acquisition.mocks.edits import OurPacketEdits, Pinned, edit_ours
 from services.acquisition.mocks.pair import MockPair
 from services.acquisition.mocks.place import MockPlace
 from services.acquisition.mocks.ports import PtyPort
 from services.acquisition.mocks.replay import MockDevice, ReplayStream, device_rng
 
+FIRMWARE = (1, 0, 0)
 OFFSET_COUNTS = 120.0
 GAIN_COUNTS_PER_KPA = 40.0
 OFFSET_SPREAD_COUNTS = 10.0
 GAIN_SPREAD = 0.05
 # What pinned cells show.
 PINNED = {"stuck": 1_000, "saturated": FULL_SCALE_COUNTS}
+
+
+class GloveAnswers:
+    """Replies of a mock glove to the requests of the host.
+
+    Args:
+        side: which hand it says it is.
+        serial_number: that it says it has.
+        device_time_ns: gives what the glove's clock shows now.
+    """
+
+    def __init__(
+        self, side: Side, *, serial_number: str, device_time_ns: Callable[[], int]
+    ) -> None:
+        self._side: Side = side
+        self._bodies = {
+            Command.IDENTIFY: lambda _: encode_identity(serial_number, FIRMWARE),
+            Command.TIME_SYNC: TIME_SYNC.pack,
+        }
+        self._device_time_ns = device_time_ns
+        self._requests = PacketDecoder(
+            COMMAND_MAGIC, min_payload=REQUEST.size, max_payload=REQUEST.size
+        )
+
+    def answer(self, data: bytes) -> list[bytes]:
+        """Replies to the requests that `data` completes."""
+        t_received_ns = self._device_time_ns()
+        return [self._reply(packet, t_received_ns) for packet in self._requests.feed(data)]
+
+    def _reply(self, packet: Packet, t_received_ns: int) -> bytes:
+        body = self._bodies.get(REQUEST.unpack(packet.payload)[0])
+        made = Packet(VERSION, SOURCES[self._side], 0, self._device_time_ns(), b"")
+        if body is None:
+            return encode_reply(packet, Status.UNKNOWN_COMMAND, b"", made=made)
+        return encode_reply(packet, Status.OK, body(t_received_ns), made=made)
 
 
 @dataclass(frozen=True)
@@ -75,20 +126,18 @@ def mock_glove(
     name, side = place.name, place.side
     glove = calibration or GloveCalibration.seeded(side, place.seed)
     told: Side = worn_side or side
-    clock_of: list[_DeviceClock] = []
-    answers = GloveAnswers(
-        told, serial_number=name, device_time_ns=lambda: clock_of[0].now_ns() if clock_of else 0
-    )
     source = TactileGloveSource(
         place.stream,
         side=told,
         calibration=glove,
         dead_taxels=place.faults.dead_taxels,
-        answers=answers,
+    )
+    # The device is made of its port, and tells its time to what answers there.
+    answers = GloveAnswers(
+        told, serial_number=name, device_time_ns=lambda: _device_time_ns(device, place.clock)
     )
     port = PtyPort(name, answer=answers.answer)
     device = MockDevice(name, source=source, port=port, faults=place.faults, seed=place.seed)
-    clock_of.append(_DeviceClock(device, place.clock))
     driver = TactileGlove(side, transport=port.transport, clock=place.clock, serial_number=name)
     return MockPair(device, driver, glove.matrices(side))
 
@@ -115,7 +164,6 @@ class TactileGloveSource:
         side: which hand.
         calibration: of this glove.
         dead_taxels: raw cells that read zero.
-        answers: to the host's requests; without it the glove hears nothing.
     """
 
     edits = GlovePacketEdits()
@@ -127,7 +175,6 @@ class TactileGloveSource:
         side: Side,
         calibration: GloveCalibration,
         dead_taxels: Sequence[int] = (),
-        answers: GloveAnswers | None = None,
     ) -> None:
         if stream.descriptor.shape != (NUM_TAXELS,):
             raise ShapeError(
@@ -135,33 +182,23 @@ class TactileGloveSource:
             )
         self.t_ns = stream.t_ns
         self._side = side
-        self._answers = answers
         self._counts = calibration.counts(stream.values, side=side)
         self._counts[:, list(dead_taxels)] = 0
 
     def units(self, index: int, sequence: int, t_device_ns: int) -> list[bytes]:
-        """One packet, and the reply that waited for it, if any."""
+        """One packet."""
         counts = self._counts[index]
         packet = Packet(VERSION, SOURCES[self._side], sequence, t_device_ns, counts.tobytes())
-        replies = [] if self._answers is None else self._answers.note_packet(counts)
-        return [encode_packet(MAGIC, packet), *replies]
+        return [encode_packet(MAGIC, packet)]
 
 
-class _DeviceClock:
-    """Current time of a mock device's clock, extrapolated from its last packet."""
-
-    def __init__(self, device: MockDevice, clock: StationClock) -> None:
-        self._device = device
-        self._clock = clock
-
-    def now_ns(self) -> int:
-        """Device time; before the first packet, time since an arbitrary origin."""
-        ledger = self._device.ledger
-        now_ns = self._clock.now_ns()
-        if not ledger.t_device_ns:
-            return now_ns
-        # The ledger is written by the player's thread: a column may be one row ahead.
-        last = len(ledger.flipped_bits) - 1
-        since_ns = now_ns - ledger.t_true_ns[last]
-        skew_ns = round(since_ns * self._device.faults.skew_ppm * 1e-6)
-        return ledger.t_device_ns[last] + since_ns + skew_ns
+def _device_time_ns(device: MockDevice, clock: StationClock) -> int:
+    """Time of a mock device's clock, from its last packet; any origin before the first."""
+    ledger, now_ns = device.ledger, clock.now_ns()
+    if not ledger.t_device_ns:
+        return now_ns
+    # The ledger is written by the player's thread: a column may be one row ahead.
+    last = len(ledger.flipped_bits) - 1
+    since_ns = now_ns - ledger.t_true_ns[last]
+    skew_ns = round(since_ns * device.faults.skew_ppm * 1e-6)
+    return ledger.t_device_ns[last] + since_ns + skew_ns

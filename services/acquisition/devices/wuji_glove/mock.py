@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float32
 
 from dextouch.tactile.layout import NUM_TAXELS, Side, split_pads
-from services.acquisition.devices.wuji_glove.packets import (
+from services.acquisition.devices.wuji_glove.driver import (
     CRC,
     CRC_OFFSET,
     GRID,

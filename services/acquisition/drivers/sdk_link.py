@@ -3,6 +3,7 @@
 The bytes are documented in docs/device_packets.md, "Bridges".
 """
 
+from abc import abstractmethod
 from collections.abc import Callable
 from typing import Final, Literal
 
@@ -10,11 +11,14 @@ import numpy as np
 from jaxtyping import Float64
 from pydantic import Field, ValidationError, model_validator
 
-from dextouch.errors import DeviceError
+from dextouch.errors import DeviceError, StaleDataError
 from dextouch.frozen_model import FrozenModel
-from services.acquisition.drivers.base import check_packet
+from dextouch.streams import StreamDescriptor
+from services.acquisition.clock import StationClock
+from services.acquisition.drivers.base import Driver, Readings, StreamDecoder, check_packet
 from services.acquisition.drivers.packets import Packet, PacketDecoder
 from services.acquisition.drivers.reports import OrderFilter
+from services.acquisition.transports.ports import Transport
 
 PROTOCOL: Final = "dextouch-bridge"
 PROTOCOL_VERSION = 1
@@ -26,8 +30,13 @@ RESTART_NS = 1_000_000_000
 MAX_DRIFT_PPM = 200
 LENGTH_UNITS_M = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 
+# Why packets of a tracker become no sample.
+DROPPED = ("occluded", "jumped", "stale")
+
 BridgeKind = Literal["finger_tracker", "pose_tracker"]
 SignedAxis = Literal["+x", "-x", "+y", "-y", "+z", "-z"]
+HELLO_READS = 20
+SILENCE_NS = 200_000_000
 
 
 class BridgedDevice(FrozenModel):
@@ -132,8 +141,6 @@ class FreshnessGate:
     """
 
     def __init__(self) -> None:
-        self.num_old = 0
-        self.num_frozen = 0
         self._offset_ns: float | None = None
         self._t_host_ns = 0
         self._t_device_ns = 0
@@ -148,16 +155,12 @@ class FreshnessGate:
         if self._offset_ns is None or t_device_ns < self._t_device_ns - RESTART_NS:
             self._offset_ns = delay_ns
         elif t_device_ns <= self._t_device_ns:
-            self.num_frozen += 1
             return False
         else:
             drift_ns = (t_host_ns - self._t_host_ns) * (MAX_DRIFT_PPM * 1e-6)
             self._offset_ns = min(delay_ns, self._offset_ns + drift_ns)
         self._t_host_ns, self._t_device_ns = t_host_ns, t_device_ns
-        if delay_ns - self._offset_ns > MAX_AGE_NS:
-            self.num_old += 1
-            return False
-        return True
+        return delay_ns - self._offset_ns <= MAX_AGE_NS
 
 
 class BridgeConnection:
@@ -279,3 +282,98 @@ class BridgeConnection:
                 event="wrong_side",
             )
         return found[0]
+
+
+class BridgeDecoder(StreamDecoder[Packet]):
+    """Base of the decoders of one device behind a bridge.
+
+    Args:
+        descriptor: of the stream.
+        connection: the bridge's hello and packets; `statistics` are of all devices of the bridge.
+    """
+
+    def __init__(self, descriptor: StreamDescriptor, connection: BridgeConnection) -> None:
+        super().__init__(descriptor, connection)
+        connection.on_hello = self._learn
+        self.connection = connection
+        self.tracking = dict.fromkeys(DROPPED, 0)
+        self._freshness = FreshnessGate()
+
+    def events(self) -> dict[str, int]:
+        """Packets left out so far, by the reason."""
+        return {**self.tracking, **self.connection.order.counts()}
+
+    def is_fresh(self, t_device_ns: int, t_host_ns: int) -> bool:
+        """Whether a sample is new; one that is not counts as stale."""
+        is_new = self._freshness.admits(t_device_ns, t_host_ns)
+        self.tracking["stale"] += not is_new
+        return is_new
+
+    def reset(self) -> None:
+        """The connection was lost."""
+        super().reset()
+        self._freshness.reset()
+
+    @abstractmethod
+    def _learn(self, hello: BridgeHello) -> None:
+        """Take in what a new connection's hello says of the sender."""
+
+
+class BridgeDriver(Driver):
+    """A device behind a bridge: waits for the hello, and takes silence for loss.
+
+    A bridge shows at least every 50 ms that it lives. A bridge that sends nothing for 200 ms has
+    stopped or is disconnected, which the socket alone would not indicate for minutes.
+    """
+
+    def __init__(
+        self, name: str, *, transport: Transport, decoder: BridgeDecoder, clock: StationClock
+    ) -> None:
+        super().__init__(name, transport=transport, decoder=decoder, clock=clock)
+        self._connection = decoder.connection
+        self._t_heard_ns = 0
+        self._first: Readings = {}
+
+    def open(self) -> None:
+        """Connect and learn who is there.
+
+        Raises:
+            DeviceError: no connection, no hello within 2 s, or another device than requested.
+        """
+        super().open()
+        self._t_heard_ns = self._clock.now_ns()
+        for _ in range(HELLO_READS):
+            self._first = super().read()
+            if self._connection.hello is not None:
+                self._t_heard_ns = self._clock.now_ns()
+                return
+        raise DeviceError(
+            f"{self.name}: {self.info} sends no hello; is this the address of a bridge?",
+            device=self.name,
+            event="wrong_hello",
+        )
+
+    def read(self) -> Readings:
+        """New samples; empty when nothing came.
+
+        Raises:
+            StaleDataError: the bridge has sent nothing for 200 ms.
+            DeviceError: the bridge is disconnected or uses another protocol.
+        """
+        if self._first:
+            first, self._first = self._first, {}
+            return first
+        data = self.transport.read()
+        t_host_ns = self._clock.now_ns()
+        if data:
+            self._t_heard_ns = t_host_ns
+            return self.decoder.decode(data, t_host_ns)
+        silence_ns = t_host_ns - self._t_heard_ns
+        if silence_ns > SILENCE_NS:
+            raise StaleDataError(
+                f"{self.name}: {self.info} has sent nothing for {silence_ns / 1e6:.0f} ms, "
+                "expected a heartbeat every 50 ms; is the SDK process still running?",
+                device=self.name,
+                event="silent_bridge",
+            )
+        return {}

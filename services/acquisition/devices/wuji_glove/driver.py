@@ -2,7 +2,7 @@
 
 import math
 import struct
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import fastcrc
 import numpy as np
@@ -11,8 +11,10 @@ from jaxtyping import Float32
 from dextouch.errors import DeviceError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import CellLayout, StreamDecoder, hand_name
-from services.acquisition.drivers.packet_search import (
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
+from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, hand_name
+from services.acquisition.drivers.packets import (
     FrameSearch,
     SequenceCounter,
 )
@@ -150,3 +152,24 @@ def are_pressures(cells: Float32[np.ndarray, " n"]) -> bool:
     # These two pass over NaN unless there is nothing else.
     low, high = float(np.fmin.reduce(cells)), float(np.fmax.reduce(cells))
     return (low >= 0.0 and high <= 1.0) or math.isnan(low)
+
+
+class WujiGloveSettings(GloveSettings):
+    """A Wuji glove on a serial line; its packets contain the hand."""
+
+    kind: Literal["wuji_glove"] = "wuji_glove"
+
+
+def build(settings: WujiGloveSettings, clock: StationClock) -> Driver:
+    """The driver of one glove."""
+    transport = serial_transport(settings, device=settings.device)
+    decoder = WujiGloveDecoder(settings.side, label=settings.label)
+    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
+
+
+KIND = DeviceKind(
+    name="wuji_glove",
+    settings=WujiGloveSettings,
+    build=build,
+    mock="services.acquisition.devices.wuji_glove.mock:mock_wuji_glove",
+)

@@ -6,14 +6,19 @@ packet apart, and only when its numbers can be readings. A bit error that leaves
 not seen by anyone; the stream's capabilities say so.
 """
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float32
+from pydantic import Field
 
 from dextouch.errors import DeviceError, InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor
 from dextouch.tactile.layout import Side
-from services.acquisition.drivers.base import CellLayout, StreamDecoder, hand_name
-from services.acquisition.drivers.packet_search import PortionedSearch
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import DeviceKind, GloveSettings, serial_transport
+from services.acquisition.drivers.base import CellLayout, Driver, StreamDecoder, hand_name
+from services.acquisition.drivers.packets import PortionedSearch
 
 TAIL = b"\x00\x00\x80\x7f"
 FLOAT_BYTES = 4
@@ -192,3 +197,39 @@ def are_readings(values: Float32[np.ndarray, " n"], largest_bits: int) -> bool:
     largest = int(np.maximum.reduce(bits))
     smallest = int(np.minimum.reduce(bits - _ONE)) + 1
     return largest <= largest_bits and smallest >= _SMALLEST_NORMAL
+
+
+class JustFloatGloveSettings(GloveSettings):
+    """Settings of a glove on a serial port whose packets do not describe themselves.
+
+    Attributes:
+        num_values: float32s of a packet.
+        full_scale: the largest reading.
+        rate_hz: nominal rate.
+    """
+
+    kind: Literal["justfloat_glove"] = "justfloat_glove"
+    num_values: int = Field(ge=1, le=4096)
+    full_scale: float = Field(gt=0, le=1e30)
+    rate_hz: float = Field(gt=0, le=10_000)
+
+
+def build(settings: JustFloatGloveSettings, clock: StationClock) -> Driver:
+    """The driver of one glove."""
+    transport = serial_transport(settings, device=settings.device)
+    decoder = JustFloatGloveDecoder(
+        settings.side,
+        num_values=settings.num_values,
+        full_scale=settings.full_scale,
+        rate_hz=settings.rate_hz,
+        label=settings.label,
+    )
+    return Driver(settings.device, transport=transport, decoder=decoder, clock=clock)
+
+
+KIND = DeviceKind(
+    name="justfloat_glove",
+    settings=JustFloatGloveSettings,
+    build=build,
+    mock="services.acquisition.devices.justfloat_glove.mock:mock_justfloat_glove",
+)

@@ -2,14 +2,18 @@
 
 import struct
 from collections.abc import Sequence
-from typing import Literal
+from typing import Literal, get_args
 
 import numpy as np
+from pydantic import Field
 
 from dextouch.errors import InvalidInputError
 from dextouch.streams import ClockCapabilities, Sample, StreamDescriptor, StreamKind
-from services.acquisition.drivers.base import Readings, check_packet
+from services.acquisition.clock import StationClock
+from services.acquisition.devices.kind import DeviceKind, TcpSettings
+from services.acquisition.drivers.base import Driver, Readings, check_packet
 from services.acquisition.drivers.packets import PacketDecoder
+from services.acquisition.transports.ports import tcp_transport
 
 MAGIC = b"DXRS"
 NUM_JOINTS = 40
@@ -26,6 +30,14 @@ STREAM_SIZES = {
 }
 PAYLOAD = struct.Struct(f"<{sum(STREAM_SIZES.values())}d")
 _NUMBER = np.dtype("<f8")
+RobotStream = Literal[
+    "joints_measured",
+    "joints_commanded",
+    "wrist_left",
+    "wrist_right",
+    "wrist_left_commanded",
+    "wrist_right_commanded",
+]
 
 
 def robot_descriptor(stream: str) -> StreamDescriptor:
@@ -97,3 +109,28 @@ class RobotStateDecoder:
                     readings.setdefault(stream, []).append(sample)
                 start += size
         return readings
+
+
+class RobotStateSettings(TcpSettings):
+    """A robot's state server at a TCP address.
+
+    `streams` names those of its six streams that are recorded: a station whose trackers give the
+    wrists leaves `wrist_left` and `wrist_right` out.
+    """
+
+    kind: Literal["robot_state"] = "robot_state"
+    streams: tuple[RobotStream, ...] = Field(default=get_args(RobotStream), min_length=1)
+
+
+def build(settings: RobotStateSettings, clock: StationClock) -> Driver:
+    """The driver of one robot."""
+    decoder = RobotStateDecoder(settings.streams)
+    return Driver(
+        "robot_state",
+        transport=tcp_transport(settings.host, settings.port),
+        decoder=decoder,
+        clock=clock,
+    )
+
+
+KIND = DeviceKind(name="robot_state", settings=RobotStateSettings, build=build)

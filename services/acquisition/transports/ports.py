@@ -1,0 +1,392 @@
+"""Ports of this host: serial lines, HID devices and stream sockets, as drivers read them."""
+
+import contextlib
+import os
+import select
+import socket
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Generic, Protocol, TypeVar, runtime_checkable
+
+import structlog
+
+from dextouch.errors import DeviceError
+
+if TYPE_CHECKING:
+    import serial
+
+logger = structlog.get_logger(__name__)
+
+Handle = TypeVar("Handle")
+
+READ_TIMEOUT_S = 0.1
+MAX_REPORT_BYTES = 64
+CONNECT_TIMEOUT_S = 2.0
+# A device that takes nothing in must not hold up the station for ever.
+WRITE_TIMEOUT_S = 0.5
+# The kernel keeps a closing port for up to 30 s while the device takes nothing in; only root may
+# shorten that.
+CLOSE_TIMEOUT_S = 1.0
+# More than a kernel buffer of a serial line holds: one read takes all that has come.
+SERIAL_READ_BYTES = 65_536
+READ_BYTES = 1 << 18
+
+
+@dataclass(frozen=True)
+class TransportInfo:
+    """Where a transport leads, for messages and the dashboard."""
+
+    kind: str
+    address: str
+    serial_number: str | None = None
+
+    def __str__(self) -> str:
+        return f"{self.kind} {self.address}"
+
+
+@runtime_checkable
+class Transport(Protocol):
+    """A way to one device. Every failure of the link is a DeviceError."""
+
+    @property
+    def info(self) -> TransportInfo:
+        """Where it leads."""
+        ...
+
+    def open(self) -> None:
+        """Open the link; an open one is closed first."""
+        ...
+
+    def read(self) -> bytes:
+        """What has arrived, waiting a moment for the first byte; b"" means: nothing yet."""
+        ...
+
+    def write(self, data: bytes) -> None:
+        """Send all of `data`."""
+        ...
+
+    def close(self) -> None:
+        """Close the link; closing twice is fine."""
+        ...
+
+
+class HandleTransport(ABC, Generic[Handle]):
+    """Base of transports over what a library opens: a port, a device, a socket, a camera.
+
+    Args:
+        info: where it leads.
+    """
+
+    def __init__(self, info: TransportInfo) -> None:
+        self.info = info
+        self._handle: Handle | None = None
+
+    def open(self) -> None:
+        """Find and open the device; an open one is closed first.
+
+        Raises:
+            DeviceError: absent, taken by another process, not permitted, or not to be opened.
+        """
+        self.close()
+        self._handle = self._connect()
+
+    def close(self) -> None:
+        """Give the device back; closing twice is fine."""
+        handle, self._handle = self._handle, None
+        if handle is not None:
+            self._release(handle)
+
+    def _opened(self) -> Handle:
+        if self._handle is None:
+            raise DeviceError(f"{self.info}: not open")
+        return self._handle
+
+    @abstractmethod
+    def _connect(self) -> Handle:
+        """Open the device anew."""
+
+    @abstractmethod
+    def _release(self, handle: Handle) -> None:
+        """Close what `_connect` gave."""
+
+
+def find_port(serial_number: str) -> str:
+    """The port of the device with this serial number, whatever its name is today.
+
+    Raises:
+        DeviceError: no such device is plugged in (the message lists those that are), or several
+            with this number.
+    """
+    from serial.tools import list_ports
+
+    ports = list_ports.comports()
+    found = sorted(port.device for port in ports if port.serial_number == serial_number)
+    if not found:
+        present = ", ".join(sorted(p.serial_number for p in ports if p.serial_number)) or "none"
+        raise DeviceError(
+            f"serial device {serial_number!r} is not plugged in; present: {present}",
+            serial_number=serial_number,
+        )
+    if len(found) > 1:
+        raise DeviceError(
+            f"serial device {serial_number!r}: got {len(found)} devices with this number "
+            f"({', '.join(found)}), expected one; name the port instead",
+            serial_number=serial_number,
+        )
+    return found[0]
+
+
+class SerialTransport(HandleTransport["serial.Serial"]):
+    """One serial port, held exclusively.
+
+    Args:
+        find: gives the port's name at every opening, so that a replugged device is found again.
+        baud_rate: bits per second (USB devices ignore it).
+        serial_number: of the device, for messages.
+    """
+
+    def __init__(
+        self,
+        find: Callable[[], str],
+        *,
+        baud_rate: int = 2_000_000,
+        serial_number: str | None = None,
+    ) -> None:
+        super().__init__(TransportInfo("serial", "not opened", serial_number))
+        self._find = find
+        self._baud_rate = baud_rate
+        self._closing: threading.Thread | None = None
+        self._poll = select.poll()
+
+    def read(self) -> bytes:
+        """All that has arrived, waiting up to 0.1 s for the first byte.
+
+        Raises:
+            DeviceError: the port is closed or the device is gone.
+        """
+        port = self._opened()
+        # The wait has its own bound: one left to the line ends only if nobody changes its settings.
+        if not self._poll.poll(READ_TIMEOUT_S * 1e3):
+            return b""
+        try:
+            data = os.read(port.fileno(), SERIAL_READ_BYTES)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
+        if not data:
+            raise DeviceError(f"{self.info}: unplugged while reading (end of file)")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes, within 0.5 s.
+
+        Raises:
+            DeviceError: the port is closed, the device is gone or takes nothing in.
+        """
+        try:
+            self._opened().write(data)
+        except (OSError, TypeError, ValueError) as error:
+            # pyserial fails with the latter two where another thread closes the port meanwhile.
+            raise DeviceError(f"{self.info}: lost while writing ({error})") from error
+
+    def _connect(self) -> "serial.Serial":
+        """Find and open the port; its input buffer is cleared."""
+        import serial
+
+        if self._closing is not None and self._closing.is_alive():
+            raise DeviceError(
+                f"{self.info}: is still being closed, because the device does not read; wait half "
+                "a minute or replug it"
+            )
+        # The port of now, for messages.
+        self.info = replace(self.info, address=self._find())
+        try:
+            port = serial.Serial(
+                self.info.address,
+                self._baud_rate,
+                timeout=READ_TIMEOUT_S,
+                write_timeout=WRITE_TIMEOUT_S,
+                exclusive=True,
+            )
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise DeviceError(f"{self.info}: cannot be opened ({error}); is it in use?") from error
+        # USB bridges of one maker hold bytes back for 16 ms unless told otherwise; now is the time,
+        # since doing it in full flow stalls them. Ports without such a timer refuse.
+        with contextlib.suppress(OSError, ValueError):
+            port.set_low_latency_mode(True)
+        self._poll = select.poll()
+        self._poll.register(port.fileno(), select.POLLIN)
+        return port
+
+    def _release(self, handle: "serial.Serial") -> None:
+        """Close the port; what takes longer than 1 s goes on by itself, and is said."""
+        self._closing = threading.Thread(
+            target=self._give_back, args=(handle,), name="close-serial", daemon=True
+        )
+        self._closing.start()
+        self._closing.join(CLOSE_TIMEOUT_S)
+        if self._closing.is_alive():
+            logger.warning("wait_for_port_to_close", address=self.info.address)
+
+    def _give_back(self, port: "serial.Serial") -> None:
+        try:
+            port.close()
+        except OSError as error:
+            logger.warning("fail_to_close_port", address=self.info.address, error=str(error))
+
+
+@runtime_checkable
+class HidDevice(Protocol):
+    """What we use of an opened hidapi device."""
+
+    def read(self, max_length: int, timeout_ms: int = 0) -> list[int]:
+        """One report; [] when none has come yet; OSError when unplugged."""
+        ...
+
+    def write(self, buff: bytes) -> int:
+        """Send a report, its id first; the number of bytes, or -1."""
+        ...
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+def hid_opener(
+    *, vendor_id: int, product_id: int, serial_number: str | None = None
+) -> Callable[[], HidDevice]:
+    """What opens the real device of these ids (hidraw; the libusb backend detaches other users)."""
+
+    def open_device() -> HidDevice:
+        import hidraw
+
+        device = hidraw.device()
+        device.open(vendor_id, product_id, serial_number)
+        return device
+
+    return open_device
+
+
+class HidTransport(HandleTransport[HidDevice]):
+    """One HID device; `read` gives one report, and b"" means nothing yet (never: stale)."""
+
+    def __init__(
+        self,
+        open_device: Callable[[], HidDevice],
+        *,
+        address: str,
+        serial_number: str | None = None,
+    ) -> None:
+        super().__init__(TransportInfo("hid", address, serial_number))
+        self._open_device = open_device
+
+    def read(self) -> bytes:
+        """One report, waiting up to 0.1 s.
+
+        Raises:
+            DeviceError: the device is gone.
+        """
+        try:
+            return bytes(self._opened().read(MAX_REPORT_BYTES, round(READ_TIMEOUT_S * 1e3)))
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while reading ({error})") from error
+
+    def write(self, data: bytes) -> None:
+        """Send one report; its first byte is the report id.
+
+        Raises:
+            DeviceError: the device is gone or takes no such report.
+        """
+        try:
+            written = self._opened().write(data)
+        except OSError as error:
+            raise DeviceError(f"{self.info}: unplugged while writing ({error})") from error
+        if written < len(data):
+            raise DeviceError(f"{self.info}: wrote {written} bytes, expected at least {len(data)}")
+
+    def _connect(self) -> HidDevice:
+        try:
+            return self._open_device()
+        except OSError as error:
+            raise DeviceError(
+                f"{self.info}: cannot be opened ({error}); plugged in, and allowed by udev?"
+            ) from error
+
+    def _release(self, handle: HidDevice) -> None:
+        handle.close()
+
+
+class SocketTransport(HandleTransport[socket.socket]):
+    """One stream socket, reconnected at every opening."""
+
+    def __init__(self, connect: Callable[[], socket.socket], *, address: str) -> None:
+        super().__init__(TransportInfo("socket", address))
+        self._dial = connect
+
+    def read(self) -> bytes:
+        """All that has arrived, waiting up to 0.1 s for the first byte.
+
+        Raises:
+            DeviceError: the far end is gone.
+        """
+        try:
+            data = self._opened().recv(READ_BYTES)
+        except TimeoutError:
+            return b""
+        except OSError as error:
+            raise DeviceError(f"{self.info}: lost while reading ({error})") from error
+        if not data:
+            raise DeviceError(f"{self.info}: closed by the device")
+        return data
+
+    def write(self, data: bytes) -> None:
+        """Send all bytes.
+
+        Raises:
+            DeviceError: the far end is gone.
+        """
+        try:
+            self._opened().sendall(data)
+        except OSError as error:
+            raise DeviceError(f"{self.info}: lost while writing ({error})") from error
+
+    def _connect(self) -> socket.socket:
+        try:
+            link = self._dial()
+        except OSError as error:
+            raise DeviceError(f"{self.info}: cannot connect ({error})") from error
+        link.settimeout(READ_TIMEOUT_S)
+        return link
+
+    def _release(self, handle: socket.socket) -> None:
+        handle.close()
+
+
+def tcp_transport(host: str, port: int) -> SocketTransport:
+    """The connection to a device or bridge at `host:port`, not opened."""
+
+    def connect() -> socket.socket:
+        link = socket.create_connection((host, port), timeout=CONNECT_TIMEOUT_S)
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        return link
+
+    return SocketTransport(connect, address=f"{host}:{port}")
+
+
+def unix_transport(path: str) -> SocketTransport:
+    """The connection to a bridge on this machine by its socket's path, not opened."""
+
+    def connect() -> socket.socket:
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        link.settimeout(CONNECT_TIMEOUT_S)
+        try:
+            link.connect(path)
+        except OSError:
+            link.close()
+            raise
+        return link
+
+    return SocketTransport(connect, address=path)
